@@ -1,0 +1,1 @@
+"""Shadowgrams and proton radiographs to deflection potentials and line-integrated fields."""

@@ -1,0 +1,23 @@
+"""The errors that a user of the package can meet.
+
+Each message is one sentence (or two) that says what was received, what is
+expected and what to do. Everything the package raises for a user's mistake is an
+`InputError` or a `FileFormatError`, so a caller needs to catch no more than
+``(ValueError, OSError)``.
+"""
+
+from __future__ import annotations
+
+__all__ = ["FileFormatError", "InputError", "InversionCancelled"]
+
+
+class InputError(ValueError):
+    """An argument, image or option that cannot be used."""
+
+
+class FileFormatError(OSError):
+    """A file that is missing, damaged, or of another kind than its name says."""
+
+
+class InversionCancelled(Exception):  # noqa: N818 - it is no error: the user asked for it
+    """Raised by the core when `should_stop` returned true."""

@@ -1,0 +1,1 @@
+"""Plane geometry of power diagrams; knows no physics."""

@@ -1,0 +1,1 @@
+"""Files: radiographs in, results out."""

@@ -1,0 +1,126 @@
+"""Every choice of an inversion, in one validated model.
+
+The same model is the keyword of `invert`, the CLI's ``--options`` file, the form
+in a window, and is saved with each result: there is no second list of defaults.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
+
+MAX_DEFAULT_SITES = 1_000_000
+
+
+class InversionOptions(BaseModel):
+    """Choices of an inversion; all have a default that suits most images.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        (a `ValueError`) if a value is out of range or a name is unknown.
+
+    Examples
+    --------
+    >>> InversionOptions(n_sites=10_000).tolerance
+    0.001
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    n_sites: int | None = Field(
+        default=None,
+        ge=4,
+        title="Sites",
+        description=(
+            "Number of sites spread over the source. Default: as many as pixels, "
+            f"at most {MAX_DEFAULT_SITES:,}."
+        ),
+    )
+    floor: float = Field(
+        default=1e-3,
+        gt=0,
+        lt=1,
+        title="Floor",
+        description=(
+            "Smallest intensity of the image, as a share of its mean: darker pixels are raised "
+            "to it. It keeps the transport solvable; below 1e-3 it rarely converges."
+        ),
+    )
+    tolerance: float = Field(
+        default=1e-3,
+        gt=0,
+        lt=1,
+        title="Tolerance",
+        description="Largest relative flux error allowed in any cell when the solver ends.",
+    )
+    lloyd_iterations: int = Field(
+        default=5,
+        ge=0,
+        le=1000,
+        title="Lloyd iterations",
+        description="Most steps of weighted Lloyd relaxation that even out the sites.",
+    )
+    lloyd_tolerance: float = Field(
+        default=0.02,
+        ge=0,
+        title="Lloyd tolerance",
+        description=(
+            "Lloyd relaxation ends when the sites move by less than this (root mean square), "
+            "in units of the mean spacing of the sites."
+        ),
+    )
+    readout: Literal["dual", "centroid"] = Field(
+        default="dual",
+        title="Read-out",
+        description=(
+            "'dual': the potential is half the weight of each site. 'centroid': the paper's way, "
+            "natural-neighbour interpolation of centroid displacements, then integration."
+        ),
+    )
+    solver: Literal["newton", "lbfgs"] = Field(
+        default="newton",
+        title="Solver",
+        description=(
+            "'newton': multilevel damped Newton. 'lbfgs': limited-memory BFGS from zero weights, "
+            "as in the paper; slow, for comparison."
+        ),
+    )
+    max_iterations: int = Field(
+        default=100,
+        ge=1,
+        title="Iterations",
+        description="Most solver steps on each level before it gives up and says so.",
+    )
+    negative: Literal["refuse", "clip"] = Field(
+        default="refuse",
+        title="Negative pixels",
+        description=(
+            "'refuse': an image with negative values is an error. 'clip': negative values "
+            "(left over from background subtraction) become zero, and are counted in the report."
+        ),
+    )
+    caustic_jacobian: float = Field(
+        default=0.1,
+        ge=0,
+        title="Caustic threshold",
+        description=(
+            "Pixels whose map has a Jacobian determinant below this are marked as caustics: "
+            "there rays cross or nearly do, and the field is less certain."
+        ),
+    )
+    seed: int = Field(
+        default=0,
+        ge=0,
+        title="Seed",
+        description="Seed of the random site positions; the same seed gives the same result.",
+    )
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        title="Threads",
+        description="Threads of the kernels. Default: all cores. Results do not depend on it.",
+    )

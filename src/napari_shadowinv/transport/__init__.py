@@ -1,0 +1,1 @@
+"""Semi-discrete optimal transport between a source and an image."""
