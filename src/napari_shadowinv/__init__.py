@@ -1,1 +1,77 @@
-"""Shadowgrams and proton radiographs to deflection potentials and line-integrated fields."""
+"""Shadowgrams and proton radiographs to deflection potentials and line-integrated fields.
+
+- invert an image: `invert`, with `InversionOptions`; the answer is an `Inversion`
+- share sites between shots with one source: `plan_sites`
+- what a deflection means in SI units: `ProtonSetup`, `OpticalSetup`
+- predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
+- read and write files: `read`, `write`
+
+Arrays are ``[y, x]``, vectors in axis order (y, x), a pixel's centre is at its integer
+index, and lengths are object-plane pixels unless a setup makes them SI.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
+    from napari_shadowinv.inversion import Inversion, Report, invert, plan_sites
+    from napari_shadowinv.io import Radiograph, read, write
+    from napari_shadowinv.options import InversionOptions
+    from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.physics.poisson import poisson_invert
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.progress import Progress
+
+__all__ = [
+    "FileFormatError",
+    "InputError",
+    "Inversion",
+    "InversionCancelled",
+    "InversionOptions",
+    "OpticalSetup",
+    "Progress",
+    "ProtonSetup",
+    "Radiograph",
+    "Report",
+    "invert",
+    "plan_sites",
+    "poisson_invert",
+    "read",
+    "synthetic_image",
+    "write",
+]
+
+_HOME = {
+    "FileFormatError": "errors",
+    "InputError": "errors",
+    "Inversion": "inversion",
+    "InversionCancelled": "errors",
+    "InversionOptions": "options",
+    "OpticalSetup": "physics.setup",
+    "Progress": "progress",
+    "ProtonSetup": "physics.setup",
+    "Radiograph": "io",
+    "Report": "inversion",
+    "invert": "inversion",
+    "plan_sites": "inversion",
+    "poisson_invert": "physics.poisson",
+    "read": "io",
+    "synthetic_image": "physics.forward",
+    "write": "io",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used: numba and scipy take a second to load."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

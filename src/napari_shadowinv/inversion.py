@@ -7,20 +7,34 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
+from napari_shadowinv.preprocess import Prepared, checked_source, number_of_sites, prepare
+from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv.readout import read_centroids, read_dual
+from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.transport.sites import Level, SitePlan, plan_levels
+from napari_shadowinv.transport.solvers import Solution, solve
 
 if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
-__all__ = ["Inversion", "Report"]
+__all__ = ["Inversion", "Report", "invert", "plan_sites"]
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -104,16 +118,16 @@ class Inversion:
         The choices that made it.
     """
 
-    image: NDArray[np.float64]
-    source: NDArray[np.float64]
-    potential: NDArray[np.float64]
-    displacement: NDArray[np.float64]
-    sites: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    site_mass: NDArray[np.float64]
-    site_displacement: NDArray[np.float64]
-    reprojection: NDArray[np.float64]
-    residual: NDArray[np.float64]
+    image: Array
+    source: Array
+    potential: Array
+    displacement: Array
+    sites: Array
+    weights: Array
+    site_mass: Array
+    site_displacement: Array
+    reprojection: Array
+    residual: Array
     caustic: NDArray[np.bool_]
     report: Report
     options: InversionOptions
@@ -134,3 +148,219 @@ class Inversion:
         from napari_shadowinv.io.dataset import dataset_from_inversion
 
         return dataset_from_inversion(self, setup)
+
+
+class _Stopwatch:
+    """Adds up the seconds spent in each stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent = time.perf_counter() - start
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
+
+
+def plan_sites(
+    source: ArrayLike,
+    options: InversionOptions | None = None,
+    *,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> SitePlan:
+    """Spread the sites over a source, once for all images that share it.
+
+    Parameters
+    ----------
+    source : array_like, shape (H, W)
+        The undisturbed beam.
+    options : InversionOptions, optional
+        Its `n_sites`, `lloyd_iterations`, `lloyd_tolerance`, `seed` and `threads` are used.
+    on_progress, should_stop
+        See `invert`.
+
+    Returns
+    -------
+    SitePlan
+        To be passed to `invert` as `plan`.
+
+    Raises
+    ------
+    InputError
+        If the source is no image of a beam or the sites do not fit in memory.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    options = options or InversionOptions()
+    beam = checked_source(source)
+    return plan_levels(
+        beam,
+        number_of_sites(beam.shape, options),
+        lloyd_iterations=options.lloyd_iterations,
+        lloyd_tolerance=options.lloyd_tolerance,
+        seed=options.seed,
+        threads=options.threads,
+        report=Reporter(on_progress, should_stop),
+    )
+
+
+def invert(
+    image: ArrayLike,
+    *,
+    source: ArrayLike | None = None,
+    options: InversionOptions | None = None,
+    plan: SitePlan | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Inversion:
+    """Retrieve the deflection potential that turns the source into the image.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot: counts or any linear measure of fluence.
+    source : array_like, shape (H, W), optional
+        The undisturbed beam. Default: uniform. Image and source are brought to the same
+        flux, so their units need not match.
+    options : InversionOptions, optional
+        Choices; the default suits most images.
+    plan : SitePlan, optional
+        Sites prepared by `plan_sites`; its source is used, and `source` must be left out.
+    on_progress : callable, optional
+        Receives a `napari_shadowinv.progress.Progress` now and then.
+    should_stop : callable, optional
+        Asked now and then; when it returns true the inversion ends.
+
+    Returns
+    -------
+    Inversion
+        Also where the solver did not converge: `Inversion.report` then says how far
+        it got and why.
+
+    Raises
+    ------
+    InputError
+        If image or source cannot be inverted.
+    InversionCancelled
+        If `should_stop` returned true.
+
+    References
+    ----------
+    Kasim et al., "Quantitative shadowgraphy and proton radiography for large intensity
+    modulations", arXiv:1607.04179, section III and its algorithm.
+
+    Examples
+    --------
+    A uniform image needs no deflection:
+
+    >>> import numpy as np
+    >>> inversion = invert(np.full((20, 20), 7.0))
+    >>> float(abs(inversion.displacement).max())
+    0.0
+    """
+    options = options or InversionOptions()
+    report = Reporter(on_progress, should_stop)
+    stopwatch = _Stopwatch()
+
+    with stopwatch("prepare"):
+        report("prepare", 0, 1)
+        if plan is not None and source is not None:
+            raise InputError("got both plan and source, expected one: a plan has its own source")
+        prepared = prepare(image, source if plan is None else plan.source, options)
+        report("prepare", 1, 1)
+    with stopwatch("sites"):
+        if plan is None:
+            plan = plan_sites(
+                prepared.source, options, on_progress=on_progress, should_stop=should_stop
+            )
+    with stopwatch("transport"):
+        solutions = solve(plan.levels, prepared.floored, options, report)
+    with stopwatch("read-out"):
+        report("read-out", 0, 2)
+        level = plan.levels[-1]
+        weights = solutions[-1].weights
+        site_displacement = _site_displacement(level, weights, prepared.floored, options)
+        height, width = prepared.image.shape
+        potential, displacement = _read_out(
+            level, weights, site_displacement, (height, width), options
+        )
+        report("read-out", 1, 2)
+        reprojection = synthetic_image(displacement, prepared.source, threads=options.threads)
+        report("read-out", 2, 2)
+    return Inversion(
+        image=prepared.image,
+        source=prepared.source,
+        potential=potential,
+        displacement=displacement,
+        sites=level.sites,
+        weights=weights,
+        site_mass=level.mass,
+        site_displacement=site_displacement,
+        reprojection=reprojection,
+        residual=prepared.image - reprojection,
+        caustic=jacobian_determinant(displacement) < options.caustic_jacobian,
+        report=_report(prepared, plan, solutions, stopwatch.seconds, options),
+        options=options,
+    )
+
+
+def _site_displacement(
+    level: Level, weights: Array, image: Array, options: InversionOptions
+) -> Array:
+    """Centroid of each cell in the image, minus its site."""
+    objective = TransportObjective(
+        level.triangulation.copy(), level.mass, Density.from_image(image), threads=options.threads
+    )
+    displacement: Array = objective.diagram(weights, with_moments=True).centroids - level.sites
+    return displacement
+
+
+def _read_out(
+    level: Level,
+    weights: Array,
+    site_displacement: Array,
+    shape: tuple[int, int],
+    options: InversionOptions,
+) -> tuple[Array, Array]:
+    """Potential and displacement at the pixels, by the read-out that the options name."""
+    if options.readout == "centroid":
+        return read_centroids(level, site_displacement, shape, options.threads)
+    return read_dual(level, weights, site_displacement, shape, options.threads)
+
+
+def _report(
+    prepared: Prepared,
+    plan: SitePlan,
+    solutions: list[Solution],
+    seconds: dict[str, float],
+    options: InversionOptions,
+) -> Report:
+    finest = solutions[-1]
+    warnings = prepared.warnings
+    if not finest.converged:
+        warnings = (
+            f"not converged: flux residual {finest.residual:.2g} per cell, asked for "
+            f"{options.tolerance:.2g}; {finest.reason}",
+            *warnings,
+        )
+    return Report(
+        converged=finest.converged,
+        iterations=sum(solution.iterations for solution in solutions),
+        residual=finest.residual,
+        tolerance=options.tolerance,
+        n_sites=len(plan.levels[-1].sites),
+        floor=options.floor,
+        floored_pixels=prepared.floored_pixels,
+        clipped_pixels=prepared.clipped_pixels,
+        levels=tuple(
+            (len(solution.weights), solution.iterations, solution.residual)
+            for solution in solutions
+        ),
+        seconds=seconds,
+        warnings=warnings,
+    )

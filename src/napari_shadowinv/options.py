@@ -90,7 +90,7 @@ class InversionOptions(BaseModel):
         ),
     )
     max_iterations: int = Field(
-        default=100,
+        default=300,
         ge=1,
         title="Iterations",
         description="Most solver steps on each level before it gives up and says so.",

@@ -1,0 +1,251 @@
+"""Sibson's natural-neighbour interpolation.
+
+A point that is added to a Voronoi diagram takes its cell from its neighbours; the shares
+of the area that each of them gives are the weights of their values. The result is
+continuous, smooth but at the sites, and exact for linear functions.
+
+- interpolate values at scattered sites: `natural_neighbor`
+
+References
+----------
+R. Sibson, "A brief description of natural neighbour interpolation" (1981); paper,
+section III.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv.geometry._threads import available_threads, in_ranges
+from napari_shadowinv.geometry.interpolation import BLOCK, locate
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+
+__all__ = ["natural_neighbor"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int32]
+
+_LARGEST_CAVITY = 256
+
+
+@njit(nogil=True, cache=True)
+def _circumcentre(
+    ay: float, ax: float, by: float, bx: float, cy: float, cx: float
+) -> tuple[float, float]:
+    """Circumcentre relative to a; far away where the points are in line."""
+    by -= ay
+    bx -= ax
+    cy -= ay
+    cx -= ax
+    double_area = by * cx - bx * cy
+    if double_area == 0.0:
+        double_area = 1e-300
+    b2 = 0.5 * (by * by + bx * bx)
+    c2 = 0.5 * (cy * cy + cx * cx)
+    return (b2 * cx - c2 * bx) / double_area, (c2 * by - b2 * cy) / double_area
+
+
+@njit(nogil=True, cache=True)
+def _circle_holds(points: Array, corners: Indices, y: float, x: float) -> bool:
+    """Whether (y, x) lies inside the circumcircle of the counter-clockwise triangle."""
+    ay = points[corners[0], 0] - y
+    ax = points[corners[0], 1] - x
+    by = points[corners[1], 0] - y
+    bx = points[corners[1], 1] - x
+    cy = points[corners[2], 0] - y
+    cx = points[corners[2], 1] - x
+    a2 = ay * ay + ax * ax
+    b2 = by * by + bx * bx
+    c2 = cy * cy + cx * cx
+    return a2 * (by * cx - bx * cy) + b2 * (cy * ax - cx * ay) + c2 * (ay * bx - ax * by) > 0
+
+
+@njit(nogil=True, cache=True)
+def _cavity(
+    vertices: Indices,
+    neighbors: Indices,
+    points: Array,
+    start: int,
+    y: float,
+    x: float,
+    cavity: Indices,
+) -> int:
+    """List the triangles whose circumcircles hold (y, x), from the one around it."""
+    cavity[0] = start
+    count = 1
+    done = 0
+    while done < count and count < cavity.shape[0]:
+        t = cavity[done]
+        done += 1
+        for k in range(3):
+            other = neighbors[t, k]
+            if other < 0 or _position(cavity, count, other) >= 0:
+                continue
+            if count < cavity.shape[0] and _circle_holds(points, vertices[other], y, x):
+                cavity[count] = other
+                count += 1
+    return count
+
+
+@njit(nogil=True, cache=True)
+def _position(items: Indices, count: int, item: int) -> int:
+    for i in range(count):
+        if items[i] == item:
+            return i
+    return -1
+
+
+@njit(nogil=True, cache=True)
+def _stolen_area(
+    vertices: Indices,
+    neighbors: Indices,
+    points: Array,
+    cavity: Indices,
+    count: int,
+    t: int,
+    k: int,
+    y: float,
+    x: float,
+) -> tuple[int, float]:
+    """Area that the site at the end of a rim edge of the cavity gives to (y, x).
+
+    The edge is the one opposite corner k of triangle t. Around its end b lie the centre of
+    the new triangle on this edge, those of the cavity's triangles at b, and the centre
+    of the new triangle on the next rim edge.
+    """
+    a = vertices[t, (k + 1) % 3]
+    b = vertices[t, (k + 2) % 3]
+    by = points[b, 0]
+    bx = points[b, 1]
+    first_y, first_x = _circumcentre(by, bx, y, x, points[a, 0], points[a, 1])
+    last_y = first_y
+    last_x = first_x
+    double_area = 0.0
+    pivot = (k + 2) % 3
+    while True:
+        i = (pivot + 1) % 3
+        j = (pivot + 2) % 3
+        centre_y, centre_x = _circumcentre(
+            by,
+            bx,
+            points[vertices[t, i], 0],
+            points[vertices[t, i], 1],
+            points[vertices[t, j], 0],
+            points[vertices[t, j], 1],
+        )
+        double_area += last_y * centre_x - last_x * centre_y
+        last_y = centre_y
+        last_x = centre_x
+        # cross the edge from b to corner i, towards the rest of b's cavity triangles
+        other = neighbors[t, j]
+        if other < 0 or _position(cavity, count, other) < 0:
+            c = vertices[t, i]
+            break
+        t = other
+        pivot = 0
+        while vertices[t, pivot] != b:
+            pivot += 1
+    new_y, new_x = _circumcentre(by, bx, y, x, points[c, 0], points[c, 1])
+    double_area += last_y * new_x - last_x * new_y
+    double_area += new_y * first_x - new_x * first_y
+    return b, abs(double_area)
+
+
+@njit(nogil=True, cache=True)
+def _interpolate_blocks(
+    start: int,
+    stop: int,
+    queries: Array,
+    vertices: Indices,
+    neighbors: Indices,
+    points: Array,
+    values: Array,
+    out: Array,
+) -> None:
+    """Interpolate blocks `start` to `stop` of the queries."""
+    n = values.shape[0]
+    cavity = np.empty(_LARGEST_CAVITY, np.int32)
+    for block in range(start, stop):
+        t = 0
+        for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
+            y, x = queries[q]
+            t = locate(vertices, neighbors, points, t, y, x)
+            met = -1
+            for k in range(3):
+                corner = vertices[t, k]
+                if corner < n and points[corner, 0] == y and points[corner, 1] == x:
+                    met = corner
+            if met >= 0:
+                out[q] = values[met]
+                continue
+            count = _cavity(vertices, neighbors, points, t, y, x, cavity)
+            total = 0.0
+            out[q] = 0.0
+            for c in range(count):
+                for k in range(3):
+                    other = neighbors[cavity[c], k]
+                    if other >= 0 and _position(cavity, count, other) >= 0:
+                        continue
+                    site, area = _stolen_area(
+                        vertices, neighbors, points, cavity, count, cavity[c], k, y, x
+                    )
+                    if site < n:
+                        total += area
+                        out[q] += area * values[site]
+            if total > 0:
+                out[q] /= total
+
+
+def natural_neighbor(
+    triangulation: RegularTriangulation,
+    values: ArrayLike,
+    queries: ArrayLike,
+    *,
+    threads: int | None = None,
+) -> Array:
+    """Interpolate values at scattered sites by Sibson's natural neighbours.
+
+    Parameters
+    ----------
+    triangulation : RegularTriangulation
+        Delaunay triangulation (zero weights) of the n sites.
+    values : array_like, shape (n, ...)
+        Values at the sites.
+    queries : array_like, shape (m, 2)
+        Points (y, x) inside the hull of the sites.
+    threads : int, optional
+        Default: all cores. Results do not depend on it.
+
+    Returns
+    -------
+    ndarray, shape (m, ...)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> corners = np.array([[0.0, 0.0], [0.0, 4.0], [4.0, 0.0], [4.0, 4.0]])
+    >>> natural_neighbor(RegularTriangulation(corners), corners[:, 0], [[1.0, 2.5]])
+    array([1.])
+    """
+    at_sites = np.asarray(values, dtype=np.float64)
+    points = np.ascontiguousarray(queries, dtype=np.float64)
+    columns = at_sites.reshape(len(at_sites), -1)
+    out = np.empty((len(points), columns.shape[1]))
+    for column in range(columns.shape[1]):
+        result = np.empty(len(points))
+        in_ranges(
+            _interpolate_blocks,
+            -(-len(points) // BLOCK),
+            available_threads(threads),
+            points,
+            triangulation.vertices,
+            triangulation.neighbors,
+            triangulation.points,
+            np.ascontiguousarray(columns[:, column]),
+            result,
+            smallest=2,
+        )
+        out[:, column] = result
+    return out.reshape(len(points), *at_sites.shape[1:])

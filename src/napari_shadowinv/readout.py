@@ -1,0 +1,116 @@
+"""From the weights of the sites to the potential and displacement at every pixel.
+
+- from the dual variables, without any integration: `read_dual` (default)
+- the paper's way, from the cells' centroids: `read_centroids`
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
+
+from napari_shadowinv.geometry.natural_neighbor import natural_neighbor
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.transport.potential import potential_surface
+from napari_shadowinv.transport.sites import Level
+
+__all__ = ["read_centroids", "read_dual"]
+
+Array = NDArray[np.float64]
+
+
+def read_dual(
+    level: Level,
+    weights: Array,
+    site_displacement: Array,
+    shape: tuple[int, int],
+    threads: int | None = None,
+) -> tuple[Array, Array]:
+    """Read the potential off the weights: at a site it is half the weight.
+
+    Parameters
+    ----------
+    level : Level
+        The sites.
+    weights : ndarray, shape (n,)
+        Weights, px².
+    site_displacement : ndarray, shape (n, 2)
+        Centroid of each cell in the image minus its site, px.
+    shape : tuple of int
+        Shape (H, W) of the image.
+    threads : int, optional
+        Default: all cores.
+
+    Returns
+    -------
+    potential : ndarray, shape (H, W)
+        px², zero in the mean over the border.
+    displacement : ndarray, shape (2, H, W)
+        Minus its gradient (central differences), px.
+    """
+    surface = potential_surface(level, weights, site_displacement, shape, threads=threads)
+    potential = surface(_pixels(shape))[0].reshape(shape)
+    potential -= border_mean(potential)
+    return potential, -np.array(np.gradient(potential, edge_order=2))
+
+
+def read_centroids(
+    level: Level,
+    site_displacement: Array,
+    shape: tuple[int, int],
+    threads: int | None = None,
+) -> tuple[Array, Array]:
+    """Interpolate the centroids' displacements and integrate them, as the paper does.
+
+    The sites nearest to the corners are moved there, so that the sites' hull covers the
+    image; this distorts the result near the corners.
+
+    Parameters
+    ----------
+    level, site_displacement, shape, threads
+        See `read_dual`.
+
+    Returns
+    -------
+    potential : ndarray, shape (H, W)
+        The mean of integrating y first and x first, px²; zero in the mean over the border.
+    displacement : ndarray, shape (2, H, W)
+        Natural-neighbour interpolation of the sites' displacements, px.
+
+    References
+    ----------
+    Paper, section III and lines 22–26 of its algorithm.
+    """
+    sites = _moved_to_corners(level.sites, shape)
+    displacement = natural_neighbor(
+        RegularTriangulation(sites), site_displacement, _pixels(shape), threads=threads
+    )
+    displacement = np.ascontiguousarray(displacement.T).reshape(2, *shape)
+    potential = _integrated(displacement)
+    return potential - border_mean(potential), displacement
+
+
+def _pixels(shape: tuple[int, int]) -> Array:
+    return np.indices(shape, dtype=np.float64).reshape(2, -1).T
+
+
+def _moved_to_corners(sites: Array, shape: tuple[int, int]) -> Array:
+    """Move the site nearest to each corner of the image to it."""
+    moved = sites.copy()
+    for y in (-0.5, shape[0] - 0.5):
+        for x in (-0.5, shape[1] - 0.5):
+            nearest = np.argmin((sites[:, 0] - y) ** 2 + (sites[:, 1] - x) ** 2)
+            moved[nearest] = y, x
+    return moved
+
+
+def _integrated(displacement: Array) -> Array:
+    """Integrate minus the displacement along y then x, and along x then y; their mean."""
+    along_y = cumulative_trapezoid(displacement[0], axis=0, initial=0)
+    along_x = cumulative_trapezoid(displacement[1], axis=1, initial=0)
+    y_first = along_y[:, :1] + along_x
+    x_first = along_x[:1, :] + along_y
+    mean: Array = -0.5 * (y_first + x_first)
+    return mean

@@ -1,0 +1,88 @@
+"""The convex function whose minimum is the transport from the source to the image.
+
+    f(w) = -Σ_i [ w_i S_i + ∫_{P_i} (|r - r_i|² - w_i) I dr ],
+    ∂f/∂w_i = T_i - S_i,   ∂²f/∂w_i∂w_j = -∫_{P_i ∩ P_j} I ds / (2 |r_i - r_j|)
+
+- f, its gradient and its Hessian at given weights: `TransportObjective`
+
+References
+----------
+Paper, Eqs. 5 and 6; F. Aurenhammer, F. Hoffmann and B. Aronov, Algorithmica 20, 61 (1998).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+
+__all__ = ["TransportObjective"]
+
+Array = NDArray[np.float64]
+
+
+class TransportObjective:
+    """The function f(w) for given sites, their source flux, and an image.
+
+    Parameters
+    ----------
+    triangulation : RegularTriangulation
+        Triangulation of the sites; it follows the weights that are asked for.
+    mass : ndarray, shape (n,)
+        Source flux S_i of each site; its sum must equal the image's flux.
+    image : Density
+        The image.
+    threads : int, optional
+        Threads of the kernels; results do not depend on it.
+    """
+
+    def __init__(
+        self,
+        triangulation: RegularTriangulation,
+        mass: Array,
+        image: Density,
+        *,
+        threads: int | None = None,
+    ) -> None:
+        self.triangulation = triangulation
+        self.mass = mass
+        self.image = image
+        self.threads = threads
+
+    def diagram(self, weights: Array, *, with_moments: bool = False) -> PowerDiagram:
+        """Return the power diagram for `weights`; empty cells are allowed."""
+        self.triangulation.update(weights)
+        return PowerDiagram(
+            self.triangulation, self.image, with_moments=with_moments, threads=self.threads
+        )
+
+    def diagram_if_full(self, weights: Array) -> PowerDiagram | None:
+        """Return the power diagram for `weights`, or None as soon as a cell proves empty."""
+        if not self.triangulation.update(weights, stop_when_hidden=True):
+            return None
+        return PowerDiagram(self.triangulation, self.image, threads=self.threads)
+
+    def value_and_gradient(self, weights: Array) -> tuple[float, Array]:
+        """Return f(w) and its gradient T - S (paper, Eqs. 5 and 6).
+
+        Parameters
+        ----------
+        weights : ndarray, shape (n,)
+            Weights in px².
+
+        Returns
+        -------
+        value : float
+        gradient : ndarray, shape (n,)
+        """
+        diagram = self.diagram(weights, with_moments=True)
+        gradient = diagram.masses - self.mass
+        value = float(weights @ gradient - diagram.inertia.sum())
+        return value, gradient
+
+    def residual(self, diagram: PowerDiagram) -> float:
+        """Return the largest relative flux error of a cell, max |T - S| / S."""
+        return float(np.max(np.abs(diagram.masses - self.mass) / self.mass))

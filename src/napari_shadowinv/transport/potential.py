@@ -1,0 +1,73 @@
+"""From the weights of the sites to a smooth potential everywhere.
+
+In the optimum the image of site i lies at r_i - ½ ∇w, so half the weights are the
+normalised deflection potential at the sites, and minus the displacements of the cells'
+centroids are, nearly, its gradients. A C¹ surface through both serves the read-out at
+the pixels and the start of a finer level.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.geometry.interpolation import (
+    CloughTocher,
+    fit_gradients,
+    mirrored_across_border,
+)
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.transport.sites import Level
+
+__all__ = ["potential_surface"]
+
+Array = NDArray[np.float64]
+
+_MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between sites
+
+
+def potential_surface(
+    level: Level,
+    weights: Array,
+    site_displacement: Array,
+    shape: tuple[int, int],
+    *,
+    sweeps: int = 1,
+    threads: int | None = None,
+) -> CloughTocher:
+    """Lay a C¹ surface through the potential at the sites.
+
+    Parameters
+    ----------
+    level : Level
+        The sites.
+    weights : ndarray, shape (n,)
+        Their weights, px².
+    site_displacement : ndarray, shape (n, 2)
+        Centroid of each cell minus its site, px.
+    shape : tuple of int
+        Shape (H, W) of the image; the surface continues smoothly to its border.
+    sweeps : int
+        Sweeps of the gradient fit (see `fit_gradients`).
+    threads : int, optional
+        Threads of the evaluation.
+
+    Returns
+    -------
+    CloughTocher
+        The potential (px²) and its gradient at any point of the image.
+    """
+    mirrored, origin = mirrored_across_border(
+        level.sites, shape, _MIRROR_BAND * level.spacing
+    )
+    potential = 0.5 * weights
+    gradient = fit_gradients(level.triangulation, potential, -site_displacement, sweeps)
+    beyond = potential[origin] + (
+        gradient[origin] * (mirrored - level.sites[origin])
+    ).sum(axis=1)
+    return CloughTocher(
+        RegularTriangulation(np.concatenate([level.sites, mirrored])),
+        np.concatenate([potential, beyond]),
+        np.concatenate([gradient, gradient[origin]]),
+        threads=threads,
+    )

@@ -1,0 +1,237 @@
+"""Sites spread over the undisturbed beam, each standing for about the same flux.
+
+- drop sites by rejection: `sample_sites`
+- even them out: `lloyd`
+- all levels of a multilevel solution, ready to use: `plan_sites`
+
+References
+----------
+Paper, sections II.C and III: rejection, then weighted Lloyd relaxation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
+from napari_shadowinv.progress import Reporter
+
+__all__ = ["Level", "SitePlan", "lloyd", "plan_levels", "sample_sites"]
+
+Array = NDArray[np.float64]
+
+COARSEST = 600  # sites with which the solver can start from zero weights
+RATIO = 4  # sites of a level per site of the next coarser one
+
+
+@dataclass(frozen=True)
+class Level:
+    """The sites of one level of the multilevel solution.
+
+    Attributes
+    ----------
+    sites : ndarray, shape (n, 2)
+        Positions, in the order of a Hilbert curve.
+    mass : ndarray, shape (n,)
+        Flux of the source in each site's Voronoi cell, S(V_i) of the paper.
+    triangulation : RegularTriangulation
+        Their Delaunay triangulation; copy it before changing weights.
+    spacing : float
+        Mean distance between neighbours, sqrt(area of the image / n), in px.
+    lloyd_iterations : int
+        Lloyd steps that were made.
+    """
+
+    sites: Array
+    mass: Array
+    triangulation: RegularTriangulation
+    spacing: float
+    lloyd_iterations: int
+
+
+@dataclass(frozen=True)
+class SitePlan:
+    """Everything about the sites that depends on the source alone.
+
+    Attributes
+    ----------
+    source : ndarray, shape (H, W)
+        The source that the sites stand for.
+    levels : tuple of Level
+        Coarse to fine.
+    """
+
+    source: Array
+    levels: tuple[Level, ...]
+
+
+@njit(nogil=True, cache=True)
+def _accepted(source: Array, first: int, count: int, shift: Array, sites: Array) -> int:
+    """Throw points of an even sequence at the source; keep them by its brightness.
+
+    The sequence is the three-dimensional Kronecker sequence of the root of x⁴ = x + 1,
+    which leaves fewer gaps and clumps than independent random points.
+    """
+    root = 1.2207440846057596
+    height, width = source.shape
+    brightest = source.max()
+    kept = 0
+    number = first
+    while kept < count:
+        number += 1
+        u = (shift[0] + number / root) % 1.0
+        v = (shift[1] + number / root**2) % 1.0
+        threshold = (shift[2] + number / root**3) % 1.0
+        y = u * height
+        x = v * width
+        if threshold * brightest < source[min(int(y), height - 1), min(int(x), width - 1)]:
+            sites[kept, 0] = y - 0.5
+            sites[kept, 1] = x - 0.5
+            kept += 1
+    return number
+
+
+def sample_sites(source: Array, n_sites: int, seed: int = 0) -> Array:
+    """Deploy sites on the source by rejection: bright places keep more of them.
+
+    Parameters
+    ----------
+    source : ndarray, shape (H, W)
+        Non-negative, with some positive pixel.
+    n_sites : int
+        How many.
+    seed : int
+        Shifts the sequence of positions.
+
+    Returns
+    -------
+    ndarray, shape (n_sites, 2)
+        Positions (y, x), in the order of a Hilbert curve.
+
+    References
+    ----------
+    Paper, section II.C; for the sequence H. Niederreiter, *Random Number Generation and
+    Quasi-Monte Carlo Methods* (SIAM, 1992), chapter 3.
+    """
+    sites = np.empty((n_sites, 2))
+    shift = np.random.default_rng(seed).random(3)
+    _accepted(np.ascontiguousarray(source, dtype=np.float64), 0, n_sites, shift, sites)
+    return np.ascontiguousarray(sites[hilbert_order(sites)])
+
+
+def lloyd(
+    sites: Array,
+    source: Density,
+    *,
+    iterations: int,
+    tolerance: float = 0.0,
+    threads: int | None = None,
+    report: Reporter | None = None,
+) -> tuple[Array, int]:
+    """Move each site to the centroid of its Voronoi cell, again and again.
+
+    Parameters
+    ----------
+    sites : ndarray, shape (n, 2)
+        Start.
+    source : Density
+        Weighs the centroids.
+    iterations : int
+        Most steps.
+    tolerance : float
+        The steps end when the root mean square move is below this, in units of the
+        mean spacing of the sites.
+    threads : int, optional
+        Threads of the kernels.
+    report : Reporter, optional
+        Told of each step.
+
+    Returns
+    -------
+    sites : ndarray, shape (n, 2)
+        Where the sites are now.
+    steps : int
+        Steps that were made.
+
+    References
+    ----------
+    Paper, section II.C, and lines 6–10 of its algorithm.
+    """
+    spacing = _spacing(source.shape, len(sites))
+    for step in range(iterations):
+        diagram = PowerDiagram(
+            RegularTriangulation(sites), source, with_moments=True, threads=threads
+        )
+        move = diagram.centroids - sites
+        sites = diagram.centroids
+        if report is not None:
+            report("sites", step + 1, iterations, f"{len(sites):,} sites, Lloyd relaxation")
+        if np.sqrt((move**2).sum(axis=1).mean()) < tolerance * spacing:
+            return sites, step + 1
+    return sites, iterations
+
+
+def _spacing(shape: tuple[int, int], n: int) -> float:
+    return float(np.sqrt(shape[0] * shape[1] / n))
+
+
+def plan_levels(
+    source: Array,
+    n_sites: int,
+    *,
+    lloyd_iterations: int,
+    lloyd_tolerance: float = 0.0,
+    seed: int = 0,
+    threads: int | None = None,
+    report: Reporter | None = None,
+) -> SitePlan:
+    """Spread the sites of all levels over a source.
+
+    Parameters
+    ----------
+    source : ndarray, shape (H, W)
+        The undisturbed beam.
+    n_sites : int
+        Sites of the finest level; each coarser one has a quarter.
+    lloyd_iterations, lloyd_tolerance, seed, threads, report
+        See `lloyd` and `sample_sites`.
+
+    Returns
+    -------
+    SitePlan
+        Levels with their masses and triangulations.
+    """
+    density = Density.from_image(source)
+    counts = [n_sites]
+    while counts[-1] > COARSEST:
+        counts.append(max(4, counts[-1] // RATIO))
+    levels = []
+    for count in reversed(counts):
+        sites = sample_sites(source, count, seed)
+        sites, steps = lloyd(
+            sites,
+            density,
+            iterations=lloyd_iterations,
+            tolerance=lloyd_tolerance,
+            threads=threads,
+            report=report,
+        )
+        levels.append(_level(sites, density, steps, threads))
+    return SitePlan(source, tuple(levels))
+
+
+def level_of_sites(sites: Array, source: Density, threads: int | None = None) -> Level:
+    """Make a level of given sites."""
+    return _level(np.ascontiguousarray(sites, dtype=np.float64), source, 0, threads)
+
+
+def _level(sites: Array, density: Density, steps: int, threads: int | None) -> Level:
+    triangulation = RegularTriangulation(sites)
+    mass = PowerDiagram(triangulation, density, threads=threads).masses
+    return Level(sites, mass, triangulation, _spacing(density.shape, len(sites)), steps)
