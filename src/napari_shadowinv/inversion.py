@@ -23,7 +23,7 @@ from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_ima
 from napari_shadowinv.preprocess import Prepared, checked_source, number_of_sites, prepare
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.readout import read_centroids, read_dual
-from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.transport.potential import site_displacement
 from napari_shadowinv.transport.sites import Level, SitePlan, plan_levels
 from napari_shadowinv.transport.solvers import Solution, solve
 
@@ -284,11 +284,9 @@ def invert(
         report("read-out", 0, 2)
         level = plan.levels[-1]
         weights = solutions[-1].weights
-        site_displacement = _site_displacement(level, weights, prepared.floored, options)
-        height, width = prepared.image.shape
-        potential, displacement = _read_out(
-            level, weights, site_displacement, (height, width), options
-        )
+        density = Density.from_image(prepared.floored)
+        of_sites = site_displacement(level, weights, density, options.threads)
+        potential, displacement = _read_out(level, weights, of_sites, density.shape, options)
         report("read-out", 1, 2)
         reprojection = synthetic_image(displacement, prepared.source, threads=options.threads)
         report("read-out", 2, 2)
@@ -300,7 +298,7 @@ def invert(
         sites=level.sites,
         weights=weights,
         site_mass=level.mass,
-        site_displacement=site_displacement,
+        site_displacement=of_sites,
         reprojection=reprojection,
         residual=prepared.image - reprojection,
         caustic=jacobian_determinant(displacement) < options.caustic_jacobian,
@@ -309,28 +307,17 @@ def invert(
     )
 
 
-def _site_displacement(
-    level: Level, weights: Array, image: Array, options: InversionOptions
-) -> Array:
-    """Centroid of each cell in the image, minus its site."""
-    objective = TransportObjective(
-        level.triangulation.copy(), level.mass, Density.from_image(image), threads=options.threads
-    )
-    displacement: Array = objective.diagram(weights, with_moments=True).centroids - level.sites
-    return displacement
-
-
 def _read_out(
     level: Level,
     weights: Array,
-    site_displacement: Array,
+    of_sites: Array,
     shape: tuple[int, int],
     options: InversionOptions,
 ) -> tuple[Array, Array]:
     """Potential and displacement at the pixels, by the read-out that the options name."""
     if options.readout == "centroid":
-        return read_centroids(level, site_displacement, shape, options.threads)
-    return read_dual(level, weights, site_displacement, shape, options.threads)
+        return read_centroids(level, of_sites, shape, options.threads)
+    return read_dual(level, weights, of_sites, shape, options.threads)
 
 
 def _report(

@@ -84,9 +84,7 @@ def prepare(image: ArrayLike, source: ArrayLike | None, options: InversionOption
         )
     beam = np.full(values.shape, values.mean()) if source is None else checked_source(source)
     if beam.shape != values.shape:
-        raise InputError(
-            f"source has shape {beam.shape}, image {values.shape}: they must match"
-        )
+        raise InputError(f"source has shape {beam.shape}, image {values.shape}: they must match")
     ratio = float(values.sum() / beam.sum())
     values = values / ratio
     least = options.floor * values.mean()

@@ -63,9 +63,7 @@ class Reporter:
         self._on_progress = on_progress
         self._should_stop = should_stop
 
-    def __call__(
-        self, stage: str, step: int, total: int | None = None, message: str = ""
-    ) -> None:
+    def __call__(self, stage: str, step: int, total: int | None = None, message: str = "") -> None:
         if self._should_stop is not None and self._should_stop():
             raise InversionCancelled(f"stopped on request during {stage}")
         if self._on_progress is not None:

@@ -50,9 +50,7 @@ def in_ranges(
         kernel(0, n, *args)
         return
     with ThreadPoolExecutor(ranges - 1) as pool:
-        others = [
-            pool.submit(kernel, bounds[k], bounds[k + 1], *args) for k in range(1, ranges)
-        ]
+        others = [pool.submit(kernel, bounds[k], bounds[k + 1], *args) for k in range(1, ranges)]
         kernel(bounds[0], bounds[1], *args)
         for other in others:
             other.result()

@@ -111,8 +111,7 @@ def _piece(
         f_mid * dy,
         sixth * (y0 * f0 + 4 * y_mid * f_mid + y1 * f1),
         sixth * (g0 + 4 * g_mid + g1),
-        sixth
-        * (y0 * y0 * f0 + k0 + 4 * (y_mid * y_mid * f_mid + k_mid) + y1 * y1 * f1 + k1),
+        sixth * (y0 * y0 * f0 + k0 + 4 * (y_mid * y_mid * f_mid + k_mid) + y1 * y1 * f1 + k1),
     )
 
 
@@ -159,10 +158,10 @@ def walk_edge(
 
     y = ya + t * dy
     x = xa + t * dx
-    row = min(max(int(math.floor(y)), 0), height - 1)
+    row = min(max(math.floor(y), 0), height - 1)
     if dy < 0 and row == y and row > 0:
         row -= 1
-    column = min(max(int(math.floor(min(max(x, -1.0), last))) + 1, 0), last)
+    column = min(max(math.floor(min(max(x, -1.0), last)) + 1, 0), last)
     if dx < 0 and column - 1 == x and column > 0:
         column -= 1
     length = math.sqrt(dy * dy + dx * dx)

@@ -186,9 +186,7 @@ def _edge_ordinates(
 
 
 @njit(nogil=True, cache=True)
-def _patch(
-    p: Array, f: Array, g: Array, y: float, x: float
-) -> tuple[float, float, float]:
+def _patch(p: Array, f: Array, g: Array, y: float, x: float) -> tuple[float, float, float]:
     """Value and gradient at (y, x) of the surface over the triangle p."""
     cy = (p[0, 0] + p[1, 0] + p[2, 0]) / 3
     cx = (p[0, 1] + p[1, 1] + p[2, 1]) / 3
@@ -200,9 +198,7 @@ def _patch(
     for k in range(3):
         i = (k + 1) % 3
         j = (k + 2) % 3
-        bary[k] = (
-            (p[i, 0] - y) * (p[j, 1] - x) - (p[i, 1] - x) * (p[j, 0] - y)
-        ) / double_area
+        bary[k] = ((p[i, 0] - y) * (p[j, 1] - x) - (p[i, 1] - x) * (p[j, 0] - y)) / double_area
         slope[k, 0] = (p[i, 1] - p[j, 1]) / double_area
         slope[k, 1] = (p[j, 0] - p[i, 0]) / double_area
 
@@ -349,7 +345,8 @@ class CloughTocher:
 
     >>> import numpy as np
     >>> sites = np.array([[0.0, 0.0], [0.0, 3.0], [3.0, 0.0], [3.0, 4.0]])
-    >>> surface = CloughTocher(RegularTriangulation(sites), sites[:, 0], np.tile([1.0, 0.0], (4, 1)))
+    >>> upwards = np.tile([1.0, 0.0], (4, 1))
+    >>> surface = CloughTocher(RegularTriangulation(sites), sites[:, 0], upwards)
     >>> surface(np.array([[1.0, 2.0], [-1.0, 1.0]]))[0]
     array([ 1., -1.])
     """

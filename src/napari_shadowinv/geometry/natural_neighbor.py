@@ -59,7 +59,8 @@ def _circle_holds(points: Array, corners: Indices, y: float, x: float) -> bool:
     a2 = ay * ay + ax * ax
     b2 = by * by + bx * bx
     c2 = cy * cy + cx * cx
-    return a2 * (by * cx - bx * cy) + b2 * (cy * ax - cx * ay) + c2 * (ay * bx - ax * by) > 0
+    signed = a2 * (by * cx - bx * cy) + b2 * (cy * ax - cx * ay) + c2 * (ay * bx - ax * by)
+    return bool(signed > 0)
 
 
 @njit(nogil=True, cache=True)

@@ -11,25 +11,59 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import (
     CloughTocher,
     fit_gradients,
     mirrored_across_border,
 )
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.sites import Level
 
-__all__ = ["potential_surface"]
+__all__ = ["potential_surface", "site_displacement"]
 
 Array = NDArray[np.float64]
 
 _MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between sites
 
 
+def site_displacement(
+    level: Level, weights: Array, image: Density, threads: int | None = None
+) -> Array:
+    """Find where the flux of each site goes.
+
+    Parameters
+    ----------
+    level : Level
+        The sites.
+    weights : ndarray, shape (n,)
+        Their weights, px².
+    image : Density
+        The image.
+    threads : int, optional
+        Threads of the kernels.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Centroid of each cell in the image minus its site, px.
+
+    References
+    ----------
+    Paper, lines 21–23 of its algorithm.
+    """
+    triangulation = level.triangulation.copy()
+    triangulation.update(weights)
+    diagram = PowerDiagram(triangulation, image, with_moments=True, threads=threads)
+    displacement: Array = diagram.centroids - level.sites
+    return displacement
+
+
 def potential_surface(
     level: Level,
     weights: Array,
-    site_displacement: Array,
+    displacement: Array,
     shape: tuple[int, int],
     *,
     sweeps: int = 1,
@@ -43,8 +77,8 @@ def potential_surface(
         The sites.
     weights : ndarray, shape (n,)
         Their weights, px².
-    site_displacement : ndarray, shape (n, 2)
-        Centroid of each cell minus its site, px.
+    displacement : ndarray, shape (n, 2)
+        Displacement of each site, px; see `site_displacement`.
     shape : tuple of int
         Shape (H, W) of the image; the surface continues smoothly to its border.
     sweeps : int
@@ -57,14 +91,10 @@ def potential_surface(
     CloughTocher
         The potential (px²) and its gradient at any point of the image.
     """
-    mirrored, origin = mirrored_across_border(
-        level.sites, shape, _MIRROR_BAND * level.spacing
-    )
+    mirrored, origin = mirrored_across_border(level.sites, shape, _MIRROR_BAND * level.spacing)
     potential = 0.5 * weights
-    gradient = fit_gradients(level.triangulation, potential, -site_displacement, sweeps)
-    beyond = potential[origin] + (
-        gradient[origin] * (mirrored - level.sites[origin])
-    ).sum(axis=1)
+    gradient = fit_gradients(level.triangulation, potential, -displacement, sweeps)
+    beyond = potential[origin] + (gradient[origin] * (mirrored - level.sites[origin])).sum(axis=1)
     return CloughTocher(
         RegularTriangulation(np.concatenate([level.sites, mirrored])),
         np.concatenate([potential, beyond]),

@@ -25,7 +25,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.linear import solve_laplacian
 from napari_shadowinv.transport.objective import TransportObjective
-from napari_shadowinv.transport.potential import potential_surface
+from napari_shadowinv.transport.potential import potential_surface, site_displacement
 from napari_shadowinv.transport.sites import Level
 
 __all__ = ["Solution", "newton", "solve", "solve_multilevel"]
@@ -102,7 +102,9 @@ def newton(
             report("transport", iterations, None, f"{len(mass):,} sites, residual {residual:.2g}")
         gap = mass - diagram.masses
         step = solve_laplacian(diagram.laplacian(), gap, _LINEAR_TOLERANCE)
-        damped = _damped_step(objective, weights, step, np.linalg.norm(gap), keep * mass.mean())
+        damped = _damped_step(
+            objective, weights, step, float(np.linalg.norm(gap)), keep * mass.mean()
+        )
         if damped is None:
             reason = "no step along Newton's direction lowers the error without emptying a cell"
             break
@@ -201,7 +203,7 @@ def solve_multilevel(
         if number == 0:
             weights = _coarsest_start(level, image, max_iterations, threads, report)
         else:
-            weights = _prolong(levels[number - 1], previous, solutions[-1], level, image.shape)
+            weights = _prolong(levels[number - 1], solutions[-1], level, density, threads)
         weights = _TOWARDS_FULL_CELLS * objective.triangulation.lower_hidden(weights)
         finest = number == len(levels) - 1
         solution = newton(
@@ -212,7 +214,6 @@ def solve_multilevel(
             report=report,
         )
         solutions.append(solution)
-        previous = objective
     return solutions
 
 
@@ -243,20 +244,15 @@ def _coarsest_start(
 
 
 def _prolong(
-    coarse: Level,
-    objective: TransportObjective,
-    solution: Solution,
-    fine: Level,
-    shape: tuple[int, int],
+    coarse: Level, solution: Solution, fine: Level, image: Density, threads: int | None
 ) -> Array:
     """Evaluate the coarse potential at the fine sites."""
-    diagram = objective.diagram(solution.weights, with_moments=True)
     surface = potential_surface(
         coarse,
         solution.weights,
-        diagram.centroids - coarse.sites,
-        shape,
-        threads=objective.threads,
+        site_displacement(coarse, solution.weights, image, threads),
+        image.shape,
+        threads=threads,
     )
     return 2 * surface(fine.sites)[0]
 

@@ -1,0 +1,145 @@
+"""The linear inversion that holds for weak modulations, for comparison.
+
+- invert an image by solving Poisson's equation: `poisson_invert`
+- the constant that a potential is free in: `border_mean`
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.fft import dctn, idctn
+
+from napari_shadowinv.errors import InputError
+
+__all__ = ["border_mean", "poisson_invert"]
+
+FloatArray = NDArray[np.float64]
+
+
+def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> FloatArray:
+    """Potential of a weak object: solve ∇²φ = I/I₀ - 1.
+
+    For small displacements I ≈ I₀ (1 - ∇·d) and d = -∇φ. No ray crosses the image's border.
+    The peak of the paper's toroid comes out 3.5 % too low at 10 MG µm, 20 % at 97 MG µm.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The image; it is scaled to the flux of the source.
+    source : array_like, shape (H, W), optional
+        The undisturbed beam, positive everywhere. Default: uniform.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        Normalised potential in px²; its mean over the image's border is 0.
+
+    Raises
+    ------
+    InputError
+        If the image has no positive flux, the source is not positive everywhere, a value
+        is not finite, or the shapes differ.
+
+    Notes
+    -----
+    For a source that varies, the linear form of conserved flux is I₀ - I = ∇·(I₀ d). The
+    usual simplification, made here too, leaves out d·∇I₀: it holds where the source varies
+    little over a displacement.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Section IV A ("Poisson's equation solver") and Eq. 4 for
+    small deflections.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:64, :64] + 0.5
+    >>> wave = np.cos(np.pi * x / 64)
+    >>> phi = poisson_invert(1 - (np.pi / 64) ** 2 * wave)
+    >>> bool(np.allclose(phi - phi.mean(), wave))
+    True
+    """
+    target = _checked("image", image)
+    flux = target.sum()
+    if not flux > 0:
+        raise InputError(f"image has a total flux of {flux:g}: it must be positive")
+    if source is None:
+        ratio = target * (target.size / flux)
+    else:
+        beam = _checked_source(source, target.shape)
+        ratio = target * (beam.sum() / flux) / beam
+    potential = _solve_neumann(ratio - 1)
+    return potential - border_mean(potential)
+
+
+def border_mean(potential: ArrayLike) -> float:
+    """Mean over the outermost pixels; a potential minus this is in the package's gauge.
+
+    Parameters
+    ----------
+    potential : array_like, shape (H, W)
+        A potential, or any other image.
+
+    Returns
+    -------
+    float
+        The mean, each pixel of the border counted once.
+
+    Raises
+    ------
+    InputError
+        If the array is not two-dimensional or is empty.
+
+    Examples
+    --------
+    >>> border_mean([[1, 1, 1], [1, 9, 1], [1, 1, 1]])
+    1.0
+    """
+    values = np.asarray(potential, dtype=np.float64)
+    if values.ndim != 2 or values.size == 0:
+        raise InputError(f"potential has shape {values.shape}: expected (height, width)")
+    border = np.ones(values.shape, dtype=bool)
+    border[1:-1, 1:-1] = False
+    return float(values[border].mean())
+
+
+def _solve_neumann(laplacian: FloatArray) -> FloatArray:
+    """Solve ∇²φ = laplacian - mean(laplacian) with no gradient across the border.
+
+    The cosines of the transform are even about the image's edges, half a pixel outside
+    the outermost centres, so each has exactly that border.
+    """
+    height, width = laplacian.shape
+    wave_y = np.pi * np.arange(height) / height
+    wave_x = np.pi * np.arange(width) / width
+    square = wave_y[:, None] ** 2 + wave_x[None, :] ** 2
+    square[0, 0] = 1.0
+    spectrum = dctn(laplacian) / -square
+    spectrum[0, 0] = 0.0
+    potential: FloatArray = idctn(spectrum)
+    return potential
+
+
+def _checked(name: str, values: ArrayLike) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2 or array.size == 0:
+        raise InputError(f"{name} has shape {array.shape}: expected (height, width)")
+    bad = array.size - np.count_nonzero(np.isfinite(array))
+    if bad:
+        raise InputError(f"{name} has {bad} values that are NaN or infinite: all must be finite")
+    return array
+
+
+def _checked_source(source: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    beam = _checked("source", source)
+    if beam.shape != shape:
+        raise InputError(f"source has shape {beam.shape}, image {shape}: they must match")
+    dark = np.count_nonzero(beam <= 0)
+    if dark:
+        raise InputError(
+            f"source has {dark} pixels that are zero or negative: the linear inversion divides "
+            "by it, so raise them to a small positive floor"
+        )
+    return beam

@@ -1,0 +1,81 @@
+"""Independent formulae for polygons, slow and plain: shoelace sums and clipping."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def clipped(polygon: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
+    """Sutherland and Hodgman: the part of a convex polygon where normal · r ≤ offset."""
+    kept = []
+    distances = polygon @ normal - offset
+    for k in range(len(polygon)):
+        here, there = polygon[k], polygon[(k + 1) % len(polygon)]
+        d_here, d_there = distances[k], distances[(k + 1) % len(polygon)]
+        if d_here <= 0:
+            kept.append(here)
+        if d_here * d_there < 0:
+            kept.append(here + (there - here) * d_here / (d_here - d_there))
+    return np.array(kept).reshape(-1, 2)
+
+
+def rectangle(low: tuple[float, float], high: tuple[float, float]) -> np.ndarray:
+    (y0, x0), (y1, x1) = low, high
+    return np.array([[y0, x0], [y1, x0], [y1, x1], [y0, x1]], dtype=float)
+
+
+def clipped_to_rectangle(
+    polygon: np.ndarray, low: tuple[float, float], high: tuple[float, float]
+) -> np.ndarray:
+    for axis in (0, 1):
+        normal = np.eye(2)[axis]
+        if len(polygon):
+            polygon = clipped(polygon, normal, high[axis])
+        if len(polygon):
+            polygon = clipped(polygon, -normal, -low[axis])
+    return polygon
+
+
+def shoelace(polygon: np.ndarray) -> tuple[float, np.ndarray, float]:
+    """Area, first moments and moment of inertia about the origin (paper, Eqs. 7)."""
+    if len(polygon) < 3:
+        return 0.0, np.zeros(2), 0.0
+    here, there = polygon, np.roll(polygon, -1, axis=0)
+    cross = here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]
+    area = cross.sum() / 2
+    moments = ((here + there) * cross[:, None]).sum(axis=0) / 6
+    squares = (here**2 + here * there + there**2).sum(axis=1)
+    return area, moments, float((squares * cross).sum() / 12)
+
+
+def over_pixels(polygon: np.ndarray, image: np.ndarray) -> tuple[float, np.ndarray, float]:
+    """Mass, first moments and inertia about the origin, pixel by pixel."""
+    mass, moments, inertia = 0.0, np.zeros(2), 0.0
+    if len(polygon) < 3:
+        return mass, moments, inertia
+    first = np.maximum(np.floor(polygon.min(axis=0) + 0.5).astype(int), 0)
+    last = np.minimum(np.floor(polygon.max(axis=0) + 0.5).astype(int), np.array(image.shape) - 1)
+    for i in range(first[0], last[0] + 1):
+        for j in range(first[1], last[1] + 1):
+            piece = clipped_to_rectangle(polygon, (i - 0.5, j - 0.5), (i + 0.5, j + 0.5))
+            area, of_piece, inertia_of_piece = shoelace(piece)
+            mass += image[i, j] * area
+            moments += image[i, j] * of_piece
+            inertia += image[i, j] * inertia_of_piece
+    return mass, moments, inertia
+
+
+def power_cell(
+    sites: np.ndarray,
+    weights: np.ndarray,
+    i: int,
+    low: tuple[float, float],
+    high: tuple[float, float],
+) -> np.ndarray:
+    """The cell of site i inside a rectangle, by cutting with every other site."""
+    cell = rectangle(low, high)
+    lift = (sites**2).sum(axis=1) - weights
+    for j in range(len(sites)):
+        if j != i and len(cell):
+            cell = clipped(cell, 2 * (sites[j] - sites[i]), lift[j] - lift[i])
+    return cell

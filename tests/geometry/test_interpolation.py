@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.geometry.interpolation import (
+    CloughTocher,
+    fit_gradients,
+    mirrored_across_border,
+)
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+
+
+def quadratic(points):
+    y, x = points.T
+    return 3 + 2 * y - x + 0.5 * y**2 - 0.25 * x**2 + 0.125 * y * x
+
+
+def quadratic_gradient(points):
+    y, x = points.T
+    return np.column_stack([2 + y + 0.125 * x, -1 - 0.5 * x + 0.125 * y])
+
+
+@pytest.fixture
+def sites():
+    return np.random.default_rng(0).random((300, 2)) * 10
+
+
+def test_quadratics_are_met_exactly_with_their_gradients(sites):
+    surface = CloughTocher(RegularTriangulation(sites), quadratic(sites), quadratic_gradient(sites))
+    queries = np.random.default_rng(1).random((500, 2)) * 6 + 2
+    values, gradients = surface(queries)
+    np.testing.assert_allclose(values, quadratic(queries), rtol=1e-11)
+    np.testing.assert_allclose(gradients, quadratic_gradient(queries), atol=1e-10)
+
+
+def test_surface_and_its_gradient_are_continuous_across_edges(sites):
+    rng = np.random.default_rng(2)
+    triangulation = RegularTriangulation(sites)
+    surface = CloughTocher(triangulation, rng.random(300), rng.normal(size=(300, 2)))
+    inner = (triangulation.vertices < 300).all(axis=1)
+    inner &= inner[triangulation.neighbors[:, 2]]  # beyond the hull the surface is cut off
+    corners = sites[triangulation.vertices[inner]]
+    on_edge = 0.3 * corners[:, 0] + 0.7 * corners[:, 1]
+    edge = corners[:, 1] - corners[:, 0]
+    length = np.linalg.norm(edge, axis=1)
+    across = 1e-9 * np.column_stack([-edge[:, 1], edge[:, 0]]) / length[:, None]
+    below, above = surface(on_edge - across), surface(on_edge + across)
+    steepness = np.abs(above[1]).max()
+    np.testing.assert_allclose(below[0], above[0], atol=1e-6 * steepness)
+    np.testing.assert_allclose(below[1], above[1], atol=1e-4 * steepness)
+
+
+def test_gradient_is_the_derivative_of_the_value(sites):
+    rng = np.random.default_rng(3)
+    surface = CloughTocher(RegularTriangulation(sites), rng.random(300), rng.normal(size=(300, 2)))
+    queries = rng.random((200, 2)) * 6 + 2
+    step = 1e-6
+    for axis in (0, 1):
+        shift = step * np.eye(2)[axis]
+        slope = (surface(queries + shift)[0] - surface(queries - shift)[0]) / (2 * step)
+        np.testing.assert_allclose(surface(queries)[1][:, axis], slope, atol=1e-4)
+
+
+def test_fitted_gradients_bend_the_edges_least(sites):
+    """Many sweeps reach the minimum: no small change of any gradient lowers the energy."""
+    triangulation = RegularTriangulation(sites)
+    values = np.sin(sites[:, 0]) * sites[:, 1]
+    pairs = {
+        tuple(sorted((a, b)))
+        for t in triangulation.vertices.tolist()
+        for a, b in ((t[0], t[1]), (t[1], t[2]), (t[2], t[0]))
+        if max(a, b) < 300
+    }
+    a, b = np.array(sorted(pairs)).T
+    edge = sites[b] - sites[a]
+    length = np.linalg.norm(edge, axis=1)
+
+    def energy(gradients):
+        rise = values[b] - values[a]
+        s, t = (gradients[a] * edge).sum(axis=1), (gradients[b] * edge).sum(axis=1)
+        return (4 / length**3 * (s**2 + s * t + t**2 - 3 * (s + t) * rise + 3 * rise**2)).sum()
+
+    fitted = fit_gradients(triangulation, values, np.zeros((300, 2)), sweeps=400)
+    least = energy(fitted)
+    for change in np.random.default_rng(4).normal(size=(10, 300, 2)):
+        assert energy(fitted + 1e-3 * change) > least
+
+
+def test_mirror_images_lie_beyond_the_border_at_the_same_distance():
+    sites = np.array([[0.0, 5.0], [5.0, 5.0], [9.2, 9.0]])
+    mirrored, origin = mirrored_across_border(sites, (10, 10), 1.5)
+    expected = {(-1.0, 5.0, 0), (9.8, 9.0, 2), (9.2, 10.0, 2), (9.8, 10.0, 2)}
+    found = np.column_stack([mirrored, origin]).round(9)
+    assert set(map(tuple, found.tolist())) == expected
+
+
+def test_one_and_many_threads_agree_bit_for_bit():
+    rng = np.random.default_rng(5)
+    sites = rng.random((5000, 2)) * 100
+    triangulation = RegularTriangulation(sites)
+    values, gradients = rng.random(5000), rng.random((5000, 2))
+    queries = np.indices((100, 100)).reshape(2, -1).T.astype(float)
+    one, many = (
+        CloughTocher(triangulation, values, gradients, threads=threads)(queries)
+        for threads in (1, 3)
+    )
+    np.testing.assert_array_equal(one[0], many[0])
+    np.testing.assert_array_equal(one[1], many[1])

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from polygons import clipped_to_rectangle, over_pixels, power_cell, shoelace
+
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.power_diagram import PowerDiagram, power_diagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+
+
+def low_and_high(shape):
+    return (-0.5, -0.5), (shape[0] - 0.5, shape[1] - 0.5)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 3.0, 30.0]))
+@settings(max_examples=40, deadline=None)
+def test_every_cell_equals_half_plane_clipping(seed, spread):
+    rng = np.random.default_rng(seed)
+    image = rng.random((9, 12))
+    sites = rng.random((40, 2)) * image.shape - 0.5
+    weights = spread * rng.random(40)
+    diagram = power_diagram(sites, Density.from_image(image), weights)
+    for i in range(40):
+        cell = power_cell(sites, weights, i, *low_and_high(image.shape))
+        mass, moments, inertia = over_pixels(cell, image)
+        assert diagram.masses[i] == pytest.approx(mass, abs=1e-10)
+        if mass > 1e-6:
+            np.testing.assert_allclose(diagram.centroids[i], moments / mass, atol=1e-6)
+            about_site = inertia - 2 * sites[i] @ moments + sites[i] @ sites[i] * mass
+            assert diagram.inertia[i] == pytest.approx(about_site, abs=1e-8)
+
+
+def test_cells_tile_the_image():
+    rng = np.random.default_rng(3)
+    image = rng.random((50, 70)) * 1000
+    sites = rng.random((2000, 2)) * image.shape - 0.5
+    diagram = power_diagram(sites, Density.from_image(image), rng.random(2000))
+    assert diagram.masses.sum() == pytest.approx(image.sum(), rel=1e-13)
+    areas = [
+        shoelace(clipped_to_rectangle(diagram.cell(i), *low_and_high(image.shape)))[0]
+        for i in range(0, 2000)
+    ]
+    assert sum(areas) == pytest.approx(50 * 70, rel=1e-12)
+
+
+def test_flux_through_each_border_is_that_of_the_polygons():
+    """In a uniform image the flux is the length of the border inside the image."""
+    rng = np.random.default_rng(4)
+    shape = (8, 8)
+    sites = rng.random((30, 2)) * shape - 0.5
+    weights = 0.5 * rng.random(30)
+    diagram = power_diagram(sites, Density.from_image(np.ones(shape)), weights)
+    lengths = {}
+    for i in range(30):
+        cell = power_cell(sites, weights, i, *low_and_high(shape))
+        lift = (sites**2).sum(axis=1) - weights
+        for here, there in zip(cell, np.roll(cell, -1, axis=0), strict=True):
+            middle = (here + there) / 2
+            powers = lift - 2 * sites @ middle
+            nearest = np.argsort(powers)[:2]
+            if powers[nearest[1]] - powers[nearest[0]] < 1e-9:
+                lengths[tuple(sorted(nearest))] = np.linalg.norm(here - there)
+    found = {
+        tuple(sorted(pair)): flux
+        for pair, flux in zip(diagram.edges.tolist(), diagram.edge_fluxes, strict=True)
+        if flux > 1e-9
+    }
+    assert found.keys() == lengths.keys()
+    for pair, length in lengths.items():
+        assert found[pair] == pytest.approx(length, abs=1e-9)
+
+
+def test_regular_grid_of_sites_gives_equal_square_cells():
+    """Every vertex of the grid is shared by four cells: the most degenerate case."""
+    image = np.ones((12, 12))
+    y, x = np.mgrid[0.5:12:2, 0.5:12:2]
+    sites = np.column_stack([y.ravel(), x.ravel()])
+    diagram = power_diagram(sites, Density.from_image(image))
+    np.testing.assert_allclose(diagram.masses, 4.0, rtol=1e-12)
+    np.testing.assert_allclose(diagram.centroids, sites, atol=1e-12)
+    np.testing.assert_allclose(diagram.inertia, 4 * (2**2 + 2**2) / 12, rtol=1e-11)
+    laplacian = diagram.laplacian().toarray()
+    assert laplacian[0, 0] == pytest.approx(2 * 2 / (2 * 2))  # a corner cell: two borders of 2 px
+
+
+def test_laplacian_is_symmetric_and_its_rows_sum_to_zero():
+    rng = np.random.default_rng(5)
+    image = rng.random((20, 20))
+    sites = rng.random((200, 2)) * 20 - 0.5
+    laplacian = power_diagram(sites, Density.from_image(image)).laplacian().toarray()
+    np.testing.assert_allclose(laplacian, laplacian.T, atol=1e-15)
+    np.testing.assert_allclose(laplacian.sum(axis=1), 0, atol=1e-12)
+    assert (laplacian - np.diag(np.diag(laplacian)) <= 0).all()
+
+
+def test_one_and_many_threads_agree_bit_for_bit():
+    rng = np.random.default_rng(6)
+    density = Density.from_image(rng.random((60, 60)))
+    triangulation = RegularTriangulation(rng.random((20000, 2)) * 60 - 0.5)
+    one, many = (
+        PowerDiagram(triangulation, density, with_moments=True, threads=threads)
+        for threads in (1, 5)
+    )
+    np.testing.assert_array_equal(one.masses, many.masses)
+    np.testing.assert_array_equal(one.centroids, many.centroids)
+    np.testing.assert_array_equal(one.inertia, many.inertia)
+    np.testing.assert_array_equal(one.laplacian().data, many.laplacian().data)
+
+
+def test_hidden_site_has_an_empty_cell():
+    sites = np.array([[1.0, 1.0], [1.0, 5.0], [5.0, 1.0], [5.0, 5.0], [3.0, 3.1]])
+    weights = np.array([0.0, 0.0, 0.0, 0.0, -100.0])
+    diagram = power_diagram(sites, Density.from_image(np.ones((7, 7))), weights)
+    assert diagram.masses[4] == 0
+    assert len(diagram.cell(4)) == 0
+    np.testing.assert_array_equal(diagram.centroids[4], sites[4])
+    assert diagram.masses[:4].sum() == pytest.approx(49)

@@ -1,0 +1,300 @@
+"""Images of displaced sources, against maps whose image is known exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
+from napari_shadowinv.physics.phantoms import ellipse_pair, paper_setup, toroid
+
+Array = NDArray[np.float64]
+
+TOROID_DATA = Path(__file__).parents[3] / "shared" / "data" / "toroid"
+
+
+def grid(shape: tuple[int, int]) -> tuple[Array, Array]:
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
+    return y, x
+
+
+def folding_field(shape: tuple[int, int]) -> Array:
+    """Return a smooth field that folds in the middle and vanishes towards the border."""
+    return ellipse_pair(shape, strength=4.0).displacement
+
+
+def random_source(shape: tuple[int, int]) -> Array:
+    return np.random.default_rng(1).uniform(0, 3, shape)
+
+
+def test_no_displacement_returns_the_source() -> None:
+    source = random_source((7, 9))
+    np.testing.assert_allclose(synthetic_image(np.zeros((2, 7, 9)), source), source, atol=1e-13)
+
+
+@pytest.mark.parametrize("rays_per_pixel", [1, 4, 7, 16, 25])
+def test_flux_is_conserved_through_folds(rays_per_pixel: int) -> None:
+    shape = (60, 80)
+    source = random_source(shape)
+    source[:8] = source[-8:] = 0
+    source[:, :8] = source[:, -8:] = 0
+    field = folding_field(shape)
+    assert jacobian_determinant(field).min() < 0
+    image = synthetic_image(field, source, rays_per_pixel=rays_per_pixel)
+    assert image.min() >= 0
+    assert image.sum() == pytest.approx(source.sum(), rel=1e-12)
+
+
+def test_whole_pixel_shift_moves_the_source_exactly() -> None:
+    source = random_source((12, 10))
+    field = np.zeros((2, 12, 10))
+    field[0], field[1] = 3, -2
+    expected = np.zeros_like(source)
+    expected[3:, :-2] = source[:-3, 2:]
+    np.testing.assert_allclose(synthetic_image(field, source), expected, atol=1e-12)
+
+
+def test_half_pixel_shift_shares_each_pixel_between_two() -> None:
+    source = random_source((6, 10))
+    field = np.zeros((2, 6, 10))
+    field[1] = 0.5
+    expected = source / 2
+    expected[:, 1:] += source[:, :-1] / 2
+    np.testing.assert_allclose(synthetic_image(field, source), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("shift", [(-0.3, -0.45), (0.3, 0.45), (-1.7, 2.2)])
+def test_any_shift_shares_each_pixel_by_areas(shift: tuple[float, float]) -> None:
+    """The image of a shifted pixel overlaps four pixels; what is outside is lost."""
+    source = random_source((8, 9))
+    field = np.zeros((2, 8, 9))
+    field[0], field[1] = shift
+    expected = np.pad(source, 5)
+    for axis, distance in enumerate(shift):
+        whole = int(np.floor(distance))
+        part = distance - whole
+        expected = (1 - part) * np.roll(expected, whole, axis) + part * np.roll(
+            expected, whole + 1, axis
+        )
+    np.testing.assert_allclose(synthetic_image(field, source), expected[5:-5, 5:-5], atol=1e-12)
+
+
+def test_rough_fields_lose_no_flux() -> None:
+    source = random_source((60, 60))
+    source[:20] = source[-20:] = 0
+    source[:, :20] = source[:, -20:] = 0
+    field = np.random.default_rng(0).normal(scale=2.0, size=(2, 60, 60))
+    image = synthetic_image(field, source)
+    assert image.min() >= 0
+    assert image.sum() == pytest.approx(source.sum(), rel=1e-12)
+
+
+def test_flux_that_leaves_is_lost() -> None:
+    field = np.full((2, 6, 6), 1e9)
+    assert synthetic_image(field).sum() == 0
+    field[:] = 3.0
+    assert synthetic_image(field).sum() == pytest.approx(9, abs=1e-12)
+
+
+def test_uniform_stretch_thins_the_image_and_ends_sharply() -> None:
+    y, x = grid((40, 40))
+    field = 0.5 * np.stack([y - 19.5, x - 19.5])
+    np.testing.assert_allclose(synthetic_image(field), 1 / 1.5**2, rtol=1e-11)
+    squeezed = synthetic_image(-field)
+    np.testing.assert_allclose(squeezed[10:30, 10:30], 4, rtol=1e-11)
+    assert squeezed.sum() == pytest.approx(1600, rel=1e-12)
+    assert squeezed[:10].max() < 1e-9
+
+
+def test_shear_and_rotation_divide_by_the_determinant() -> None:
+    """Tiles that are no rectangles leave neither gaps nor ripples."""
+    y, x = grid((50, 50))
+    y, x = y - 24.5, x - 24.5
+    field = np.stack([0.3 * y + 0.4 * x, -0.2 * y + 0.1 * x])
+    determinant = 1.3 * 1.1 + 0.4 * 0.2
+    image = synthetic_image(field, rays_per_pixel=9)
+    np.testing.assert_allclose(image[15:35, 15:35], 1 / determinant, rtol=1e-11)
+
+
+def test_point_reflection_turns_the_source_around() -> None:
+    y, x = grid((9, 11))
+    source = random_source((9, 11))
+    field = np.stack([8 - 2 * y, 10 - 2 * x])
+    np.testing.assert_allclose(synthetic_image(field, source), source[::-1, ::-1], atol=1e-11)
+
+
+def test_swapping_axes_swaps_the_image() -> None:
+    field = folding_field((50, 70))
+    source = random_source((50, 70))
+    swapped = synthetic_image(field[::-1].transpose(0, 2, 1), source.T)
+    np.testing.assert_allclose(swapped.T, synthetic_image(field, source), atol=1e-10)
+
+
+def test_image_is_linear_in_the_source() -> None:
+    field = folding_field((40, 40))
+    one, other = random_source((40, 40)), np.ones((40, 40))
+    together = synthetic_image(field, 2 * one + other)
+    apart = 2 * synthetic_image(field, one) + synthetic_image(field, other)
+    np.testing.assert_allclose(together, apart, atol=1e-11)
+
+
+@pytest.mark.parametrize(("rays_per_pixel", "tolerance"), [(16, 0.02), (400, 0.001)])
+def test_fold_of_a_parabola(rays_per_pixel: int, tolerance: float) -> None:
+    """Landing at X = X₀ + k (x - c)², a flux of 2 √((X - X₀)/k) lies below X."""
+    y, x = grid((4, 60))
+    edge, k, center = 3.3, 0.05, 29.5
+    field = np.stack([np.zeros_like(y), edge + k * (x - center) ** 2 - x])
+    image = synthetic_image(field, rays_per_pixel=rays_per_pixel)
+    pixel_edges = np.arange(61) - 0.5
+    below = 2 * np.sqrt(np.maximum(pixel_edges - edge, 0) / k)
+    expected = np.diff(np.minimum(below, 60))
+    np.testing.assert_allclose(image, np.tile(expected, (4, 1)), atol=tolerance * expected.max())
+    assert image.sum() == pytest.approx(240, rel=1e-12)
+    assert image[:, :3].max() < 1e-9
+
+
+def test_everything_on_one_point() -> None:
+    y, x = grid((12, 12))
+    image = synthetic_image(np.stack([7.2 - y, 3.1 - x]))
+    assert image[7, 3] == pytest.approx(144, rel=1e-9)
+    assert image.sum() == pytest.approx(144, rel=1e-12)
+
+
+def test_everything_on_one_line() -> None:
+    y, x = grid((10, 12))
+    image = synthetic_image(np.stack([np.zeros_like(y), 4.2 - x]))
+    np.testing.assert_allclose(image[:, 4], 12, rtol=1e-9)
+    assert image.sum() == pytest.approx(120, rel=1e-12)
+
+
+def exact_toroid_image(peak_displacement: float, sigma: float, size: int) -> Array:
+    """Pixel averages of 1/det for the toroid's map, inverted along the radius."""
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    position = ((np.arange(size) - (size - 1) / 2)[:, None] + nodes / 2).ravel()
+    radius = np.hypot(position[:, None], position[None, :])
+    low, high = np.zeros_like(radius), radius.copy()
+
+    def shape(r: Array) -> Array:
+        return peak_displacement / sigma * np.exp(0.5 - r**2 / (2 * sigma**2))
+
+    for _ in range(45):
+        middle = (low + high) / 2
+        short = middle * (1 + shape(middle)) < radius
+        low, high = np.where(short, middle, low), np.where(short, high, middle)
+    along = 1 + shape(low) * (1 - (low / sigma) ** 2)
+    intensity = 1 / (along * (1 + shape(low)))
+    blocks = intensity.reshape(size, 5, size, 5)
+    average: Array = np.einsum("iajb,a,b->ij", blocks, weights / 2, weights / 2)
+    return average
+
+
+@pytest.mark.parametrize(
+    ("rays_per_pixel", "largest", "typical"), [(4, 3e-3, 3e-4), (16, 6e-4, 6e-5)]
+)
+def test_intensity_is_one_over_the_jacobian(
+    rays_per_pixel: int, largest: float, typical: float
+) -> None:
+    """The paper's toroid at 97 MG µm, intensity between 0.2 and 1.7."""
+    setup = paper_setup()
+    field = toroid((200, 200), setup, 97, 30e-6).displacement
+    peak = abs(float(setup.displacement_from_path_integrated_b([97.0, 0.0], "MG um")[1]))
+    error = synthetic_image(field, rays_per_pixel=rays_per_pixel) - exact_toroid_image(
+        peak, 20.0, 200
+    )
+    assert np.abs(error).max() < largest
+    assert np.sqrt(np.mean(error**2)) < typical
+
+
+def test_cubic_displacement_is_exact_up_to_the_border() -> None:
+    """The tiles' corners lie on a cubic exactly, so no flux is misplaced by interpolation."""
+    y, x = grid((4, 20))
+    t = (x - 9.5) / 10
+    field = np.stack([np.zeros_like(y), t - 2 * t**2 + 1.5 * t**3])
+    image = synthetic_image(field, rays_per_pixel=32**2)
+    fine = np.linspace(-0.5, 19.5, 200_001)
+    t = (fine - 9.5) / 10
+    landing = fine + t - 2 * t**2 + 1.5 * t**3
+    expected = np.diff(np.interp(np.arange(21) - 0.5, landing, fine))
+    np.testing.assert_allclose(image[1], expected, atol=2e-5)
+
+
+def test_number_of_threads_changes_no_bit() -> None:
+    field = folding_field((90, 70))
+    one = synthetic_image(field, random_source((90, 70)), threads=1)
+    for threads in (2, 5, None):
+        again = synthetic_image(field, random_source((90, 70)), threads=threads)
+        np.testing.assert_array_equal(one, again)
+
+
+def test_rays_are_rounded_up_to_a_square() -> None:
+    field = folding_field((40, 40))
+    np.testing.assert_array_equal(
+        synthetic_image(field, rays_per_pixel=10), synthetic_image(field, rays_per_pixel=16)
+    )
+
+
+def test_jacobian_of_polynomials_is_exact_up_to_the_border() -> None:
+    y, x = grid((8, 9))
+    linear = np.stack([0.2 * y + 0.3 * x, -0.1 * y + 0.5 * x])
+    np.testing.assert_allclose(jacobian_determinant(linear), 1.2 * 1.5 + 0.3 * 0.1)
+    quadratic = np.stack([0.05 * y**2, np.zeros_like(x)])
+    np.testing.assert_allclose(jacobian_determinant(quadratic), 1 + 0.1 * y)
+
+
+def test_wrong_input_is_told() -> None:
+    good = np.zeros((2, 6, 7))
+    bad = good.copy()
+    bad[0, 1, 1] = np.nan
+    with pytest.raises(InputError, match=r"shape \(6, 7\): expected \(2, height, width\)"):
+        synthetic_image(good[0])
+    with pytest.raises(InputError, match="at least 4"):
+        synthetic_image(np.zeros((2, 3, 9)))
+    with pytest.raises(InputError, match="displacement has 1 values that are NaN"):
+        jacobian_determinant(bad)
+    with pytest.raises(InputError, match=r"source has shape \(7, 6\)"):
+        synthetic_image(good, np.ones((7, 6)))
+    with pytest.raises(InputError, match="source has 42 negative pixels"):
+        synthetic_image(good, -np.ones((6, 7)))
+    with pytest.raises(InputError, match="source is zero everywhere"):
+        synthetic_image(good, np.zeros((6, 7)))
+    with pytest.raises(InputError, match="source has 42 values that are NaN"):
+        synthetic_image(good, np.full((6, 7), np.inf))
+    with pytest.raises(InputError, match="rays_per_pixel is 0"):
+        synthetic_image(good, rays_per_pixel=0)
+    with pytest.raises(InputError, match="threads is 0"):
+        synthetic_image(good, threads=0)
+
+
+needs_toroid_data = pytest.mark.skipif(
+    not TOROID_DATA.is_dir(), reason="the shared toroid images are not beside the project"
+)
+
+
+def blurred_by_one_pixel(image: Array) -> Array:
+    """Blur as bilinear deposit does: by the variance of one more pixel, 1/12."""
+    kernel = [1 / 24, 22 / 24, 1 / 24]
+    result: Array = convolve1d(convolve1d(image, kernel, axis=0), kernel, axis=1)
+    return result
+
+
+@needs_toroid_data
+def test_independent_forward_model_agrees() -> None:
+    field = np.load(TOROID_DATA / "dm097_displacement.npy")
+    expected = np.load(TOROID_DATA / "dm097.npy")
+    difference = blurred_by_one_pixel(synthetic_image(field)) - expected
+    assert np.abs(difference).max() < 2e-3
+    assert difference.std() < 2e-4
+
+
+@needs_toroid_data
+def test_independent_forward_model_agrees_at_caustics() -> None:
+    """Where the blur hides the caustic's shape, blocks of pixels still hold the same flux."""
+    field = np.load(TOROID_DATA / "dm194_displacement.npy")
+    expected = np.load(TOROID_DATA / "dm194.npy").reshape(20, 10, 20, 10).mean(axis=(1, 3))
+    image = blurred_by_one_pixel(synthetic_image(field)).reshape(20, 10, 20, 10).mean(axis=(1, 3))
+    np.testing.assert_allclose(image, expected, atol=0.02)

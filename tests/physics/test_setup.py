@@ -1,0 +1,275 @@
+"""Conversions between pixels and SI, and the models' behaviour as files."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+
+import numpy as np
+import pytest
+import tomli_w
+from pydantic import TypeAdapter, ValidationError
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.phantoms import paper_setup
+from napari_shadowinv.physics.setup import (
+    SPECIES,
+    OpticalSetup,
+    ProtonSetup,
+    Setup,
+    setup_from_dict,
+)
+
+PROTON = {
+    "kind": "proton",
+    "energy": 14.7,
+    "source_object_distance": 1.3e-3,
+    "object_image_distance": 2e-2,
+    "pixel_size": 1.5e-6,
+}
+OPTICAL = {
+    "kind": "optical",
+    "wavelength": 810e-9,
+    "object_image_distance": 0.1,
+    "detector_pixel_size": 5e-6,
+}
+ELECTRONVOLT = 1.602176634e-19
+LIGHT_SPEED = 299792458.0
+
+
+@pytest.fixture
+def proton() -> ProtonSetup:
+    return ProtonSetup(**PROTON)
+
+
+@pytest.fixture
+def optical() -> OpticalSetup:
+    return OpticalSetup(**OPTICAL)
+
+
+def test_magnification_of_the_paper() -> None:
+    assert paper_setup().magnification == pytest.approx(1 + 20 / 1.3)
+
+
+def test_collimated_beam_does_not_magnify(optical: OpticalSetup) -> None:
+    assert optical.collimated
+    assert optical.magnification == 1
+    assert optical.object_pixel_size == 5e-6
+
+
+def test_magnification_tends_to_one_as_the_source_recedes(proton: ProtonSetup) -> None:
+    far = proton.model_copy(update={"source_object_distance": 1e9})
+    assert not far.collimated
+    assert far.magnification == pytest.approx(1, abs=1e-10)
+
+
+def test_detector_pixels_are_smaller_in_the_object_plane(proton: ProtonSetup) -> None:
+    on_detector = proton.pixel_size * proton.magnification
+    same = ProtonSetup(
+        **{k: v for k, v in PROTON.items() if k != "pixel_size"}, detector_pixel_size=on_detector
+    )
+    assert same.object_pixel_size == pytest.approx(1.5e-6)
+    assert same.potential(2.0) == pytest.approx(proton.potential(2.0))
+
+
+def test_deflection_moves_the_ray_by_the_displacement_on_the_screen(proton: ProtonSetup) -> None:
+    angle = proton.deflection_angle(3.0)
+    on_screen = angle * proton.object_image_distance
+    assert on_screen / proton.magnification == pytest.approx(3.0 * 1.5e-6)
+
+
+def test_angle_is_minus_the_gradient_of_the_potential(proton: ProtonSetup) -> None:
+    phi = np.arange(5.0) ** 2
+    gradient = np.gradient(proton.potential(phi), 1.5e-6)
+    np.testing.assert_allclose(-gradient, proton.deflection_angle(-np.gradient(phi)))
+
+
+@pytest.mark.parametrize("setup", [ProtonSetup(**PROTON), OpticalSetup(**OPTICAL)])
+def test_round_trips_of_angle_and_potential(setup: ProtonSetup | OpticalSetup) -> None:
+    values = np.linspace(-3, 5, 24).reshape(2, 3, 4)
+    np.testing.assert_allclose(setup.displacement(setup.deflection_angle(values)), values)
+    np.testing.assert_allclose(setup.normalized_potential(setup.potential(values)), values)
+
+
+def test_momentum_of_the_papers_protons(proton: ProtonSetup) -> None:
+    momentum = proton.momentum * LIGHT_SPEED / ELECTRONVOLT / 1e6
+    assert momentum == pytest.approx(math.sqrt(14.7**2 + 2 * 14.7 * 938.27209), rel=1e-8)
+    assert momentum == pytest.approx(166.74, abs=0.01)
+
+
+def test_velocity_of_the_papers_protons(proton: ProtonSetup) -> None:
+    gamma = 1 + 14.7 / 938.27209
+    assert proton.velocity / LIGHT_SPEED == pytest.approx(math.sqrt(1 - gamma**-2), rel=1e-8)
+
+
+def test_momentum_is_classical_when_slow_and_that_of_light_when_fast(proton: ProtonSetup) -> None:
+    slow = proton.model_copy(update={"energy": 1e-6})
+    mass = SPECIES["proton"].mass
+    assert slow.momentum == pytest.approx(math.sqrt(2 * mass * ELECTRONVOLT), rel=1e-8)
+    fast = proton.model_copy(update={"energy": 1e6, "species": "electron"})
+    assert fast.momentum == pytest.approx(1e12 * ELECTRONVOLT / LIGHT_SPEED, rel=1e-6)
+    assert fast.velocity == pytest.approx(LIGHT_SPEED, rel=1e-9)
+    assert fast.velocity <= LIGHT_SPEED
+
+
+def test_known_uniform_magnetic_field(proton: ProtonSetup) -> None:
+    """1 T over 1 mm along +y bends a proton that flies along +z to -x, by q B L / p."""
+    field = np.zeros((2, 3, 3))
+    field[0] = 1e-3
+    displacement = proton.displacement_from_path_integrated_b(field)
+    angle = proton.deflection_angle(displacement)
+    momentum = 166.74e6 * ELECTRONVOLT / LIGHT_SPEED
+    np.testing.assert_allclose(angle[1], -ELECTRONVOLT * 1e-3 / momentum, rtol=1e-4)
+    np.testing.assert_array_equal(angle[0], 0)
+
+
+def test_magnetic_force_is_velocity_cross_field(proton: ProtonSetup) -> None:
+    """Against numpy's cross product, for any direction of the field and the sign of the charge."""
+    for species, sign in (("proton", 1), ("electron", -1)):
+        setup = proton.model_copy(update={"species": species})
+        field_y, field_x = 0.4e-3, -0.7e-3
+        force = sign * np.cross([0, 0, 1], [field_x, field_y, 0])
+        angle = setup.deflection_angle(
+            setup.displacement_from_path_integrated_b([field_y, field_x])
+        )
+        expected = ELECTRONVOLT * force[[1, 0]] / setup.momentum
+        np.testing.assert_allclose(angle, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("unit", ["T m", "MG um"])
+def test_round_trip_of_the_magnetic_field(proton: ProtonSetup, unit: str) -> None:
+    field = np.random.default_rng(0).normal(size=(2, 4, 5))
+    displacement = proton.displacement_from_path_integrated_b(field, unit)
+    np.testing.assert_allclose(proton.path_integrated_b(displacement, unit), field)
+
+
+def test_megagauss_micrometres(proton: ProtonSetup) -> None:
+    """1 MG is 100 T and 1 µm is 1e-6 m."""
+    displacement = np.ones((2, 2, 2))
+    in_tesla_metres = proton.path_integrated_b(displacement, "T m")
+    in_megagauss = proton.path_integrated_b(displacement, "MG um")
+    np.testing.assert_allclose(in_tesla_metres, in_megagauss * 1e-4)
+
+
+def test_known_uniform_electric_field(proton: ProtonSetup) -> None:
+    """A field along +x of 1 GV/m over 1 mm pushes a proton to +x by q E L / (p v)."""
+    momentum = 166.74e6 * ELECTRONVOLT / LIGHT_SPEED
+    angle = ELECTRONVOLT * 1e6 / (momentum * proton.velocity)
+    displacement = proton.displacement(np.array([0.0, angle]))
+    np.testing.assert_allclose(proton.path_integrated_e(displacement), [0, 1e6], rtol=1e-4)
+
+
+def test_slow_particles_follow_the_papers_electric_formula() -> None:
+    """Eq. 2b: a = q/(2W) ∫E dz."""
+    setup = ProtonSetup(**{**PROTON, "energy": 1e-3})
+    angle = setup.deflection_angle([1.0, 0.0])[0]
+    assert setup.path_integrated_e([1.0, 0.0])[0] == pytest.approx(2 * 1e3 * angle, rel=1e-5)
+
+
+def test_electric_and_magnetic_force_balance(proton: ProtonSetup) -> None:
+    """E = v B: a field that deflects as much as another is v times as large."""
+    displacement = np.array([0.0, 2.0])
+    electric = proton.path_integrated_e(displacement)[1]
+    magnetic = -proton.path_integrated_b(displacement)[0]
+    assert electric / magnetic == pytest.approx(proton.velocity)
+
+
+def test_critical_density_at_810_nm(optical: OpticalSetup) -> None:
+    """1.1e21 cm⁻³ divided by the square of the wavelength in µm."""
+    assert optical.critical_density * 1e-6 == pytest.approx(1.115e21 / 0.81**2, rel=1e-3)
+    assert optical.critical_density * 1e-6 == pytest.approx(1.7e21, rel=1e-2)
+
+
+def test_density_gives_the_refractive_index_that_made_the_potential(optical: OpticalSetup) -> None:
+    """A slab of thin plasma: ln √(1 - n/n_c) times its thickness, there and back."""
+    density, thickness = 1e-4 * optical.critical_density, 2e-3
+    log_index = 0.5 * math.log(1 - density / optical.critical_density) * thickness
+    phi = optical.normalized_potential(-log_index)
+    assert optical.line_integrated_log_index(phi) == pytest.approx(log_index)
+    assert optical.line_integrated_density(phi) == pytest.approx(density * thickness, rel=1e-4)
+    modulation = optical.relative_density_modulation(phi, density)
+    assert modulation == pytest.approx(thickness, rel=1e-4)
+
+
+@pytest.mark.parametrize("density", [0.0, -1.0, math.nan, math.inf])
+def test_density_must_be_positive(optical: OpticalSetup, density: float) -> None:
+    with pytest.raises(InputError, match=r"density is .* must be positive"):
+        optical.relative_density_modulation(1.0, density)
+
+
+@pytest.mark.parametrize(
+    "setup", [ProtonSetup(**PROTON), OpticalSetup(**OPTICAL)], ids=["proton", "optical"]
+)
+def test_a_setup_survives_every_file(setup: ProtonSetup | OpticalSetup) -> None:
+    dump = setup.model_dump()
+    assert type(setup)(**dump) == setup
+    assert type(setup).model_validate_json(setup.model_dump_json()) == setup
+    assert setup_from_dict(json.loads(setup.model_dump_json())) == setup
+    assert setup_from_dict(tomllib.loads(tomli_w.dumps(dump))) == setup
+    assert TypeAdapter(Setup).validate_python(dump) == setup
+
+
+def test_every_field_tells_its_meaning() -> None:
+    for model in (ProtonSetup, OpticalSetup):
+        for field in model.model_fields.values():
+            assert field.title
+            assert field.description
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"energy": 0}, r"'energy' is 0: kinetic energy \(MeV\) must be greater than 0"),
+        ({"object_image_distance": -1}, "'object_image_distance' is -1: .* greater than 0"),
+        ({"object_image_distance": math.inf}, "must be a finite number"),
+        ({"pixel_size": 0.0}, "'pixel_size' is 0.0: .* greater than 0"),
+        ({"detector_pixel_size": 1e-5}, "either 'pixel_size' .* received both"),
+        ({"pixel_size": None}, "either 'pixel_size' .* received neither"),
+        ({"energi": 3}, "unknown key 'energi', did you mean 'energy'"),
+        ({"colour": 3}, "unknown key 'colour'; known keys are kind"),
+        ({"species": "proten"}, "'species' is 'proten': species must be 'proton'"),
+        ({"energy": "high"}, "'energy' is 'high': .* must be a valid number"),
+        ({"kind": "protons"}, "'kind' is 'protons', .* did you mean 'proton'"),
+        ({"kind": ["proton"]}, "'kind' is .* must be 'proton' or 'optical'"),
+        ({"kind": None}, "'kind' is missing"),
+    ],
+)
+def test_a_wrong_value_is_told_in_one_sentence(change: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        setup_from_dict({**PROTON, **change}, "setup file shot.toml")
+    assert str(caught.value).startswith("setup file shot.toml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_misspelt_key_is_not_reported_as_missing_too() -> None:
+    misspelt = {k: v for k, v in PROTON.items() if k != "energy"} | {"enery": 14.7}
+    with pytest.raises(InputError) as caught:
+        setup_from_dict(misspelt)
+    assert str(caught.value) == "setup: unknown key 'enery', did you mean 'energy'?"
+
+
+def test_a_missing_key_is_named() -> None:
+    with pytest.raises(InputError, match="'energy' is missing, give the kinetic energy"):
+        setup_from_dict({k: v for k, v in PROTON.items() if k != "energy"})
+
+
+def test_a_setup_is_no_list() -> None:
+    with pytest.raises(InputError, match="received a list"):
+        setup_from_dict([PROTON])  # type: ignore[arg-type]
+
+
+def test_constructor_and_later_changes_are_checked(proton: ProtonSetup) -> None:
+    with pytest.raises(ValidationError, match="energy"):
+        ProtonSetup(**{**PROTON, "energy": 0})
+    with pytest.raises(ValidationError, match="frozen"):
+        proton.energy = 3.0  # type: ignore[misc]
+
+
+def test_vectors_must_have_two_components(proton: ProtonSetup) -> None:
+    with pytest.raises(InputError, match=r"displacement has shape \(3, 4\)"):
+        proton.path_integrated_b(np.zeros((3, 4)))
+    with pytest.raises(InputError, match=r"field has shape \(\)"):
+        proton.displacement_from_path_integrated_b(1.0)
+    with pytest.raises(InputError, match="unit is 'G cm': it must be one of T m, MG um"):
+        proton.path_integrated_b(np.zeros((2, 4)), "G cm")  # type: ignore[arg-type]

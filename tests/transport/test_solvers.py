@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.progress import Reporter
+from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.transport.sites import plan_levels
+from napari_shadowinv.transport.solvers import lbfgs, newton, solve
+
+
+def bright_spot(shape=(40, 50)):
+    y, x = np.indices(shape)
+    image = 0.2 + 3 * np.exp(-(((y - 15) / 5) ** 2) - ((x - 30) / 7) ** 2)
+    return image / image.mean()
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return plan_levels(np.ones((40, 50)), 2000, lloyd_iterations=5)
+
+
+def residual(level, weights, image):
+    triangulation = RegularTriangulation(level.sites, weights)
+    masses = PowerDiagram(triangulation, Density.from_image(image)).masses
+    return np.max(np.abs(masses - level.mass) / level.mass)
+
+
+@pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-8])
+def test_every_cell_holds_its_flux_to_the_tolerance(plan, tolerance):
+    solution = solve(plan.levels, bright_spot(), InversionOptions(tolerance=tolerance))[-1]
+    assert solution.converged
+    assert residual(plan.levels[-1], solution.weights, bright_spot()) <= tolerance
+    assert solution.weights.mean() == pytest.approx(0, abs=1e-12)
+
+
+def test_newton_converges_quadratically_near_the_solution(plan):
+    level = plan.levels[-1]
+    objective = TransportObjective(
+        level.triangulation.copy(), level.mass, Density.from_image(bright_spot())
+    )
+    start = solve(plan.levels, bright_spot(), InversionOptions(tolerance=1e-2))[-1].weights
+    residuals = [
+        newton(objective, start, tolerance=1e-14, max_iterations=steps).residual
+        for steps in (0, 1, 2)
+    ]
+    assert residuals[1] < 0.05 * residuals[0]
+    assert residuals[2] < 0.05 * residuals[1]
+
+
+def test_newton_and_lbfgs_find_the_same_weights():
+    plan = plan_levels(np.ones((30, 30)), 150, lloyd_iterations=20)
+    y, x = np.indices((30, 30))
+    image = 1 + 0.5 * np.sin(y / 5) * np.cos(x / 4)
+    image /= image.mean()
+    options = InversionOptions(tolerance=1e-6)
+    by_newton = solve(plan.levels, image, options)[-1]
+    by_lbfgs = lbfgs(plan.levels[-1], image, options.model_copy(update={"max_iterations": 5000}))
+    assert by_lbfgs.converged
+    np.testing.assert_allclose(by_lbfgs.weights, by_newton.weights, atol=1e-4)
+
+
+def test_an_exhausted_solver_says_how_far_it_got_and_why(plan):
+    options = InversionOptions(tolerance=1e-9, max_iterations=1)
+    solution = solve(plan.levels, bright_spot(), options)[-1]
+    assert not solution.converged
+    assert "all 1 iterations" in solution.reason
+    assert residual(plan.levels[-1], solution.weights, bright_spot()) == pytest.approx(
+        solution.residual, rel=1e-6
+    )
+
+
+def test_a_request_to_stop_ends_the_solver(plan):
+    steps = []
+
+    def after_three() -> bool:
+        steps.append(1)
+        return len(steps) > 3
+
+    with pytest.raises(InversionCancelled, match="transport"):
+        solve(plan.levels, bright_spot(), InversionOptions(), Reporter(None, after_three))
+    assert len(steps) == 4
+
+
+def test_threads_do_not_change_the_weights():
+    plan = plan_levels(np.ones((60, 60)), 12000, lloyd_iterations=2, threads=1)
+    again = plan_levels(np.ones((60, 60)), 12000, lloyd_iterations=2, threads=3)
+    np.testing.assert_array_equal(plan.levels[-1].sites, again.levels[-1].sites)
+    y, x = np.indices((60, 60))
+    image = 0.3 + np.exp(-(((y - 25) / 9) ** 2) - ((x - 33) / 8) ** 2)
+    image /= image.mean()
+    one, three = (
+        solve(plan.levels, image, InversionOptions(threads=threads))[-1].weights
+        for threads in (1, 3)
+    )
+    np.testing.assert_array_equal(one, three)
