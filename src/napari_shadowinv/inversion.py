@@ -105,7 +105,7 @@ class Inversion:
     site_mass : ndarray, shape (n,)
         Flux of the source in each site's cell.
     site_displacement : ndarray, shape (n, 2)
-        Centroid of each site's cell in the image, minus the site.
+        Centroid of each site's cell in the image minus that in the source, px.
     reprojection : ndarray, shape (H, W)
         The image that the retrieved displacement makes of the source.
     residual : ndarray, shape (H, W)

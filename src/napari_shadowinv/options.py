@@ -104,7 +104,7 @@ class InversionOptions(BaseModel):
         ),
     )
     caustic_jacobian: float = Field(
-        default=0.1,
+        default=0.2,
         ge=0,
         title="Caustic threshold",
         description=(

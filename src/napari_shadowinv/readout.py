@@ -37,7 +37,7 @@ def read_dual(
     weights : ndarray, shape (n,)
         Weights, px².
     site_displacement : ndarray, shape (n, 2)
-        Centroid of each cell in the image minus its site, px.
+        Displacement of each site, px; see `site_displacement`.
     shape : tuple of int
         Shape (H, W) of the image.
     threads : int, optional

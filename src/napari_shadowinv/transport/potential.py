@@ -47,7 +47,9 @@ def site_displacement(
     Returns
     -------
     ndarray, shape (n, 2)
-        Centroid of each cell in the image minus its site, px.
+        Centroid of each cell in the image minus that of the same site's cell in the
+        source, px. (The paper subtracts the site, which is the same after enough Lloyd
+        steps; with the centroid an image that equals its source gives exactly zero.)
 
     References
     ----------
@@ -56,7 +58,7 @@ def site_displacement(
     triangulation = level.triangulation.copy()
     triangulation.update(weights)
     diagram = PowerDiagram(triangulation, image, with_moments=True, threads=threads)
-    displacement: Array = diagram.centroids - level.sites
+    displacement: Array = diagram.centroids - level.centroids
     return displacement
 
 

@@ -40,6 +40,8 @@ class Level:
         Positions, in the order of a Hilbert curve.
     mass : ndarray, shape (n,)
         Flux of the source in each site's Voronoi cell, S(V_i) of the paper.
+    centroids : ndarray, shape (n, 2)
+        Centres of flux of the Voronoi cells; the sites themselves after many Lloyd steps.
     triangulation : RegularTriangulation
         Their Delaunay triangulation; copy it before changing weights.
     spacing : float
@@ -50,6 +52,7 @@ class Level:
 
     sites: Array
     mass: Array
+    centroids: Array
     triangulation: RegularTriangulation
     spacing: float
     lloyd_iterations: int
@@ -233,5 +236,6 @@ def level_of_sites(sites: Array, source: Density, threads: int | None = None) ->
 
 def _level(sites: Array, density: Density, steps: int, threads: int | None) -> Level:
     triangulation = RegularTriangulation(sites)
-    mass = PowerDiagram(triangulation, density, threads=threads).masses
-    return Level(sites, mass, triangulation, _spacing(density.shape, len(sites)), steps)
+    diagram = PowerDiagram(triangulation, density, with_moments=True, threads=threads)
+    spacing = _spacing(density.shape, len(sites))
+    return Level(sites, diagram.masses, diagram.centroids, triangulation, spacing, steps)

@@ -1,0 +1,285 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import (
+    InputError,
+    InversionCancelled,
+    InversionOptions,
+    invert,
+    plan_sites,
+    synthetic_image,
+)
+from napari_shadowinv.physics.forward import jacobian_determinant
+from napari_shadowinv.physics.phantoms import ellipse_pair, gaussian_blob
+
+SHAPE = (60, 80)
+
+
+@pytest.fixture(scope="module")
+def phantom():
+    """Off-centre and asymmetric, so that a shift, flip or swap of axes shows."""
+    return gaussian_blob(SHAPE, 40.0, (6.0, 9.0), (25.3, 47.8), 0.5) + gaussian_blob(
+        SHAPE, -15.0, 5.0, (38.0, 28.5)
+    )
+
+
+@pytest.fixture(scope="module")
+def image(phantom):
+    return synthetic_image(phantom.displacement)
+
+
+def relative_error(found, true):
+    return np.linalg.norm(found - true) / np.linalg.norm(true)
+
+
+def peak(displacement):
+    return np.hypot(*displacement).max()
+
+
+def test_an_off_centre_asymmetric_object_is_found_where_it_is(phantom, image):
+    inversion = invert(image)
+    assert inversion.report.converged
+    assert relative_error(inversion.displacement, phantom.displacement) < 0.02
+    assert peak(inversion.displacement) == pytest.approx(peak(phantom.displacement), rel=0.02)
+    potential = phantom.potential - inversion.potential
+    assert np.ptp(potential) < 0.03 * np.ptp(phantom.potential)
+    # half a pixel of shift would cost more than this
+    for axis in (1, 2):
+        shifted = (phantom.displacement + np.roll(phantom.displacement, 1, axis=axis)) / 2
+        assert relative_error(inversion.displacement, shifted) > 0.05
+
+
+def test_uniform_image_gives_zero_field():
+    inversion = invert(np.full((30, 40), 3.0))
+    assert peak(inversion.displacement) < 1e-9
+    np.testing.assert_allclose(inversion.reprojection, 3.0, rtol=1e-9)
+    assert not inversion.caustic.any()
+
+
+def test_an_image_equal_to_its_source_gives_zero_field():
+    source = 1 + np.random.default_rng(0).random((30, 40))
+    inversion = invert(5 * source, source=source)
+    assert peak(inversion.displacement) < 1e-5  # as far as the tolerance of the flux goes
+    assert inversion.report.warnings[0].startswith("the image's flux is 5 times")
+
+
+@pytest.mark.parametrize(
+    ("turn", "turn_vectors"),
+    [
+        (lambda a: a[::-1], lambda d: d[:, ::-1] * np.array([-1, 1])[:, None, None]),
+        (lambda a: a[:, ::-1], lambda d: d[:, :, ::-1] * np.array([1, -1])[:, None, None]),
+        (np.transpose, lambda d: d[::-1].transpose(0, 2, 1)),
+    ],
+    ids=["flip y", "flip x", "transpose"],
+)
+def test_flips_and_transpose_commute_with_the_inversion(image, turn, turn_vectors):
+    """The sites differ, so fields agree to the discretisation, not to rounding."""
+    straight = invert(image)
+    turned = invert(turn(image))
+    assert relative_error(turned.displacement, turn_vectors(straight.displacement)) < 0.012
+
+
+def test_translation_moves_the_field_by_as_much():
+    blob = {"amplitude": 40.0, "sigma": (6.0, 8.0)}
+    here = gaussian_blob((70, 80), center=(30.0, 35.0), **blob)
+    there = gaussian_blob((70, 80), center=(35.0, 42.0), **blob)
+    first = invert(synthetic_image(here.displacement)).displacement
+    second = invert(synthetic_image(there.displacement)).displacement
+    assert relative_error(second[:, 5:, 7:], first[:, :-5, :-7]) < 0.012
+
+
+def test_displacement_is_minus_the_gradient_of_the_potential(image):
+    inversion = invert(image)
+    gradient = np.array(np.gradient(inversion.potential, edge_order=2))
+    np.testing.assert_allclose(inversion.displacement, -gradient, atol=1e-12)
+    border = np.concatenate(
+        [
+            inversion.potential[0],
+            inversion.potential[-1],
+            inversion.potential[1:-1, 0],
+            inversion.potential[1:-1, -1],
+        ]
+    )
+    assert border.mean() == pytest.approx(0, abs=1e-10)
+
+
+def test_reprojection_is_the_image_and_the_residual_their_difference(image):
+    inversion = invert(image)
+    np.testing.assert_array_equal(inversion.residual, inversion.image - inversion.reprojection)
+    assert np.abs(inversion.residual).mean() < 0.02 * image.mean()
+    assert inversion.reprojection.sum() == pytest.approx(image.sum(), rel=2e-3)
+
+
+def test_sites_carry_the_source_and_point_along_the_field(phantom, image):
+    inversion = invert(image, options=InversionOptions(n_sites=3000))
+    assert inversion.sites.shape == (3000, 2)
+    assert inversion.site_mass.sum() == pytest.approx(inversion.source.sum(), rel=1e-12)
+    y, x = np.rint(inversion.sites.T).astype(int)
+    true = phantom.displacement[:, y, x].T
+    assert relative_error(inversion.site_displacement, true) < 0.12
+
+
+def test_both_read_outs_agree_on_a_smooth_object(phantom, image):
+    options = InversionOptions(lloyd_iterations=30)
+    dual = invert(image, options=options)
+    centroid = invert(image, options=options.model_copy(update={"readout": "centroid"}))
+    inner = np.s_[:, 3:-3, 3:-3]  # the corners are distorted by the sites moved there
+    assert relative_error(centroid.displacement[inner], dual.displacement[inner]) < 0.05
+    assert relative_error(dual.displacement, phantom.displacement) < relative_error(
+        centroid.displacement, phantom.displacement
+    )
+
+
+def test_non_uniform_source_is_accounted_for(phantom):
+    y, x = np.indices(SHAPE)
+    source = 1 + 0.5 * np.cos(y / 20) * np.sin(x / 15)
+    image = synthetic_image(phantom.displacement, source)
+    with_source = invert(image, source=source)
+    assert relative_error(with_source.displacement, phantom.displacement) < 0.02
+    assert relative_error(invert(image).displacement, phantom.displacement) > 0.5
+
+
+def test_caustics_are_marked_where_the_map_folds():
+    folding = ellipse_pair((80, 100), strength=4.0)
+    inversion = invert(synthetic_image(folding.displacement))
+    nearly_folds = jacobian_determinant(folding.displacement) < 0.4
+    assert inversion.caustic.sum() > 200
+    assert nearly_folds[inversion.caustic].mean() > 0.9
+    weak = invert(synthetic_image(ellipse_pair((80, 100), strength=0.5).displacement))
+    assert not weak.caustic.any()
+
+
+def test_a_plan_gives_the_same_answer_as_its_source(image):
+    source = 1 + np.random.default_rng(1).random(SHAPE)
+    shot = image * source
+    plan = plan_sites(source)
+    with_plan = invert(shot, plan=plan)
+    alone = invert(shot, source=source)
+    np.testing.assert_array_equal(with_plan.potential, alone.potential)
+    again = invert(shot, plan=plan)  # an inversion leaves its plan as it was
+    np.testing.assert_array_equal(with_plan.potential, again.potential)
+
+
+def test_threads_do_not_change_a_bit(image):
+    one, many = (
+        invert(image, options=InversionOptions(n_sites=20000, threads=threads))
+        for threads in (1, 4)
+    )
+    for name in ("potential", "displacement", "weights", "site_displacement", "reprojection"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+
+
+def test_the_report_tells_how_it_went(image):
+    noisy = image - 0.3 * (np.random.default_rng(2).random(SHAPE) < 0.01)
+    noisy[5, 5] = -1.0
+    inversion = invert(noisy, options=InversionOptions(negative="clip"))
+    report = inversion.report
+    assert report.clipped_pixels == (noisy < 0).sum()
+    assert report.floored_pixels >= report.clipped_pixels
+    assert report.n_sites == noisy.size
+    assert report.residual <= report.tolerance == 1e-3
+    assert report.iterations == sum(steps for _, steps, _ in report.levels)
+    assert set(report.seconds) == {"prepare", "sites", "transport", "read-out"}
+    assert any("negative" in warning for warning in report.warnings)
+
+
+def test_an_inversion_that_does_not_converge_says_so(image):
+    options = InversionOptions(tolerance=1e-9, max_iterations=1)
+    report = invert(image, options=options).report
+    assert not report.converged
+    assert report.residual > 1e-9
+    assert "not converged: flux residual" in report.warnings[0]
+    assert "all 1 iterations" in report.warnings[0]
+
+
+def test_progress_covers_all_stages_and_cancelling_ends_each(image):
+    stages = []
+    invert(image, on_progress=lambda progress: stages.append(progress.stage))
+    assert list(dict.fromkeys(stages)) == ["prepare", "sites", "transport", "read-out"]
+    for stage in ("prepare", "sites", "transport", "read-out"):
+        seen = []
+        with pytest.raises(InversionCancelled):
+            invert(
+                image,
+                on_progress=lambda progress, seen=seen: seen.append(progress.stage),
+                should_stop=lambda stage=stage, seen=seen: stage in seen,
+            )
+
+
+def nan_image():
+    image = np.ones((20, 20))
+    image[3, 4] = np.nan
+    return image
+
+
+@pytest.mark.parametrize(
+    ("image", "options", "says"),
+    [
+        (np.ones((3, 20, 20)), {}, r"image has shape \(3, 20, 20\), expected two dimensions"),
+        (np.ones((1, 20)), {}, r"image has shape \(1, 20\), expected at least 4 × 4"),
+        (np.ones((20, 20), complex), {}, "complex128, expected real numbers"),
+        (nan_image(), {}, "image has 1 pixels that are NaN or infinite"),
+        (np.zeros((20, 20)), {}, "image has no positive pixel"),
+        (-np.ones((20, 20)), {"negative": "clip"}, "image has no positive pixel"),
+        (np.ones((20, 20)) - 2 * np.eye(20), {}, "image has 20 negative pixels"),
+        (np.ones((20, 20)), {"n_sites": 10**12}, "1,000,000,000,000 sites need about"),
+    ],
+)
+def test_a_bad_image_is_one_clear_sentence(image, options, says):
+    with pytest.raises(InputError, match=says):
+        invert(image, options=InversionOptions(**options))
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        (np.ones((20, 21)), r"source has shape \(20, 21\), image \(20, 20\): they must match"),
+        (np.zeros((20, 20)), "source is zero everywhere"),
+        (nan_image(), "source has 1 pixels that are NaN"),
+        (-np.ones((20, 20)), "source has 400 negative pixels"),
+    ],
+)
+def test_a_bad_source_is_one_clear_sentence(source, says):
+    with pytest.raises(InputError, match=says):
+        invert(np.ones((20, 20)), source=source)
+
+
+def test_fewer_than_four_sites_are_refused():
+    with pytest.raises(ValueError, match="n_sites"):
+        InversionOptions(n_sites=3)
+
+
+def test_given_both_a_plan_and_a_source_it_asks_for_one():
+    source = np.ones((20, 20))
+    with pytest.raises(InputError, match="expected one"):
+        invert(source, source=source, plan=plan_sites(source))
+
+
+@pytest.mark.parametrize(
+    ("name", "peak_percent", "l2_percent"),
+    [
+        ("dm024_noise", 3.5, 12),
+        ("dm097", 0.3, 0.3),
+        ("dm097_noise", 3, 4),
+        ("dm194", 0.5, 1.6),
+        ("dm194_noise", 1, 2.6),
+    ],
+)
+def test_the_papers_toroid_is_retrieved(shared_data, name, peak_percent, l2_percent):
+    image = np.load(shared_data / "toroid" / f"{name}.npy")
+    true = np.load(shared_data / "toroid" / f"{name.split('_')[0]}_displacement.npy")
+    inversion = invert(image, source=np.ones_like(image), options=InversionOptions(negative="clip"))
+    assert inversion.report.converged
+    assert 100 * abs(peak(inversion.displacement) / peak(true) - 1) <= peak_percent
+    assert 100 * relative_error(inversion.displacement, true) <= l2_percent
+
+
+def test_the_donut_is_retrieved(shared_data):
+    image = np.load(shared_data / "donut" / "intensity.npy")
+    true = np.load(shared_data / "donut" / "displacement.npy")
+    inversion = invert(image)
+    assert inversion.report.converged
+    assert 100 * abs(peak(inversion.displacement) / peak(true) - 1) <= 1.5
+    assert 100 * relative_error(inversion.displacement, true) <= 2.4
