@@ -1,15 +1,89 @@
+"""A small inversion with a known potential, and what is needed to write about it."""
+
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+from napari_shadowinv.inversion import Inversion, Report
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
+    """Inversion of an off-centre blob, as if it had been solved exactly."""
+    height, width = shape
+    blob = gaussian_blob(shape, 12.0, 0.15 * min(shape), (0.4 * height, 0.6 * width))
+    source = np.full(shape, 3.0)
+    reprojection = synthetic_image(blob.displacement, source)
+    image = reprojection + np.random.default_rng(1).normal(0, 0.05, shape)
+    sites = np.random.default_rng(2).uniform(0, min(shape), (17, 2))
+    caustic = np.zeros(shape, dtype=bool)
+    caustic[height // 3 : height // 3 + 6, width // 3 : width // 3 + 7] = True
+    facts = {
+        "converged": True,
+        "iterations": 31,
+        "residual": 1 / 3000,
+        "tolerance": 1e-3,
+        "n_sites": 17,
+        "floor": 1e-3,
+        "floored_pixels": 2,
+        "clipped_pixels": 1,
+        "levels": ((4, 10, 0.1), (17, 21, 1 / 3000)),
+        "seconds": {"prepare": 0.1, "sites": 0.2, "transport": 1.0, "read-out": 0.1},
+        "warnings": ("1 negative pixel was set to zero",),
+    }
+    return Inversion(
+        image=image,
+        source=source,
+        potential=blob.potential,
+        displacement=blob.displacement,
+        sites=sites,
+        weights=np.linspace(-1, 1, 17),
+        site_mass=np.full(17, source.sum() / 17),
+        site_displacement=sites / 7,
+        reprojection=reprojection,
+        residual=image - reprojection,
+        caustic=caustic,
+        report=Report(**{**facts, **report}),  # type: ignore[arg-type]
+        options=InversionOptions(n_sites=17, tolerance=1e-3, seed=5, negative="clip"),
+    )
 
 
 @pytest.fixture(scope="session")
+def inversion() -> Inversion:
+    return invert_exactly((24, 32))
+
+
+@pytest.fixture(scope="session")
+def make_inversion() -> Callable[..., Inversion]:
+    return invert_exactly
+
+
+@pytest.fixture(scope="session")
+def proton_setup() -> ProtonSetup:
+    return ProtonSetup(
+        energy=14.7,
+        source_object_distance=1.3e-3,
+        object_image_distance=2e-2,
+        pixel_size=1.5e-6,
+    )
+
+
+@pytest.fixture(scope="session")
+def optical_setup() -> OpticalSetup:
+    return OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=12e-6)
+
+
+@pytest.fixture
 def shared_data() -> Path:
-    """Folder of real and reference images that live beside the project."""
     if not SHARED_DATA.is_dir():
-        pytest.skip(f"reference images are not at {SHARED_DATA}")
+        pytest.skip(f"no shared data at {SHARED_DATA}")
     return SHARED_DATA

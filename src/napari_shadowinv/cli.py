@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import functools
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 
@@ -108,6 +110,10 @@ def main(
     ] = False,
 ) -> None:
     """Shadowgrams and proton radiographs to deflection potentials and fields."""
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that knows no ∫ or µ is no reason to fail after the work is done.
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 SourceFile = Annotated[

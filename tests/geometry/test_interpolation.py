@@ -89,9 +89,14 @@ def test_fitted_gradients_bend_the_edges_least(sites):
 
 def test_mirror_images_lie_beyond_the_border_at_the_same_distance():
     sites = np.array([[0.0, 5.0], [5.0, 5.0], [9.2, 9.0]])
-    mirrored, origin = mirrored_across_border(sites, (10, 10), 1.5)
-    expected = {(-1.0, 5.0, 0), (9.8, 9.0, 2), (9.2, 10.0, 2), (9.8, 10.0, 2)}
-    found = np.column_stack([mirrored, origin]).round(9)
+    mirrored, origin, sense = mirrored_across_border(sites, (10, 10), 1.5)
+    expected = {
+        (-1.0, 5.0, 0, -1, 1),
+        (9.8, 9.0, 2, -1, 1),
+        (9.2, 10.0, 2, 1, -1),
+        (9.8, 10.0, 2, -1, -1),
+    }
+    found = np.column_stack([mirrored, origin, sense]).round(9)
     assert set(map(tuple, found.tolist())) == expected
 
 

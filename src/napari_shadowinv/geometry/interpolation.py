@@ -6,8 +6,7 @@
 Clough and Tocher's triangle: each Delaunay triangle is cut at its centroid into three
 cubic Bézier patches. Values and gradients are met at the sites, and the derivative
 across each edge is linear along it, so neighbours join with continuous gradients. To
-reach beyond the outermost sites, those near the border are mirrored across it and
-continued with their own gradients.
+reach beyond the outermost sites, those near the border can be mirrored across it.
 
 References
 ----------
@@ -34,7 +33,7 @@ BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothi
 
 def mirrored_across_border(
     sites: Array, shape: tuple[int, int], band: float
-) -> tuple[Array, NDArray[np.intp]]:
+) -> tuple[Array, NDArray[np.intp], Array]:
     """Mirror the sites that are closer than `band` to the image's border across it.
 
     Parameters
@@ -52,21 +51,29 @@ def mirrored_across_border(
         The mirror images; a site near a corner has three.
     origin : ndarray of int, shape (k,)
         The site that each comes from.
+    sense : ndarray, shape (k, 2)
+        -1 for the axes along which it was mirrored, else 1: what a mirrored gradient is
+        multiplied by.
     """
     points = sites
     origin = np.arange(len(sites))
+    sense = np.ones_like(sites)
     for axis in (0, 1):
         images = [points]
         origins = [origin]
+        senses = [sense]
         for wall in (-0.5, shape[axis] - 0.5):
             near = np.abs(points[:, axis] - wall) < band
             image = points[near].copy()
             image[:, axis] = 2 * wall - image[:, axis]
             images.append(image)
             origins.append(origin[near])
+            senses.append(sense[near] * (1 - 2 * np.eye(2)[axis]))
         points = np.concatenate(images)
         origin = np.concatenate(origins)
-    return points[len(sites) :], origin[len(sites) :]
+        sense = np.concatenate(senses)
+    n = len(sites)
+    return points[n:], origin[n:], sense[n:]
 
 
 @njit(nogil=True, cache=True)

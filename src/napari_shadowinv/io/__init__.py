@@ -1,1 +1,28 @@
-"""Files: radiographs in, results out."""
+"""Files: radiographs in, results out, a module for each family of formats."""
+
+from napari_shadowinv.io.dataset import (
+    dataset_from_inversion,
+    inversion_from_dataset,
+    provenance,
+    setup_from_dataset,
+)
+from napari_shadowinv.io.files import check_output, replacing
+from napari_shadowinv.io.radiograph import Radiograph, binned_setup
+from napari_shadowinv.io.reading import read, read_dataset, read_radiograph, read_toml
+from napari_shadowinv.io.writing import write
+
+__all__ = [
+    "Radiograph",
+    "binned_setup",
+    "check_output",
+    "dataset_from_inversion",
+    "inversion_from_dataset",
+    "provenance",
+    "read",
+    "read_dataset",
+    "read_radiograph",
+    "read_toml",
+    "replacing",
+    "setup_from_dataset",
+    "write",
+]

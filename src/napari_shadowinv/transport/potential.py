@@ -73,6 +73,9 @@ def potential_surface(
 ) -> CloughTocher:
     """Lay a C¹ surface through the potential at the sites.
 
+    No flux crosses the border of the image, so the potential is level across it, and its
+    mirror image continues it smoothly.
+
     Parameters
     ----------
     level : Level
@@ -93,13 +96,14 @@ def potential_surface(
     CloughTocher
         The potential (px²) and its gradient at any point of the image.
     """
-    mirrored, origin = mirrored_across_border(level.sites, shape, _MIRROR_BAND * level.spacing)
+    mirrored, origin, sense = mirrored_across_border(
+        level.sites, shape, _MIRROR_BAND * level.spacing
+    )
     potential = 0.5 * weights
     gradient = fit_gradients(level.triangulation, potential, -displacement, sweeps)
-    beyond = potential[origin] + (gradient[origin] * (mirrored - level.sites[origin])).sum(axis=1)
     return CloughTocher(
         RegularTriangulation(np.concatenate([level.sites, mirrored])),
-        np.concatenate([potential, beyond]),
-        np.concatenate([gradient, gradient[origin]]),
+        np.concatenate([potential, potential[origin]]),
+        np.concatenate([gradient, sense * gradient[origin]]),
         threads=threads,
     )
