@@ -41,6 +41,7 @@ _RESIDUAL_MAP = "RdBu_r"
 _CUT_COLOURS = ("#1f9bff", "#18b368")
 _CAUSTIC_COLOUR = "white"
 _CAUSTIC_DENSITY = 0.15
+_LARGEST_INTENSITY = 3.5
 _LARGEST_RESIDUAL = 50.0
 _ALARM_COLOUR = "#b00020"
 _QUIET_COLOUR = "0.3"
@@ -448,9 +449,13 @@ def _draw_reprojection(panel: _Panel, inversion: Inversion) -> None:
 
 
 def _intensity_limits(inversion: Inversion) -> tuple[float, float]:
-    # The bright pixels of a caustic would turn all the rest black.
-    bright = float(np.percentile(inversion.image, 99.7) / inversion.source.mean())
-    return 0.0, min(bright, 3.5) if bright > 0 else 1.0
+    """Limits that neither a caustic's few bright pixels nor a faint contrast can spoil."""
+    mean = inversion.source.mean()
+    dark, bright = (float(p / mean) for p in np.percentile(inversion.image, (0.1, 99.7)))
+    if not bright > 0:
+        return 0.0, 1.0
+    high = min(bright, _LARGEST_INTENSITY)
+    return (dark if 0.3 * high < dark < high else 0.0), high
 
 
 def _draw_potential(

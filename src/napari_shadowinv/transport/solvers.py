@@ -36,7 +36,8 @@ _SHORTEST_STEP = 1e-7
 _LINEAR_TOLERANCE = 1e-2
 _COARSE_TOLERANCE = 3e-2
 _BLURS = (4.0, 2.0, 1.0, 0.5)
-_TOWARDS_FULL_CELLS = 0.999
+_SHARES_OF_START = (0.999, 0.99, 0.9, 0.5)
+_LEAST_START = 1e-12  # of a mean cell's flux
 
 
 @dataclass(frozen=True)
@@ -204,17 +205,30 @@ def solve_multilevel(
             weights = _coarsest_start(level, image, max_iterations, threads, report)
         else:
             weights = _prolong(levels[number - 1], solutions[-1], level, density, threads)
-        weights = _TOWARDS_FULL_CELLS * objective.triangulation.lower_hidden(weights)
         finest = number == len(levels) - 1
         solution = newton(
             objective,
-            weights,
+            _with_full_cells(objective, weights),
             tolerance=tolerance if finest else max(tolerance, _COARSE_TOLERANCE),
             max_iterations=max_iterations,
             report=report,
         )
         solutions.append(solution)
     return solutions
+
+
+def _with_full_cells(objective: TransportObjective, weights: Array) -> Array:
+    """Find weights near the given ones for which every cell holds some flux.
+
+    Hidden sites are lowered to where they just show; then a little of the zero weights,
+    for which every cell is round and full, is mixed in.
+    """
+    shown = objective.triangulation.lower_hidden(weights)
+    for share in _SHARES_OF_START:
+        diagram = objective.diagram_if_full(share * shown)
+        if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
+            return share * shown
+    return np.zeros(len(weights))
 
 
 def _coarsest_start(
@@ -232,10 +246,9 @@ def _coarsest_start(
         objective = TransportObjective(
             level.triangulation.copy(), level.mass, Density.from_image(blurred), threads=threads
         )
-        weights = _TOWARDS_FULL_CELLS * objective.triangulation.lower_hidden(weights)
         weights = newton(
             objective,
-            weights,
+            _with_full_cells(objective, weights),
             tolerance=_COARSE_TOLERANCE,
             max_iterations=max_iterations,
             report=report,
