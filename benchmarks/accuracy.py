@@ -11,9 +11,9 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from reference import Case, donut_case, ellipses_case, errors, toroid_case
 
 from napari_shadowinv import InversionOptions, invert, poisson_invert
+from reference import Case, donut_case, ellipses_case, errors, toroid_case
 
 LIMITS = {  # largest peak and L2 error allowed, in per cent
     "toroid 24 with noise": (3.5, 12),

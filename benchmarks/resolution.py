@@ -1,6 +1,6 @@
 """The same object with pixels halved twice: the error falls, the time grows linearly.
 
-    python benchmarks/resolution.py
+python benchmarks/resolution.py
 """
 
 from __future__ import annotations
@@ -8,10 +8,10 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from reference import Case, errors
 
 from napari_shadowinv import InversionOptions, invert, synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from reference import Case, errors
 
 
 def case(side: int, peak: float) -> Case:

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from reference import toroid_case
 from scipy.spatial import ConvexHull
 
 from napari_shadowinv import InversionOptions, invert, plan_sites
@@ -22,6 +21,7 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.preprocess import prepare
 from napari_shadowinv.transport.sites import SitePlan
 from napari_shadowinv.transport.solvers import solve
+from reference import toroid_case
 
 
 def best(work: Callable[[], object], repeat: int) -> float:
