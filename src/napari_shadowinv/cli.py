@@ -339,11 +339,7 @@ def _check_outputs(outputs: Mapping[Path, tuple[str, ...]], overwrite: bool) -> 
     from napari_shadowinv.io import check_output
 
     for path, suffixes in outputs.items():
-        try:
-            check_output(path, overwrite, suffixes=suffixes)
-        except FileFormatError as error:
-            hint = "allow overwriting"
-            raise FileFormatError(str(error).replace(hint, "add --overwrite")) from None
+        check_output(path, overwrite, suffixes=suffixes)
 
 
 def _protect(outputs: list[Path], inputs: list[Path | None]) -> None:

@@ -1,4 +1,12 @@
-"""Files: radiographs in, results out, a module for each family of formats."""
+"""Files: radiographs in, results out, a module for each family of formats.
+
+- read an image or a result: `read`; only one of them: `read_radiograph`, `read_dataset`
+- an image with what is known about it: `Radiograph`; sum its pixels: `Radiograph.binned`
+- write a result or an image: `write`; check the path beforehand: `check_output`
+- an inversion as a labelled dataset and back: `dataset_from_inversion`,
+  `inversion_from_dataset`, `setup_from_dataset`
+- write a file of your own, whole or not at all: `replacing`
+"""
 
 from napari_shadowinv.io.dataset import (
     dataset_from_inversion,

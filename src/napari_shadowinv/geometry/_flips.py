@@ -1,0 +1,476 @@
+"""Building and repairing a regular triangulation by flips; see `triangulation`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from napari_shadowinv.geometry._hilbert import insertion_order
+from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
+from napari_shadowinv.geometry._mesh import (
+    EVERYWHERE,
+    FLIPS,
+    FREE,
+    LAST,
+    LIMIT,
+    OVERFLOW,
+    POLICY,
+    RAISES,
+    SIZE,
+    TOP,
+    Mesh,
+    after,
+    around,
+    before,
+    compact,
+    flip,
+    push,
+    push_triangle,
+    remove,
+    replace,
+    split_edge,
+    split_triangle,
+)
+from napari_shadowinv.geometry._predicates import (
+    FLIP,
+    LEGAL,
+    LIFT_BOUND,
+    REFLEX_A,
+    edge_state,
+    excess,
+    precise_excess,
+    turn,
+)
+
+__all__ = ["DONE", "EXHAUSTED", "HIDDEN", "REMOVE", "STOP", "build", "raise_hidden", "repair"]
+
+# What to do with a vertex that is proven hidden.
+REMOVE = 0
+STOP = 1
+RAISE = 2
+KEEP = 3
+
+# How a repair ended.
+DONE = 0
+HIDDEN = 1
+EXHAUSTED = 2
+
+# Where a site was found.
+INSIDE = 0
+ON_EDGE = 1
+ON_CORNER = 2
+NOWHERE = 3
+
+# Longest step above the plane when a weight is raised, in roundings of the weight.
+LONGEST_STEP = 1 << 15
+
+
+@kernel
+def _state(mesh: Mesh, h: int, g: int) -> int:
+    """Tell the state of the edge h with twin g; its corners are a = after(h), b = before(h).
+
+    Seen from a distant corner the small differences between the others would be lost; so the
+    nearer one looks. The answer must not depend on the side that the edge was reached from.
+    """
+    points = mesh.points
+    p, a, b, q = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)], mesh.corners[g]
+    p_far = abs(points[p, 0] - points[a, 0]) + abs(points[p, 1] - points[a, 1])
+    q_far = abs(points[q, 0] - points[b, 0]) + abs(points[q, 1] - points[b, 1])
+    if p_far < q_far or (p_far == q_far and p < q):
+        return edge_state(points, mesh.weights, mesh.scratch, p, a, b, q)
+    state = edge_state(points, mesh.weights, mesh.scratch, q, b, a, p)
+    return state if state <= FLIP else 5 - state
+
+
+@kernel
+def _raise_vertex(mesh: Mesh, h: int, a: int, b: int, c: int) -> None:
+    """Raise the weight of the vertex at corner h to the lifted plane of (a, b, c).
+
+    Close sites that are coplanar but for rounding would chase each other up by single roundings.
+    A wider step now and then (1, 8, 1, 64, 1, 8, 1, 512 ... roundings) ends that soon.
+    """
+    v = mesh.corners[h]
+    weight = mesh.weights[v]
+    mesh.counters[RAISES] += 1
+    step = min((mesh.counters[RAISES] & -mesh.counters[RAISES]) ** 3, LONGEST_STEP)
+    rounding = np.nextafter(abs(weight), np.inf) - abs(weight)
+    height = precise_excess(mesh.points, mesh.weights, a, b, c, v)
+    mesh.weights[v] = weight + max(height, 0.0) + step * rounding
+    g = h
+    while True:
+        push(mesh, g)
+        push(mesh, after(g))
+        g = around(mesh, g)
+        if g == h:
+            break
+
+
+@kernel
+def _give_way(mesh: Mesh, h: int, g: int, reflex_a: bool) -> None:
+    """Remove or raise the hidden end of the edge h, whose twin is g."""
+    v = after(h) if reflex_a else before(h)
+    if mesh.counters[POLICY] == REMOVE:
+        remove(mesh, v)
+        return
+    p, q = mesh.corners[h], mesh.corners[g]
+    other = mesh.corners[before(h) if reflex_a else after(h)]
+    if reflex_a:
+        _raise_vertex(mesh, v, p, q, other)
+    else:
+        _raise_vertex(mesh, v, q, p, other)
+
+
+@kernel
+def _restore(mesh: Mesh) -> int:
+    """Flip until the stack is empty.
+
+    After an insertion into a regular triangulation only edges opposite to the new vertex can
+    be irregular; with counters[EVERYWHERE] all four edges around a flip are looked at.
+    """
+    counters, twins, corners = mesh.counters, mesh.twins, mesh.corners
+    while counters[TOP] > 0:
+        counters[TOP] -= 1
+        h = mesh.stack[counters[TOP]]
+        if corners[h - h % 3] < 0:
+            continue
+        g = twins[h]
+        if g < 0:
+            continue
+        state = _state(mesh, h, g)
+        if state == LEGAL:
+            continue
+        if counters[FLIPS] + counters[RAISES] >= counters[LIMIT]:
+            counters[TOP] = 0
+            return EXHAUSTED
+        if state == FLIP:
+            flip(mesh, h, g)
+            if counters[EVERYWHERE] == 1:
+                push(mesh, before(h))
+                push(mesh, g)
+            push(mesh, h)
+            push(mesh, before(g))
+            continue
+        if counters[POLICY] == KEEP:
+            continue
+        if counters[POLICY] == STOP:
+            counters[TOP] = 0
+            return HIDDEN
+        counters[EVERYWHERE] = 1
+        _give_way(mesh, h, g, state == REFLEX_A)
+    return DONE
+
+
+@kernel
+def _mark_irregular(mesh: Mesh, t: int) -> bool:
+    """Push the edges of triangle t that may be irregular, unless the neighbour looks at them.
+
+    The triangle's own part of the determinant serves for its three edges.
+    """
+    corners, twins, points, weights = mesh.corners, mesh.twins, mesh.points, mesh.weights
+    n = mesh.hidden.size
+    e = 3 * t
+    i, j, k = corners[e], corners[e + 1], corners[e + 2]
+    marked = False
+    if i >= n or j >= n or k >= n:
+        for h in range(e, e + 3):
+            g = twins[h]
+            if g > h and _state(mesh, h, g) != LEGAL:
+                push(mesh, h)
+                marked = True
+        return marked
+    x0, y0, w0 = points[i, 0], points[i, 1], weights[i]
+    ax, ay, a_gain = points[j, 0] - x0, points[j, 1] - y0, weights[j] - w0
+    bx, by, b_gain = points[k, 0] - x0, points[k, 1] - y0, weights[k] - w0
+    a_square = ax * ax + ay * ay
+    b_square = bx * bx + by * by
+    a_lift = a_square - a_gain
+    b_lift = b_square - b_gain
+    a_size = a_square + abs(a_gain)
+    b_size = b_square + abs(b_gain)
+    area = ax * by - ay * bx
+    area_size = abs(ax * by) + abs(ay * bx)
+    for h in range(e, e + 3):
+        g = twins[h]
+        if g > h:
+            q = corners[g]
+            qx, qy, q_gain = points[q, 0] - x0, points[q, 1] - y0, weights[q] - w0
+            q_square = qx * qx + qy * qy
+            height = (
+                (q_square - q_gain) * area
+                - a_lift * (qx * by - qy * bx)
+                - b_lift * (ax * qy - ay * qx)
+            )
+            size = (
+                (q_square + abs(q_gain)) * area_size
+                + a_size * (abs(qx * by) + abs(qy * bx))
+                + b_size * (abs(ax * qy) + abs(ay * qx))
+            )
+            if height < LIFT_BOUND * size:
+                push(mesh, h)
+                marked = True
+    return marked
+
+
+@kernel
+def _sweep(mesh: Mesh) -> int:
+    """Make every edge locally regular; the sites stay those that are in."""
+    counters = mesh.counters
+    counters[OVERFLOW] = 1
+    while counters[OVERFLOW] == 1:
+        counters[OVERFLOW] = 0
+        t = 0
+        while t < counters[SIZE]:
+            if mesh.corners[3 * t] < 0:
+                marked = False
+            elif counters[POLICY] == RAISE:
+                push_triangle(mesh, t)
+                marked = True
+            else:
+                marked = _mark_irregular(mesh, t)
+            if marked:
+                counters[EVERYWHERE] = 1
+                status = _restore(mesh)
+                if status != DONE:
+                    return status
+            t += 1
+    return DONE
+
+
+@kernel
+def _locate(mesh: Mesh, v: int) -> tuple[int, int]:
+    """Walk to site v; where it is, and that triangle's corner, edge or first corner.
+
+    The walk visits the other two edges in random order: so it cannot go in circles.
+    """
+    corners, twins, points = mesh.corners, mesh.twins, mesh.points
+    h = 3 * mesh.counters[LAST]
+    side = turn(points, mesh.scratch, corners[h + 1], corners[h + 2], v)
+    if side < 0:
+        h, side = twins[h], 1
+    noise = v + 1
+    steps = 0
+    while steps < 4 * mesh.counters[SIZE] + 1000:
+        steps += 1
+        noise = (noise * 1103515245 + 12345) & 0x7FFFFFFF
+        swap = (noise >> 16) & 1
+        first, second = after(h), before(h)
+        if swap:
+            first, second = second, first
+        first_side = turn(points, mesh.scratch, corners[after(first)], corners[before(first)], v)
+        if first_side < 0:
+            h, side = twins[first], 1
+            if h < 0:
+                break
+            continue
+        second_side = turn(points, mesh.scratch, corners[after(second)], corners[before(second)], v)
+        if second_side < 0:
+            h, side = twins[second], 1
+            if h < 0:
+                break
+            continue
+        zeros = (side == 0) + (first_side == 0) + (second_side == 0)
+        if zeros == 0:
+            return INSIDE, h
+        if zeros == 1:
+            return ON_EDGE, h if side == 0 else (first if first_side == 0 else second)
+        # The corner that two edges meet at is opposite to the third.
+        return ON_CORNER, h if side != 0 else (first if first_side != 0 else second)
+    return NOWHERE, 0
+
+
+@kernel
+def _outweighs(mesh: Mesh, v: int, u: int) -> bool:
+    """Tell whether v, rather than its duplicate u, is the one that stays."""
+    return mesh.weights[v] > mesh.weights[u] or (mesh.weights[v] == mesh.weights[u] and v < u)
+
+
+@kernel
+def _insert(mesh: Mesh, v: int, certainty: float) -> int:
+    """Insert site v where its power cell is not empty.
+
+    `certainty` in units of the error bound: 1 lets in a site that may touch the lower hull
+    (zero area), -1 only one that lies certainly below it, infinity any.
+    """
+    where, h = _locate(mesh, v)
+    if where == NOWHERE:
+        return EXHAUSTED
+    mesh.counters[LAST] = h // 3
+    if where == ON_CORNER:
+        if not _outweighs(mesh, v, mesh.corners[h]):
+            return DONE
+        replace(mesh, h, v)
+    else:
+        a, b, c = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)]
+        height, bound = excess(mesh.points, mesh.weights, a, b, c, v)
+        if height > certainty * bound:
+            return DONE
+        mesh.hidden[v] = False
+        if where == INSIDE:
+            split_triangle(mesh, h // 3, v)
+        else:
+            split_edge(mesh, h, v)
+    mesh.counters[EVERYWHERE] = 0
+    return _restore(mesh)
+
+
+@kernel_that_allocates
+def _return_hidden(mesh: Mesh) -> int:
+    """Insert the hidden sites that lie below the lower hull.
+
+    One pass is enough: an insertion lowers the hull, so who stays hidden stays so.
+    """
+    for v in range(mesh.hidden.size):
+        if mesh.hidden[v]:
+            status = _insert(mesh, v, -1.0)
+            if status != DONE:
+                return status
+    return DONE
+
+
+@kernel_that_allocates
+def repair(mesh: Mesh, policy: int) -> int:
+    """Make the triangulation regular for the weights in `mesh`.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The triangulation; any valid one.
+    policy : int
+        REMOVE hidden sites, or STOP at the first.
+
+    Returns
+    -------
+    int
+        DONE, HIDDEN (with STOP) or EXHAUSTED, when the limit of flips was reached.
+    """
+    mesh.counters[TOP] = 0
+    mesh.counters[FLIPS] = 0
+    mesh.counters[RAISES] = 0
+    mesh.counters[POLICY] = policy
+    status = _sweep(mesh)
+    if status == DONE:
+        status = _return_hidden(mesh)
+    if status == DONE and mesh.counters[OVERFLOW] == 1:
+        status = _sweep(mesh)
+    compact(mesh)
+    return status
+
+
+@kernel
+def _insert_on_hull(mesh: Mesh, v: int) -> int:
+    """Raise the weight of site v to the lower hull and insert it."""
+    where, h = _locate(mesh, v)
+    if where == NOWHERE:
+        return EXHAUSTED
+    mesh.counters[LAST] = h // 3
+    a, b, c = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)]
+    if where == ON_CORNER:
+        mesh.weights[v] = max(mesh.weights[v], mesh.weights[a])
+        return DONE
+    height = precise_excess(mesh.points, mesh.weights, a, b, c, v)
+    mesh.weights[v] += max(height, 0.0)
+    return _insert(mesh, v, np.inf)
+
+
+@kernel_that_allocates
+def raise_hidden(mesh: Mesh) -> int:
+    """Raise the weights of the hidden sites to the lower hull and insert them.
+
+    Rounding leaves some of them a trace above the hull; these are raised a trace more, until
+    none is hidden. Where the weights' own rounding exceeds the squared distance of sites times
+    the relative rounding (tight clusters), that may not end; then the trace is left to be.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        A regular triangulation; its weights are changed.
+
+    Returns
+    -------
+    int
+        DONE, or EXHAUSTED. Duplicates of other sites get their weight, but stay out.
+    """
+    mesh.counters[TOP] = 0
+    mesh.counters[FLIPS] = 0
+    mesh.counters[RAISES] = 0
+    mesh.counters[POLICY] = KEEP
+    for v in insertion_order(mesh.hidden.size):
+        if mesh.hidden[v] and _insert_on_hull(mesh, v) == EXHAUSTED:
+            return EXHAUSTED
+    on_hull = mesh.weights.copy()
+    mesh.counters[POLICY] = RAISE
+    if _sweep(mesh) == EXHAUSTED:
+        mesh.weights[:] = on_hull
+    compact(mesh)
+    return DONE
+
+
+@kernel
+def _start(mesh: Mesh) -> None:
+    """Two triangles of ghosts, no site."""
+    n = mesh.hidden.size
+    mesh.counters[:] = 0
+    mesh.counters[FREE] = -1
+    mesh.counters[POLICY] = REMOVE
+    mesh.counters[SIZE] = 2
+    mesh.counters[LIMIT] = 100 * n + 1000
+    mesh.hidden[:] = True
+    for h, corner in enumerate((n, n + 1, n + 2, n + 2, n + 3, n)):
+        mesh.corners[h] = corner
+    mesh.twins[:6] = -1
+    mesh.twins[1] = 4
+    mesh.twins[4] = 1
+
+
+@kernel_that_allocates
+def _sort_triangles(mesh: Mesh) -> None:
+    """Store the triangles in the order of their smallest corner: neighbours close in memory."""
+    m = mesh.counters[SIZE]
+    n = mesh.hidden.size
+    starts = np.zeros(n + 5, dtype=np.int32)
+    smallest = np.empty(m, dtype=np.int32)
+    for t in range(m):
+        smallest[t] = min(mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2])
+        starts[smallest[t] + 1] += 1
+    for k in range(n + 4):
+        starts[k + 1] += starts[k]
+    places = smallest
+    for t in range(m):
+        k = smallest[t]
+        places[t] = starts[k]
+        starts[k] += 1
+    corners = mesh.corners[: 3 * m].copy()
+    twins = mesh.twins[: 3 * m].copy()
+    for t in range(m):
+        s = places[t]
+        for k in range(3):
+            g = twins[3 * t + k]
+            mesh.corners[3 * s + k] = corners[3 * t + k]
+            mesh.twins[3 * s + k] = 3 * places[g // 3] + g % 3 if g >= 0 else -1
+    mesh.counters[LAST] = places[mesh.counters[LAST]]
+
+
+@kernel_that_allocates
+def build(mesh: Mesh) -> int:
+    """Build the regular triangulation from scratch.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Points, sorted along a curve, and weights; the rest is written.
+
+    Returns
+    -------
+    int
+        DONE or EXHAUSTED.
+    """
+    _start(mesh)
+    status = DONE
+    for v in insertion_order(mesh.hidden.size):
+        status = _insert(mesh, v, 1.0)
+        if status != DONE:
+            break
+    if status == DONE and mesh.counters[OVERFLOW] == 1:
+        status = _sweep(mesh)
+    compact(mesh)
+    _sort_triangles(mesh)
+    return status

@@ -1,0 +1,140 @@
+"""Orders of points: along a Hilbert curve, and along it in random rounds.
+
+- sort points so that near in the order is near in the plane: `hilbert_permutation`
+- insert sorted points in an order that no arrangement of them can spoil: `insertion_order`
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
+
+__all__ = ["hilbert_permutation", "insertion_order"]
+
+BITS = 16
+DIGIT_BITS = 11
+
+# A round of insertion has 2³ - 1 times as many points as all before it.
+ROUND_BITS = 3
+
+
+@kernel
+def _distance_along(x: int, y: int) -> int:
+    """Distance of the grid cell (x, y) along the curve."""
+    distance = 0
+    half = 1 << (BITS - 1)
+    while half > 0:
+        right = 1 if x & half else 0
+        up = 1 if y & half else 0
+        distance += half * half * ((3 * right) ^ up)
+        if up == 0:
+            if right == 1:
+                x = (2 * half - 1) - (x & (2 * half - 1))
+                y = (2 * half - 1) - (y & (2 * half - 1))
+            x, y = y, x
+        half >>= 1
+    return distance
+
+
+@kernel_that_allocates
+def _keys(points: NDArray[np.float64]) -> NDArray[np.uint32]:
+    n = points.shape[0]
+    keys = np.zeros(n, dtype=np.uint32)
+    x_low, x_high = points[:, 0].min(), points[:, 0].max()
+    y_low, y_high = points[:, 1].min(), points[:, 1].max()
+    extent = max(x_high - x_low, y_high - y_low)
+    if extent == 0.0:
+        return keys
+    last = (1 << BITS) - 1
+    scale = (1 << BITS) / extent
+    for i in range(n):
+        x = min(int((points[i, 0] - x_low) * scale), last)
+        y = min(int((points[i, 1] - y_low) * scale), last)
+        keys[i] = _distance_along(x, y)
+    return keys
+
+
+@kernel_that_allocates
+def _stable_order(keys: NDArray[np.uint32]) -> NDArray[np.int32]:
+    """Permutation that sorts the keys; equal keys keep their order."""
+    n = keys.size
+    order = np.arange(n).astype(np.int32)
+    if np.all(keys[:-1] <= keys[1:]):
+        return order
+    other = np.empty(n, dtype=np.int32)
+    mask = (1 << DIGIT_BITS) - 1
+    for shift in range(0, 2 * BITS, DIGIT_BITS):
+        starts = np.zeros(mask + 2, dtype=np.int64)
+        for k in range(n):
+            starts[((np.int64(keys[k]) >> shift) & mask) + 1] += 1
+        for digit in range(mask + 1):
+            starts[digit + 1] += starts[digit]
+        for i in order:
+            place = (np.int64(keys[i]) >> shift) & mask
+            other[starts[place]] = i
+            starts[place] += 1
+        order, other = other, order
+    return order
+
+
+@kernel_that_allocates
+def hilbert_permutation(points: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Sort points along a Hilbert curve through a grid of 2¹⁶ × 2¹⁶ square cells.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 2)
+        Coordinates.
+
+    Returns
+    -------
+    ndarray of int32, shape (n,)
+        The permutation; points in one grid cell keep their order.
+    """
+    return _stable_order(_keys(points))
+
+
+@kernel
+def _round_of(k: int) -> int:
+    """Tell how many rounds before the last one point k is inserted, by a hash of k."""
+    z = (np.uint64(k) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    rounds = 0
+    while rounds < 31 and z & np.uint64((1 << ROUND_BITS) - 1) == 0:
+        z >>= np.uint64(ROUND_BITS)
+        rounds += 1
+    return rounds
+
+
+@kernel_that_allocates
+def insertion_order(n: int) -> NDArray[np.int64]:
+    """Biased randomized insertion order: ever larger random samples, each in order.
+
+    Amenta, Choi and Rote 2003, Proc. 19th Symp. Computational Geometry, 211.
+
+    Parameters
+    ----------
+    n : int
+        Number of sites, which are taken to be sorted along a curve.
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+        A permutation; always the same.
+    """
+    starts = np.zeros(33, dtype=np.int64)
+    for k in range(n):
+        starts[32 - _round_of(k)] += 1
+    total = 0
+    for r in range(33):
+        total, starts[r] = total + starts[r], total
+    order = np.empty(n, dtype=np.int64)
+    for k in range(n):
+        r = 32 - _round_of(k)
+        order[starts[r]] = k
+        starts[r] += 1
+    return order

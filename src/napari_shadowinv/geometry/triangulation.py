@@ -1,0 +1,330 @@
+"""Regular triangulations that follow their weights: the dual of a power diagram.
+
+- triangulate weighted sites, or repair for new weights: `RegularTriangulation`
+- raise the weights of sites with empty cells until they count:
+  `RegularTriangulation.lower_hidden`
+- sort sites so that neighbours are close in memory: `hilbert_order`
+
+A site at r with weight w owns the points x where |x - r|² - w is smallest: its power cell.
+Two sites are joined by an edge where their cells touch; a site with an empty cell is
+hidden and no vertex. Equivalently, the triangles are the lower convex hull of the sites
+lifted to the heights (|r|² - w) / 2.
+
+After a change of weights, each edge that has become irregular is flipped; if it cannot be,
+then one of its ends is hidden. So flipping finishes or proves an empty cell, and costs
+little when little has changed.
+
+References
+----------
+H. Edelsbrunner and N. R. Shah, "Incremental topological flipping works for regular
+triangulations", Algorithmica 15, 223 (1996).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry import _flips
+from napari_shadowinv.geometry._hilbert import hilbert_permutation
+from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Mesh, neighbors_of
+
+__all__ = ["RegularTriangulation", "hilbert_order"]
+
+# Distance of the ghosts from the centre of the sites, in extents of the sites. From 3.5 on a ghost
+# that weighs no more than any site has its cell outside three times the bounding box.
+GHOST_DISTANCE = 10.0
+
+# The weight of the ghosts, in units of their squared distance, moves in steps of this factor:
+# it must not follow each change of the smallest weight, which would flip edges at the border.
+GHOST_STEP = 1024.0
+
+STACK_SIZE = 1 << 14
+
+T = TypeVar("T", bound=np.generic)
+
+
+def hilbert_order(points: ArrayLike) -> NDArray[np.int32]:
+    """Sort points along a Hilbert curve: near in the order is near in the plane.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 2)
+        Coordinates.
+
+    Returns
+    -------
+    ndarray of int32, shape (n,)
+        The permutation; points in the same cell of a 2¹⁶ × 2¹⁶ grid keep their order.
+
+    Raises
+    ------
+    InputError
+        If the points are not finite or not of shape (n, 2).
+
+    Examples
+    --------
+    >>> hilbert_order([[0.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
+    array([0, 2, 1, 3], dtype=int32)
+    """
+    return np.asarray(hilbert_permutation(_checked_points(points)))
+
+
+def _checked_points(points: ArrayLike) -> NDArray[np.float64]:
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 2 or array.shape[0] == 0:
+        raise InputError(f"sites have shape {array.shape}: expected (n, 2) with at least one site")
+    if not np.all(np.isfinite(array)):
+        raise InputError("sites contain NaN or infinity: all coordinates must be finite")
+    return array
+
+
+def _checked_weights(weights: ArrayLike, n: int) -> NDArray[np.float64]:
+    array = np.asarray(weights, dtype=np.float64)
+    if array.shape != (n,):
+        raise InputError(f"weights have shape {array.shape}, there are {n} sites: expected ({n},)")
+    if not np.all(np.isfinite(array)):
+        raise InputError("weights contain NaN or infinity: all weights must be finite")
+    return array
+
+
+def _with_ghosts(sites: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Sites and the corners of a distant square around them, and half its side."""
+    low, high = sites.min(axis=0), sites.max(axis=0)
+    extent = float((high - low).max())
+    if extent == 0.0:
+        extent = max(1.0, float(np.abs(sites).max()))
+    distance = GHOST_DISTANCE * extent
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    return np.concatenate([sites, low + (high - low) / 2 + distance * corners]), distance
+
+
+def _read_only(array: NDArray[T]) -> NDArray[T]:
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+class RegularTriangulation:
+    """Regular (weighted Delaunay) triangulation of sites in the plane.
+
+    Four ghost sites, the corners of a square far outside, close the plane: their cells stay
+    outside three times the sites' bounding box. Cells of sites may end at them out there.
+
+    Parameters
+    ----------
+    sites : array_like, shape (n, 2)
+        Positions (y, x), in any unit. They are triangulated in Hilbert order inside; nothing has
+        to be rearranged if they come in that order (see `hilbert_order`).
+    weights : array_like, shape (n,), optional
+        Weights of the power diagram, in squared units of the sites; 0 by default.
+
+    Raises
+    ------
+    InputError
+        If shapes do not match or a value is not finite.
+
+    Notes
+    -----
+    Of sites at the same place the heaviest is a vertex, the first one if they weigh the same; the
+    others are hidden. A cell whose area is zero within rounding may count as empty or not.
+
+    The arrays are read-only and valid until the next `update` or `lower_hidden`.
+
+    Examples
+    --------
+    >>> triangulation = RegularTriangulation([[0, 0], [0, 4], [4, 0], [4, 4], [1, 2]])
+    >>> triangulation.vertices.shape
+    (12, 3)
+    >>> triangulation.update([9, 9, 9, 9, 0])
+    True
+    >>> triangulation.hidden
+    array([False, False, False, False,  True])
+    """
+
+    def __init__(self, sites: ArrayLike, weights: ArrayLike | None = None) -> None:
+        given = _checked_points(sites)
+        n = given.shape[0]
+        order = hilbert_permutation(given)
+        self._order = None if np.array_equal(order, np.arange(n)) else order
+        points, self._ghost_distance = _with_ghosts(given if self._order is None else given[order])
+        self._mesh = Mesh(
+            points=points,
+            weights=np.zeros(n + 4),
+            corners=np.empty(6 * n + 6, dtype=np.int32),
+            twins=np.empty(6 * n + 6, dtype=np.int32),
+            hidden=np.zeros(n, dtype=np.bool_),
+            stack=np.empty(STACK_SIZE, dtype=np.int64),
+            counters=np.zeros(N_COUNTERS, dtype=np.int64),
+            scratch=np.empty(16),
+        )
+        self._set_weights(np.zeros(n) if weights is None else _checked_weights(weights, n))
+        self._build()
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Positions of the sites, then of the four ghosts, shape (n + 4, 2)."""
+        return _read_only(self._in_given_order(self._mesh.points))
+
+    @property
+    def sites(self) -> NDArray[np.float64]:
+        """Positions of the sites, shape (n, 2)."""
+        return self.points[:-4]
+
+    @cached_property
+    def weights(self) -> NDArray[np.float64]:
+        """Weights of the sites, then of the four ghosts, shape (n + 4,)."""
+        return _read_only(self._in_given_order(self._mesh.weights))
+
+    @cached_property
+    def hidden(self) -> NDArray[np.bool_]:
+        """Which sites have an empty cell and are no vertex, shape (n,)."""
+        return _read_only(self._in_given_order(self._mesh.hidden))
+
+    @cached_property
+    def vertices(self) -> NDArray[np.int32]:
+        """Rows of `points` at the corners of each triangle, shape (m, 3).
+
+        Counter-clockwise in that cross(p₁ - p₀, p₂ - p₀) > 0, cross(a, b) = a₀ b₁ - a₁ b₀.
+        """
+        corners = self._mesh.corners[: 3 * self._mesh.counters[SIZE]]
+        if self._order is not None:
+            n = self._order.size
+            corners = np.append(self._order, np.arange(n, n + 4, dtype=np.int32))[corners]
+        return _read_only(corners.reshape(-1, 3))
+
+    @cached_property
+    def neighbors(self) -> NDArray[np.int32]:
+        """Triangle across the edge opposite to each corner, shape (m, 3); -1 if there is none."""
+        return _read_only(neighbors_of(self._mesh).reshape(-1, 3))
+
+    def update(self, weights: ArrayLike, *, stop_when_hidden: bool = False) -> bool:
+        """Repair the triangulation for new weights.
+
+        Parameters
+        ----------
+        weights : array_like, shape (n,)
+            New weights of the sites.
+        stop_when_hidden : bool
+            Whether to stop as soon as a site that is in the triangulation is proven hidden. It
+            then stays a valid triangulation with all those sites, irregular for now, from
+            which the next update starts.
+
+        Returns
+        -------
+        bool
+            True if the triangulation is regular for the new weights, False if it was stopped.
+
+        Raises
+        ------
+        InputError
+            If the weights are not finite or not of shape (n,).
+        """
+        self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
+        self._forget_triangles()
+        status = _flips.repair(self._mesh, _flips.STOP if stop_when_hidden else _flips.REMOVE)
+        if status != _flips.EXHAUSTED:
+            return bool(status == _flips.DONE)
+        fresh = self.copy()
+        fresh._build()
+        if stop_when_hidden and np.any(fresh._mesh.hidden & ~self._mesh.hidden):
+            return False
+        self._mesh = fresh._mesh
+        return True
+
+    def lower_hidden(self, weights: ArrayLike) -> NDArray[np.float64]:
+        """Raise the weights of hidden sites by the least that makes their cells count.
+
+        The lifted heights (|r|² - w) / 2 of hidden sites are lowered to the convex hull of the
+        others. The triangulation is then that of the new weights, with every site in it; the
+        cells of the raised sites have no area within rounding.
+
+        Parameters
+        ----------
+        weights : array_like, shape (n,)
+            Weights of the sites.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            The new weights. Sites at the same place get the weight of the heaviest; only one
+            of them can be in the triangulation.
+
+        Notes
+        -----
+        Where rounding of a weight would leave its site above the hull, it is raised a few
+        roundings more. In clusters so tight that the weights' rounding exceeds what separates
+        the cells, this does not settle: such sites may hide again in the next `update`.
+
+        Raises
+        ------
+        InputError
+            If the weights are not finite or not of shape (n,).
+        RuntimeError
+            If the limit of flips was reached.
+        """
+        self.update(weights)
+        ghosts = np.inf
+        while self._mesh.hidden.any() and ghosts != self._mesh.weights[-1]:
+            ghosts = self._mesh.weights[-1]
+            if _flips.raise_hidden(self._mesh) == _flips.EXHAUSTED:
+                raise RuntimeError(self._exhausted())
+            self._forget_triangles()
+            # The ghosts follow if the lightest sites were raised; then a site may hide again.
+            self._weigh_ghosts()
+            if ghosts != self._mesh.weights[-1]:
+                self.update(self.weights[:-4])
+        return self.weights[:-4].copy()
+
+    def copy(self) -> RegularTriangulation:
+        """Return an independent copy."""
+        twin = object.__new__(RegularTriangulation)
+        twin._order = self._order
+        twin._ghost_distance = self._ghost_distance
+        twin._mesh = Mesh(
+            points=self._mesh.points,
+            weights=self._mesh.weights.copy(),
+            corners=self._mesh.corners.copy(),
+            twins=self._mesh.twins.copy(),
+            hidden=self._mesh.hidden.copy(),
+            stack=self._mesh.stack.copy(),
+            counters=self._mesh.counters.copy(),
+            scratch=self._mesh.scratch.copy(),
+        )
+        return twin
+
+    def _build(self) -> None:
+        if _flips.build(self._mesh) == _flips.EXHAUSTED:
+            raise RuntimeError(self._exhausted())
+
+    def _exhausted(self) -> str:
+        return (
+            f"the triangulation of {self._mesh.hidden.size} sites was not finished within "
+            f"{self._mesh.counters[LIMIT]} flips: please report it with the sites and weights"
+        )
+
+    def _set_weights(self, weights: NDArray[np.float64]) -> None:
+        self._mesh.weights[:-4] = weights if self._order is None else weights[self._order]
+        self._weigh_ghosts()
+
+    def _weigh_ghosts(self) -> None:
+        ghosts = -(self._ghost_distance**2)
+        lightest = float(self._mesh.weights[:-4].min())
+        while ghosts > lightest:
+            ghosts *= GHOST_STEP
+        self._mesh.weights[-4:] = ghosts
+
+    def _in_given_order(self, values: NDArray[T]) -> NDArray[T]:
+        if self._order is None:
+            return values
+        given = values.copy()
+        given[self._order] = values[: self._order.size]
+        return given
+
+    def _forget_triangles(self) -> None:
+        for name in ("weights", "hidden", "vertices", "neighbors"):
+            self.__dict__.pop(name, None)

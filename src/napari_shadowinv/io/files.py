@@ -1,0 +1,201 @@
+"""What every file needs, whatever its format.
+
+- tell the kind of a file from its first bytes: `kind_of`
+- its fingerprint: `sha256`
+- refuse an output before hours of work: `check_output`
+- write all of a file or nothing: `replacing`
+"""
+
+from __future__ import annotations
+
+import codecs
+import hashlib
+import os
+import secrets
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from napari_shadowinv.errors import FileFormatError
+
+__all__ = ["READABLE", "check_output", "kind_of", "replacing", "sha256"]
+
+READABLE = "TIFF, PNG, BMP, JPEG, NPY, pradformat HDF5 or .shadowinv"
+
+_READABLE_SIGNATURES: dict[bytes, str] = {
+    b"II*\x00": "tiff",
+    b"MM\x00*": "tiff",
+    b"II+\x00": "tiff",
+    b"MM\x00+": "tiff",
+    b"\x89PNG\r\n\x1a\n": "png",
+    b"BM": "bmp",
+    b"\xff\xd8\xff": "jpeg",
+    b"\x93NUMPY": "npy",
+    b"\x89HDF\r\n\x1a\n": "hdf5",
+}
+
+_OTHER_SIGNATURES: dict[bytes, str] = {
+    b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
+    b"\x1f\x8b": "a gzip archive",
+    b"%PDF": "a PDF document",
+    b"GIF8": "a GIF picture",
+    b"SIMPLE  =": "a FITS file",
+    b"CDF": "a NetCDF 3 file",
+    b"MATLAB": "a MATLAB file",
+}
+
+
+def kind_of(path: str | Path) -> str:
+    """Tell the kind of a file from its content; its name may lie.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file.
+
+    Returns
+    -------
+    str
+        ``"tiff"``, ``"png"``, ``"bmp"``, ``"jpeg"``, ``"npy"`` or ``"hdf5"``.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no such file, it cannot be opened, is empty, or of another kind.
+    """
+    path = Path(path)
+    head = _first_bytes(path)
+    if not head:
+        raise FileFormatError(f"{path} is empty (0 bytes): expected {READABLE}; copy it again")
+    for signature, kind in _READABLE_SIGNATURES.items():
+        if head.startswith(signature):
+            return kind
+    raise FileFormatError(
+        f"{path} is {_describe(head)}: expected {READABLE}; export the image to one of these"
+    )
+
+
+def _first_bytes(path: Path, count: int = 64) -> bytes:
+    if path.is_dir():
+        raise FileFormatError(f"{path} is a folder: expected one file ({READABLE})")
+    try:
+        with path.open("rb") as file:
+            return file.read(count)
+    except FileNotFoundError:
+        raise FileFormatError(
+            f"{path} does not exist: expected a file ({READABLE}); check the path"
+        ) from None
+    except OSError as error:
+        raise FileFormatError(
+            f"{path} cannot be opened ({error.strerror}): check its permissions and the path"
+        ) from None
+
+
+def _describe(head: bytes) -> str:
+    for signature, text in _OTHER_SIGNATURES.items():
+        if head.startswith(signature):
+            return text
+    with suppress(UnicodeDecodeError):
+        # Incremental, because the last character may have been cut in two.
+        text = codecs.getincrementaldecoder("utf-8")().decode(head)
+        if all(character.isprintable() or character.isspace() for character in text):
+            return "a text file"
+    return "not an image that can be recognised"
+
+
+def sha256(path: str | Path) -> str:
+    """Return the SHA-256 checksum of a file, in hexadecimal."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def check_output(
+    path: str | Path, overwrite: bool = False, *, suffixes: Collection[str] = ()
+) -> Path:
+    """Refuse a path that cannot be written, before any long work.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file to be written later.
+    overwrite : bool
+        Whether an existing file may be replaced.
+    suffixes : collection of str
+        The endings that name a format here; empty if any will do.
+
+    Returns
+    -------
+    Path
+        The same path.
+
+    Raises
+    ------
+    FileFormatError
+        If the path exists, is a folder, has no folder to lie in, cannot be written, or
+        has an ending that names no format.
+    """
+    path = Path(path)
+    if suffixes and path.suffix.lower() not in suffixes:
+        found = f"'{path.suffix}'" if path.suffix else "none"
+        raise FileFormatError(
+            f"{path} cannot be written: its ending is {found}, expected one of "
+            f"{', '.join(sorted(suffixes))}"
+        )
+    if path.is_dir():
+        raise FileFormatError(f"{path} is a folder: give the name of a file to write")
+    if path.exists() and not overwrite:
+        raise FileFormatError(
+            f"{path} exists: choose another name or allow overwriting (overwrite=True, or "
+            "--overwrite on the command line)"
+        )
+    if not path.parent.is_dir():
+        raise FileFormatError(
+            f"{path} cannot be written: the folder {path.parent} does not exist; create it first"
+        )
+    if not os.access(path.parent, os.W_OK):
+        raise FileFormatError(
+            f"{path} cannot be written: the folder {path.parent} is read-only; choose another"
+        )
+    return path
+
+
+@contextmanager
+def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
+    """Write a file completely or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file to be made.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Yields
+    ------
+    Path
+        A new name beside `path`, with the same ending, to write to. It becomes `path`
+        when the block ends well, and is removed on any error or interruption.
+
+    Raises
+    ------
+    FileFormatError
+        As `check_output`, before the block and again when it has ended.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "note.txt"
+    >>> with replacing(path) as temporary:
+    ...     _ = temporary.write_text("done")
+    >>> path.read_text()
+    'done'
+    """
+    path = check_output(path, overwrite)
+    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
+    try:
+        yield temporary
+        # Someone else may have written the file during the work.
+        check_output(path, overwrite)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,211 @@
+"""Pictures: TIFF with 8, 16 or 32 bits, PNG, BMP and JPEG.
+
+- read: `read_picture`
+- write a plane: `write_tiff`, `write_png`
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import FileFormatError
+
+__all__ = ["read_picture", "write_png", "write_tiff"]
+
+
+def read_picture(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Read a picture as it is stored.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    kind : str
+        What `kind_of` said.
+
+    Returns
+    -------
+    array : ndarray, shape (H, W) or (H, W, C)
+        Pixels in the file's own dtype.
+    metadata : dict
+        ``bits``: bits per sample.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged or holds anything else than one picture.
+    """
+    try:
+        array, metadata = _read_tiff(path) if kind == "tiff" else _read_other(path, kind)
+    except (FileFormatError, MemoryError):
+        raise
+    except Exception as error:
+        # Decoders raise whatever comes: struct.error, zlib.error, KeyError, SyntaxError …
+        raise FileFormatError(
+            f"{path} begins as {kind.upper()} but is damaged or cut short "
+            f"({_one_line(error)}): expected a complete picture; copy or export it again"
+        ) from error
+    _check(path, kind, array)
+    return array, metadata
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
+
+
+def _check(path: Path, kind: str, array: NDArray[Any]) -> None:
+    is_picture = array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (2, 3, 4))
+    if not is_picture or array.size == 0:
+        raise FileFormatError(
+            f"{path} holds a {kind.upper()} array of shape {array.shape}: expected one picture, "
+            "(height, width) or with 3 or 4 colour channels last; save one plane"
+        )
+    if array.dtype.kind not in "buif":
+        raise FileFormatError(
+            f"{path} holds {array.dtype} pixels: expected whole or real numbers; convert them"
+        )
+
+
+@contextmanager
+def _silent(name: str) -> Iterator[None]:
+    """Keep a decoder's own log lines off the terminal: the error says it once."""
+    logger = logging.getLogger(name)
+    before = logger.disabled
+    logger.disabled = True
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+def _read_tiff(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+    import tifffile
+
+    with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
+        if len(tiff.pages) != 1:
+            raise FileFormatError(
+                f"{path} has {len(tiff.pages)} pages: expected one radiograph per file; "
+                "save the page that you want on its own"
+            )
+        page = tiff.pages[0].aspage()
+        _check_complete(path, page)
+        array = _decode(path, page)
+        if page.photometric == tifffile.PHOTOMETRIC.PALETTE and page.colormap is not None:
+            array = _apply_palette(array, page.colormap)
+        if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and array.dtype.kind == "u":
+            # The format says that 0 is the brightest value here.
+            array = (2**page.bitspersample - 1 - array).astype(array.dtype)
+        if array.ndim == 3 and page.axes in ("SYX", "CYX"):
+            array = np.moveaxis(array, 0, -1)
+        return array, {"bits": int(page.bitspersample)}
+
+
+def _decode(path: Path, page: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(page.asarray())
+    except ValueError as error:
+        if "imagecodecs" not in str(error):
+            raise
+    # Pillow brings some codecs, LZW among them, but not for every pixel type.
+    array = _read_with_pillow(path)
+    same = array.dtype == page.dtype.newbyteorder("=") and array.shape == page.shape
+    if not same or page.photometric.name not in ("MINISBLACK", "RGB"):
+        raise FileFormatError(
+            f"{path} is compressed with {page.compression.name}, which cannot be read here: "
+            "save it without compression, or install the package imagecodecs"
+        )
+    return array
+
+
+def _check_complete(path: Path, page: Any) -> None:
+    # tifffile fills missing strips with zeros, which would pass for a void in the beam.
+    size = path.stat().st_size
+    ends = [
+        offset + count
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
+        if count
+    ]
+    if not ends or max(ends) > size:
+        raise FileFormatError(
+            f"{path} is cut short: its TIFF header promises {max(ends, default=0)} bytes, found "
+            f"{size}; copy it again"
+        )
+
+
+def _apply_palette(array: NDArray[Any], palette: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    return np.moveaxis(palette[:, array], 0, -1)
+
+
+def _read_other(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
+    bits = _png_bits(path) if kind == "png" else 8
+    array = _read_with_pillow(path)
+    if bits == 16 and array.dtype.itemsize == 1:
+        raise FileFormatError(
+            f"{path} is a colour PNG with 16 bits per channel, which would be cut to 8 bits: "
+            "expected a grey PNG or a TIFF; save it as TIFF"
+        )
+    return array, {"bits": bits}
+
+
+def _read_with_pillow(path: Path) -> NDArray[Any]:
+    import imageio.v3 as iio
+
+    # A file object, because imageio would believe the name.
+    with path.open("rb") as file:
+        return np.asarray(iio.imread(file, plugin="pillow", index=0))
+
+
+def _png_bits(path: Path) -> int:
+    with path.open("rb") as file:
+        return file.read(25)[24]
+
+
+def write_tiff(path: Path, plane: NDArray[Any], pixel_size: float | None = None) -> None:
+    """Write a plane as float32 TIFF.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    plane : ndarray, shape (H, W)
+        The values, kept as they are.
+    pixel_size : float, optional
+        Width of a pixel in metres, stored as the resolution.
+    """
+    import tifffile
+
+    options: dict[str, Any] = {}
+    if pixel_size is not None:
+        per_centimetre = 0.01 / pixel_size
+        options = {"resolution": (per_centimetre, per_centimetre), "resolutionunit": "CENTIMETER"}
+    tifffile.imwrite(path, np.asarray(plane, dtype=np.float32), photometric="minisblack", **options)
+
+
+def write_png(path: Path, plane: NDArray[Any]) -> float:
+    """Write a plane as a grey PNG with 16 bits, its largest value white.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    plane : ndarray, shape (H, W)
+        The values; negative ones become black.
+
+    Returns
+    -------
+    float
+        What one grey level stands for.
+    """
+    import imageio.v3 as iio
+
+    level = max(float(np.max(plane)), 0.0) / 65535 or 1.0
+    grey = np.clip(np.rint(np.asarray(plane) / level), 0, 65535).astype(np.uint16)
+    iio.imwrite(path, grey, extension=".png", plugin="pillow")
+    return level

@@ -1,0 +1,296 @@
+"""pradformat, the HDF5 layout that codes for proton radiography exchange files in.
+
+- read a radiograph or an inversion: `read_pradformat`
+- write an inversion: `write_pradformat`
+
+What differs from this package: energies are in eV; a radiograph's ``pixel_width`` is in
+the detector plane; axis 1 is the first of the array, here y; an inversion's ``phi`` (m) has
+the deflection angle as its gradient, where here the angle is *minus* the gradient.
+
+References
+----------
+Feister, S. pradformat, https://github.com/sfeister/pradformat
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.dataset import FORMAT, dataset_from_field, displacement_from_potential
+
+if TYPE_CHECKING:
+    import xarray
+
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup, Species
+
+__all__ = [
+    "VERSION",
+    "check_pradformat_setup",
+    "is_result",
+    "read_pradformat",
+    "write_pradformat",
+]
+
+VERSION = "0.2.0"
+
+_EV_PER_MEV = 1e6
+
+_SYMBOLS: dict[Species, str] = {
+    "proton": "p+",
+    "deuteron": "D 1+",
+    "triton": "T 1+",
+    "helion": "He-3 2+",
+    "alpha": "He-4 2+",
+    "electron": "e-",
+}
+
+
+def is_result(path: Path) -> bool:
+    """Tell whether an HDF5 file is a ``.shadowinv`` result, whatever its name.
+
+    Parameters
+    ----------
+    path : Path
+        An HDF5 file.
+
+    Returns
+    -------
+    bool
+        False for any other HDF5 file.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged.
+    """
+    return str(_root_attributes(path).get("format", "")).startswith(FORMAT)
+
+
+def _root_attributes(path: Path) -> dict[str, Any]:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            return {name: _plain(value) for name, value in file.attrs.items()}
+    except (OSError, RuntimeError, KeyError) as error:
+        raise FileFormatError(
+            f"{path} begins as HDF5 but is damaged or cut short: expected a complete file; "
+            "copy it again"
+        ) from error
+
+
+def _plain(value: Any) -> Any:
+    """Turn an HDF5 attribute into a Python value; MATLAB writes bytes and arrays of one."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    if isinstance(value, bytes):
+        return value.decode("utf-8", errors="replace")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def read_pradformat(path: Path) -> tuple[NDArray[Any], dict[str, Any]] | xarray.Dataset:
+    """Read a radiograph, or a potential or field that some code retrieved.
+
+    Parameters
+    ----------
+    path : Path
+        A pradformat file with object type "radiograph" or "inversion".
+
+    Returns
+    -------
+    (ndarray, dict) or xarray.Dataset
+        For a radiograph, the image and what the file says: ``geometry`` holds the fields of
+        `ProtonSetup` that it knows. For an inversion, a dataset with displacement and,
+        where given, potential, in pixels and in SI units.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is no pradformat file, of another object type, incomplete or damaged.
+    """
+    attributes = _root_attributes(path)
+    kind = attributes.get("object_type")
+    if kind == "radiograph":
+        image = _read_datasets(path, ("image",)).get("image")
+        if image is None or image.ndim != 2:
+            found = "no image" if image is None else f"an image of shape {image.shape}"
+            raise FileFormatError(
+                f"{path} is a pradformat radiograph with {found}: expected a dataset 'image' of "
+                "shape (height, width); export it again"
+            )
+        return image, {**attributes, "geometry": _geometry(path, attributes, "pixel_width")}
+    if kind == "inversion":
+        return _read_inversion(path, attributes)
+    found = f"the object type {kind!r}" if kind else "no attribute 'object_type'"
+    raise FileFormatError(
+        f"{path} is an HDF5 file with {found}: expected a pradformat radiograph or inversion, or "
+        "a .shadowinv result; export the image as TIFF or NPY"
+    )
+
+
+def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            return {name: np.asarray(file[name][()]) for name in names if name in file}
+    except (OSError, RuntimeError, KeyError, TypeError) as error:
+        raise FileFormatError(
+            f"{path} begins as pradformat but its data are damaged or cut short: expected a "
+            "complete file; copy it again"
+        ) from error
+
+
+def _geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, Any]:
+    """Fields of `ProtonSetup` that the attributes tell."""
+    geometry: dict[str, Any] = {"kind": "proton"}
+    source, image = _distances(attributes)
+    species = {symbol: name for name, symbol in _SYMBOLS.items()}.get(
+        attributes.get("spec_name", _SYMBOLS["proton"])
+    )
+    energy = attributes.get("spec_energy")
+    pixel = "pixel_size" if width == "dr" else "detector_pixel_size"
+    for name, value in (
+        ("source_object_distance", source),
+        ("object_image_distance", image),
+        (pixel, attributes.get(width)),
+        ("species", species if "spec_name" in attributes else None),
+        # The energy of a species that nobody here knows gives no field.
+        ("energy", energy / _EV_PER_MEV if energy is not None and species else None),
+    ):
+        if value is not None:
+            geometry[name] = value
+    _check_square(path, attributes, width)
+    return geometry
+
+
+def _distances(attributes: dict[str, Any]) -> tuple[float | None, float | None]:
+    """Return source to object and object to image, from any version of the format."""
+    if "object_image_dist" in attributes or "source_object_dist" in attributes:
+        return attributes.get("source_object_dist"), attributes.get("object_image_dist")
+    # Version 0.1 gave the distances of source and object from the image.
+    source_image, object_image = attributes.get("source_distance"), attributes.get("ROI_distance")
+    if source_image is None or object_image is None:
+        return None, object_image
+    return source_image - object_image, object_image
+
+
+def _check_square(path: Path, attributes: dict[str, Any], width: str) -> None:
+    first, second = attributes.get(width), attributes.get(f"{width}_ax2")
+    if first is not None and second is not None and not np.isclose(first, second, rtol=1e-6):
+        raise FileFormatError(
+            f"{path} has pixels of {first:g} m by {second:g} m: expected square pixels; resample it"
+        )
+
+
+def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
+    from napari_shadowinv.physics.setup import ProtonSetup
+    from napari_shadowinv.validation import validated
+
+    setup = validated(ProtonSetup, _geometry(path, attributes, "dr"), str(path))
+    arrays = _read_datasets(path, ("phi", "defl_ax1", "defl_ax2"))
+    if "phi" not in arrays and not {"defl_ax1", "defl_ax2"} <= arrays.keys():
+        raise FileFormatError(
+            f"{path} is a pradformat inversion without data: expected 'phi' or both 'defl_ax1' "
+            "and 'defl_ax2'; export it again"
+        )
+    potential = -setup.normalized_potential(arrays["phi"]) if "phi" in arrays else None
+    if "defl_ax1" in arrays and "defl_ax2" in arrays:
+        displacement = setup.displacement(np.stack([arrays["defl_ax1"], arrays["defl_ax2"]]))
+    else:
+        displacement = displacement_from_potential(-setup.normalized_potential(arrays["phi"]))
+    return dataset_from_field(displacement, potential, setup, attributes={"format": "pradformat"})
+
+
+def write_pradformat(
+    path: Path,
+    displacement: ArrayLike,
+    potential: ArrayLike,
+    setup: ProtonSetup | OpticalSetup | None,
+    *,
+    radiograph_filename: str = "",
+) -> None:
+    """Write a potential and its deflection angles as a pradformat "simple inversion".
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    displacement : array_like, shape (2, H, W)
+        Displacement in px, axis order (y, x).
+    potential : array_like, shape (H, W)
+        Normalised potential in px².
+    setup : ProtonSetup
+        The experiment; the format needs all of it.
+    radiograph_filename : str
+        Name of the file that was inverted.
+
+    Raises
+    ------
+    InputError
+        If the setup is missing or that of a light beam.
+    """
+    import h5py
+
+    particles = check_pradformat_setup(setup)
+    angle = particles.deflection_angle(displacement)
+    datasets = {"phi": -particles.potential(potential), "defl_ax1": angle[0], "defl_ax2": angle[1]}
+    with h5py.File(path, "w") as file:
+        for name, values in datasets.items():
+            file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
+        file.attrs.update(_inversion_attributes(particles, radiograph_filename))
+
+
+def check_pradformat_setup(setup: ProtonSetup | OpticalSetup | None) -> ProtonSetup:
+    """Refuse a setup that a pradformat inversion cannot be written with.
+
+    Parameters
+    ----------
+    setup : ProtonSetup or OpticalSetup or None
+        What is known of the experiment.
+
+    Returns
+    -------
+    ProtonSetup
+        The same.
+
+    Raises
+    ------
+    InputError
+        If the setup is missing or that of a light beam.
+    """
+    from napari_shadowinv.physics.setup import ProtonSetup
+
+    if not isinstance(setup, ProtonSetup):
+        found = "none" if setup is None else f"kind '{setup.kind}'"
+        raise InputError(
+            f"a pradformat inversion needs a setup of kind 'proton', received {found}: give one, "
+            "or write .shadowinv"
+        )
+    return setup
+
+
+def _inversion_attributes(setup: ProtonSetup, radiograph_filename: str) -> dict[str, Any]:
+    attributes: dict[str, Any] = {
+        "object_type": "inversion",
+        "inversion_type": "simple",
+        "pradformat_version": VERSION,
+        "dr": setup.object_pixel_size,
+        "source_object_dist": setup.source_object_distance,
+        "object_image_dist": setup.object_image_distance,
+        "spec_name": _SYMBOLS[setup.species],
+        "spec_mass": setup.particle.mass,
+        "spec_charge": setup.particle.charge,
+        "spec_energy": setup.energy * _EV_PER_MEV,
+        "file_date": datetime.now(UTC).date().isoformat(),
+        "description": "Power-diagram inversion by napari-shadowinv",
+    }
+    if radiograph_filename:
+        attributes["radiograph_filename"] = radiograph_filename
+    return attributes

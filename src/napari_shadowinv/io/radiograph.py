@@ -1,0 +1,177 @@
+"""An image as it was measured, with what is known about it: `Radiograph`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+__all__ = ["CHANNELS", "Radiograph", "to_grey"]
+
+CHANNELS = ("red", "green", "blue", "mean")
+
+
+@dataclass(frozen=True, eq=False)
+class Radiograph:
+    """One image, ready to be inverted.
+
+    Attributes
+    ----------
+    image : ndarray of float64, shape (H, W)
+        Intensity or counts, ``[y, x]``, as stored.
+    setup : ProtonSetup or OpticalSetup or None
+        The geometry, where the file tells all of it.
+    path : Path or None
+        The file it comes from.
+    metadata : mapping
+        What else the file says: ``kind``, ``dtype``, ``bits``, ``sha256``, and for pradformat
+        ``geometry``, the part of the setup that the file knows.
+    source : ndarray, shape (H, W), or None
+        The undisturbed beam.
+    mask : ndarray of bool, shape (H, W), or None
+        True where the image cannot be trusted.
+    """
+
+    image: NDArray[np.float64]
+    setup: ProtonSetup | OpticalSetup | None = None
+    path: Path | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    source: NDArray[np.float64] | None = None
+    mask: NDArray[np.bool_] | None = None
+
+    def binned(self, factor: int) -> Radiograph:
+        """Sum blocks of pixels; the setup's pixel grows with them.
+
+        Parameters
+        ----------
+        factor : int
+            Side of a block in pixels. Rows and columns that fill no block are cut off at
+            the end.
+
+        Returns
+        -------
+        Radiograph
+            A smaller one, with ``bin`` and ``cropped`` (rows, columns) in its metadata. A
+            block is masked if any of its pixels is.
+
+        Raises
+        ------
+        InputError
+            If `factor` is less than 1 or leaves less than 2×2 blocks.
+
+        Examples
+        --------
+        >>> Radiograph(np.ones((5, 6))).binned(2).image
+        array([[4., 4., 4.],
+               [4., 4., 4.]])
+        """
+        height, width = self.image.shape
+        if factor < 1 or min(height, width) // factor < 2:
+            raise InputError(
+                f"cannot bin {height}×{width} pixels by {factor}: expected a whole number from "
+                f"1 to {min(height, width) // 2}"
+            )
+        if factor == 1:
+            return self
+        return replace(
+            self,
+            image=_blocks(self.image, factor).sum(axis=(1, 3)),
+            source=None if self.source is None else _blocks(self.source, factor).sum(axis=(1, 3)),
+            mask=None
+            if self.mask is None
+            else np.asarray(_blocks(self.mask, factor).any(axis=(1, 3))),
+            setup=None if self.setup is None else binned_setup(self.setup, factor),
+            metadata={
+                **self.metadata,
+                "bin": factor * int(self.metadata.get("bin", 1)),
+                "cropped": (height % factor, width % factor),
+            },
+        )
+
+
+def binned_setup(setup: ProtonSetup | OpticalSetup, factor: int) -> ProtonSetup | OpticalSetup:
+    """Return the setup of an image whose pixels were summed in blocks.
+
+    Parameters
+    ----------
+    setup : ProtonSetup or OpticalSetup
+        Setup of the image as measured.
+    factor : int
+        Side of a block in pixels.
+
+    Returns
+    -------
+    ProtonSetup or OpticalSetup
+        The same with a pixel that is `factor` times as wide.
+    """
+    values = setup.model_dump()
+    for name in ("pixel_size", "detector_pixel_size"):
+        if values.get(name) is not None:
+            values[name] *= factor
+    return type(setup)(**values)
+
+
+def _blocks(array: NDArray[Any], factor: int) -> NDArray[Any]:
+    rows, columns = (n // factor for n in array.shape)
+    cropped = array[: rows * factor, : columns * factor]
+    return cropped.reshape(rows, factor, columns, factor)
+
+
+def to_grey(
+    array: NDArray[Any], channel: str | int | None, where: str | Path
+) -> NDArray[np.float64]:
+    """Reduce an image with channels to one plane, as the user says.
+
+    Parameters
+    ----------
+    array : ndarray, shape (H, W) or (H, W, C)
+        Grey, grey and alpha (C = 2), RGB (3) or RGBA (4) image. Alpha counts as no channel.
+    channel : {"red", "green", "blue", "mean"} or int or None
+        What to take of a colour image; a grey one is taken as it is.
+    where : str or Path
+        Name of the image in messages.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The plane.
+
+    Raises
+    ------
+    InputError
+        If the channels differ and none was chosen, or there is no such channel.
+    """
+    if array.ndim == 2:
+        return np.ascontiguousarray(array, dtype=np.float64)
+    colours = array[..., : {2: 1, 4: 3}.get(array.shape[-1], array.shape[-1])]
+    if (colours == colours[..., :1]).all():
+        return np.ascontiguousarray(colours[..., 0], dtype=np.float64)
+    if channel is None:
+        raise InputError(
+            f"{where} is a colour image with {colours.shape[-1]} channels: choose one with channel "
+            '"red", "green", "blue" or "mean", or its number'
+        )
+    if channel == "mean":
+        return np.ascontiguousarray(colours.mean(axis=-1, dtype=np.float64))
+    index = _channel_index(channel, colours.shape[-1], where)
+    return np.ascontiguousarray(colours[..., index], dtype=np.float64)
+
+
+def _channel_index(channel: str | int, count: int, where: str | Path) -> int:
+    text = str(channel)
+    index = CHANNELS.index(text) if text in CHANNELS else int(text) if text.isdecimal() else -1
+    if not 0 <= index < count:
+        raise InputError(
+            f"{where} has no channel {text!r}: expected "
+            f'"red", "green", "blue", "mean" or a number from 0 to {count - 1}'
+        )
+    return index

@@ -1,0 +1,198 @@
+"""Read whatever a user points at; the content decides what it is, not the name.
+
+- any file: `read`
+- where only one of them makes sense: `read_radiograph`, `read_dataset`
+- a file with options or a setup: `read_toml`
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.arrays import read_npy
+from napari_shadowinv.io.dataset import read_result
+from napari_shadowinv.io.files import kind_of, sha256
+from napari_shadowinv.io.images import read_picture
+from napari_shadowinv.io.pradformat import is_result, read_pradformat
+from napari_shadowinv.io.radiograph import Radiograph, to_grey
+
+if TYPE_CHECKING:
+    import xarray
+
+    from napari_shadowinv.physics.setup import ProtonSetup
+
+__all__ = ["read", "read_dataset", "read_radiograph", "read_toml"]
+
+_COMPLETE = {"energy", "source_object_distance", "object_image_distance"}
+
+
+def read(path: str | Path, *, channel: str | int | None = None) -> Radiograph | xarray.Dataset:
+    """Read an image or a result.
+
+    Parameters
+    ----------
+    path : str or Path
+        TIFF (8, 16 or 32 bits, one page), PNG, BMP, JPEG, NPY, a pradformat radiograph or
+        inversion, or a ``.shadowinv`` result.
+    channel : {"red", "green", "blue", "mean"} or int, optional
+        What to take of a colour image. An image whose channels are all equal is grey
+        and needs no choice.
+
+    Returns
+    -------
+    Radiograph or xarray.Dataset
+        A dataset for a result or an inversion, a radiograph for all else.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, empty, damaged or of a kind that cannot be read.
+    InputError
+        If it is a colour image and no channel, or one that it has not, was chosen.
+    """
+    path = Path(path)
+    kind = kind_of(path)
+    if kind == "hdf5":
+        content = read_result(path) if is_result(path) else read_pradformat(path)
+        if not isinstance(content, tuple):
+            return content
+        return _radiograph(path, "pradformat", *content)
+    if kind == "npy":
+        array = read_npy(path)
+        if array.ndim != 2 or array.size == 0:
+            raise FileFormatError(
+                f"{path} holds an array of shape {array.shape}: expected an image of shape "
+                "(height, width); save one plane of it"
+            )
+        return _radiograph(path, kind, array, {})
+    array, metadata = read_picture(path, kind)
+    grey = to_grey(array, channel, path)
+    if array.ndim == 3 and channel is not None:
+        metadata["channel"] = channel
+    return _radiograph(path, kind, grey, {"dtype": str(array.dtype), **metadata})
+
+
+def _radiograph(path: Path, kind: str, array: NDArray[Any], metadata: dict[str, Any]) -> Radiograph:
+    described = {
+        "kind": kind,
+        "dtype": str(array.dtype),
+        "bits": 8 * array.dtype.itemsize,
+        "sha256": sha256(path),
+        **metadata,
+    }
+    if array.dtype.kind not in "buif":
+        raise FileFormatError(
+            f"{path} holds {array.dtype} pixels: expected whole or real numbers; convert them"
+        )
+    return Radiograph(
+        image=np.ascontiguousarray(array, dtype=np.float64),
+        setup=_complete_setup(path, metadata.get("geometry", {})),
+        path=path,
+        metadata=described,
+    )
+
+
+def _complete_setup(path: Path, geometry: dict[str, Any]) -> ProtonSetup | None:
+    if not (geometry.keys() >= _COMPLETE and {"pixel_size", "detector_pixel_size"} & set(geometry)):
+        return None
+    from napari_shadowinv.physics.setup import ProtonSetup
+    from napari_shadowinv.validation import validated
+
+    return validated(ProtonSetup, geometry, str(path))
+
+
+def read_radiograph(path: str | Path, *, channel: str | int | None = None) -> Radiograph:
+    """Read an image; a result is an error.
+
+    Parameters
+    ----------
+    path : str or Path
+        As for `read`.
+    channel : {"red", "green", "blue", "mean"} or int, optional
+        What to take of a colour image.
+
+    Returns
+    -------
+    Radiograph
+        The image and what is known about it.
+
+    Raises
+    ------
+    FileFormatError, InputError
+        As `read`, and if the file holds a result.
+    """
+    content = read(path, channel=channel)
+    if not isinstance(content, Radiograph):
+        raise FileFormatError(
+            f"{path} is the result of an inversion: expected an image; give the image that it "
+            "was made from"
+        )
+    return content
+
+
+def read_dataset(path: str | Path) -> xarray.Dataset:
+    """Read a result or an inversion; an image is an error.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ``.shadowinv`` file or a pradformat inversion.
+
+    Returns
+    -------
+    xarray.Dataset
+        With the displacement at least.
+
+    Raises
+    ------
+    FileFormatError
+        As `read`, and if the file holds an image.
+    """
+    path = Path(path)
+    content = read(path) if kind_of(path) == "hdf5" else None
+    if content is None or isinstance(content, Radiograph):
+        raise FileFormatError(
+            f"{path} is an image: expected the result of an inversion, .shadowinv or pradformat"
+        )
+    return content
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Read the keys and values of a TOML file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    dict
+        Its content.
+
+    Raises
+    ------
+    FileFormatError
+        If it is missing or cannot be opened.
+    InputError
+        If it is not TOML; the message names the line.
+    """
+    path = Path(path)
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileFormatError(f"{path} does not exist: expected a TOML file; check the path") from (
+            None
+        )
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path} is not a text file: expected TOML") from None
+    except OSError as error:
+        raise FileFormatError(f"{path} cannot be opened ({error.strerror})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path} is not valid TOML: {error}") from None

@@ -1,0 +1,461 @@
+"""Facts about regular triangulations: they are dual to power diagrams, however they came to be."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry import triangulation as module
+from napari_shadowinv.geometry._mesh import LIMIT
+from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
+
+Array = NDArray[np.float64]
+
+few = settings(max_examples=60, deadline=None)
+fewer = settings(max_examples=25, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_sites(kind: str, rng: np.random.Generator) -> Array:
+    n = int(rng.integers(1, 70))
+    if kind == "uniform":
+        return rng.random((n, 2)) * rng.choice([1e-3, 1.0, 512.0]) + rng.choice([0.0, -3.0, 1e4])
+    if kind == "grid":
+        rows, columns = rng.integers(1, 10, 2)
+        return np.stack(np.meshgrid(np.arange(rows), np.arange(columns)), -1).reshape(-1, 2) * 1.0
+    if kind == "rounded grid":
+        axis = np.linspace(-0.7, 1.1, rng.integers(2, 9))
+        return np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    if kind == "collinear":
+        return np.outer(rng.random(n), rng.normal(size=2)) + rng.normal(size=2)
+    if kind == "duplicates":
+        return rng.integers(0, 6, (n, 2)) / 7
+    if kind == "clustered":
+        return rng.random((3, 2))[rng.integers(0, 3, n)] + 1e-4 * rng.normal(size=(n, 2))
+    angle = 2 * np.pi * np.arange(n) / n
+    return np.stack([np.cos(angle), np.sin(angle)], -1)
+
+
+KINDS = ("uniform", "grid", "rounded grid", "collinear", "duplicates", "clustered", "circle")
+
+
+def random_weights(sites: Array, rng: np.random.Generator) -> Array:
+    n = len(sites)
+    scale = max(float(np.ptp(sites, axis=0).max()), 1e-3) ** 2
+    choice = rng.integers(0, 6)
+    if choice == 0:
+        return np.zeros(n)
+    if choice == 1:
+        return rng.integers(0, 3, n) * scale / 64
+    if choice == 2:
+        return scale * 10.0 ** rng.uniform(-8, 2, n) * rng.choice([-1, 1], n)
+    return scale * rng.normal(size=n) * [1e-4, 1e-2, 1.0][choice - 3]
+
+
+def cross(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def clipped(polygon: Array, normal: Array, offset: float) -> Array:
+    """Part of a convex polygon where normal · x <= offset."""
+    side = polygon @ normal - offset
+    following, side_following = np.roll(polygon, -1, axis=0), np.roll(side, -1)
+    corners = []
+    for p, q, s, t in zip(polygon, following, side, side_following, strict=True):
+        if s <= 0:
+            corners.append(p)
+        if (s < 0 < t) or (t < 0 < s):
+            corners.append(p + (q - p) * (s / (s - t)))
+    return np.array(corners).reshape(-1, 2)
+
+
+def area(polygon: Array) -> float:
+    if len(polygon) < 3:
+        return 0.0
+    corners = polygon - polygon[0]
+    return float(cross(corners, np.roll(corners, -1, axis=0)).sum() / 2)
+
+
+def clipped_cell(i: int, triangulation: RegularTriangulation, bonus: float) -> Array:
+    """Power cell of site i with a bonus to its weight, by half-planes, relative to the site."""
+    points, weights = triangulation.points, triangulation.weights
+    distance = float(np.abs(points[-1] - points[0]).max())
+    reach = 8 * (distance + np.abs(weights).max() / distance)
+    polygon = reach * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    for j in np.argsort(((points - points[i]) ** 2).sum(1)):
+        between = points[j] - points[i]
+        gain = weights[j] - weights[i]
+        if j != i and not between.any():
+            if gain > 0 or (gain == 0 and j < i):
+                return np.empty((0, 2))
+        elif j != i:
+            polygon = clipped(polygon, 2 * between, between @ between - gain + bonus)
+        if len(polygon) < 3:
+            return np.empty((0, 2))
+    return polygon
+
+
+def dual_areas(triangulation: RegularTriangulation) -> Array:
+    """Cell areas from the power centres; nan where the cell touches that of a ghost."""
+    points, weights = triangulation.points, triangulation.weights
+    vertices, neighbors = triangulation.vertices, triangulation.neighbors
+    origin = points[vertices[:, 0]]
+    a, b = points[vertices[:, 1]] - origin, points[vertices[:, 2]] - origin
+    w = weights[vertices] - weights[vertices[:, :1]]
+    a_lift, b_lift = (a**2).sum(1) - w[:, 1], (b**2).sum(1) - w[:, 2]
+    turned = a_lift[:, None] * np.stack([b[:, 1], -b[:, 0]], 1)
+    turned += b_lift[:, None] * np.stack([-a[:, 1], a[:, 0]], 1)
+    centres = origin + turned / (2 * cross(a, b))[:, None]
+    areas = np.zeros(len(points))
+    for k in range(3):
+        t = np.flatnonzero(neighbors[:, k] >= 0)
+        i = vertices[t, (k + 2) % 3]
+        np.add.at(areas, i, cross(centres[t] - points[i], centres[neighbors[t, k]] - points[i]) / 2)
+    n = len(triangulation.sites)
+    beside_ghost = vertices[(vertices >= n).any(axis=1)]
+    areas[beside_ghost] = np.nan
+    return areas[:n]
+
+
+def exact_cross(p: Array, q: Array, r: Array) -> Fraction:
+    (px, py), (qx, qy), (rx, ry) = ([Fraction(float(x)) for x in s] for s in (p, q, r))
+    return (qx - px) * (ry - py) - (qy - py) * (rx - px)
+
+
+def assert_triangulation(triangulation: RegularTriangulation) -> None:
+    """Assert Euler's formula, symmetric neighbours, and positive orientation, exactly."""
+    vertices, neighbors = triangulation.vertices, triangulation.neighbors
+    points = triangulation.points
+    n = len(triangulation.sites)
+    visible = np.flatnonzero(~triangulation.hidden)
+    assert len(vertices) == 2 * len(visible) + 2
+    np.testing.assert_array_equal(np.unique(vertices), np.append(visible, np.arange(n, n + 4)))
+    assert (neighbors < 0).sum() == 4
+    for t, k in np.argwhere(neighbors >= 0):
+        u = neighbors[t, k]
+        j = np.flatnonzero(neighbors[u] == t)
+        assert j.size == 1
+        assert vertices[u, (j[0] + 1) % 3] == vertices[t, (k + 2) % 3]
+        assert vertices[u, (j[0] + 2) % 3] == vertices[t, (k + 1) % 3]
+    p, q, r = (points[vertices[:, k]] for k in range(3))
+    size = np.abs(q - p).max(1) * np.abs(r - p).max(1)
+    doubtful = cross(q - p, r - p) < 1e-12 * size
+    for t in np.flatnonzero(doubtful):
+        assert exact_cross(*points[vertices[t]]) > 0
+
+
+def assert_locally_regular(triangulation: RegularTriangulation) -> None:
+    """Assert that no neighbour's far corner lies below a triangle's lifted plane."""
+    vertices, neighbors = triangulation.vertices, triangulation.neighbors
+    t, k = np.nonzero(neighbors >= 0)
+    u = neighbors[t, k]
+    j = np.argmax(neighbors[u] == t[:, None], axis=1)
+    corners = np.column_stack([vertices[t, (k + i) % 3] for i in range(3)] + [vertices[u, j]])
+    ghostly = corners[:, 0] >= len(triangulation.sites)
+    corners[ghostly] = corners[ghostly][:, [3, 2, 1, 0]]
+    d = triangulation.points[corners] - triangulation.points[corners[:, :1]]
+    w = triangulation.weights[corners] - triangulation.weights[corners[:, :1]]
+    square = (d**2).sum(-1)
+    a, b, q = d[:, 1], d[:, 2], d[:, 3]
+    lift = square - w
+    height = lift[:, 3] * cross(a, b) - lift[:, 1] * cross(q, b) - lift[:, 2] * cross(a, q)
+    longest = np.sqrt(square.max(1))
+    size = (square + np.abs(w)).max(1) * longest * np.sort(np.sqrt(square), axis=1)[:, 2]
+    assert np.all(height >= -1e-13 * size)
+
+
+def triangles(triangulation: RegularTriangulation) -> set[tuple[int, ...]]:
+    """Triangles, each starting from its smallest vertex."""
+    vertices = triangulation.vertices
+    start = np.argmin(vertices, axis=1)[:, None]
+    rolled = np.take_along_axis(vertices, (start + np.arange(3)) % 3, axis=1)
+    return set(map(tuple, rolled.tolist()))
+
+
+def assert_hides_empty_cells(triangulation: RegularTriangulation) -> None:
+    """Assert that a cell is empty if and only if its site is hidden, give or take a touch."""
+    extent = float(np.ptp(triangulation.sites, axis=0).max())
+    rounding = 1e-13 * float(np.abs(triangulation.weights).max())
+    touch = 1e-9 * extent**2 / len(triangulation.sites) + rounding
+    for i, hidden in enumerate(triangulation.hidden):
+        cell = clipped_cell(i, triangulation, -touch if hidden else touch)
+        assert (area(cell) == 0) == hidden
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@fewer
+@given(seed=seeds)
+def test_sites_are_hidden_when_their_cells_are_empty(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sites = random_sites(kind, rng)
+    triangulation = RegularTriangulation(sites, random_weights(sites, rng))
+    assert_triangulation(triangulation)
+    assert_locally_regular(triangulation)
+    assert_hides_empty_cells(triangulation)
+    triangulation.update(random_weights(sites, rng))
+    assert_triangulation(triangulation)
+    assert_locally_regular(triangulation)
+    assert_hides_empty_cells(triangulation)
+
+
+@few
+@given(seed=seeds, spread=st.sampled_from([0.0, 1e-4, 1e-2]))
+def test_power_centres_span_the_cells(seed: int, spread: float) -> None:
+    rng = np.random.default_rng(seed)
+    sites = rng.random((80, 2))
+    triangulation = RegularTriangulation(sites, spread * rng.random(80))
+    areas = dual_areas(triangulation)
+    for i in np.flatnonzero(np.isfinite(areas) & ~triangulation.hidden):
+        expected = area(clipped_cell(i, triangulation, 0.0))
+        assert areas[i] == pytest.approx(expected, abs=1e-9 / 80)
+
+
+@few
+@given(seed=seeds)
+def test_repaired_equals_rebuilt(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 300))
+    sites = rng.random((n, 2))
+    triangulation = RegularTriangulation(sites, rng.random(n))
+    for scale in rng.choice([1e-4, 1e-2, 1.0, 1e6], 4):
+        weights = scale * rng.random(n)
+        assert triangulation.update(weights)
+        fresh = RegularTriangulation(sites, weights)
+        assert triangles(triangulation) == triangles(fresh)
+        np.testing.assert_array_equal(triangulation.hidden, fresh.hidden)
+        np.testing.assert_array_equal(triangulation.weights, fresh.weights)
+
+
+@few
+@given(seed=seeds)
+def test_stopped_repair_keeps_all_sites_and_can_go_on(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(30, 300))
+    sites = rng.random((n, 2))
+    triangulation = RegularTriangulation(sites)
+    direction = rng.normal(size=n) / n
+    assert not triangulation.update(100 * direction, stop_when_hidden=True)
+    assert_triangulation(triangulation)
+    assert not triangulation.hidden.any()
+    step = 1.0
+    while not triangulation.update(step * direction, stop_when_hidden=True):
+        assert RegularTriangulation(sites, step * direction).hidden.any()
+        step /= 2
+    fresh = RegularTriangulation(sites, step * direction)
+    assert not fresh.hidden.any()
+    assert triangles(triangulation) == triangles(fresh)
+
+
+@fewer
+@given(seed=seeds, kind=st.sampled_from(KINDS))
+def test_stopped_repair_of_degenerate_sites_is_valid(seed: int, kind: str) -> None:
+    rng = np.random.default_rng(seed)
+    sites = random_sites(kind, rng)
+    triangulation = RegularTriangulation(sites)
+    for _ in range(3):
+        finished = triangulation.update(random_weights(sites, rng), stop_when_hidden=True)
+        assert_triangulation(triangulation)
+        if finished:
+            assert_locally_regular(triangulation)
+
+
+def hull_heights(triangulation: RegularTriangulation) -> Array:
+    """Height of the lower convex hull of the lifted points above each site."""
+    points = triangulation.points - triangulation.sites.mean(axis=0)
+    lifted = np.column_stack([points, ((points**2).sum(1) - triangulation.weights) / 2])
+    facets = ConvexHull(lifted).equations
+    facets = facets[facets[:, 2] < -1e-9]
+    planes = -(points[:-4] @ facets[:, :2].T + facets[:, 3]) / facets[:, 2]
+    return np.asarray(planes.max(axis=1))
+
+
+@few
+@given(seed=seeds, scale=st.sampled_from([1e-4, 1e-2, 1.0]))
+def test_lower_hidden_reaches_the_convex_hull(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 300))
+    sites = rng.random((n, 2))
+    weights = scale * rng.random(n)
+    regular = RegularTriangulation(sites, weights)
+    triangulation = RegularTriangulation(sites)
+    raised = triangulation.lower_hidden(weights)
+    assert not triangulation.hidden.any()
+    assert_triangulation(triangulation)
+    assert_locally_regular(triangulation)
+    np.testing.assert_array_equal(raised, triangulation.weights[:-4])
+    np.testing.assert_array_equal(raised[~regular.hidden], weights[~regular.hidden])
+    assert np.all(raised[regular.hidden] > weights[regular.hidden])
+    centred = sites - sites.mean(axis=0)
+    heights = ((centred**2).sum(1) - raised) / 2
+    hidden = regular.hidden
+    np.testing.assert_allclose(heights[hidden], hull_heights(regular)[hidden], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@fewer
+@given(seed=seeds)
+def test_lower_hidden_leaves_only_duplicates_out(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sites = random_sites(kind, rng)
+    weights = random_weights(sites, rng)
+    triangulation = RegularTriangulation(sites)
+    raised = triangulation.lower_hidden(weights)
+    assert np.all(raised >= weights)
+    places = np.unique(sites, axis=0)
+    assert np.count_nonzero(~triangulation.hidden) == len(places)
+    assert_triangulation(triangulation)
+    if kind != "clustered":  # there the weights' rounding exceeds what separates the cells
+        assert_locally_regular(triangulation)
+        assert triangulation.update(raised, stop_when_hidden=True)
+
+
+def test_shrinking_lowered_weights_opens_every_cell() -> None:
+    rng = np.random.default_rng(1)
+    sites = rng.random((2000, 2))
+    triangulation = RegularTriangulation(sites)
+    raised = triangulation.lower_hidden(0.05 * rng.random(2000))
+    assert triangulation.update(0.99 * raised, stop_when_hidden=True)
+    areas = dual_areas(triangulation)
+    assert np.nanmin(areas) > 0
+
+
+@few
+@given(seed=seeds, scale=st.sampled_from([0.0, 1e-3, 1e-1]))
+def test_order_of_sites_does_not_matter(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    sites = rng.random((200, 2))
+    weights = scale * rng.random(200)
+    shuffle = rng.permutation(200)
+    triangulation = RegularTriangulation(sites, weights)
+    shuffled = RegularTriangulation(sites[shuffle], weights[shuffle])
+    np.testing.assert_array_equal(shuffled.points[:200], sites[shuffle])
+    back = np.append(shuffle, np.arange(200, 204))
+    renamed = back[shuffled.vertices]
+    start = np.argmin(renamed, axis=1)[:, None]
+    renamed = np.take_along_axis(renamed, (start + np.arange(3)) % 3, axis=1)
+    assert set(map(tuple, renamed.tolist())) == triangles(triangulation)
+    np.testing.assert_array_equal(triangulation.hidden[shuffle], shuffled.hidden)
+
+
+def test_weights_up_to_a_constant_give_the_same_triangles() -> None:
+    rng = np.random.default_rng(2)
+    sites = rng.random((500, 2))
+    weights = rng.random(500) / 100
+    triangulation = RegularTriangulation(sites, weights)
+    shifted = RegularTriangulation(sites, weights + 3)
+    assert triangles(triangulation) == triangles(shifted)
+
+
+@pytest.mark.parametrize(
+    ("weights", "visible"), [([0, 0, 0], 0), ([0, 1, 0], 1), ([0, 1, 1], 1), ([2, 3, 5], 2)]
+)
+def test_heaviest_duplicate_stays(weights: list[float], visible: int) -> None:
+    sites = [[0.5, 0.5]] * 3 + [[0, 0], [0, 1], [1, 0], [1, 1]]
+    triangulation = RegularTriangulation(sites)
+    triangulation.update(weights + [0] * 4)
+    assert np.flatnonzero(~triangulation.hidden[:3]).tolist() == [visible]
+
+
+def test_short_stack_gives_the_same_triangles(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    sites, weights, later = rng.random((400, 2)), rng.random(400) / 100, rng.random(400) / 1000
+    built, repaired = RegularTriangulation(sites, weights), RegularTriangulation(sites, later)
+    monkeypatch.setattr(module, "STACK_SIZE", 5)
+    triangulation = RegularTriangulation(sites, weights)
+    assert triangles(triangulation) == triangles(built)
+    triangulation.update(later)
+    assert triangles(triangulation) == triangles(repaired)
+
+
+def test_exhausted_repair_is_rebuilt() -> None:
+    rng = np.random.default_rng(6)
+    sites, weights = rng.random((400, 2)), rng.random(400) / 1000
+    triangulation = RegularTriangulation(sites)
+    triangulation._mesh.counters[LIMIT] = 3
+    assert triangulation.update(weights)
+    assert triangles(triangulation) == triangles(RegularTriangulation(sites, weights))
+    triangulation = RegularTriangulation(sites)
+    triangulation._mesh.counters[LIMIT] = 3
+    assert not triangulation.update(weights, stop_when_hidden=True)
+    assert_triangulation(triangulation)
+    assert not triangulation.hidden.any()
+    assert triangulation.update(np.zeros(400), stop_when_hidden=True)
+    assert triangles(triangulation) == triangles(RegularTriangulation(sites))
+
+
+def test_copy_is_independent() -> None:
+    rng = np.random.default_rng(3)
+    triangulation = RegularTriangulation(rng.random((100, 2)))
+    before = triangles(triangulation)
+    other = triangulation.copy()
+    assert triangles(other) == before
+    other.update(rng.random(100))
+    assert triangles(triangulation) == before
+    assert not triangulation.hidden.any()
+
+
+def test_large_grid_with_all_kinds_of_ties() -> None:
+    rng = np.random.default_rng(4)
+    axis = np.arange(60.0)
+    sites = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    triangulation = RegularTriangulation(sites)
+    for weights in (
+        rng.integers(0, 2, 3600),
+        np.zeros(3600),
+        1.0 * (sites.sum(1) % 2),
+        sites[:, 0],
+    ):
+        triangulation.update(weights)
+        assert_triangulation(triangulation)
+        assert_locally_regular(triangulation)
+        assert not triangulation.hidden.any()
+
+
+def test_heavy_site_swallows_the_cells_within_its_radius() -> None:
+    axis = np.arange(60.0)
+    sites = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    heavy = np.zeros(3600)
+    heavy[1830] = 200.5
+    triangulation = RegularTriangulation(sites)
+    triangulation.update(heavy)
+    farthest = ((np.abs(sites - sites[1830]) + 0.5) ** 2).sum(axis=1)
+    swallowed = farthest - 200.5 < 0.5
+    swallowed[1830] = False
+    np.testing.assert_array_equal(triangulation.hidden, swallowed)
+
+
+def test_hilbert_order_is_a_permutation_with_short_steps() -> None:
+    axis = np.arange(64.0)
+    points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    order = hilbert_order(points)
+    np.testing.assert_array_equal(np.sort(order), np.arange(4096))
+    steps = np.abs(np.diff(points[order], axis=0)).sum(axis=1)
+    assert np.all(steps == 1)
+    np.testing.assert_array_equal(hilbert_order(points[order]), np.arange(4096))
+
+
+def test_arrays_cannot_be_written() -> None:
+    triangulation = RegularTriangulation([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    for name in ("sites", "points", "weights", "vertices", "neighbors", "hidden"):
+        assert not getattr(triangulation, name).flags.writeable
+
+
+@pytest.mark.parametrize("sites", [[[0.0, np.nan]], [[0.0, 1.0, 2.0]], np.empty((0, 2))])
+def test_bad_sites_are_refused(sites: object) -> None:
+    with pytest.raises(InputError, match="sites"):
+        RegularTriangulation(sites)
+
+
+def test_bad_weights_are_refused() -> None:
+    triangulation = RegularTriangulation([[0.0, 0.0], [1.0, 0.0]])
+    with pytest.raises(InputError, match=r"weights have shape \(3,\), there are 2 sites"):
+        triangulation.update([0.0, 0.0, 0.0])
+    with pytest.raises(InputError, match="infinity"):
+        triangulation.update([0.0, np.inf])

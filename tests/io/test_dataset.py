@@ -1,0 +1,147 @@
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.io import (
+    Radiograph,
+    dataset_from_inversion,
+    inversion_from_dataset,
+    provenance,
+    read,
+    setup_from_dataset,
+    write,
+)
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+
+def assert_same(first: Inversion, second: Inversion) -> None:
+    for field in dataclasses.fields(Inversion):
+        before, after = getattr(first, field.name), getattr(second, field.name)
+        if isinstance(before, np.ndarray):
+            assert after.dtype == before.dtype, field.name
+            np.testing.assert_array_equal(after, before, err_msg=field.name)
+        else:
+            assert after == before, field.name
+
+
+@pytest.mark.parametrize("kind", ["none", "proton", "optical", "collimated"])
+def test_file_gives_back_every_bit(
+    tmp_path: Path,
+    inversion: Inversion,
+    proton_setup: ProtonSetup,
+    optical_setup: OpticalSetup,
+    kind: str,
+) -> None:
+    setups = {
+        "none": None,
+        "proton": proton_setup,
+        "optical": optical_setup,
+        "collimated": ProtonSetup(
+            energy=1 / 3,
+            source_object_distance=np.inf,
+            object_image_distance=0.1,
+            detector_pixel_size=1e-5 / 3,
+            species="alpha",
+        ),
+    }
+    path = tmp_path / "shot.shadowinv"
+    write(path, inversion, setup=setups[kind])
+    dataset = read(path)
+    assert isinstance(dataset, xr.Dataset)
+    assert_same(inversion, inversion_from_dataset(dataset))
+    assert setup_from_dataset(dataset) == setups[kind]
+    xr.testing.assert_identical(
+        dataset.drop_attrs(deep=False),
+        dataset_from_inversion(inversion, setups[kind]).drop_attrs(deep=False),
+    )
+
+
+def test_not_a_number_and_infinity_survive(tmp_path: Path, inversion: Inversion) -> None:
+    report = dataclasses.replace(inversion.report, residual=np.inf)
+    potential = inversion.potential.copy()
+    potential[3, 4] = np.nan
+    changed = dataclasses.replace(inversion, potential=potential, report=report)
+    write(tmp_path / "shot.shadowinv", changed)
+    dataset = read(tmp_path / "shot.shadowinv")
+    assert isinstance(dataset, xr.Dataset)
+    assert_same(changed, inversion_from_dataset(dataset))
+
+
+def test_every_variable_has_units_and_a_name(
+    inversion: Inversion, proton_setup: ProtonSetup, optical_setup: OpticalSetup
+) -> None:
+    for setup in (None, proton_setup, optical_setup):
+        dataset = dataset_from_inversion(inversion, setup)
+        for name, variable in dataset.variables.items():
+            assert variable.attrs.get("units"), name
+            assert variable.attrs.get("long_name"), name
+    assert dict(dataset.sizes) == {"y": 24, "x": 32, "component": 2, "site": 17}
+    assert dataset["displacement"].dims == ("component", "y", "x")
+    assert dataset["component"].values.tolist() == ["y", "x"]
+
+
+def test_si_values_of_protons_follow_from_the_setup(
+    inversion: Inversion, proton_setup: ProtonSetup
+) -> None:
+    dataset = inversion.to_dataset(proton_setup)
+    slope = 1.5e-6 * proton_setup.magnification / 2e-2
+    np.testing.assert_allclose(dataset["deflection_angle"], inversion.displacement * slope)
+    np.testing.assert_allclose(dataset["potential_si"], inversion.potential * slope * 1.5e-6)
+    np.testing.assert_array_equal(
+        dataset["path_integrated_b"], proton_setup.path_integrated_b(inversion.displacement)
+    )
+    np.testing.assert_array_equal(
+        dataset["path_integrated_e"], proton_setup.path_integrated_e(inversion.displacement)
+    )
+    np.testing.assert_allclose(dataset["x_si"], np.arange(32) * 1.5e-6)
+    np.testing.assert_array_equal(dataset["y"], np.arange(24))
+    units = {name: dataset[name].attrs["units"] for name in ("potential_si", "path_integrated_b")}
+    assert units == {"potential_si": "m", "path_integrated_b": "T m"}
+
+
+def test_si_values_of_light_follow_from_the_setup(
+    inversion: Inversion, optical_setup: OpticalSetup
+) -> None:
+    dataset = inversion.to_dataset(optical_setup)
+    np.testing.assert_array_equal(
+        dataset["line_integrated_density"],
+        optical_setup.line_integrated_density(inversion.potential),
+    )
+    np.testing.assert_allclose(dataset["line_integrated_log_index"], -dataset["potential_si"])
+    assert "path_integrated_b" not in dataset
+
+
+def test_attributes_tell_how_and_from_what(tmp_path: Path, inversion: Inversion) -> None:
+    np.save(tmp_path / "shot.npy", inversion.image)
+    np.save(tmp_path / "beam.npy", inversion.source)
+    shot, beam = read(tmp_path / "shot.npy"), read(tmp_path / "beam.npy")
+    assert isinstance(shot, Radiograph)
+    assert isinstance(beam, Radiograph)
+    dataset = dataset_from_inversion(inversion, attributes=provenance(shot, beam))
+    assert dataset.attrs["input_file"] == "shot.npy"
+    assert dataset.attrs["input_sha256"] == shot.metadata["sha256"]
+    assert dataset.attrs["source_file"] == "beam.npy"
+    assert dataset.attrs["source_sha256"] == beam.metadata["sha256"]
+    assert json.loads(dataset.attrs["options"])["n_sites"] == 17
+    assert json.loads(dataset.attrs["report"])["iterations"] == 31
+    assert dataset.attrs["created"].endswith("+00:00")
+    assert dataset.attrs["package_version"][0].isdigit()
+
+
+def test_dataset_of_something_else_is_refused() -> None:
+    with pytest.raises(InputError, match=r"'potential'.*'options', 'report'"):
+        inversion_from_dataset(xr.Dataset())
+
+
+def test_damaged_result_is_named(tmp_path: Path, inversion: Inversion) -> None:
+    path = tmp_path / "shot.shadowinv"
+    write(path, inversion)
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(FileFormatError, match=r"shot\.shadowinv .*damaged"):
+        read(path)

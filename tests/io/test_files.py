@@ -1,0 +1,96 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.io.files import check_output, kind_of, replacing, sha256
+
+
+def test_checksum_is_sha256_of_content(tmp_path: Path) -> None:
+    path = tmp_path / "abc"
+    path.write_bytes(b"abc")
+    assert sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"", "empty"),
+        (b"energy = 14.7\n", "a text file"),
+        ("größe µm".encode(), "a text file"),
+        (b"PK\x03\x04rest", "zip archive"),
+        (b"%PDF-1.7", "PDF"),
+        (bytes(range(128, 200)), "not an image"),
+    ],
+)
+def test_other_content_is_named(tmp_path: Path, content: bytes, found: str) -> None:
+    path = tmp_path / "shot.tif"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=found) as error:
+        kind_of(path)
+    assert str(path) in str(error.value)
+    assert "TIFF" in str(error.value)
+
+
+def test_folder_and_missing_file_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="is a folder"):
+        kind_of(tmp_path)
+    with pytest.raises(FileFormatError, match=r"nowhere\.tif does not exist"):
+        kind_of(tmp_path / "nowhere.tif")
+
+
+def test_outputs_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    existing = tmp_path / "there.npy"
+    existing.write_text("old")
+    with pytest.raises(FileFormatError, match="exists"):
+        check_output(existing)
+    assert check_output(existing, overwrite=True) == existing
+    with pytest.raises(FileFormatError, match=r"folder .*nowhere does not exist"):
+        check_output(tmp_path / "nowhere" / "a.npy")
+    with pytest.raises(FileFormatError, match="is a folder"):
+        check_output(tmp_path, overwrite=True)
+    with pytest.raises(FileFormatError, match=r"its ending is '\.doc', expected one of \.npy"):
+        check_output(tmp_path / "a.doc", suffixes=(".npy",))
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_failed_write_keeps_the_old_file_and_leaves_nothing(
+    tmp_path: Path, error: type[BaseException]
+) -> None:
+    path = tmp_path / "result.bin"
+    path.write_text("old")
+
+    def write_half() -> None:
+        with replacing(path, overwrite=True) as temporary:
+            temporary.write_text("half of the n")
+            raise error
+
+    with pytest.raises(error):
+        write_half()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_file_that_appears_during_the_work_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "result.bin"
+
+    def write_late() -> None:
+        with replacing(path) as temporary:
+            temporary.write_text("mine")
+            path.write_text("theirs")
+
+    with pytest.raises(FileFormatError, match="exists"):
+        write_late()
+    assert path.read_text() == "theirs"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_temporary_file_lies_beside_with_the_same_ending(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    with replacing(path) as temporary:
+        assert temporary.parent == path.parent
+        assert temporary.suffix == ".npy"
+        assert not path.exists()
+        np.save(temporary, np.arange(3))
+    assert np.load(path).tolist() == [0, 1, 2]

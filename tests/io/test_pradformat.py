@@ -1,0 +1,179 @@
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.io import Radiograph, read, read_radiograph, setup_from_dataset, write
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+IMAGE = np.arange(20.0).reshape(4, 5)
+ATTRIBUTES = {
+    "object_type": "radiograph",
+    "radiograph_type": "simple",
+    "pradformat_version": "0.2.0",
+    "scale_factor": 1.0,
+    "pixel_width": 3.1e-4,
+    "source_object_dist": 0.01,
+    "object_image_dist": 0.3,
+    "spec_name": "p+",
+    "spec_energy": 14.7e6,
+}
+
+
+def radiograph_file(path: Path, **changes: object) -> Path:
+    with h5py.File(path, "w") as file:
+        file["image"] = IMAGE
+        for name, value in {**ATTRIBUTES, **changes}.items():
+            if value is not None:
+                file.attrs[name] = value
+    return path
+
+
+def test_complete_radiograph_brings_its_setup(tmp_path: Path) -> None:
+    radiograph = read_radiograph(radiograph_file(tmp_path / "shot.h5"))
+    np.testing.assert_array_equal(radiograph.image, IMAGE)
+    assert radiograph.setup == ProtonSetup(
+        energy=14.7,
+        species="proton",
+        source_object_distance=0.01,
+        object_image_distance=0.3,
+        detector_pixel_size=3.1e-4,
+    )
+    assert radiograph.setup.object_pixel_size == pytest.approx(1e-5)
+
+
+def test_distances_of_version_0_1_are_measured_from_the_image(tmp_path: Path) -> None:
+    path = radiograph_file(
+        tmp_path / "shot.h5",
+        source_object_dist=None,
+        object_image_dist=None,
+        source_distance=0.31,
+        ROI_distance=0.3,
+        spec_name=b"D 1+",
+    )
+    setup = read_radiograph(path).setup
+    assert isinstance(setup, ProtonSetup)
+    assert setup.source_object_distance == pytest.approx(0.01)
+    assert setup.object_image_distance == 0.3
+    assert setup.species == "deuteron"
+
+
+@pytest.mark.parametrize(
+    "changes", [{"spec_energy": None}, {"spec_name": "Au 79+"}, {"source_object_dist": None}]
+)
+def test_incomplete_radiograph_keeps_what_it_knows(
+    tmp_path: Path, changes: dict[str, object]
+) -> None:
+    radiograph = read_radiograph(radiograph_file(tmp_path / "shot.h5", **changes))
+    assert radiograph.setup is None
+    assert radiograph.metadata["geometry"]["detector_pixel_size"] == 3.1e-4
+    assert radiograph.metadata["geometry"]["object_image_distance"] == 0.3
+
+
+def test_mistakes_in_the_file_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"0\.00031 m by 0\.0005 m: expected square"):
+        read(radiograph_file(tmp_path / "a.h5", pixel_width_ax2=5e-4))
+    with pytest.raises(InputError, match=r"b\.h5: 'energy' is 0"):
+        read(radiograph_file(tmp_path / "b.h5", spec_energy=0.0))
+    path = radiograph_file(tmp_path / "c.h5")
+    with h5py.File(path, "a") as file:
+        del file["image"]
+    with pytest.raises(FileFormatError, match="with no image"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "side", "width", "mean"),
+    [
+        ("gaussian_charge_blob_mu_0p5_veryhighres_lowres.h5", 50, 1.2e-3, 54),
+        ("gaussian_charge_cylinder_mu_0p5_highres.h5", 150, 0.5333e-3, 10.6),
+    ],
+)
+def test_published_examples(
+    shared_data: Path, name: str, side: int, width: float, mean: float
+) -> None:
+    radiograph = read_radiograph(shared_data / "pradformat" / name)
+    geometry = radiograph.metadata["geometry"]
+    assert radiograph.image.shape == (side, side)
+    assert radiograph.image.mean() == pytest.approx(mean, rel=0.01)
+    assert geometry["detector_pixel_size"] == pytest.approx(width, rel=1e-3)
+    assert geometry["source_object_distance"] == 0.01
+    assert geometry["object_image_distance"] == 0.3
+    # The files do not tell the energy, so they tell no field either.
+    assert radiograph.setup is None
+
+
+def written(path: Path, inversion: Inversion, setup: ProtonSetup) -> Path:
+    shot = Radiograph(inversion.image, path=Path("somewhere/shot.tif"))
+    return write(path, inversion, setup=setup, shot=shot)
+
+
+def test_inversion_follows_the_format(
+    tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup
+) -> None:
+    path = written(tmp_path / "shot.h5", inversion, proton_setup)
+    with h5py.File(path) as file:
+        attributes = dict(file.attrs)
+        phi, first, second = (file[name][()] for name in ("phi", "defl_ax1", "defl_ax2"))
+    assert attributes["object_type"] == "inversion"
+    assert attributes["inversion_type"] == "simple"
+    assert attributes["dr"] == 1.5e-6
+    assert attributes["spec_name"] == "p+"
+    assert attributes["spec_energy"] == 14.7e6
+    assert attributes["spec_mass"] == pytest.approx(1.67262e-27, rel=1e-5)
+    assert attributes["spec_charge"] == pytest.approx(1.602177e-19, rel=1e-6)
+    assert attributes["source_object_dist"] == 1.3e-3
+    assert attributes["object_image_dist"] == 2e-2
+    assert attributes["radiograph_filename"] == "shot.tif"
+    # In this format the angle is the gradient of phi, without a minus.
+    slopes = np.gradient(phi, attributes["dr"])
+    for slope, angle in zip(slopes, (first, second), strict=True):
+        middle = (slice(2, -2), slice(2, -2))
+        np.testing.assert_allclose(slope[middle], angle[middle], atol=0.1 * np.abs(angle).max())
+
+
+def test_inversion_comes_back(
+    tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup
+) -> None:
+    dataset = read(written(tmp_path / "shot.h5", inversion, proton_setup))
+    assert isinstance(dataset, xr.Dataset)
+    np.testing.assert_allclose(dataset["displacement"], inversion.displacement, rtol=1e-12)
+    np.testing.assert_allclose(dataset["potential"], inversion.potential, rtol=1e-12)
+    np.testing.assert_allclose(
+        dataset["path_integrated_b"],
+        proton_setup.path_integrated_b(inversion.displacement),
+        rtol=1e-12,
+    )
+    setup = setup_from_dataset(dataset)
+    assert isinstance(setup, ProtonSetup)
+    assert setup.energy == pytest.approx(14.7)
+    assert setup.object_pixel_size == 1.5e-6
+
+
+def test_potential_alone_gives_the_displacement(
+    tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup
+) -> None:
+    path = written(tmp_path / "shot.h5", inversion, proton_setup)
+    with h5py.File(path, "a") as file:
+        del file["defl_ax1"]
+    dataset = read(path)
+    assert isinstance(dataset, xr.Dataset)
+    error = dataset["displacement"].values - inversion.displacement
+    assert np.abs(error).max() < 0.1 * np.abs(inversion.displacement).max()
+    with h5py.File(path, "a") as file:
+        del file["phi"]
+    with pytest.raises(FileFormatError, match="expected 'phi' or both"):
+        read(path)
+
+
+def test_inversion_needs_a_particle_beam(
+    tmp_path: Path, inversion: Inversion, optical_setup: OpticalSetup
+) -> None:
+    for setup, found in ((None, "none"), (optical_setup, "'optical'")):
+        with pytest.raises(InputError, match=f"needs a setup of kind 'proton', received.*{found}"):
+            write(tmp_path / "shot.h5", inversion, setup=setup)
+    assert list(tmp_path.iterdir()) == []
