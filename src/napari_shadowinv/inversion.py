@@ -56,7 +56,7 @@ class Report:
     floor : float
         Smallest intensity allowed in the image, as a share of its mean.
     floored_pixels : int
-        Pixels that were raised to the floor.
+        Pixels that were raised to the floor, clipped ones included.
     clipped_pixels : int
         Pixels that were negative and set to zero.
     levels : tuple of (int, int, float)

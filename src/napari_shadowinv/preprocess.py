@@ -35,7 +35,7 @@ class Prepared:
     floored : ndarray, shape (H, W)
         `image` with every pixel at or above the floor, of the same flux.
     clipped_pixels, floored_pixels : int
-        How many pixels were negative, and below the floor.
+        How many pixels were negative, and how many, these included, below the floor.
     warnings : tuple of str
         What the user should know.
     """
@@ -108,9 +108,10 @@ def _warnings(ratio: float, clipped: int, floored: int, size: int) -> tuple[str,
         )
     if clipped:
         warnings.append(f"{clipped} negative pixels ({clipped / size:.2%}) were set to zero")
-    if floored - clipped > 0:
+    dark = floored - clipped
+    if dark > 0:
         warnings.append(
-            f"{floored} pixels ({floored / size:.2%}) were raised to the floor; "
+            f"{dark} dark pixels ({dark / size:.2%}) were raised to the floor; "
             "the field inside dark areas is not reliable"
         )
     return tuple(warnings)

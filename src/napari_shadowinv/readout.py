@@ -48,12 +48,14 @@ def read_dual(
     potential : ndarray, shape (H, W)
         px², zero in the mean over the border.
     displacement : ndarray, shape (2, H, W)
-        Minus its gradient (central differences), px.
+        Minus its gradient by central differences, px; beyond the border, which no flux
+        crosses, the potential is taken as its mirror image.
     """
     surface = potential_surface(level, weights, site_displacement, shape, threads=threads)
     potential = surface(_pixels(shape))[0].reshape(shape)
     potential -= border_mean(potential)
-    return potential, -np.array(np.gradient(potential, edge_order=2))
+    gradient = np.array(np.gradient(np.pad(potential, 1, mode="symmetric")))
+    return potential, np.ascontiguousarray(-gradient[:, 1:-1, 1:-1])
 
 
 def read_centroids(

@@ -18,8 +18,8 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilber
 
 Array = NDArray[np.float64]
 
-few = settings(max_examples=60, deadline=None)
-fewer = settings(max_examples=25, deadline=None)
+few = settings(max_examples=50, deadline=None)
+fewer = settings(max_examples=20, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -22,19 +22,18 @@ ROUND_BITS = 3
 
 @kernel
 def _distance_along(x: int, y: int) -> int:
-    """Distance of the grid cell (x, y) along the curve."""
+    """Distance of the grid cell (x, y) along the curve; free of branches that guess wrong."""
     distance = 0
-    half = 1 << (BITS - 1)
-    while half > 0:
-        right = 1 if x & half else 0
-        up = 1 if y & half else 0
-        distance += half * half * ((3 * right) ^ up)
-        if up == 0:
-            if right == 1:
-                x = (2 * half - 1) - (x & (2 * half - 1))
-                y = (2 * half - 1) - (y & (2 * half - 1))
-            x, y = y, x
-        half >>= 1
+    for bit in range(BITS - 1, -1, -1):
+        right = (x >> bit) & 1
+        up = (y >> bit) & 1
+        distance = (distance << 2) | ((3 * right) ^ up)
+        turned = -(right & (1 - up))
+        x ^= turned
+        y ^= turned
+        swapped = (x ^ y) & (up - 1)
+        x ^= swapped
+        y ^= swapped
     return distance
 
 

@@ -11,6 +11,7 @@ Paper, sections II.C and III: rejection, then weighted Lloyd relaxation.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,7 +136,7 @@ def lloyd(
     iterations: int,
     tolerance: float = 0.0,
     threads: int | None = None,
-    report: Reporter | None = None,
+    report: Callable[[int, int], None] | None = None,
 ) -> tuple[Array, int]:
     """Move each site to the centroid of its Voronoi cell, again and again.
 
@@ -152,8 +153,8 @@ def lloyd(
         mean spacing of the sites.
     threads : int, optional
         Threads of the kernels.
-    report : Reporter, optional
-        Told of each step.
+    report : callable, optional
+        Told the number of each step and the number of sites.
 
     Returns
     -------
@@ -174,7 +175,7 @@ def lloyd(
         move = diagram.centroids - sites
         sites = diagram.centroids
         if report is not None:
-            report("sites", step + 1, iterations, f"{len(sites):,} sites, Lloyd relaxation")
+            report(step + 1, len(sites))
         if np.sqrt((move**2).sum(axis=1).mean()) < tolerance * spacing:
             return sites, step + 1
     return sites, iterations
@@ -202,8 +203,10 @@ def plan_levels(
         The undisturbed beam.
     n_sites : int
         Sites of the finest level; each coarser one has a quarter.
-    lloyd_iterations, lloyd_tolerance, seed, threads, report
+    lloyd_iterations, lloyd_tolerance, seed, threads
         See `lloyd` and `sample_sites`.
+    report : Reporter, optional
+        Told of each step.
 
     Returns
     -------
@@ -214,7 +217,14 @@ def plan_levels(
     counts = [n_sites]
     while counts[-1] > COARSEST:
         counts.append(max(4, counts[-1] // RATIO))
-    levels = []
+    levels: list[Level] = []
+
+    def report_step(step: int, count: int) -> None:
+        if report is not None:
+            done = len(levels) * lloyd_iterations + step
+            total = len(counts) * lloyd_iterations
+            report("sites", done, total, f"{count:,} sites, Lloyd relaxation")
+
     for count in reversed(counts):
         sites = sample_sites(source, count, seed)
         sites, steps = lloyd(
@@ -223,7 +233,7 @@ def plan_levels(
             iterations=lloyd_iterations,
             tolerance=lloyd_tolerance,
             threads=threads,
-            report=report,
+            report=report_step,
         )
         levels.append(_level(sites, density, steps, threads))
     return SitePlan(source, tuple(levels))
