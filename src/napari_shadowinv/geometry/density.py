@@ -37,34 +37,33 @@ class Density:
 
     Attributes
     ----------
-    padded : ndarray, shape (H, W + 2)
-        The image between two columns of zeros.
-    sums : ndarray, shape (3, H, W + 2)
-        ∫ I, ∫ s I and ∫ s² I from 0 to the left edge of each padded column.
+    image : ndarray, shape (H, W)
+        Intensity of each pixel.
+    sums : ndarray, shape (3, H, W + 1)
+        ∫ I, ∫ s I and ∫ s² I over each row, from 0 to the left edge of each pixel; the
+        last column holds the whole row's.
     """
 
-    padded: Array
+    image: Array
     sums: Array
 
     @classmethod
     def from_image(cls, image: ArrayLike) -> Density:
         """Make a density of an image of shape (H, W)."""
-        values = np.asarray(image, dtype=np.float64)
+        values = np.ascontiguousarray(image, dtype=np.float64)
         height, width = values.shape
-        padded = np.zeros((height, width + 2))
-        padded[:, 1:-1] = values
         left = np.arange(width, dtype=np.float64)
         right = left + 1
-        sums = np.zeros((3, height, width + 2))
+        sums = np.zeros((3, height, width + 1))
         for power in range(3):
             of_pixel = values * (right ** (power + 1) - left ** (power + 1)) / (power + 1)
-            np.cumsum(of_pixel, axis=1, out=sums[power, :, 2:])
-        return cls(padded, sums)
+            np.cumsum(of_pixel, axis=1, out=sums[power, :, 1:])
+        return cls(values, sums)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (H, W) of the image."""
-        return self.padded.shape[0], self.padded.shape[1] - 2
+        return self.image.shape[0], self.image.shape[1]
 
     @property
     def total(self) -> float:
@@ -73,8 +72,30 @@ class Density:
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _piece(
-    padded: Array,
+def _moments(
+    f0: float,
+    f_mid: float,
+    f1: float,
+    g: float,
+    k0: float,
+    k_mid: float,
+    k1: float,
+    y0: float,
+    y1: float,
+) -> tuple[float, float, float]:
+    """∫ y F dy, ∫ G dy and ∫ (y² F + K) dy by Simpson's rule; g is the sum for G."""
+    y_mid = 0.5 * (y0 + y1)
+    sixth = (y1 - y0) / 6
+    return (
+        sixth * (y0 * f0 + 4 * y_mid * f_mid + y1 * f1),
+        sixth * g,
+        sixth * (y0 * y0 * f0 + k0 + 4 * (y_mid * y_mid * f_mid + k_mid) + y1 * y1 * f1 + k1),
+    )
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _moments_in_pixel(
+    value: float,
     sums: Array,
     row: int,
     column: int,
@@ -82,48 +103,108 @@ def _piece(
     x0: float,
     y1: float,
     x1: float,
-    with_moments: bool,
-) -> tuple[float, float, float, float]:
-    """∫ F dy, ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
-    value = padded[row, column]
-    base = sums[0, row, column]
-    left = max(column - 1.0, 0.0)
-    dy = y1 - y0
-    x_mid = 0.5 * (x0 + x1)
-    f_mid = base + value * (x_mid - left)
-    if not with_moments:
-        return f_mid * dy, 0.0, 0.0, 0.0
-    f0 = base + value * (x0 - left)
-    f1 = base + value * (x1 - left)
-    y_mid = 0.5 * (y0 + y1)
-    g_base = sums[1, row, column]
-    k_base = sums[2, row, column]
+) -> tuple[float, float, float]:
+    """∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
+    left = float(column)
     left2 = left * left
     left3 = left2 * left
-    g0 = g_base + value * (x0 * x0 - left2) / 2
-    g1 = g_base + value * (x1 * x1 - left2) / 2
-    g_mid = g_base + value * (x_mid * x_mid - left2) / 2
-    k0 = k_base + value * (x0 * x0 * x0 - left3) / 3
-    k1 = k_base + value * (x1 * x1 * x1 - left3) / 3
-    k_mid = k_base + value * (x_mid * x_mid * x_mid - left3) / 3
-    sixth = dy / 6
-    return (
-        f_mid * dy,
-        sixth * (y0 * f0 + 4 * y_mid * f_mid + y1 * f1),
-        sixth * (g0 + 4 * g_mid + g1),
-        sixth * (y0 * y0 * f0 + k0 + 4 * (y_mid * y_mid * f_mid + k_mid) + y1 * y1 * f1 + k1),
+    x_mid = 0.5 * (x0 + x1)
+    f_base = sums[0, row, column] - value * left
+    g_base = sums[1, row, column] - value * left2 / 2
+    k_base = sums[2, row, column] - value * left3 / 3
+    g = 6 * g_base + value * (x0 * x0 + 4 * x_mid * x_mid + x1 * x1) / 2
+    third = value / 3
+    return _moments(
+        f_base + value * x0,
+        f_base + value * x_mid,
+        f_base + value * x1,
+        g,
+        k_base + third * x0 * x0 * x0,
+        k_base + third * x_mid * x_mid * x_mid,
+        k_base + third * x1 * x1 * x1,
+        y0,
+        y1,
     )
 
 
 @njit(nogil=True, cache=True)
+def _walk_inside(
+    image: Array, sums: Array, ya: float, xa: float, yb: float, xb: float, with_moments: bool
+) -> tuple[float, float, float, float, float]:
+    """Integrate along a segment inside the image; see `walk_edge`."""
+    height, width = image.shape
+    row = min(int(ya), height - 1)
+    column = min(int(xa), width - 1)
+    last_row = min(int(yb), height - 1)
+    last_column = min(int(xb), width - 1)
+    dy = yb - ya
+    dx = xb - xa
+    length = math.sqrt(dy * dy + dx * dx)
+    down = 1 if last_row > row else 0
+    right = 1 if last_column > column else 0
+    per_y = 1.0 / dy if last_row != row else 0.0
+    per_x = 1.0 / dx if last_column != column else 0.0
+    crossings = abs(last_row - row) + abs(last_column - column)
+    flux = mass = moment_y = moment_x = inertia = 0.0
+    t = 0.0
+    y = ya
+    x = xa
+    for crossing in range(crossings + 1):
+        # where the segment leaves this pixel, and whether by its upper or lower side
+        t_y = (row + down - ya) * per_y if row != last_row else 2.0
+        t_x = (column + right - xa) * per_x if column != last_column else 2.0
+        t_next = min(t_y, t_x)
+        y_next = ya + t_next * dy
+        x_next = xa + t_next * dx
+        if crossing == crossings:
+            t_next = 1.0
+            y_next = yb
+            x_next = xb
+        value = image[row, column]
+        flux += value * (t_next - t)
+        mass += (sums[0, row, column] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
+        if with_moments:
+            of_y, of_x, of_both = _moments_in_pixel(value, sums, row, column, y, x, y_next, x_next)
+            moment_y += of_y
+            moment_x += of_x
+            inertia += of_both
+        if t_x <= t_y:
+            column += 2 * right - 1
+        else:
+            row += 2 * down - 1
+        t = t_next
+        y = y_next
+        x = x_next
+    return flux * length, mass, moment_y, moment_x, inertia
+
+
+@njit(nogil=True, cache=True)
+def _walk_right_of_image(
+    image: Array, sums: Array, ya: float, yb: float
+) -> tuple[float, float, float, float]:
+    """Integrate from row position ya to yb beyond the right edge, where F is the row's sum."""
+    height, width = image.shape
+    low = min(ya, yb)
+    high = max(ya, yb)
+    sign = 1.0 if yb > ya else -1.0
+    mass = moment_y = moment_x = inertia = 0.0
+    for row in range(min(int(low), height - 1), min(int(high), height - 1) + 1):
+        y0 = max(low, float(row))
+        y1 = min(high, row + 1.0)
+        f = sums[0, row, width]
+        g = sums[1, row, width]
+        k = sums[2, row, width]
+        of_y, of_x, of_both = _moments(f, f, f, 6 * g, k, k, k, y0, y1)
+        mass += sign * f * (y1 - y0)
+        moment_y += sign * of_y
+        moment_x += sign * of_x
+        inertia += sign * of_both
+    return mass, moment_y, moment_x, inertia
+
+
+@njit(nogil=True, cache=True)
 def walk_edge(
-    padded: Array,
-    sums: Array,
-    ya: float,
-    xa: float,
-    yb: float,
-    xb: float,
-    with_moments: bool,
+    image: Array, sums: Array, ya: float, xa: float, yb: float, xb: float, with_moments: bool
 ) -> tuple[float, float, float, float, float]:
     """Integrate along the segment from (ya, xa) to (yb, xb), in corner coordinates.
 
@@ -133,73 +214,52 @@ def walk_edge(
         ∫ I ds, then ∫ F dy, ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy; the last three
         are 0 unless `with_moments`.
     """
-    height = padded.shape[0]
-    last = padded.shape[1] - 1
-    dy = yb - ya
-    dx = xb - xa
-    flux = 0.0
-    mass = 0.0
-    moment_y = 0.0
-    moment_x = 0.0
-    inertia = 0.0
+    height, width = image.shape
+    if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
+        return _walk_inside(image, sums, ya, xa, yb, xb, with_moments)
 
-    t = 0.0
-    end = 1.0
-    if dy > 0:
-        t = max(t, -ya / dy)
-        end = min(end, (height - ya) / dy)
-    elif dy < 0:
-        t = max(t, (height - ya) / dy)
-        end = min(end, -ya / dy)
-    elif ya < 0 or ya >= height:
-        return flux, mass, moment_y, moment_x, inertia
-    if t >= end:
-        return flux, mass, moment_y, moment_x, inertia
+    start, end = _inside_share(ya, yb - ya, height)
+    if start >= end:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    left, right = _inside_share(xa, xb - xa, width)
+    left = min(max(left, start), end)
+    right = max(min(right, end), left)
+    flux = mass = moment_y = moment_x = inertia = 0.0
+    if right > left:
+        y0, x0 = _point(ya, xa, yb, xb, left, height, width)
+        y1, x1 = _point(ya, xa, yb, xb, right, height, width)
+        flux, mass, moment_y, moment_x, inertia = _walk_inside(
+            image, sums, y0, x0, y1, x1, with_moments
+        )
+    # the parts before and after the image count where they are to its right
+    for t0, t1 in ((start, left), (right, end)):
+        if t1 > t0 and xa + 0.5 * (t0 + t1) * (xb - xa) > 0.5 * width:
+            y0, _ = _point(ya, xa, yb, xb, t0, height, width)
+            y1, _ = _point(ya, xa, yb, xb, t1, height, width)
+            of_mass, of_y, of_x, of_both = _walk_right_of_image(image, sums, y0, y1)
+            mass += of_mass
+            if with_moments:
+                moment_y += of_y
+                moment_x += of_x
+                inertia += of_both
+    return flux, mass, moment_y, moment_x, inertia
 
-    y = ya + t * dy
-    x = xa + t * dx
-    row = min(max(math.floor(y), 0), height - 1)
-    if dy < 0 and row == y and row > 0:
-        row -= 1
-    column = min(max(math.floor(min(max(x, -1.0), last)) + 1, 0), last)
-    if dx < 0 and column - 1 == x and column > 0:
-        column -= 1
-    length = math.sqrt(dy * dy + dx * dx)
-    inverse_y = 1.0 / dy if dy != 0 else 0.0
-    inverse_x = 1.0 / dx if dx != 0 else 0.0
 
-    while True:
-        t_y = math.inf
-        if dy > 0:
-            t_y = (row + 1 - ya) * inverse_y
-        elif dy < 0:
-            t_y = (row - ya) * inverse_y
-        t_x = math.inf
-        if dx > 0 and column < last:
-            t_x = (column - xa) * inverse_x
-        elif dx < 0 and column > 0:
-            t_x = (column - 1 - xa) * inverse_x
-        t_next = max(t, min(t_x, t_y, end))
-        y_next = ya + t_next * dy if t_next < 1 else yb
-        x_next = xa + t_next * dx if t_next < 1 else xb
-        flux += padded[row, column] * (t_next - t)
-        if column > 0:
-            d_mass, d_y, d_x, d_inertia = _piece(
-                padded, sums, row, column, y, x, y_next, x_next, with_moments
-            )
-            mass += d_mass
-            moment_y += d_y
-            moment_x += d_x
-            inertia += d_inertia
-        if t_next >= end:
-            break
-        if t_x <= t_y:
-            column += 1 if dx > 0 else -1
-        else:
-            row += 1 if dy > 0 else -1
-            if row < 0 or row >= height:
-                break
-        t = t_next
-        y = y_next
-        x = x_next
-    return flux * length, mass, moment_y, moment_x, inertia
+@njit(nogil=True, cache=True)
+def _inside_share(position: float, step: float, size: int) -> tuple[float, float]:
+    """Range of t in [0, 1] for which position + t·step lies in [0, size]."""
+    if step == 0:
+        return (0.0, 1.0) if 0 <= position < size else (1.0, 1.0)
+    first = -position / step
+    second = (size - position) / step
+    return max(0.0, min(first, second)), min(1.0, max(first, second))
+
+
+@njit(nogil=True, cache=True)
+def _point(
+    ya: float, xa: float, yb: float, xb: float, t: float, height: int, width: int
+) -> tuple[float, float]:
+    """The point at share t of a segment, not further out than the image's border."""
+    y = ya + t * (yb - ya) if t < 1 else yb
+    x = xa + t * (xb - xa) if t < 1 else xb
+    return min(max(y, 0.0), float(height)), min(max(x, 0.0), float(width))

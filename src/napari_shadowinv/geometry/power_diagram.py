@@ -77,7 +77,7 @@ def _integrate_edges(
     stop: int,
     edges: Indices,
     centres: Array,
-    padded: Array,
+    image: Array,
     sums: Array,
     with_moments: bool,
     integrals: Array,
@@ -87,7 +87,7 @@ def _integrate_edges(
         left = edges[e, 2]
         right = edges[e, 3]
         flux, mass, moment_y, moment_x, inertia = walk_edge(
-            padded,
+            image,
             sums,
             centres[left, 0] + 0.5,
             centres[left, 1] + 0.5,
@@ -240,7 +240,7 @@ class PowerDiagram:
             self._threads,
             ends,
             self.vertices,
-            self._density.padded,
+            self._density.image,
             self._density.sums,
             self._with_moments,
             integrals,

@@ -50,6 +50,7 @@ class _Network(NamedTuple):
     neighbors: Indices
     conductances: Array
     degrees: Array
+    inverse_degrees: Array
 
 
 class _Vectors(NamedTuple):
@@ -68,6 +69,7 @@ def _empty_network(nodes: int, entries: int) -> _Network:
         np.empty(nodes, np.int32),
         np.empty(entries, np.int32),
         np.empty(entries),
+        np.empty(nodes),
         np.empty(nodes),
     )
 
@@ -91,6 +93,7 @@ def _put_lower_first(network: _Network, node: int, end: int) -> None:
         middle += 1 if neighbor < node else 0
     network.middles[node] = middle
     network.degrees[node] = degree
+    network.inverse_degrees[node] = 1.0 / degree if degree > 0.0 else 0.0
     network.starts[node + 1] = end
 
 
@@ -114,13 +117,13 @@ def _closest(network: _Network, node: int, groups: Indices, free: bool) -> int:
     A pair's quality is its conductance relative to the harmonic mean of the two degrees
     (Napov and Notay, Eq. 3.6, for rows that sum to zero).
     """
-    degrees = network.degrees
+    inverses = network.inverse_degrees
     best = -1
     highest = 0.0
     for k in range(network.starts[node], network.starts[node + 1]):
         other = network.neighbors[k]
         if (groups[other] < 0) == free:
-            tie = network.conductances[k] * (1.0 / degrees[node] + 1.0 / degrees[other])
+            tie = network.conductances[k] * (inverses[node] + inverses[other])
             if tie > highest:
                 highest = tie
                 best = other
@@ -239,16 +242,14 @@ def _descend(
         total = residual[i]
         for k in range(network.starts[i], network.middles[i]):
             total += network.conductances[k] * x[network.neighbors[k]]
-        value = total / network.degrees[i]
+        value = total * network.inverse_degrees[i]
         x[i] = value
         for k in range(network.starts[i], network.middles[i]):
             residual[parents[network.neighbors[k]]] += network.conductances[k] * value
 
 
 @njit(nogil=True, cache=True)
-def _ascend(
-    start: int, stop: int, network: _Network, parents: Indices, vectors: _Vectors
-) -> None:
+def _ascend(start: int, stop: int, network: _Network, parents: Indices, vectors: _Vectors) -> None:
     """Add the next level's correction and sweep backward."""
     x = vectors.correction
     for i in range(start, stop):
@@ -257,7 +258,7 @@ def _ascend(
         total = vectors.residual[i]
         for k in range(network.starts[i], network.starts[i + 1]):
             total += network.conductances[k] * x[network.neighbors[k]]
-        x[i] = total / network.degrees[i]
+        x[i] = total * network.inverse_degrees[i]
 
 
 @njit(nogil=True, cache=True)
@@ -339,9 +340,7 @@ def _cycle(
     level = 0
     while True:
         while level < deepest:
-            _descend(
-                bounds[level], bounds[level + 1], bounds[level + 2], network, parents, vectors
-            )
+            _descend(bounds[level], bounds[level + 1], bounds[level + 2], network, parents, vectors)
             level += 1
             returning[level] = False
         _solve_coarsest(bounds[level], bounds[level + 1], inverse, vectors)
@@ -376,3 +375,187 @@ def _advance(n: int, length: float, solution: Array, vectors: _Vectors) -> None:
         vectors.residual[i] -= length * vectors.direction_product[i]
 
 
+def _add_level(network: _Network, parents: Indices, start: int, stop: int) -> tuple[_Network, int]:
+    """Pair the nodes of the last level, pair the pairs, append what results.
+
+    Returns the network, which may have moved to make room, and its new number of nodes.
+    """
+    pairs = _empty_network((stop - start) // 2 + 1, network.starts[stop] - network.starts[start])
+    count = _pair(network, start, stop, parents, 0)
+    if count < 0:
+        raise _not_connected()
+    _contract(network, start, stop, parents, pairs, 0, count)
+    groups = np.empty(count, np.int32)
+    last = _pair(pairs, 0, count, groups, stop)
+    if last < 0:
+        raise _not_connected()
+    network = _with_room(network, network.starts[stop] + pairs.starts[count])
+    _contract(pairs, 0, count, groups, network, stop, last)
+    _compose(start, stop, parents, groups)
+    return network, last
+
+
+def _with_room(network: _Network, entries: int) -> _Network:
+    """Make room for that many entries; a planar network comes with enough."""
+    missing = entries - len(network.neighbors)
+    if missing <= 0:
+        return network
+    return network._replace(
+        neighbors=np.concatenate([network.neighbors, np.empty(missing, np.int32)]),
+        conductances=np.concatenate([network.conductances, np.empty(missing)]),
+    )
+
+
+def _not_connected() -> RuntimeError:
+    return RuntimeError(
+        "the cells form several groups with no flux between them: "
+        "the weights of one group relative to another are not determined"
+    )
+
+
+def _invert_coarsest(network: _Network, start: int, stop: int) -> Array:
+    """Invert the last level's Laplacian, with constants made regular."""
+    entries = slice(network.starts[start], network.starts[stop])
+    graph = csr_array(
+        (
+            network.conductances[entries],
+            network.neighbors[entries] - start,
+            network.starts[start : stop + 1] - network.starts[start],
+        ),
+        shape=(stop - start, stop - start),
+    )
+    if connected_components(graph, directed=False, return_labels=False) > 1:
+        raise _not_connected()
+    degrees = network.degrees[start:stop]
+    regular = np.diag(degrees) - graph.toarray() + (degrees.mean() or 1.0) / (stop - start)
+    inverse: Array = np.linalg.inv(regular)
+    return inverse
+
+
+class LaplacianSolver:
+    """Conjugate gradients for a connected graph Laplacian, with a multigrid set up once.
+
+    One object must not be used by several threads at the same time.
+
+    Parameters
+    ----------
+    laplacian : csr_array, shape (n, n)
+        Symmetric, nothing positive off the diagonal, rows sum to zero. Columns may come in
+        any order; neighbours should be near in the numbering for speed.
+    threads : int
+        Most threads to use. Results do not depend on it.
+
+    Raises
+    ------
+    RuntimeError
+        The graph is not connected.
+
+    Examples
+    --------
+    >>> from scipy.sparse import csr_array
+    >>> chain = csr_array(np.array([[1.0, -1, 0], [-1, 3, -2], [0, -2, 2]]))
+    >>> solution, iterations, residual = LaplacianSolver(chain).solve(np.array([1.0, 0, -1]))
+    >>> solution - solution[2]
+    array([1.5, 0.5, 0. ])
+    """
+
+    def __init__(self, laplacian: csr_array, *, threads: int = 1) -> None:
+        n = int(laplacian.shape[0])
+        network = _empty_network(2 * n, 2 * int(laplacian.nnz))
+        parents: Indices = np.empty(2 * n, np.int32)
+        _read_laplacian(
+            laplacian.indptr.astype(np.int32, copy=False),
+            laplacian.indices.astype(np.int32, copy=False),
+            laplacian.data.astype(np.float64, copy=False),
+            network,
+        )
+        bounds = [0, n]
+        while bounds[-1] - bounds[-2] > _COARSEST:
+            network, stop = _add_level(network, parents, bounds[-2], bounds[-1])
+            bounds.append(stop)
+        self._n = n
+        self._threads = threads
+        self._network = network
+        self._parents = parents
+        self._inverse = _invert_coarsest(network, bounds[-2], bounds[-1])
+        self._bounds: Offsets = np.array(bounds, np.int64)
+        self._vectors = _Vectors(*(np.zeros(bounds[-1]) for _ in _Vectors._fields))
+
+    def solve(
+        self, right: Array, tolerance: float = 1e-2, max_iterations: int = 200
+    ) -> tuple[Array, int, float]:
+        """Solve L x = b.
+
+        Parameters
+        ----------
+        right : ndarray, shape (n,)
+            Right side; its mean is ignored.
+        tolerance : float
+            Norm of the residual to reach, relative to the right side's.
+        max_iterations : int
+            Most iterations.
+
+        Returns
+        -------
+        solution : ndarray, shape (n,)
+            Of mean zero.
+        iterations : int
+            Iterations done.
+        residual : float
+            Relative norm of the residual, more than `tolerance` if it was not reached.
+        """
+        right = right - right.mean()
+        scale = self._norm(right)
+        solution: Array = np.zeros(self._n)
+        if scale == 0.0:
+            return solution, 0, 0.0
+        self._vectors.residual[: self._n] = right
+        self._vectors.direction[: self._n] = 0.0
+        self._vectors.direction_product[: self._n] = 0.0
+        energy = 1.0
+        iterations = 0
+        relative = 1.0
+        while relative > tolerance and iterations < max_iterations:
+            energy = self._iterate(solution, energy)
+            iterations += 1
+            relative = self._norm(self._vectors.residual) / scale
+            if relative <= tolerance or iterations == max_iterations or not energy > 0.0:
+                # the residual was only updated so far, and rounding errors add up
+                relative = self._renew_residual(right, solution) / scale
+            if not energy > 0.0:
+                break
+        return solution - solution.mean(), iterations, relative
+
+    def _iterate(self, solution: Array, energy: float) -> float:
+        """Do one step of flexible conjugate gradients; return its direction's energy."""
+        n = self._n
+        vectors = self._vectors
+        _cycle(self._bounds, self._network, self._parents, self._inverse, vectors)
+        share = _dot(0, n, vectors.correction, vectors.direction_product) / energy
+        _turn(n, share, vectors)
+        self._multiply(vectors.direction, vectors.direction_product)
+        energy = _dot(0, n, vectors.direction, vectors.direction_product)
+        if energy > 0.0:
+            length = _dot(0, n, vectors.direction, vectors.residual) / energy
+            _advance(n, length, solution, vectors)
+        return energy
+
+    def _renew_residual(self, right: Array, solution: Array) -> float:
+        residual = self._vectors.residual[: self._n]
+        self._multiply(solution, residual)
+        np.subtract(right, residual, out=residual)
+        return self._norm(residual)
+
+    def _multiply(self, x: Array, product: Array) -> None:
+        in_ranges(
+            _multiply,
+            self._n,
+            self._threads,
+            self._network,
+            x,
+            product,
+            smallest=_WORTH_A_THREAD,
+        )
+
+    def _norm(self, x: Array) -> float:
+        return float(np.sqrt(_dot(0, self._n, x, x)))
