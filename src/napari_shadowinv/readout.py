@@ -51,7 +51,7 @@ def read_dual(
         Minus its gradient by central differences, px; beyond the border, which no flux
         crosses, the potential is taken as its mirror image.
     """
-    surface = potential_surface(level, weights, site_displacement, shape, threads=threads)
+    surface = potential_surface(level, weights, site_displacement, threads=threads)
     potential = surface(_pixels(shape))[0].reshape(shape)
     potential -= border_mean(potential)
     gradient = np.array(np.gradient(np.pad(potential, 1, mode="symmetric")))

@@ -15,17 +15,13 @@ from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import (
     CloughTocher,
     fit_gradients,
-    mirrored_across_border,
 )
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
-from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.sites import Level
 
 __all__ = ["potential_surface", "site_displacement"]
 
 Array = NDArray[np.float64]
-
-_MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between sites
 
 
 def site_displacement(
@@ -66,7 +62,6 @@ def potential_surface(
     level: Level,
     weights: Array,
     displacement: Array,
-    shape: tuple[int, int],
     *,
     sweeps: int = 1,
     threads: int | None = None,
@@ -84,8 +79,6 @@ def potential_surface(
         Their weights, px².
     displacement : ndarray, shape (n, 2)
         Displacement of each site, px; see `site_displacement`.
-    shape : tuple of int
-        Shape (H, W) of the image; the surface continues smoothly to its border.
     sweeps : int
         Sweeps of the gradient fit (see `fit_gradients`).
     threads : int, optional
@@ -96,14 +89,12 @@ def potential_surface(
     CloughTocher
         The potential (px²) and its gradient at any point of the image.
     """
-    mirrored, origin, sense = mirrored_across_border(
-        level.sites, shape, _MIRROR_BAND * level.spacing
-    )
+    mirrored = level.mirrored
     potential = 0.5 * weights
     gradient = fit_gradients(level.triangulation, potential, -displacement, sweeps)
     return CloughTocher(
-        RegularTriangulation(np.concatenate([level.sites, mirrored])),
-        np.concatenate([potential, potential[origin]]),
-        np.concatenate([gradient, sense * gradient[origin]]),
+        mirrored.triangulation,
+        np.concatenate([potential, potential[mirrored.origin]]),
+        np.concatenate([gradient, mirrored.sense * gradient[mirrored.origin]]),
         threads=threads,
     )

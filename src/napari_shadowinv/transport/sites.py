@@ -19,6 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.interpolation import mirrored_across_border
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 from napari_shadowinv.progress import Reporter
@@ -29,6 +30,32 @@ Array = NDArray[np.float64]
 
 COARSEST = 600  # sites with which the solver can start from zero weights
 RATIO = 4  # sites of a level per site of the next coarser one
+
+_MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between sites
+
+
+@dataclass(frozen=True)
+class Mirrored:
+    """Sites and, after them, the mirror images of those near the image's border.
+
+    Attributes
+    ----------
+    triangulation : RegularTriangulation
+        Delaunay triangulation of sites and mirror images; it covers the whole image.
+    origin, sense : ndarray
+        Where the mirror images come from; see `mirrored_across_border`.
+    """
+
+    triangulation: RegularTriangulation
+    origin: NDArray[np.intp]
+    sense: Array
+
+    @classmethod
+    def from_sites(cls, sites: Array, shape: tuple[int, int]) -> Mirrored:
+        """Mirror the sites of an image of shape (H, W)."""
+        band = _MIRROR_BAND * _spacing(shape, len(sites))
+        images, origin, sense = mirrored_across_border(sites, shape, band)
+        return cls(RegularTriangulation(np.concatenate([sites, images])), origin, sense)
 
 
 @dataclass(frozen=True)
@@ -45,6 +72,8 @@ class Level:
         Centres of flux of the Voronoi cells; the sites themselves after many Lloyd steps.
     triangulation : RegularTriangulation
         Their Delaunay triangulation; copy it before changing weights.
+    mirrored : Mirrored
+        The sites with those near the border mirrored across it.
     spacing : float
         Mean distance between neighbours, sqrt(area of the image / n), in px.
     lloyd_iterations : int
@@ -55,6 +84,7 @@ class Level:
     mass: Array
     centroids: Array
     triangulation: RegularTriangulation
+    mirrored: Mirrored
     spacing: float
     lloyd_iterations: int
 
@@ -79,10 +109,12 @@ class SitePlan:
 def _accepted(source: Array, first: int, count: int, shift: Array, sites: Array) -> int:
     """Throw points of an even sequence at the source; keep them by its brightness.
 
-    The sequence is the three-dimensional Kronecker sequence of the root of x⁴ = x + 1,
-    which leaves fewer gaps and clumps than independent random points.
+    The positions are the Kronecker sequence of the real root of x³ = x + 1, which leaves
+    fewer gaps and clumps than independent random points; the golden ratio's decides
+    what to keep.
     """
-    root = 1.2207440846057596
+    root = 1.3247179572447460
+    golden = 1.6180339887498949
     height, width = source.shape
     brightest = source.max()
     kept = 0
@@ -91,7 +123,7 @@ def _accepted(source: Array, first: int, count: int, shift: Array, sites: Array)
         number += 1
         u = (shift[0] + number / root) % 1.0
         v = (shift[1] + number / root**2) % 1.0
-        threshold = (shift[2] + number / root**3) % 1.0
+        threshold = (shift[2] + number / golden) % 1.0
         y = u * height
         x = v * width
         if threshold * brightest < source[min(int(y), height - 1), min(int(x), width - 1)]:
@@ -239,13 +271,15 @@ def plan_levels(
     return SitePlan(source, tuple(levels))
 
 
-def level_of_sites(sites: Array, source: Density, threads: int | None = None) -> Level:
-    """Make a level of given sites."""
-    return _level(np.ascontiguousarray(sites, dtype=np.float64), source, 0, threads)
-
-
 def _level(sites: Array, density: Density, steps: int, threads: int | None) -> Level:
     triangulation = RegularTriangulation(sites)
     diagram = PowerDiagram(triangulation, density, with_moments=True, threads=threads)
-    spacing = _spacing(density.shape, len(sites))
-    return Level(sites, diagram.masses, diagram.centroids, triangulation, spacing, steps)
+    return Level(
+        sites=sites,
+        mass=diagram.masses,
+        centroids=diagram.centroids,
+        triangulation=triangulation,
+        mirrored=Mirrored.from_sites(sites, density.shape),
+        spacing=_spacing(density.shape, len(sites)),
+        lloyd_iterations=steps,
+    )

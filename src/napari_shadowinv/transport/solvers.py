@@ -264,7 +264,6 @@ def _prolong(
         coarse,
         solution.weights,
         site_displacement(coarse, solution.weights, image, threads),
-        image.shape,
         threads=threads,
     )
     return 2 * surface(fine.sites)[0]
