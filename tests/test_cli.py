@@ -431,13 +431,13 @@ def test_ctrl_c_while_computing_leaves_nothing(folder: Path) -> None:
     np.save("shot.npy", synthetic_image(gaussian_blob((100, 100), 100.0, 12.0).displacement))
     say_when = """
         import contextlib
-        from napari_shadowinv import cli
+        from napari_shadowinv.cli import _progress
 
         @contextlib.contextmanager
         def bars():
             yield lambda progress: print("now" if progress.stage == "transport" else "")
 
-        cli._progress_bars = bars
+        _progress.progress_bars = bars
     """
     before = content(folder)
     code, errors = interrupted(folder, say_when, ["invert", "shot.npy", "--n-sites", "30000"])

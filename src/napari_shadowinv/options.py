@@ -65,7 +65,7 @@ class InversionOptions(BaseModel):
         description="Most steps of weighted Lloyd relaxation that even out the sites.",
     )
     lloyd_tolerance: float = Field(
-        default=0.05,
+        default=0.1,
         ge=0,
         title="Lloyd tolerance",
         description=(

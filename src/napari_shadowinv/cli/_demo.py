@@ -1,0 +1,93 @@
+"""The shot that `shadowinv demo` simulates, and how its inversion compares with the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from napari_shadowinv.cli._tables import closing_rows, inversion_rows, setup_text, two_columns
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from rich.table import Table
+
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.physics.setup import ProtonSetup
+
+    Fields = Mapping[str, NDArray[np.float64]]
+
+_SHAPE = (200, 200)
+_SIGMA = 30e-6
+_SEED = 0
+
+
+def simulated_shot(
+    setup: ProtonSetup, dm: float, noise: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Image with noise, and the displacement that made it."""
+    import numpy as np
+
+    from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.physics.phantoms import toroid
+
+    truth = toroid(_SHAPE, setup, peak=dm, sigma=_SIGMA).displacement
+    image = synthetic_image(truth)
+    grain = np.random.default_rng(_SEED).normal(size=image.shape)
+    return image + noise * image.mean() * grain, truth
+
+
+def compared_fields(
+    image: NDArray[np.float64], truth: NDArray[np.float64], inversion: Inversion
+) -> Fields:
+    """Displacements by name: the truth, ours, and what linear inversion makes of the image."""
+    from napari_shadowinv.io.dataset import displacement_from_potential
+    from napari_shadowinv.physics.poisson import poisson_invert
+
+    poisson = displacement_from_potential(poisson_invert(image))
+    return {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
+
+
+def write_demo(
+    folder: Path, name: str, inversion: Inversion, setup: ProtonSetup, fields: Fields
+) -> list[Path]:
+    """Write the result, its figure, and the fields side by side."""
+    from napari_shadowinv.io import write
+    from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
+
+    caption = "Errors: " + "; ".join(
+        f"{which} {_errors_text(fields, which)}" for which in ("Retrieved", "Poisson")
+    )
+    comparison = comparison_figure(fields, setup, title="True and retrieved", caption=caption)
+    report = report_figure(inversion, setup, title=f"Demo {name}")
+    return [
+        write(folder / f"{name}.shadowinv", inversion, setup=setup, overwrite=True),
+        save_figure(folder / f"{name}.png", report, overwrite=True),
+        save_figure(folder / f"{name}_comparison.png", comparison, overwrite=True),
+    ]
+
+
+def demo_table(
+    inversion: Inversion, setup: ProtonSetup, fields: Fields, written: list[Path]
+) -> Table:
+    """Tell how well the inversion went, and how far it is from the truth."""
+    rows = [
+        ("setup", setup_text(setup)),
+        *inversion_rows(inversion, setup),
+        ("error", _errors_text(fields, "Retrieved")),
+        ("error of Poisson", _errors_text(fields, "Poisson")),
+        *closing_rows(inversion.report, written),
+    ]
+    return two_columns("Demo", rows)
+
+
+def _errors_text(fields: Fields, name: str) -> str:
+    import numpy as np
+
+    truth, found = fields["True"], fields[name]
+    largest, strongest = (float(np.hypot(*field).max()) for field in (truth, found))
+    if not largest:
+        return f"peak {strongest:.3g} px where the truth is zero"
+    distance = float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+    return f"peak {strongest / largest - 1:+.1%}, L2 {distance:.1%}"

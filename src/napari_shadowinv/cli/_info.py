@@ -1,0 +1,113 @@
+"""What `shadowinv info` tells about a file: an array, a picture, a radiograph or a result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from napari_shadowinv.cli._tables import (
+    Rows,
+    closing_rows,
+    inversion_rows,
+    peak_rows,
+    setup_text,
+    size_text,
+    two_columns,
+)
+
+if TYPE_CHECKING:
+    import xarray
+    from numpy.typing import NDArray
+    from rich.table import Table
+
+    from napari_shadowinv.io import Radiograph
+
+
+def described(path: Path) -> Table:
+    """Tell what a file is and what is in it."""
+    return two_columns(str(path), _rows(path))
+
+
+def _rows(path: Path) -> Rows:
+    from napari_shadowinv.io import Radiograph, read
+    from napari_shadowinv.io.arrays import read_npy
+    from napari_shadowinv.io.files import kind_of
+
+    kind = kind_of(path)
+    if kind == "npy":
+        return [("kind", "NPY array"), *_array_rows(read_npy(path))]
+    if kind != "hdf5":
+        return _picture_rows(path, kind)
+    content = read(path)
+    if isinstance(content, Radiograph):
+        return _radiograph_rows(content)
+    return _result_rows(content)
+
+
+def _picture_rows(path: Path, kind: str) -> Rows:
+    from napari_shadowinv.io.images import read_picture
+
+    array, metadata = read_picture(path, kind)
+    rows = [("kind", f"{kind.upper()} picture, {metadata['bits']} bits per sample")]
+    if array.ndim == 3:
+        rows.append(("channels", f"{array.shape[-1]}: choose with --channel if they differ"))
+    return rows + _array_rows(array)
+
+
+def _radiograph_rows(shot: Radiograph) -> Rows:
+    return [
+        ("kind", "pradformat radiograph"),
+        *_array_rows(shot.image),
+        *_geometry_rows(shot.metadata["geometry"]),
+        ("setup", setup_text(shot.setup, shot)),
+    ]
+
+
+def _geometry_rows(geometry: Mapping[str, Any]) -> Rows:
+    units = {"energy": "MeV"}
+    return [
+        (f"{name.replace('_', ' ')} ({units.get(name, 'm')})", f"{value:g}")
+        for name, value in geometry.items()
+        if isinstance(value, int | float)
+    ]
+
+
+def _array_rows(array: NDArray[Any]) -> Rows:
+    import numpy as np
+
+    values = array.astype(np.float64)
+    finite = values[np.isfinite(values)]
+    rows = [
+        ("shape", f"{array.shape}, [y, x]" if array.ndim == 2 else str(array.shape)),
+        ("dtype", str(array.dtype)),
+    ]
+    if finite.size:
+        rows.append(("min, mean, max", f"{finite.min():g}, {finite.mean():g}, {finite.max():g}"))
+    rows.append(("negative", f"{np.count_nonzero(finite < 0)} values"))
+    rows.append(("NaN or infinite", f"{values.size - finite.size} values"))
+    return rows
+
+
+def _result_rows(dataset: xarray.Dataset) -> Rows:
+    from napari_shadowinv.io import inversion_from_dataset, setup_from_dataset
+
+    setup = setup_from_dataset(dataset)
+    displacement = dataset["displacement"].values
+    experiment = [("image", size_text(displacement[0])), ("setup", setup_text(setup))]
+    if "options" not in dataset.attrs:
+        return [("kind", "pradformat inversion"), *experiment, *peak_rows(displacement, setup)]
+    inversion = inversion_from_dataset(dataset)
+    return [
+        ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),
+        ("created", str(dataset.attrs["created"])),
+        *[
+            (name.replace("_", " "), str(dataset.attrs[name]))
+            for name in ("input_file", "input_sha256", "source_file", "source_sha256")
+            if name in dataset.attrs
+        ],
+        *experiment,
+        *inversion_rows(inversion, setup),
+        *closing_rows(inversion.report),
+        ("options", ", ".join(f"{k} = {v}" for k, v in inversion.options.model_dump().items())),
+    ]

@@ -1,0 +1,71 @@
+"""What a command writes: names chosen and checked before the work, files after it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from napari_shadowinv.errors import FileFormatError, InputError
+
+if TYPE_CHECKING:
+    from napari_shadowinv.cli._inputs import Experiment
+    from napari_shadowinv.inversion import Inversion
+
+FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
+
+
+def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:
+    """Choose the names of result and figure; the figure never takes the image's name."""
+    result = Path(f"{image.stem}.shadowinv") if out is None else out
+    if report is not None:
+        return result, report
+    figure = result.with_suffix(".png")
+    if _is_same(figure, image):
+        figure = result.with_name(f"{result.stem}_report.png")
+    return result, figure
+
+
+def check_outputs(outputs: Mapping[Path, tuple[str, ...]], overwrite: bool) -> None:
+    """Refuse, before any work, files whose ending, folder or existence forbids to write them."""
+    from napari_shadowinv.io import check_output
+
+    for path, suffixes in outputs.items():
+        check_output(path, overwrite, suffixes=suffixes)
+
+
+def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
+    """Refuse to overwrite what is read, whatever --overwrite says."""
+    for path in outputs:
+        if any(other is not None and _is_same(path, other) for other in inputs):
+            raise InputError(f"{path} is both read and written: choose another name for the output")
+    if len({path.resolve() for path in outputs}) < len(outputs):
+        raise InputError(f"{outputs[0]} is to be written twice: choose two names")
+
+
+def _is_same(first: Path, second: Path) -> bool:
+    return first.resolve() == second.resolve()
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, with those above it, unless it is there."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(
+            f"{path} cannot be made a folder ({error.strerror}): choose another name"
+        ) from None
+
+
+def write_all(
+    inversion: Inversion, experiment: Experiment, out: Path, report: Path, overwrite: bool
+) -> None:
+    """Write result and figure; should drawing the figure fail, nothing is written."""
+    from napari_shadowinv.io import write
+    from napari_shadowinv.plotting import report_figure, save_figure
+
+    shot, setup = experiment.shot, experiment.setup
+    title = "" if shot.path is None else shot.path.name
+    figure = report_figure(inversion, setup, title=title)
+    write(out, inversion, setup=setup, shot=shot, source=experiment.source, overwrite=overwrite)
+    save_figure(report, figure, overwrite)

@@ -1,0 +1,76 @@
+"""The inversion, seen through progress bars and within reach of Ctrl-C."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING
+
+from napari_shadowinv.cli._guard import interruptible
+from napari_shadowinv.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+    from napari_shadowinv.cli._inputs import Experiment
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.options import InversionOptions
+    from napari_shadowinv.progress import OnProgress, Progress
+
+
+def inverted(experiment: Experiment, options: InversionOptions, quiet: bool = False) -> Inversion:
+    """Invert an experiment's shot; a mistake in it is told with the file's name."""
+    from napari_shadowinv.inversion import invert
+
+    shot, source = experiment.shot, experiment.source
+    with interruptible() as should_stop, nullcontext() if quiet else progress_bars() as show:
+        try:
+            return invert(
+                shot.image,
+                source=None if source is None else source.image,
+                options=options,
+                on_progress=show,
+                should_stop=should_stop,
+            )
+        except InputError as error:
+            raise InputError(f"{shot.path}: {error}" if shot.path else str(error)) from error
+
+
+@contextmanager
+def progress_bars() -> Iterator[OnProgress | None]:
+    """One bar for each stage, on a terminal only."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield None
+        return
+    columns = (
+        TextColumn("{task.description:<10}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("[dim]{task.fields[message]}"),
+    )
+    with Bars(*columns, console=console) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def finish_all() -> None:
+            for task in tasks.values():
+                bars.update(task, total=1, completed=1)
+                bars.stop_task(task)
+
+        def show(progress: Progress) -> None:
+            if progress.stage not in tasks:
+                finish_all()
+                tasks[progress.stage] = bars.add_task(progress.stage, total=None, message="")
+            bars.update(
+                tasks[progress.stage],
+                total=progress.total,
+                completed=progress.step,
+                message=progress.message,
+            )
+
+        yield show
+        finish_all()

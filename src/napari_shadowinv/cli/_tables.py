@@ -1,0 +1,139 @@
+"""What a command prints about an inversion, in two columns.
+
+- after an inversion: `summary`
+- rows that other tables share: `inversion_rows`, `peak_rows`, `closing_rows`
+- texts: `setup_text`, `size_text`; all of it goes out through `say`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from rich.table import Table
+
+    from napari_shadowinv.cli._inputs import Experiment
+    from napari_shadowinv.inversion import Inversion, Report
+    from napari_shadowinv.io import Radiograph
+    from napari_shadowinv.physics.setup import Setup
+
+Rows = list[tuple[str, str]]
+
+
+def say(text: str | Table) -> None:
+    """Print a sentence or a table."""
+    from rich.console import Console
+
+    Console().print(text, soft_wrap=isinstance(text, str), highlight=False)
+
+
+def two_columns(title: str, rows: Rows) -> Table:
+    """Names on the left, values on the right, warnings in yellow."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, show_header=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in rows:
+        table.add_row(name, Text(value, style="yellow" if name == "warning" else ""))
+    return table
+
+
+def summary(inversion: Inversion, experiment: Experiment, written: list[Path]) -> Table:
+    """Tell what was inverted, how well it went, and where the answer is."""
+    shot, source, setup = experiment.shot, experiment.source, experiment.setup
+    rows = [
+        ("image", f"{shot.path}, {size_text(inversion.image)}{_binning_text(shot)}"),
+        ("source", "uniform" if source is None else str(source.path)),
+        ("setup", setup_text(setup, shot)),
+        *inversion_rows(inversion, setup),
+        *closing_rows(inversion.report, written),
+    ]
+    return two_columns("Inversion", rows)
+
+
+def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
+    """How well an inversion went, and the strongest point of its field."""
+    report = inversion.report
+    residual = 100 * float((inversion.residual**2).mean() ** 0.5 / inversion.source.mean())
+    verdict = "converged" if report.converged else "NOT converged"
+    return [
+        ("sites", f"{report.n_sites:,}"),
+        (
+            "flux residual",
+            f"{report.residual:.2g} of a cell, asked for {report.tolerance:.2g}: {verdict}",
+        ),
+        ("image residual", f"{residual:.2g} % of the mean (root mean square)"),
+        ("iterations", f"{report.iterations} on {len(report.levels)} levels"),
+        (
+            "floor",
+            f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
+            f"{report.clipped_pixels} clipped",
+        ),
+        ("caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
+        *peak_rows(inversion.displacement, setup),
+    ]
+
+
+def peak_rows(displacement: NDArray[np.float64], setup: Setup | None) -> Rows:
+    """The strongest point, in pixels and where there is a setup in SI units."""
+    from napari_shadowinv.plotting import shown_fields
+
+    (pixels,) = shown_fields([displacement], None)
+    row, column = pixels.peak
+    rows = [("displacement", f"{pixels.peak_text}, at y = {row}, x = {column} px")]
+    if setup is not None:
+        (field,) = shown_fields([displacement], setup)
+        rows.append(("field", field.peak_text))
+    return rows
+
+
+def closing_rows(report: Report, written: Iterable[Path] = ()) -> Rows:
+    """The time that it took, warnings, and the files that were written."""
+    return [
+        ("time", _times_text(report.seconds)),
+        *[("warning", warning) for warning in report.warnings],
+        *[("written", str(path)) for path in written],
+    ]
+
+
+def setup_text(setup: Setup | None, shot: Radiograph | None = None) -> str:
+    """The experiment in a line, or what is missing for SI units."""
+    if setup is not None:
+        probe = (
+            f"{setup.energy:g} MeV {setup.species}"
+            if setup.kind == "proton"
+            else f"light of {setup.wavelength * 1e9:g} nm"
+        )
+        return (
+            f"{probe}, magnification {setup.magnification:.4g}, "
+            f"pixel {setup.object_pixel_size * 1e6:.4g} µm at the object"
+        )
+    if shot is not None and shot.metadata.get("geometry"):
+        return "none: the file tells the geometry but not the energy; give it with --setup"
+    return "none: results in pixels; give --setup for SI units"
+
+
+def size_text(array: NDArray[Any]) -> str:
+    """Height and width are given as people do, width first."""
+    return f"{array.shape[1]} × {array.shape[0]} px (width × height)"
+
+
+def _binning_text(shot: Radiograph) -> str:
+    factor = shot.metadata.get("bin", 1)
+    if factor == 1:
+        return ""
+    rows, columns = shot.metadata["cropped"]
+    cut = f", {rows} rows and {columns} columns cut off" if rows or columns else ""
+    return f", binned {factor} × {factor}{cut}"
+
+
+def _times_text(seconds: Mapping[str, float]) -> str:
+    stages = ", ".join(f"{stage} {value:.2f}" for stage, value in seconds.items())
+    return f"{sum(seconds.values()):.2f} s ({stages})"

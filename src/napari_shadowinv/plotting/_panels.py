@@ -1,0 +1,189 @@
+"""A page of panels: where they are, and what each can show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv.plotting._units import FloatArray, Scale
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+STYLE: Any = {
+    "font.family": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9.0,
+    "axes.linewidth": 0.7,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-3, 5),
+}
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Sizes in inches that put panels of one shape on a page without overlaps."""
+
+    rows: int
+    columns: int
+    width: float
+    height: float
+    foot: float
+    head: float
+    left: float = 0.68
+    right: float = 0.95
+    below: float = 0.52
+    above: float = 0.36
+
+    @property
+    def extra(self) -> float:
+        """What the last panel, with the profiles, is wider than a narrow image."""
+        return max(0.0, 2.5 - self.width)
+
+    @property
+    def figure_size(self) -> tuple[float, float]:
+        cell_width = self.left + self.width + self.right
+        cell_height = self.below + self.height + self.above
+        height = self.head + self.rows * cell_height + self.foot
+        return self.columns * cell_width + self.extra, height
+
+    def box(self, index: int) -> tuple[float, float, float, float]:
+        """Left, bottom, width and height of a panel as shares of the figure."""
+        is_last = index == self.rows * self.columns - 1
+        row, column = divmod(index, self.columns)
+        total_width, total_height = self.figure_size
+        left = column * (self.left + self.width + self.right) + self.left
+        top = self.head + row * (self.below + self.height + self.above) + self.above
+        return (
+            left / total_width,
+            1 - (top + self.height) / total_height,
+            (self.width + is_last * self.extra) / total_width,
+            self.height / total_height,
+        )
+
+
+def choose_grid(
+    shape: tuple[int, int], panels: int, *, foot: float = 0.0, title: bool = True
+) -> Grid:
+    """Choose the columns for which the page is closest to a slide's 16:10."""
+    aspect = shape[0] / shape[1]
+    # Panels of equal area, within limits that leave room for ticks on the short side.
+    width = float(np.clip(2.75 / np.sqrt(aspect), 1.2, 6.4))
+    height = float(np.clip(width * aspect, 1.2, 6.4))
+    grids = [
+        Grid(panels // columns, columns, width, height, foot, head=0.4 if title else 0.05)
+        for columns in range(1, panels + 1)
+        if panels % columns == 0
+    ]
+    return min(grids, key=lambda g: abs(np.log(g.figure_size[0] / g.figure_size[1] / 1.6)))
+
+
+def new_page(grid: Grid, scale: Scale, title: str | None) -> tuple[Figure, list[Panel]]:
+    """Return a figure with all its panels, still empty."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=grid.figure_size)
+    FigureCanvasAgg(figure)
+    if title:
+        width, height = grid.figure_size
+        figure.text(0.2 / width, 1 - 0.26 / height, title, size=13, weight="bold", va="center")
+    boxes = [grid.box(index) for index in range(grid.rows * grid.columns)]
+    return figure, [Panel(figure.add_axes(box), scale, grid) for box in boxes]
+
+
+def write_footer(figure: Figure, lines: list[tuple[str, str]], grid: Grid) -> None:
+    """Write lines, each with its colour, below the panels."""
+    width, height = grid.figure_size
+    for number, (text, colour) in enumerate(reversed(lines)):
+        y = (0.1 + 0.18 * number) / height
+        figure.text(0.2 / width, y, text, size=8.5, color=colour, va="bottom")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Axes with room for a colour bar on their right."""
+
+    axes: Axes
+    scale: Scale
+    grid: Grid
+
+    def show(
+        self, plane: FloatArray, title: str, label: str, cmap: str, limits: tuple[float, float]
+    ) -> None:
+        """Show a plane in false colours; the colour bar tells where limits cut it."""
+        picture = self.axes.imshow(
+            plane,
+            extent=self.scale.extent(plane.shape),
+            cmap=cmap,
+            vmin=limits[0],
+            vmax=limits[1],
+            # Smoothing would hide single bad pixels.
+            interpolation="nearest",
+            aspect="equal",
+        )
+        self.axes.set_title(title)
+        self._label_axes()
+        self._add_colour_bar(picture, label, _extend(plane, limits))
+
+    def contour(self, plane: NDArray[Any], levels: ArrayLike, colour: str, **style: Any) -> None:
+        """Draw lines of equal value onto the picture."""
+        self.axes.contour(
+            plane,
+            levels=levels,
+            extent=self.scale.extent(plane.shape),
+            origin="upper",
+            colors=colour,
+            **style,
+        )
+
+    def plot(self, values: FloatArray, **style: Any) -> None:
+        """Plot a cut along an axis of the image."""
+        self.axes.plot(self.scale.centres(values.size), values, **style)
+
+    @property
+    def width(self) -> float:
+        """Width in inches."""
+        return float(self.axes.get_position().width * self.grid.figure_size[0])
+
+    def few_ticks(self) -> None:
+        """Keep the tick labels apart on small panels."""
+        from matplotlib.ticker import MaxNLocator
+
+        for axis, length in (
+            (self.axes.xaxis, self.width / 0.5),
+            (self.axes.yaxis, self.grid.height / 0.3),
+        ):
+            bins = max(2, min(6, int(length)))
+            axis.set_major_locator(MaxNLocator(nbins=bins, steps=[1, 2, 5, 10]))
+
+    def _label_axes(self) -> None:
+        self.axes.set_xlabel(f"x ({self.scale.unit})")
+        self.axes.set_ylabel(f"y ({self.scale.unit})")
+        self.few_ticks()
+
+    def _add_colour_bar(self, picture: Any, label: str, extend: str) -> None:
+        room = self.axes.inset_axes((1 + 0.08 / self.grid.width, 0, 0.12 / self.grid.width, 1))
+        bar = self.axes.figure.colorbar(picture, cax=room, extend=extend)
+        bar.set_label(label)
+        bar.outline.set_linewidth(0.7)
+
+
+def _extend(plane: FloatArray, limits: tuple[float, float]) -> str:
+    below, above = bool(plane.min() < limits[0]), bool(plane.max() > limits[1])
+    if below and above:
+        return "both"
+    return "min" if below else "max" if above else "neither"
