@@ -2,21 +2,15 @@
 
 - solve one system, or several with the same matrix: `LaplacianSolver`
 
-A graph Laplacian is a network of conductors. Sites that are tied strongly together have
-nearly the same potential, so two rounds of pairing make groups of about four, and the
-coarse network has one node per group and the sums of the conductances between groups:
-again a graph Laplacian, again planar. One Gauss–Seidel sweep before and its mirror image
-after each visit of the coarse network smooth the error. Constants on groups interpolate
+Flexible conjugate gradients, preconditioned by one cycle over the levels of
+`napari_shadowinv.transport._coarsening`. One Gauss–Seidel sweep before and its mirror image
+after each visit of the next level smooth the error. Constants on groups of nodes interpolate
 poorly; two steps of conjugate gradients at every coarse level (the K-cycle) make up for
 it, and the number of iterations hardly depends on the number of sites.
 
-All levels are stored as one network whose nodes are numbered level after level, so each
-kernel works on a range of nodes and vectors of all levels are single arrays.
-
 References
 ----------
-Y. Notay, Electron. Trans. Numer. Anal. 37, 123 (2010); A. Napov and Y. Notay, SIAM J.
-Sci. Comput. 34, A1079 (2012).
+Y. Notay, Electron. Trans. Numer. Anal. 37, 123 (2010).
 """
 
 from __future__ import annotations
@@ -27,30 +21,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from napari_shadowinv.geometry._threads import in_ranges
+from napari_shadowinv.transport._coarsening import Hierarchy, Network, build_hierarchy
 
 __all__ = ["LaplacianSolver"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int32]
-Offsets = NDArray[np.int64]
 
-_COARSEST = 60
-_GOOD_ENOUGH = 0.25
 _WORTH_A_THREAD = 100_000
-
-
-class _Network(NamedTuple):
-    """Conductors as rows of (neighbour, conductance), those to lower nodes first."""
-
-    starts: Indices
-    middles: Indices
-    neighbors: Indices
-    conductances: Array
-    degrees: Array
-    inverse_degrees: Array
 
 
 class _Vectors(NamedTuple):
@@ -63,160 +43,8 @@ class _Vectors(NamedTuple):
     direction_product: Array
 
 
-def _empty_network(nodes: int, entries: int) -> _Network:
-    return _Network(
-        np.zeros(nodes + 1, np.int32),
-        np.empty(nodes, np.int32),
-        np.empty(entries, np.int32),
-        np.empty(entries),
-        np.empty(nodes),
-        np.empty(nodes),
-    )
-
-
 @njit(nogil=True, cache=True)
-def _put_lower_first(network: _Network, node: int, end: int) -> None:
-    """Close a node's row at `end`: sort its entries to lower and upper, sum them."""
-    neighbors = network.neighbors
-    conductances = network.conductances
-    begin = network.starts[node]
-    middle = begin
-    degree = 0.0
-    for k in range(begin, end):
-        neighbor = neighbors[k]
-        conductance = conductances[k]
-        degree += conductance
-        neighbors[k] = neighbors[middle]
-        conductances[k] = conductances[middle]
-        neighbors[middle] = neighbor
-        conductances[middle] = conductance
-        middle += 1 if neighbor < node else 0
-    network.middles[node] = middle
-    network.degrees[node] = degree
-    network.inverse_degrees[node] = 1.0 / degree if degree > 0.0 else 0.0
-    network.starts[node + 1] = end
-
-
-@njit(nogil=True, cache=True)
-def _read_laplacian(starts: Indices, columns: Indices, values: Array, network: _Network) -> None:
-    """Take the conductors out of a sparse matrix, in any order of columns."""
-    end = np.int64(0)
-    for i in range(starts.shape[0] - 1):
-        for k in range(starts[i], starts[i + 1]):
-            if columns[k] != i and values[k] < 0.0:
-                network.neighbors[end] = columns[k]
-                network.conductances[end] = -values[k]
-                end += 1
-        _put_lower_first(network, i, end)
-
-
-@njit(nogil=True, cache=True)
-def _closest(network: _Network, node: int, groups: Indices, free: bool) -> int:
-    """Find the neighbour, free or grouped, that is tied most strongly to a node, or -1.
-
-    A pair's quality is its conductance relative to the harmonic mean of the two degrees
-    (Napov and Notay, Eq. 3.6, for rows that sum to zero).
-    """
-    inverses = network.inverse_degrees
-    best = -1
-    highest = 0.0
-    for k in range(network.starts[node], network.starts[node + 1]):
-        other = network.neighbors[k]
-        if (groups[other] < 0) == free:
-            tie = network.conductances[k] * (inverses[node] + inverses[other])
-            if tie > highest:
-                highest = tie
-                best = other
-    return best
-
-
-@njit(nogil=True, cache=True)
-def _pair(network: _Network, start: int, stop: int, groups: Indices, first: int) -> int:
-    """Group each node with a free neighbour, or with a pair; groups count from `first`.
-
-    Returns the number after the last group, or -1 if a node has no neighbour at all.
-    """
-    for i in range(start, stop):
-        groups[i] = -1
-    count = first
-    for i in range(start, stop):
-        if groups[i] >= 0:
-            continue
-        partner = _closest(network, i, groups, True)
-        if partner >= 0:
-            groups[i] = count
-            groups[partner] = count
-            count += 1
-        else:
-            partner = _closest(network, i, groups, False)
-            if partner < 0:
-                return -1
-            groups[i] = groups[partner]
-    return count
-
-
-@njit(nogil=True, cache=True)
-def _list_members(
-    start: int, stop: int, groups: Indices, first: int, last: int
-) -> tuple[Indices, Indices]:
-    """Sort the nodes by group: the places where each group begins, and the nodes."""
-    begins = np.zeros(last - first + 1, np.int32)
-    for i in range(start, stop):
-        begins[groups[i] - first + 1] += 1
-    for g in range(last - first):
-        begins[g + 1] += begins[g]
-    filled = begins[:-1].copy()
-    members = np.empty(stop - start, np.int32)
-    for i in range(start, stop):
-        g = groups[i] - first
-        members[filled[g]] = i
-        filled[g] += 1
-    return begins, members
-
-
-@njit(nogil=True, cache=True)
-def _contract(
-    fine: _Network,
-    start: int,
-    stop: int,
-    groups: Indices,
-    coarse: _Network,
-    first: int,
-    last: int,
-) -> None:
-    """Make each group one node, with the sums of the conductances between groups."""
-    begins, members = _list_members(start, stop, groups, first, last)
-    neighbors = coarse.neighbors
-    conductances = coarse.conductances
-    place = np.full(last - first, -1, np.int32)
-    for g in range(first, last):
-        begin = end = coarse.starts[g]
-        for m in range(begins[g - first], begins[g - first + 1]):
-            node = members[m]
-            for k in range(fine.starts[node], fine.starts[node + 1]):
-                other = groups[fine.neighbors[k]]
-                if other == g:
-                    continue
-                at = place[other - first]
-                if at < begin:
-                    place[other - first] = end
-                    neighbors[end] = other
-                    conductances[end] = fine.conductances[k]
-                    end += 1
-                else:
-                    conductances[at] += fine.conductances[k]
-        _put_lower_first(coarse, g, end)
-
-
-@njit(nogil=True, cache=True)
-def _compose(start: int, stop: int, groups: Indices, parents: Indices) -> None:
-    """Replace each node's group by that group's parent."""
-    for i in range(start, stop):
-        groups[i] = parents[groups[i]]
-
-
-@njit(nogil=True, cache=True)
-def _multiply(start: int, stop: int, network: _Network, x: Array, product: Array) -> None:
+def _multiply(start: int, stop: int, network: Network, x: Array, product: Array) -> None:
     """Multiply by the Laplacian."""
     for i in range(start, stop):
         total = network.degrees[i] * x[i]
@@ -227,7 +55,7 @@ def _multiply(start: int, stop: int, network: _Network, x: Array, product: Array
 
 @njit(nogil=True, cache=True)
 def _descend(
-    start: int, stop: int, end: int, network: _Network, parents: Indices, vectors: _Vectors
+    start: int, stop: int, end: int, network: Network, parents: Indices, vectors: _Vectors
 ) -> None:
     """Sweep forward from zero and hand what is left to the next level, up to `end`.
 
@@ -249,7 +77,7 @@ def _descend(
 
 
 @njit(nogil=True, cache=True)
-def _ascend(start: int, stop: int, network: _Network, parents: Indices, vectors: _Vectors) -> None:
+def _ascend(start: int, stop: int, network: Network, parents: Indices, vectors: _Vectors) -> None:
     """Add the next level's correction and sweep backward."""
     x = vectors.correction
     for i in range(start, stop):
@@ -281,91 +109,82 @@ def _dot(start: int, stop: int, a: Array, b: Array) -> float:
 
 
 @njit(nogil=True, cache=True)
-def _first_step(
-    start: int, stop: int, network: _Network, vectors: _Vectors
-) -> tuple[bool, float, float]:
-    """Minimise along the level's first correction.
-
-    Returns whether that is good enough (then `correction` is final), the direction's energy
-    and the length of the step.
-    """
+def _first_step(start: int, stop: int, network: Network, vectors: _Vectors) -> tuple[float, float]:
+    """Minimise along the level's first correction; return its energy and the step's length."""
     residual = vectors.residual
     x = vectors.correction
     _multiply(start, stop, network, x, vectors.direction_product)
     energy = _dot(start, stop, x, vectors.direction_product)
     if not energy > 0.0:
-        return True, 0.0, 0.0
-    before = _dot(start, stop, residual, residual)
+        energy = 1.0
     length = _dot(start, stop, x, residual) / energy
     for i in range(start, stop):
         residual[i] -= length * vectors.direction_product[i]
         vectors.direction[i] = x[i]
-    if _dot(start, stop, residual, residual) > _GOOD_ENOUGH**2 * before:
-        return False, energy, length
-    for i in range(start, stop):
-        x[i] *= length
-    return True, energy, length
+    return energy, length
 
 
 @njit(nogil=True, cache=True)
 def _second_step(
-    start: int, stop: int, network: _Network, vectors: _Vectors, energy: float, length: float
+    start: int, stop: int, network: Network, vectors: _Vectors, energy: float, length: float
 ) -> None:
     """Minimise over the plane of the level's first and second corrections."""
     x = vectors.correction
     _multiply(start, stop, network, x, vectors.product)
-    mixed = _dot(start, stop, x, vectors.direction_product)
-    second_energy = _dot(start, stop, x, vectors.product) - mixed * mixed / energy
+    mixed = _dot(start, stop, x, vectors.direction_product) / energy
+    second_energy = _dot(start, stop, x, vectors.product) - mixed * mixed * energy
     second = 0.0
     if second_energy > 0.0:
         second = _dot(start, stop, x, vectors.residual) / second_energy
-    first = length - second * mixed / energy
+    first = length - second * mixed
     for i in range(start, stop):
         x[i] = first * vectors.direction[i] + second * x[i]
 
 
 @njit(nogil=True, cache=True)
-def _cycle(
-    bounds: Offsets, network: _Network, parents: Indices, inverse: Array, vectors: _Vectors
-) -> None:
+def _cycle(hierarchy: Hierarchy, vectors: _Vectors) -> None:
     """Turn the residual of level 0 into its correction by one K-cycle.
 
-    The levels are walked with a stack of what the first step of each has found, because
-    a cached kernel cannot call itself.
+    What the first step of each level has found waits in arrays, because a cached kernel
+    must not call itself.
     """
+    bounds, twice, network, parents, inverse = hierarchy
     deepest = bounds.shape[0] - 2
     energies = np.zeros(deepest + 1)
     lengths = np.zeros(deepest + 1)
-    returning = np.zeros(deepest + 1, np.bool_)
+    halfway = np.zeros(deepest + 1, np.bool_)
     level = 0
     while True:
         while level < deepest:
-            _descend(bounds[level], bounds[level + 1], bounds[level + 2], network, parents, vectors)
+            start, stop, end = bounds[level], bounds[level + 1], bounds[level + 2]
+            _descend(start, stop, end, network, parents, vectors)
             level += 1
-            returning[level] = False
         _solve_coarsest(bounds[level], bounds[level + 1], inverse, vectors)
-        done = True
-        while done and level > 0:
+        again = False
+        while level > 0 and not again:
             level -= 1
-            start = bounds[level]
-            stop = bounds[level + 1]
+            start, stop = bounds[level], bounds[level + 1]
             _ascend(start, stop, network, parents, vectors)
-            if level == 0:
-                return
-            if returning[level]:
+            if twice[level] and halfway[level]:
                 _second_step(start, stop, network, vectors, energies[level], lengths[level])
-            else:
-                done, energies[level], lengths[level] = _first_step(start, stop, network, vectors)
-                returning[level] = True
-        if done:
+                halfway[level] = False
+            elif twice[level]:
+                energies[level], lengths[level] = _first_step(start, stop, network, vectors)
+                halfway[level] = again = True
+        if not again:
             return
 
 
 @njit(nogil=True, cache=True)
 def _turn(n: int, share: float, vectors: _Vectors) -> None:
     """Make the next direction from the correction and a share of the last direction."""
+    total = 0.0
     for i in range(n):
-        vectors.direction[i] = vectors.correction[i] - share * vectors.direction[i]
+        total += vectors.correction[i]
+    # the Laplacian forgets a constant only up to rounding
+    mean = total / n
+    for i in range(n):
+        vectors.direction[i] = vectors.correction[i] - mean - share * vectors.direction[i]
 
 
 @njit(nogil=True, cache=True)
@@ -373,63 +192,6 @@ def _advance(n: int, length: float, solution: Array, vectors: _Vectors) -> None:
     for i in range(n):
         solution[i] += length * vectors.direction[i]
         vectors.residual[i] -= length * vectors.direction_product[i]
-
-
-def _add_level(network: _Network, parents: Indices, start: int, stop: int) -> tuple[_Network, int]:
-    """Pair the nodes of the last level, pair the pairs, append what results.
-
-    Returns the network, which may have moved to make room, and its new number of nodes.
-    """
-    pairs = _empty_network((stop - start) // 2 + 1, network.starts[stop] - network.starts[start])
-    count = _pair(network, start, stop, parents, 0)
-    if count < 0:
-        raise _not_connected()
-    _contract(network, start, stop, parents, pairs, 0, count)
-    groups = np.empty(count, np.int32)
-    last = _pair(pairs, 0, count, groups, stop)
-    if last < 0:
-        raise _not_connected()
-    network = _with_room(network, network.starts[stop] + pairs.starts[count])
-    _contract(pairs, 0, count, groups, network, stop, last)
-    _compose(start, stop, parents, groups)
-    return network, last
-
-
-def _with_room(network: _Network, entries: int) -> _Network:
-    """Make room for that many entries; a planar network comes with enough."""
-    missing = entries - len(network.neighbors)
-    if missing <= 0:
-        return network
-    return network._replace(
-        neighbors=np.concatenate([network.neighbors, np.empty(missing, np.int32)]),
-        conductances=np.concatenate([network.conductances, np.empty(missing)]),
-    )
-
-
-def _not_connected() -> RuntimeError:
-    return RuntimeError(
-        "the cells form several groups with no flux between them: "
-        "the weights of one group relative to another are not determined"
-    )
-
-
-def _invert_coarsest(network: _Network, start: int, stop: int) -> Array:
-    """Invert the last level's Laplacian, with constants made regular."""
-    entries = slice(network.starts[start], network.starts[stop])
-    graph = csr_array(
-        (
-            network.conductances[entries],
-            network.neighbors[entries] - start,
-            network.starts[start : stop + 1] - network.starts[start],
-        ),
-        shape=(stop - start, stop - start),
-    )
-    if connected_components(graph, directed=False, return_labels=False) > 1:
-        raise _not_connected()
-    degrees = network.degrees[start:stop]
-    regular = np.diag(degrees) - graph.toarray() + (degrees.mean() or 1.0) / (stop - start)
-    inverse: Array = np.linalg.inv(regular)
-    return inverse
 
 
 class LaplacianSolver:
@@ -460,26 +222,11 @@ class LaplacianSolver:
     """
 
     def __init__(self, laplacian: csr_array, *, threads: int = 1) -> None:
-        n = int(laplacian.shape[0])
-        network = _empty_network(2 * n, 2 * int(laplacian.nnz))
-        parents: Indices = np.empty(2 * n, np.int32)
-        _read_laplacian(
-            laplacian.indptr.astype(np.int32, copy=False),
-            laplacian.indices.astype(np.int32, copy=False),
-            laplacian.data.astype(np.float64, copy=False),
-            network,
-        )
-        bounds = [0, n]
-        while bounds[-1] - bounds[-2] > _COARSEST:
-            network, stop = _add_level(network, parents, bounds[-2], bounds[-1])
-            bounds.append(stop)
-        self._n = n
+        self._n = int(laplacian.shape[0])
         self._threads = threads
-        self._network = network
-        self._parents = parents
-        self._inverse = _invert_coarsest(network, bounds[-2], bounds[-1])
-        self._bounds: Offsets = np.array(bounds, np.int64)
-        self._vectors = _Vectors(*(np.zeros(bounds[-1]) for _ in _Vectors._fields))
+        self._hierarchy = build_hierarchy(laplacian)
+        nodes = int(self._hierarchy.bounds[-1])
+        self._vectors = _Vectors(*(np.zeros(nodes) for _ in _Vectors._fields))
 
     def solve(
         self, right: Array, tolerance: float = 1e-2, max_iterations: int = 200
@@ -530,7 +277,7 @@ class LaplacianSolver:
         """Do one step of flexible conjugate gradients; return its direction's energy."""
         n = self._n
         vectors = self._vectors
-        _cycle(self._bounds, self._network, self._parents, self._inverse, vectors)
+        _cycle(self._hierarchy, vectors)
         share = _dot(0, n, vectors.correction, vectors.direction_product) / energy
         _turn(n, share, vectors)
         self._multiply(vectors.direction, vectors.direction_product)
@@ -551,7 +298,7 @@ class LaplacianSolver:
             _multiply,
             self._n,
             self._threads,
-            self._network,
+            self._hierarchy.network,
             x,
             product,
             smallest=_WORTH_A_THREAD,

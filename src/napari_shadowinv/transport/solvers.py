@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import minimize
 
+from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.options import InversionOptions
@@ -102,7 +103,13 @@ def newton(
         if report is not None:
             report("transport", iterations, None, f"{len(mass):,} sites, residual {residual:.2g}")
         gap = mass - diagram.masses
-        step = solve_laplacian(diagram.laplacian(), gap, _LINEAR_TOLERANCE)
+        try:
+            step = solve_laplacian(
+                diagram.laplacian(), gap, _LINEAR_TOLERANCE, available_threads(objective.threads)
+            )
+        except RuntimeError as error:
+            reason = f"Newton's system cannot be solved: {error}"
+            break
         damped = _damped_step(
             objective, weights, step, float(np.linalg.norm(gap)), keep * mass.mean()
         )

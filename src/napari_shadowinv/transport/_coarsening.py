@@ -1,0 +1,344 @@
+"""Levels of a conductor network: groups of strongly tied nodes become single nodes.
+
+- all levels for a graph Laplacian: `build_hierarchy`
+- refuse a graph in several pieces: `require_connected`
+
+Nodes that are tied strongly have nearly the same potential, so two rounds of pairing make
+groups of about four, and the coarse network has one node per group and the sums of the
+conductances between groups: again a graph Laplacian, again planar.
+
+All levels are stored as one network whose nodes are numbered level after level, so each
+kernel works on a range of nodes and the vectors of all levels are single arrays.
+
+References
+----------
+Y. Notay, Electron. Trans. Numer. Anal. 37, 123 (2010); A. Napov and Y. Notay, SIAM J.
+Sci. Comput. 34, A1079 (2012).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+__all__ = ["Hierarchy", "Network", "build_hierarchy", "require_connected"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int32]
+Offsets = NDArray[np.int64]
+
+_COARSEST = 60
+_WEAKEST_TIE = 0.2
+_FEW_PAIRS = 0.75
+_NOT_CONNECTED = (
+    "the cells form several groups with no flux between them: "
+    "the weights of one group relative to another are not determined"
+)
+
+
+class Network(NamedTuple):
+    """Conductors as rows of (neighbour, conductance), those to lower nodes first."""
+
+    starts: Indices
+    middles: Indices
+    neighbors: Indices
+    conductances: Array
+    degrees: Array
+    inverse_degrees: Array
+
+
+class Hierarchy(NamedTuple):
+    """All that one cycle needs: the nodes of level k are `bounds[k]` to `bounds[k + 1]`."""
+
+    bounds: Offsets
+    twice: NDArray[np.bool_]
+    network: Network
+    parents: Indices
+    inverse: Array
+
+
+def _empty_network(nodes: int, entries: int) -> Network:
+    return Network(
+        np.zeros(nodes + 1, np.int32),
+        np.empty(nodes, np.int32),
+        np.empty(entries, np.int32),
+        np.empty(entries),
+        np.empty(nodes),
+        np.empty(nodes),
+    )
+
+
+@njit(nogil=True, cache=True)
+def _put_lower_first(
+    neighbors: Indices, conductances: Array, begin: int, end: int, node: int
+) -> tuple[int, float]:
+    """Sort a row to lower and upper neighbours; return where the upper begin, and the sum."""
+    middle = begin
+    degree = 0.0
+    for k in range(begin, end):
+        neighbor = neighbors[k]
+        conductance = conductances[k]
+        degree += conductance
+        neighbors[k] = neighbors[middle]
+        conductances[k] = conductances[middle]
+        neighbors[middle] = neighbor
+        conductances[middle] = conductance
+        middle += 1 if neighbor < node else 0
+    return middle, degree
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _read_laplacian(starts: Indices, columns: Indices, values: Array, network: Network) -> None:
+    """Take the conductors out of a sparse matrix, in any order of columns."""
+    neighbors = network.neighbors
+    conductances = network.conductances
+    end = 0
+    for i in range(starts.shape[0] - 1):
+        begin = end
+        for k in range(starts[i], starts[i + 1]):
+            if columns[k] != i and values[k] < 0.0:
+                neighbors[end] = columns[k]
+                conductances[end] = -values[k]
+                end += 1
+        network.starts[i + 1] = end
+        middle, degree = _put_lower_first(neighbors, conductances, begin, end, i)
+        network.middles[i] = middle
+        network.degrees[i] = degree
+        network.inverse_degrees[i] = 1.0 / degree
+
+
+@njit(nogil=True, cache=True)
+def _pair(
+    network: Network,
+    start: int,
+    stop: int,
+    weakest: float,
+    inverses: Array,
+    groups: Indices,
+    first: int,
+    group_inverses: Array,
+) -> int:
+    """Group each node with a free neighbour, or with a group; groups count from `first`.
+
+    A tie is a conductance times the sum of the inverses of the two sides' degrees, where a
+    group's degree is the sum over the nodes of the level it stands for (Napov and Notay,
+    Eq. 3.6, for rows that sum to zero). The inverses are given for the nodes and found for
+    the groups. Nodes without a tie of at least `weakest` stay alone: where both sides are
+    held much more strongly by others, the sweeps do not smooth an error that differs between
+    them. Returns the number after the last group.
+    """
+    # the attributes are looked up once because each look-up counts references
+    starts, _, neighbors, conductances, _, _ = network
+    for i in range(start, stop):
+        groups[i] = -1
+    count = first
+    for i in range(start, stop):
+        if groups[i] >= 0:
+            continue
+        free = taken = -1
+        free_tie = taken_tie = weakest
+        for k in range(starts[i], starts[i + 1]):
+            other = neighbors[k]
+            group = groups[other]
+            if group < 0:
+                tie = conductances[k] * (inverses[i] + inverses[other])
+                if tie > free_tie:
+                    free_tie = tie
+                    free = other
+            else:
+                tie = conductances[k] * (inverses[i] + group_inverses[group - first])
+                if tie > taken_tie:
+                    taken_tie = tie
+                    taken = group
+        if free >= 0:
+            groups[i] = groups[free] = count
+            group_inverses[count - first] = _of_sum(inverses[i], inverses[free])
+            count += 1
+        elif taken >= 0:
+            groups[i] = taken
+            group_inverses[taken - first] = _of_sum(inverses[i], group_inverses[taken - first])
+        else:
+            groups[i] = count
+            group_inverses[count - first] = inverses[i]
+            count += 1
+    return count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _of_sum(a: float, b: float) -> float:
+    """Return the inverse of the sum of two numbers, all given by their inverses."""
+    return a * b / (a + b)
+
+
+@njit(nogil=True, cache=True)
+def _list_members(
+    start: int, stop: int, groups: Indices, first: int, last: int
+) -> tuple[Indices, Indices]:
+    """Sort the nodes by group: the places where each group begins, and the nodes."""
+    begins = np.zeros(last - first + 1, np.int32)
+    for i in range(start, stop):
+        begins[groups[i] - first + 1] += 1
+    for g in range(last - first):
+        begins[g + 1] += begins[g]
+    filled = begins[:-1].copy()
+    members = np.empty(stop - start, np.int32)
+    for i in range(start, stop):
+        g = groups[i] - first
+        members[filled[g]] = i
+        filled[g] += 1
+    return begins, members
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _contract(
+    fine: Network,
+    start: int,
+    stop: int,
+    groups: Indices,
+    coarse: Network,
+    first: int,
+    last: int,
+) -> None:
+    """Make each group one node, with the sums of the conductances between groups."""
+    begins, members = _list_members(start, stop, groups, first, last)
+    starts, _, neighbors, conductances, _, _ = fine
+    coarse_neighbors = coarse.neighbors
+    coarse_conductances = coarse.conductances
+    place = np.full(last - first, -1, np.int32)
+    end = int(coarse.starts[first])
+    for g in range(first, last):
+        begin = end
+        for m in range(begins[g - first], begins[g - first + 1]):
+            node = members[m]
+            for k in range(starts[node], starts[node + 1]):
+                other = groups[neighbors[k]]
+                if other == g:
+                    continue
+                at = place[other - first]
+                if at < begin:
+                    place[other - first] = end
+                    coarse_neighbors[end] = other
+                    coarse_conductances[end] = conductances[k]
+                    end += 1
+                else:
+                    coarse_conductances[at] += conductances[k]
+        coarse.starts[g + 1] = end
+        middle, degree = _put_lower_first(coarse_neighbors, coarse_conductances, begin, end, g)
+        coarse.middles[g] = middle
+        coarse.degrees[g] = degree
+        coarse.inverse_degrees[g] = 1.0 / degree
+
+
+@njit(nogil=True, cache=True)
+def _compose(start: int, stop: int, groups: Indices, parents: Indices) -> None:
+    """Replace each node's group by that group's parent."""
+    for i in range(start, stop):
+        groups[i] = parents[groups[i]]
+
+
+def build_hierarchy(laplacian: csr_array) -> Hierarchy:
+    """Group nodes, and groups of nodes, until few are left.
+
+    Raises
+    ------
+    RuntimeError
+        The graph is not connected or a conductance is not finite.
+    """
+    n = int(laplacian.shape[0])
+    # every level has at most three quarters of the nodes of the last, so 4 n are enough;
+    # pages that are never touched take no memory
+    network = _empty_network(4 * n + _COARSEST, 2 * int(laplacian.nnz))
+    parents: Indices = np.empty(4 * n + _COARSEST, np.int32)
+    _read_laplacian(
+        laplacian.indptr.astype(np.int32, copy=False),
+        laplacian.indices.astype(np.int32, copy=False),
+        laplacian.data.astype(np.float64, copy=False),
+        network,
+    )
+    bounds = [0, n]
+    while bounds[-1] - bounds[-2] > _COARSEST:
+        network, last = _add_level(network, parents, bounds[-2], bounds[-1])
+        bounds.append(last)
+    return Hierarchy(
+        np.array(bounds, np.int64),
+        _choose_second_steps(network, bounds),
+        network,
+        parents,
+        _invert_coarsest(network, bounds[-2], bounds[-1]),
+    )
+
+
+def _add_level(network: Network, parents: Indices, start: int, stop: int) -> tuple[Network, int]:
+    """Pair the nodes of the last level, pair the pairs, append what results.
+
+    Returns the network, which may have moved to make room, and its new number of nodes.
+    """
+    if stop - start > 1 and not network.degrees[start:stop].min() > 0.0:
+        raise RuntimeError(_NOT_CONNECTED)
+    inverses = np.empty(stop - start)
+    for weakest in (_WEAKEST_TIE, 0.0):
+        count = _pair(network, start, stop, weakest, network.inverse_degrees, parents, 0, inverses)
+        if count <= _FEW_PAIRS * (stop - start):
+            break
+    else:
+        raise RuntimeError("the fluxes between cells are not finite, or smaller than numbers go")
+    pairs = _empty_network(count, network.starts[stop] - network.starts[start])
+    _contract(network, start, stop, parents, pairs, 0, count)
+    groups = np.empty(count, np.int32)
+    last = _pair(pairs, 0, count, _WEAKEST_TIE, inverses, groups, stop, np.empty(count))
+    network = _with_room(network, network.starts[stop] + pairs.starts[count])
+    _contract(pairs, 0, count, groups, network, stop, last)
+    _compose(start, stop, parents, groups)
+    return network, last
+
+
+def _with_room(network: Network, entries: int) -> Network:
+    """Make room for that many entries; a planar network comes with enough."""
+    missing = entries - len(network.neighbors)
+    if missing <= 0:
+        return network
+    return network._replace(
+        neighbors=np.concatenate([network.neighbors, np.empty(missing, np.int32)]),
+        conductances=np.concatenate([network.conductances, np.empty(missing)]),
+    )
+
+
+def _choose_second_steps(network: Network, bounds: list[int]) -> NDArray[np.bool_]:
+    """Tell at which levels a cycle does two steps: where all visits cost less than level 0."""
+    entries = np.diff(network.starts[bounds])
+    twice = np.zeros(len(entries), np.bool_)
+    visits = 2
+    for level in range(1, len(entries) - 1):
+        if visits * entries[level] <= entries[0]:
+            twice[level] = True
+            visits *= 2
+    return twice
+
+
+def _invert_coarsest(network: Network, start: int, stop: int) -> Array:
+    """Invert the last level's Laplacian, with constants made regular."""
+    entries = slice(network.starts[start], network.starts[stop])
+    graph = csr_array(
+        (
+            network.conductances[entries],
+            network.neighbors[entries] - start,
+            network.starts[start : stop + 1] - network.starts[start],
+        ),
+        shape=(stop - start, stop - start),
+    )
+    require_connected(graph)
+    degrees = network.degrees[start:stop]
+    regular = np.diag(degrees) - graph.toarray() + (degrees.mean() or 1.0) / (stop - start)
+    inverse: Array = np.linalg.inv(regular)
+    return inverse
+
+
+def require_connected(graph: csr_array) -> None:
+    """Raise a RuntimeError if a symmetric matrix falls into several blocks."""
+    if connected_components(graph, directed=False, return_labels=False) > 1:
+        raise RuntimeError(_NOT_CONNECTED)

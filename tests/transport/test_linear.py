@@ -1,0 +1,269 @@
+"""What a solution of Newton's systems must satisfy, for easy and for nasty networks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.linalg import splu
+from scipy.spatial import Delaunay
+
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
+from napari_shadowinv.transport import linear
+from napari_shadowinv.transport._multigrid import LaplacianSolver
+from napari_shadowinv.transport.linear import solve_laplacian
+
+Array = NDArray[np.float64]
+Edges = NDArray[np.int64]
+
+
+def laplacian_of(edges: Edges, conductances: Array, n: int) -> csr_array:
+    a, b = edges.T
+    both = coo_array(
+        (np.tile(conductances, 2), (np.append(a, b), np.append(b, a))), shape=(n, n)
+    ).tocsr()
+    return csr_array(diags_array(both.sum(axis=1)) - both)
+
+
+def delaunay_edges(n: int, seed: int = 0) -> tuple[Array, Edges]:
+    points = np.random.default_rng(seed).random((n, 2))
+    points = points[hilbert_order(points)]
+    corners = Delaunay(points).simplices
+    pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [0, 2]]])
+    return points, np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def grid_edges(height: int, width: int) -> Edges:
+    node = np.arange(height * width).reshape(height, width)
+    across = np.stack([node[:, :-1].ravel(), node[:, 1:].ravel()], axis=1)
+    down = np.stack([node[:-1].ravel(), node[1:].ravel()], axis=1)
+    return np.concatenate([across, down])
+
+
+def unit_delaunay(n: int) -> csr_array:
+    _, edges = delaunay_edges(n)
+    return laplacian_of(edges, np.ones(len(edges)), n)
+
+
+def independent_contrast(n: int) -> csr_array:
+    _, edges = delaunay_edges(n)
+    exponents = np.random.default_rng(1).uniform(-4, 4, len(edges))
+    return laplacian_of(edges, 10**exponents, n)
+
+
+def conducting_islands(n: int) -> csr_array:
+    _, edges = delaunay_edges(n)
+    exponent = np.where(np.random.default_rng(2).random(n) < 0.3, 4.0, -4.0)
+    return laplacian_of(edges, 10 ** exponent[edges].min(axis=1), n)
+
+
+def smooth_contrast(n: int) -> csr_array:
+    points, edges = delaunay_edges(n)
+    middle = points[edges].mean(axis=1)
+    exponents = 4 * np.sin(9 * middle[:, 0]) * np.cos(7 * middle[:, 1])
+    return laplacian_of(edges, 10**exponents, n)
+
+
+def grid(n: int, anisotropy: float = 1.0) -> csr_array:
+    side = round(np.sqrt(n))
+    edges = grid_edges(side, side)
+    across = edges[:, 1] - edges[:, 0] == 1
+    return laplacian_of(edges, np.where(across, anisotropy, 1.0), side * side)
+
+
+def path(n: int) -> csr_array:
+    nodes = np.arange(n)
+    return laplacian_of(np.stack([nodes[:-1], nodes[1:]], axis=1), np.ones(n - 1), n)
+
+
+def star(n: int) -> csr_array:
+    leaves = np.arange(1, n)
+    return laplacian_of(np.stack([np.zeros_like(leaves), leaves], axis=1), np.ones(n - 1), n)
+
+
+def tangle(n: int) -> csr_array:
+    edges = np.random.default_rng(3).integers(0, n, (10 * n, 2))
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    return laplacian_of(edges, np.ones(len(edges)), n)
+
+
+def noise(n: int, seed: int = 4) -> Array:
+    values = np.random.default_rng(seed).standard_normal(n)
+    return np.asarray(values - values.mean())
+
+
+def residual(laplacian: csr_array, solution: Array, right: Array) -> float:
+    return float(np.linalg.norm(right - laplacian @ solution) / np.linalg.norm(right))
+
+
+NETWORKS = {
+    "Delaunay": lambda: unit_delaunay(20_000),
+    "independent contrast 1e8": lambda: independent_contrast(20_000),
+    "islands 1e8": lambda: conducting_islands(20_000),
+    "smooth contrast 1e8": lambda: smooth_contrast(20_000),
+    "grid": lambda: grid(20_000),
+    "grid, 1000 times more along x": lambda: grid(20_000, 1000.0),
+    "path": lambda: path(20_000),
+    "star": lambda: star(20_000),
+    "not planar": lambda: tangle(3_000),
+}
+
+
+@given(n=st.integers(4, 700), seed=st.integers(0, 1000), decades=st.floats(0, 3))
+@settings(max_examples=30, deadline=None)
+def test_small_systems_have_the_pseudoinverse_solution(n: int, seed: int, decades: float) -> None:
+    _, edges = delaunay_edges(n, seed)
+    exponents = np.random.default_rng(seed).uniform(-decades, decades, len(edges)) / 2
+    laplacian = laplacian_of(edges, 10**exponents, n)
+    right = noise(n, seed)
+    expected = np.linalg.pinv(laplacian.toarray(), rcond=1e-12, hermitian=True) @ right
+    for solution in (
+        solve_laplacian(laplacian, right, 1e-12),
+        LaplacianSolver(laplacian).solve(right, 1e-12)[0],
+    ):
+        assert np.abs(solution - expected).max() < 1e-7 * np.abs(expected).max()
+
+
+def test_larger_systems_have_the_factorised_solution() -> None:
+    laplacian = smooth_contrast(5000)
+    right = noise(5000)
+    expected = np.append(0.0, splu(laplacian[1:, 1:].tocsc()).solve(right[1:]))
+    expected -= expected.mean()
+    solution = solve_laplacian(laplacian, right, 1e-10)
+    assert np.abs(solution - expected).max() < 1e-6 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_tolerance_is_honoured_in_few_iterations(name: str) -> None:
+    laplacian = NETWORKS[name]()
+    right = noise(laplacian.shape[0])
+    solution, iterations, reported = LaplacianSolver(laplacian).solve(right, 1e-2)
+    assert iterations <= 30
+    assert reported <= 1e-2
+    assert residual(laplacian, solution, right) <= 1e-2
+    assert abs(solution.mean()) < 1e-12 * np.abs(solution).max()
+
+
+def test_newton_systems_of_a_noisy_caustic_are_solved() -> None:
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[-1:1:100j, -1:1:100j]
+    ring = np.exp(-(((np.hypot(y, x) - 0.5) / 0.02) ** 2))
+    image = np.maximum(0.2 + 10 * ring + rng.normal(0, 0.2, ring.shape), 1e-3)
+    sites = rng.uniform(-0.5, 99.5, (20_000, 2))
+    sites = sites[hilbert_order(sites)]
+    diagram = PowerDiagram(RegularTriangulation(sites), Density.from_image(image))
+    gap = diagram.masses.mean() - diagram.masses
+    solution, iterations, _ = LaplacianSolver(diagram.laplacian()).solve(gap, 1e-2)
+    assert iterations <= 30
+    assert residual(diagram.laplacian(), solution, gap) <= 1e-2
+
+
+def test_iterations_hardly_grow_with_size() -> None:
+    def iterations(n: int) -> int:
+        return LaplacianSolver(unit_delaunay(n)).solve(noise(n), 1e-8)[1]
+
+    assert iterations(80_000) <= 1.6 * iterations(5_000)
+
+
+def test_solution_does_not_depend_on_threads() -> None:
+    n = 320_000
+    laplacian = grid(n, 2.0)
+    right = noise(laplacian.shape[0])
+    one = LaplacianSolver(laplacian, threads=1).solve(right)[0]
+    three = LaplacianSolver(laplacian, threads=3).solve(right)[0]
+    assert np.array_equal(one, three)
+
+
+@pytest.mark.parametrize("order", ["by column", "diagonal first", "descending"])
+def test_columns_may_come_in_any_order(order: str) -> None:
+    laplacian = unit_delaunay(3000)
+    rows = np.repeat(np.arange(3000), np.diff(laplacian.indptr))
+    key = {
+        "by column": laplacian.indices,
+        "diagonal first": np.where(laplacian.indices == rows, -1, laplacian.indices),
+        "descending": -laplacian.indices,
+    }[order]
+    permutation = np.lexsort((key, rows))
+    shuffled = csr_array(
+        (laplacian.data[permutation], laplacian.indices[permutation], laplacian.indptr),
+        shape=laplacian.shape,
+    )
+    right = noise(3000)
+    solution = solve_laplacian(shuffled, right, 1e-10)
+    assert residual(laplacian, solution, right) <= 1e-10
+
+
+def test_numbering_does_not_change_the_answer() -> None:
+    laplacian = smooth_contrast(5000)
+    right = noise(5000)
+    order = np.random.default_rng(6).permutation(5000)
+    permuted = csr_array(laplacian[order][:, order])
+    solution = solve_laplacian(laplacian, right, 1e-10)
+    again = solve_laplacian(permuted, right[order], 1e-10)
+    assert np.abs(again - solution[order]).max() < 1e-6 * np.abs(solution).max()
+
+
+@pytest.mark.parametrize("n", [20, 150, 5000])
+def test_a_constant_in_the_right_side_is_ignored(n: int) -> None:
+    laplacian = unit_delaunay(n)
+    right = noise(n)
+    solution = solve_laplacian(laplacian, right, 1e-10)
+    shifted = solve_laplacian(laplacian, right + 7.0, 1e-10)
+    assert np.allclose(shifted, solution, atol=1e-6 * np.abs(solution).max())
+    assert abs(shifted.mean()) < 1e-12 * np.abs(shifted).max()
+
+
+def test_one_set_up_serves_many_right_sides() -> None:
+    laplacian = unit_delaunay(5000)
+    solver = LaplacianSolver(laplacian)
+    first = solver.solve(noise(5000, 1))[0]
+    solver.solve(noise(5000, 2))
+    assert np.array_equal(solver.solve(noise(5000, 1))[0], first)
+
+
+def test_a_zero_right_side_gives_zeros() -> None:
+    assert not solve_laplacian(unit_delaunay(1000), np.full(1000, 3.0), 1e-2).any()
+
+
+@pytest.mark.parametrize("sizes", [(10, 10), (60, 1), (2000, 1), (2000, 2000), (4000, 5)])
+def test_a_graph_in_two_pieces_is_refused(sizes: tuple[int, int]) -> None:
+    pieces = [path(size) for size in sizes]
+    n = sum(sizes)
+    whole = coo_array((n, n)).tolil()
+    whole[: sizes[0], : sizes[0]] = pieces[0]
+    whole[sizes[0] :, sizes[0] :] = pieces[1]
+    with pytest.raises(RuntimeError, match="several groups with no flux between them"):
+        solve_laplacian(csr_array(whole), noise(n), 1e-2)
+
+
+def test_many_pieces_are_refused() -> None:
+    pairs = np.arange(2000).reshape(-1, 2)
+    with pytest.raises(RuntimeError, match="several groups with no flux between them"):
+        solve_laplacian(laplacian_of(pairs, np.ones(1000), 2000), noise(2000), 1e-2)
+
+
+def test_infinite_conductances_are_refused() -> None:
+    edges = grid_edges(40, 40)
+    with pytest.raises(RuntimeError, match="not finite"):
+        LaplacianSolver(laplacian_of(edges, np.full(len(edges), np.inf), 1600))
+
+
+def test_factorisation_takes_over_where_iterations_do_not_suffice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Lazy(LaplacianSolver):
+        def solve(
+            self, right: Array, tolerance: float = 1e-2, max_iterations: int = 200
+        ) -> tuple[Array, int, float]:
+            return super().solve(right, tolerance, 1)
+
+    laplacian = smooth_contrast(5000)
+    right = noise(5000)
+    monkeypatch.setattr(linear, "LaplacianSolver", Lazy)
+    assert Lazy(laplacian).solve(right, 1e-6)[2] > 1e-6
+    assert residual(laplacian, solve_laplacian(laplacian, right, 1e-6), right) <= 1e-6
