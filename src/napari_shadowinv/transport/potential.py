@@ -94,7 +94,7 @@ def potential_surface(
     gradient = fit_gradients(level.triangulation, potential, -displacement, sweeps)
     return CloughTocher(
         mirrored.triangulation,
-        np.concatenate([potential, potential[mirrored.origin]]),
-        np.concatenate([gradient, mirrored.sense * gradient[mirrored.origin]]),
+        potential[mirrored.origin],
+        mirrored.sense * gradient[mirrored.origin],
         threads=threads,
     )

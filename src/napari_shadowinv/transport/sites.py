@@ -36,26 +36,36 @@ _MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between site
 
 @dataclass(frozen=True)
 class Mirrored:
-    """Sites and, after them, the mirror images of those near the image's border.
+    """Sites and the mirror images of those near the image's border.
 
     Attributes
     ----------
     triangulation : RegularTriangulation
         Delaunay triangulation of sites and mirror images; it covers the whole image.
-    origin, sense : ndarray
-        Where the mirror images come from; see `mirrored_across_border`.
+    origin : ndarray of int32, shape (n + k,)
+        The site that each point is, or is the mirror image of.
+    sense : ndarray of int8, shape (n + k, 2)
+        -1 for the axes along which a point was mirrored, else 1.
     """
 
     triangulation: RegularTriangulation
-    origin: NDArray[np.intp]
-    sense: Array
+    origin: NDArray[np.int32]
+    sense: NDArray[np.int8]
 
     @classmethod
     def from_sites(cls, sites: Array, shape: tuple[int, int]) -> Mirrored:
         """Mirror the sites of an image of shape (H, W)."""
         band = _MIRROR_BAND * _spacing(shape, len(sites))
         images, origin, sense = mirrored_across_border(sites, shape, band)
-        return cls(RegularTriangulation(np.concatenate([sites, images])), origin, sense)
+        points = np.concatenate([sites, images])
+        order = hilbert_order(points)
+        origins = np.concatenate([np.arange(len(sites)), origin])[order]
+        senses = np.concatenate([np.ones_like(sites), sense])[order]
+        return cls(
+            RegularTriangulation(points[order]),
+            origins.astype(np.int32),
+            senses.astype(np.int8),
+        )
 
 
 @dataclass(frozen=True)

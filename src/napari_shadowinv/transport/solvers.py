@@ -12,7 +12,9 @@ J. Eur. Math. Soc. 21, 2603 (2019) for the damped Newton method.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,19 +102,21 @@ def newton(
     iterations = 0
     reason = f"the solver used all {max_iterations} iterations allowed"
     while residual > tolerance and iterations < max_iterations:
-        if report is not None:
-            report("transport", iterations, None, f"{len(mass):,} sites, residual {residual:.2g}")
+        message = f"{len(mass):,} sites, residual {residual:.2g}"
+        alive = partial(report or Reporter(), "transport", iterations, None, message)
+        alive()
         gap = mass - diagram.masses
+        laplacian = diagram.laplacian()
+        del diagram  # the trial steps need its memory
         try:
             step = solve_laplacian(
-                diagram.laplacian(), gap, _LINEAR_TOLERANCE, available_threads(objective.threads)
+                laplacian, gap, _LINEAR_TOLERANCE, available_threads(objective.threads)
             )
         except RuntimeError as error:
             reason = f"Newton's system cannot be solved: {error}"
             break
-        damped = _damped_step(
-            objective, weights, step, float(np.linalg.norm(gap)), keep * mass.mean()
-        )
+        del laplacian
+        damped = _damped_step(objective, weights, step, gap, keep * mass.mean(), alive)
         if damped is None:
             reason = "no step along Newton's direction lowers the error without emptying a cell"
             break
@@ -126,11 +130,19 @@ def newton(
 
 
 def _damped_step(
-    objective: TransportObjective, weights: Array, step: Array, error: float, least: float
+    objective: TransportObjective,
+    weights: Array,
+    step: Array,
+    gap: Array,
+    least: float,
+    alive: Callable[[], None],
 ) -> tuple[Array, PowerDiagram] | None:
     """Halve the step until all cells keep some flux and the error falls."""
+    error = np.linalg.norm(gap)
     share = 1.0
     while share > _SHORTEST_STEP:
+        diagram = None  # one at a time: they are large
+        alive()
         trial = weights + share * step
         diagram = objective.diagram_if_full(trial)
         if diagram is not None and diagram.masses.min() > least:
