@@ -214,8 +214,10 @@ def lloyd(
         diagram = PowerDiagram(
             RegularTriangulation(sites), source, with_moments=True, threads=threads
         )
-        move = diagram.centroids - sites
-        sites = diagram.centroids
+        centroids = diagram.centroids
+        del diagram  # before the next one is made: they are large
+        move = centroids - sites
+        sites = centroids
         if report is not None:
             report(step + 1, len(sites))
         if np.sqrt((move**2).sum(axis=1).mean()) < tolerance * spacing:
@@ -282,12 +284,16 @@ def plan_levels(
 
 
 def _level(sites: Array, density: Density, steps: int, threads: int | None) -> Level:
-    triangulation = RegularTriangulation(sites)
+    # Lloyd's steps disturb the order; neighbours in the plane should be neighbours in memory
+    triangulation = RegularTriangulation(sites[hilbert_order(sites)])
+    sites = triangulation.sites
     diagram = PowerDiagram(triangulation, density, with_moments=True, threads=threads)
+    mass, centroids = diagram.masses, diagram.centroids
+    del diagram
     return Level(
         sites=sites,
-        mass=diagram.masses,
-        centroids=diagram.centroids,
+        mass=mass,
+        centroids=centroids,
         triangulation=triangulation,
         mirrored=Mirrored.from_sites(sites, density.shape),
         spacing=_spacing(density.shape, len(sites)),
