@@ -18,7 +18,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.fft import dctn, idctn
 from scipy.optimize import minimize
 
 from napari_shadowinv.geometry._threads import available_threads
@@ -260,10 +260,11 @@ def _coarsest_start(
     """Follow the solution from a blurred image to a sharp one."""
     weights = np.zeros(len(level.sites))
     for blur in _BLURS:
-        blurred = gaussian_filter(image, blur * level.spacing, mode="reflect")
-        blurred *= image.sum() / blurred.sum()
         objective = TransportObjective(
-            level.triangulation.copy(), level.mass, Density.from_image(blurred), threads=threads
+            level.triangulation.copy(),
+            level.mass,
+            Density.from_image(_blurred(image, blur * level.spacing)),
+            threads=threads,
         )
         weights = newton(
             objective,
@@ -273,6 +274,17 @@ def _coarsest_start(
             report=report,
         ).weights
     return weights
+
+
+def _blurred(image: Array, width: float) -> Array:
+    """Blur by a Gaussian, mirrored at the border, so that the flux stays."""
+    spectrum = dctn(image)
+    for axis in (0, 1):
+        waves = np.pi * np.arange(image.shape[axis]) / image.shape[axis]
+        damping = np.exp(-0.5 * (width * waves) ** 2)
+        spectrum *= np.expand_dims(damping, 1 - axis)
+    blurred: Array = idctn(spectrum)
+    return blurred
 
 
 def _prolong(
