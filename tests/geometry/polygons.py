@@ -76,6 +76,11 @@ def power_cell(
     cell = rectangle(low, high)
     lift = (sites**2).sum(axis=1) - weights
     for j in range(len(sites)):
-        if j != i and len(cell):
+        if j == i or not len(cell):
+            continue
+        if (sites[j] == sites[i]).all():  # of duplicates the heaviest, then the first, has it all
+            if (weights[j], -j) > (weights[i], -i):
+                return np.empty((0, 2))
+        else:
             cell = clipped(cell, 2 * (sites[j] - sites[i]), lift[j] - lift[i])
     return cell

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.power_diagram import power_diagram
+from napari_shadowinv.geometry.power_diagram import PowerDiagram, power_diagram
 from napari_shadowinv.transport.sites import lloyd, plan_levels, sample_sites
 
 
@@ -65,3 +65,12 @@ def test_levels_quarter_and_their_masses_add_up_to_the_source():
     for level in plan.levels:
         assert level.mass.sum() == pytest.approx(source.sum(), rel=1e-12)
         assert (level.mass > 0).all()
+
+
+def test_few_sites_on_a_small_bright_spot_still_hold_the_whole_image():
+    source = np.zeros((200, 200))
+    source[100:103, 50:53] = 1
+    plan = plan_levels(source, 30, lloyd_iterations=2)
+    triangulation = plan.levels[-1].triangulation
+    masses = PowerDiagram(triangulation, Density.from_image(np.ones((200, 200)))).masses
+    assert masses.sum() == pytest.approx(200 * 200, rel=1e-12)

@@ -66,6 +66,11 @@ class Density:
         return self.image.shape[0], self.image.shape[1]
 
     @property
+    def region(self) -> Array:
+        """Corners (y, x) of the image, half a pixel beyond the outermost centres, shape (2, 2)."""
+        return np.array([[0.0, 0.0], self.shape]) - 0.5
+
+    @property
     def total(self) -> float:
         """The image's flux."""
         return float(self.sums[0, :, -1].sum())

@@ -172,7 +172,8 @@ class PowerDiagram:
     ----------
     triangulation : RegularTriangulation
         Triangulation of the n sites with their weights, in the image's coordinates
-        (y, x). The diagram holds for the weights it has now.
+        (y, x). The diagram holds for the weights it has now. Where the sites cover only a
+        part of the image, the triangulation must know of it as its `region`.
     density : Density
         The image.
     with_moments : bool
@@ -332,4 +333,5 @@ def power_diagram(
     sites: ArrayLike, density: Density, weights: ArrayLike | None = None
 ) -> PowerDiagram:
     """Build the triangulation of `sites` and its power diagram with moments in one go."""
-    return PowerDiagram(RegularTriangulation(sites, weights), density, with_moments=True)
+    triangulation = RegularTriangulation(sites, weights, region=density.region)
+    return PowerDiagram(triangulation, density, with_moments=True)

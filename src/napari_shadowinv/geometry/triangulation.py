@@ -92,9 +92,12 @@ def _checked_weights(weights: ArrayLike, n: int) -> NDArray[np.float64]:
     return array
 
 
-def _with_ghosts(sites: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Sites and the corners of a distant square around them, and half its side."""
-    low, high = sites.min(axis=0), sites.max(axis=0)
+def _with_ghosts(
+    sites: NDArray[np.float64], region: ArrayLike | None
+) -> tuple[NDArray[np.float64], float]:
+    """Sites and the corners of a distant square around them and the region, and half its side."""
+    inside = sites if region is None else np.concatenate([sites, np.asarray(region, np.float64)])
+    low, high = inside.min(axis=0), inside.max(axis=0)
     extent = float((high - low).max())
     if extent == 0.0:
         extent = max(1.0, float(np.abs(sites).max()))
@@ -113,7 +116,8 @@ class RegularTriangulation:
     """Regular (weighted Delaunay) triangulation of sites in the plane.
 
     Four ghost sites, the corners of a square far outside, close the plane: their cells stay
-    outside three times the sites' bounding box. Cells of sites may end at them out there.
+    outside three times the bounding box of sites and `region`. Cells of sites may end at them
+    out there.
 
     Parameters
     ----------
@@ -122,6 +126,9 @@ class RegularTriangulation:
         to be rearranged if they come in that order (see `hilbert_order`).
     weights : array_like, shape (n,), optional
         Weights of the power diagram, in squared units of the sites; 0 by default.
+    region : array_like, shape (2, 2), optional
+        Two opposite corners of a box that matters, such as an image. Only needed where it
+        reaches much further than the sites.
 
     Raises
     ------
@@ -146,12 +153,20 @@ class RegularTriangulation:
     array([False, False, False, False,  True])
     """
 
-    def __init__(self, sites: ArrayLike, weights: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        sites: ArrayLike,
+        weights: ArrayLike | None = None,
+        *,
+        region: ArrayLike | None = None,
+    ) -> None:
         given = _checked_points(sites)
         n = given.shape[0]
         order = hilbert_permutation(given)
         self._order = None if np.array_equal(order, np.arange(n)) else order
-        points, self._ghost_distance = _with_ghosts(given if self._order is None else given[order])
+        points, self._ghost_distance = _with_ghosts(
+            given if self._order is None else given[order], region
+        )
         self._mesh = Mesh(
             points=points,
             weights=np.zeros(n + 4),

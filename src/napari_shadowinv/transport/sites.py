@@ -212,7 +212,10 @@ def lloyd(
     spacing = _spacing(source.shape, len(sites))
     for step in range(iterations):
         diagram = PowerDiagram(
-            RegularTriangulation(sites), source, with_moments=True, threads=threads
+            RegularTriangulation(sites, region=source.region),
+            source,
+            with_moments=True,
+            threads=threads,
         )
         centroids = diagram.centroids
         del diagram  # before the next one is made: they are large
@@ -285,7 +288,7 @@ def plan_levels(
 
 def _level(sites: Array, density: Density, steps: int, threads: int | None) -> Level:
     # Lloyd's steps disturb the order; neighbours in the plane should be neighbours in memory
-    triangulation = RegularTriangulation(sites[hilbert_order(sites)])
+    triangulation = RegularTriangulation(sites[hilbert_order(sites)], region=density.region)
     sites = triangulation.sites
     diagram = PowerDiagram(triangulation, density, with_moments=True, threads=threads)
     mass, centroids = diagram.masses, diagram.centroids
