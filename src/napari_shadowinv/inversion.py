@@ -17,15 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.preprocess import Prepared, checked_source, number_of_sites, prepare
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.readout import read_centroids, read_dual
-from napari_shadowinv.transport.potential import site_displacement
 from napari_shadowinv.transport.sites import Level, SitePlan, plan_levels
-from napari_shadowinv.transport.solvers import Solution, solve
+from napari_shadowinv.transport.solvers import LevelSolution, solve
 
 if TYPE_CHECKING:
     import xarray
@@ -283,10 +281,9 @@ def invert(
     with stopwatch("read-out"):
         report("read-out", 0, 2)
         level = plan.levels[-1]
-        weights = solutions[-1].weights
-        density = Density.from_image(prepared.floored)
-        of_sites = site_displacement(level, weights, density, options.threads)
-        potential, displacement = _read_out(level, weights, of_sites, density.shape, options)
+        weights, of_sites = solutions[-1].weights, solutions[-1].displacement
+        height, width = prepared.image.shape
+        potential, displacement = _read_out(level, weights, of_sites, (height, width), options)
         report("read-out", 1, 2)
         reprojection = synthetic_image(displacement, prepared.source, threads=options.threads)
         report("read-out", 2, 2)
@@ -323,7 +320,7 @@ def _read_out(
 def _report(
     prepared: Prepared,
     plan: SitePlan,
-    solutions: list[Solution],
+    solutions: list[LevelSolution],
     seconds: dict[str, float],
     options: InversionOptions,
 ) -> Report:

@@ -37,7 +37,7 @@ def read_dual(
     weights : ndarray, shape (n,)
         Weights, px².
     site_displacement : ndarray, shape (n, 2)
-        Displacement of each site, px; see `site_displacement`.
+        Displacement of each site, px; see `LevelSolution`.
     shape : tuple of int
         Shape (H, W) of the image.
     threads : int, optional

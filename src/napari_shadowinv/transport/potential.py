@@ -11,51 +11,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import (
     CloughTocher,
     fit_gradients,
 )
-from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.transport.sites import Level
 
-__all__ = ["potential_surface", "site_displacement"]
+__all__ = ["potential_surface"]
 
 Array = NDArray[np.float64]
-
-
-def site_displacement(
-    level: Level, weights: Array, image: Density, threads: int | None = None
-) -> Array:
-    """Find where the flux of each site goes.
-
-    Parameters
-    ----------
-    level : Level
-        The sites.
-    weights : ndarray, shape (n,)
-        Their weights, px².
-    image : Density
-        The image.
-    threads : int, optional
-        Threads of the kernels.
-
-    Returns
-    -------
-    ndarray, shape (n, 2)
-        Centroid of each cell in the image minus that of the same site's cell in the
-        source, px. (The paper subtracts the site, which is the same after enough Lloyd
-        steps; with the centroid an image that equals its source gives exactly zero.)
-
-    References
-    ----------
-    Paper, lines 21–23 of its algorithm.
-    """
-    triangulation = level.triangulation.copy()
-    triangulation.update(weights)
-    diagram = PowerDiagram(triangulation, image, with_moments=True, threads=threads)
-    displacement: Array = diagram.centroids - level.centroids
-    return displacement
 
 
 def potential_surface(
@@ -78,7 +42,7 @@ def potential_surface(
     weights : ndarray, shape (n,)
         Their weights, px².
     displacement : ndarray, shape (n, 2)
-        Displacement of each site, px; see `site_displacement`.
+        Displacement of each site, px; see `LevelSolution`.
     sweeps : int
         Sweeps of the gradient fit (see `fit_gradients`).
     threads : int, optional

@@ -28,10 +28,10 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.linear import solve_laplacian
 from napari_shadowinv.transport.objective import TransportObjective
-from napari_shadowinv.transport.potential import potential_surface, site_displacement
+from napari_shadowinv.transport.potential import potential_surface
 from napari_shadowinv.transport.sites import Level
 
-__all__ = ["Solution", "newton", "solve", "solve_multilevel"]
+__all__ = ["LevelSolution", "Solution", "newton", "solve", "solve_multilevel"]
 
 Array = NDArray[np.float64]
 
@@ -68,12 +68,40 @@ class Solution:
     reason: str = ""
 
 
+@dataclass(frozen=True, kw_only=True)
+class LevelSolution(Solution):
+    """A solution and where it moves the sites of its level.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (n, 2)
+        Centroid of each cell in the image minus that of the same site's cell in the
+        source, px. (The paper subtracts the site, which is the same after enough Lloyd
+        steps; with the centroid an image that equals its source gives exactly zero.)
+
+    References
+    ----------
+    Paper, lines 21–23 of its algorithm.
+    """
+
+    displacement: Array
+
+    @classmethod
+    def of_level(
+        cls, level: Level, objective: TransportObjective, solution: Solution
+    ) -> LevelSolution:
+        """Add the displacement of the sites to a solution that `objective` has arrived at."""
+        diagram = objective.diagram(solution.weights, with_moments=True)
+        return cls(**vars(solution), displacement=diagram.centroids - level.centroids)
+
+
 def newton(
     objective: TransportObjective,
     weights: Array,
     *,
     tolerance: float,
     max_iterations: int,
+    diagram: PowerDiagram | None = None,
     report: Reporter | None = None,
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
@@ -88,6 +116,8 @@ def newton(
         Largest relative flux error allowed in any cell.
     max_iterations : int
         Most steps.
+    diagram : PowerDiagram, optional
+        The diagram of `weights`, where it is known.
     report : Reporter, optional
         Told of each step.
 
@@ -96,7 +126,8 @@ def newton(
     Solution
     """
     mass = objective.mass
-    diagram = objective.diagram(weights)
+    if diagram is None:
+        diagram = objective.diagram(weights)
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     iterations = 0
@@ -158,7 +189,7 @@ def solve(
     image: Array,
     options: InversionOptions,
     report: Reporter | None = None,
-) -> list[Solution]:
+) -> list[LevelSolution]:
     """Find the weights with the solver, tolerance and limits that `options` name.
 
     Parameters
@@ -174,7 +205,7 @@ def solve(
 
     Returns
     -------
-    list of Solution
+    list of LevelSolution
         One for each level that was solved; the last is the answer.
     """
     if options.solver == "lbfgs":
@@ -197,7 +228,7 @@ def solve_multilevel(
     max_iterations: int,
     threads: int | None = None,
     report: Reporter | None = None,
-) -> list[Solution]:
+) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
     Parameters
@@ -211,11 +242,11 @@ def solve_multilevel(
 
     Returns
     -------
-    list of Solution
+    list of LevelSolution
         One for each level; the last is the answer.
     """
     density = Density.from_image(image)
-    solutions: list[Solution] = []
+    solutions: list[LevelSolution] = []
     for number, level in enumerate(levels):
         objective = TransportObjective(
             level.triangulation.copy(), level.mass, density, threads=threads
@@ -223,20 +254,23 @@ def solve_multilevel(
         if number == 0:
             weights = _coarsest_start(level, image, max_iterations, threads, report)
         else:
-            weights = _prolong(levels[number - 1], solutions[-1], level, density, threads)
+            weights = _prolong(levels[number - 1], solutions[-1], level, threads)
         finest = number == len(levels) - 1
+        weights, diagram = _with_full_cells(objective, weights)
         solution = newton(
             objective,
-            _with_full_cells(objective, weights),
+            weights,
+            diagram=diagram,
             tolerance=tolerance if finest else max(tolerance, _COARSE_TOLERANCE),
             max_iterations=max_iterations,
             report=report,
         )
-        solutions.append(solution)
+        del diagram
+        solutions.append(LevelSolution.of_level(level, objective, solution))
     return solutions
 
 
-def _with_full_cells(objective: TransportObjective, weights: Array) -> Array:
+def _with_full_cells(objective: TransportObjective, weights: Array) -> tuple[Array, PowerDiagram]:
     """Find weights near the given ones for which every cell holds some flux.
 
     Hidden sites are lowered to where they just show; then a little of the zero weights,
@@ -246,8 +280,9 @@ def _with_full_cells(objective: TransportObjective, weights: Array) -> Array:
     for share in _SHARES_OF_START:
         diagram = objective.diagram_if_full(share * shown)
         if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
-            return share * shown
-    return np.zeros(len(weights))
+            return share * shown, diagram
+    zeros = np.zeros(len(weights))
+    return zeros, objective.diagram(zeros)
 
 
 def _coarsest_start(
@@ -266,9 +301,11 @@ def _coarsest_start(
             Density.from_image(_blurred(image, blur * level.spacing)),
             threads=threads,
         )
+        weights, diagram = _with_full_cells(objective, weights)
         weights = newton(
             objective,
-            _with_full_cells(objective, weights),
+            weights,
+            diagram=diagram,
             tolerance=_COARSE_TOLERANCE,
             max_iterations=max_iterations,
             report=report,
@@ -287,22 +324,15 @@ def _blurred(image: Array, width: float) -> Array:
     return blurred
 
 
-def _prolong(
-    coarse: Level, solution: Solution, fine: Level, image: Density, threads: int | None
-) -> Array:
+def _prolong(coarse: Level, solution: LevelSolution, fine: Level, threads: int | None) -> Array:
     """Evaluate the coarse potential at the fine sites."""
-    surface = potential_surface(
-        coarse,
-        solution.weights,
-        site_displacement(coarse, solution.weights, image, threads),
-        threads=threads,
-    )
+    surface = potential_surface(coarse, solution.weights, solution.displacement, threads=threads)
     return 2 * surface(fine.sites)[0]
 
 
 def lbfgs(
     level: Level, image: Array, options: InversionOptions, report: Reporter | None = None
-) -> Solution:
+) -> LevelSolution:
     """Minimise the convex function by limited-memory BFGS from zero weights.
 
     Parameters
@@ -318,7 +348,7 @@ def lbfgs(
 
     Returns
     -------
-    Solution
+    LevelSolution
 
     References
     ----------
@@ -360,4 +390,5 @@ def lbfgs(
     residual = objective.residual(objective.diagram(weights))
     converged = residual <= options.tolerance
     reason = "" if converged else f"limited-memory BFGS ended after {steps} iterations"
-    return Solution(weights - weights.mean(), residual, steps, converged, reason)
+    solution = Solution(weights - weights.mean(), residual, steps, converged, reason)
+    return LevelSolution.of_level(level, objective, solution)
