@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -82,10 +83,8 @@ class Level:
         Centres of flux of the Voronoi cells; the sites themselves after many Lloyd steps.
     triangulation : RegularTriangulation
         Their Delaunay triangulation; copy it before changing weights.
-    mirrored : Mirrored
-        The sites with those near the border mirrored across it.
-    spacing : float
-        Mean distance between neighbours, sqrt(area of the image / n), in px.
+    shape : tuple of int
+        Shape (H, W) of the source.
     lloyd_iterations : int
         Lloyd steps that were made.
     """
@@ -94,9 +93,18 @@ class Level:
     mass: Array
     centroids: Array
     triangulation: RegularTriangulation
-    mirrored: Mirrored
-    spacing: float
+    shape: tuple[int, int]
     lloyd_iterations: int
+
+    @property
+    def spacing(self) -> float:
+        """Mean distance between neighbours, sqrt(area of the image / n), in px."""
+        return _spacing(self.shape, len(self.sites))
+
+    @cached_property
+    def mirrored(self) -> Mirrored:
+        """The sites with those near the border mirrored across it; made when first asked for."""
+        return Mirrored.from_sites(self.sites, self.shape)
 
 
 @dataclass(frozen=True)
@@ -298,7 +306,6 @@ def _level(sites: Array, density: Density, steps: int, threads: int | None) -> L
         mass=mass,
         centroids=centroids,
         triangulation=triangulation,
-        mirrored=Mirrored.from_sites(sites, density.shape),
-        spacing=_spacing(density.shape, len(sites)),
+        shape=density.shape,
         lloyd_iterations=steps,
     )

@@ -101,7 +101,6 @@ def newton(
     *,
     tolerance: float,
     max_iterations: int,
-    diagram: PowerDiagram | None = None,
     report: Reporter | None = None,
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
@@ -116,8 +115,6 @@ def newton(
         Largest relative flux error allowed in any cell.
     max_iterations : int
         Most steps.
-    diagram : PowerDiagram, optional
-        The diagram of `weights`, where it is known.
     report : Reporter, optional
         Told of each step.
 
@@ -126,8 +123,7 @@ def newton(
     Solution
     """
     mass = objective.mass
-    if diagram is None:
-        diagram = objective.diagram(weights)
+    diagram = objective.diagram(weights)
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     iterations = 0
@@ -256,21 +252,18 @@ def solve_multilevel(
         else:
             weights = _prolong(levels[number - 1], solutions[-1], level, threads)
         finest = number == len(levels) - 1
-        weights, diagram = _with_full_cells(objective, weights)
         solution = newton(
             objective,
-            weights,
-            diagram=diagram,
+            _with_full_cells(objective, weights),
             tolerance=tolerance if finest else max(tolerance, _COARSE_TOLERANCE),
             max_iterations=max_iterations,
             report=report,
         )
-        del diagram
         solutions.append(LevelSolution.of_level(level, objective, solution))
     return solutions
 
 
-def _with_full_cells(objective: TransportObjective, weights: Array) -> tuple[Array, PowerDiagram]:
+def _with_full_cells(objective: TransportObjective, weights: Array) -> Array:
     """Find weights near the given ones for which every cell holds some flux.
 
     Hidden sites are lowered to where they just show; then a little of the zero weights,
@@ -280,9 +273,8 @@ def _with_full_cells(objective: TransportObjective, weights: Array) -> tuple[Arr
     for share in _SHARES_OF_START:
         diagram = objective.diagram_if_full(share * shown)
         if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
-            return share * shown, diagram
-    zeros = np.zeros(len(weights))
-    return zeros, objective.diagram(zeros)
+            return share * shown
+    return np.zeros(len(weights))
 
 
 def _coarsest_start(
@@ -301,11 +293,9 @@ def _coarsest_start(
             Density.from_image(_blurred(image, blur * level.spacing)),
             threads=threads,
         )
-        weights, diagram = _with_full_cells(objective, weights)
         weights = newton(
             objective,
-            weights,
-            diagram=diagram,
+            _with_full_cells(objective, weights),
             tolerance=_COARSE_TOLERANCE,
             max_iterations=max_iterations,
             report=report,
