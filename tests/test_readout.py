@@ -50,3 +50,14 @@ def test_a_constant_displacement_integrates_to_a_plane(level):
     np.testing.assert_allclose(potential - potential.mean(), plane - plane.mean(), atol=1e-9)
     np.testing.assert_allclose(displacement[0], 0.5, atol=1e-12)
     np.testing.assert_allclose(displacement[1], -0.25, atol=1e-12)
+
+
+def test_the_mean_integration_lies_between_the_two_orders(level):
+    rng = np.random.default_rng(0)
+    turning = rng.normal(size=level.sites.shape)  # not curl-free: the orders disagree
+    by_order = {
+        order: read_centroids(level, turning, SHAPE, integration=order)[0]
+        for order in ("y", "x", "mean")
+    }
+    assert np.ptp(by_order["y"] - by_order["x"]) > 0.1
+    np.testing.assert_allclose(by_order["mean"], (by_order["y"] + by_order["x"]) / 2, atol=1e-12)

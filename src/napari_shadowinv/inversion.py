@@ -313,7 +313,9 @@ def _read_out(
 ) -> tuple[Array, Array]:
     """Potential and displacement at the pixels, by the read-out that the options name."""
     if options.readout == "centroid":
-        return read_centroids(level, of_sites, shape, options.threads)
+        return read_centroids(
+            level, of_sites, shape, options.threads, integration=options.integration
+        )
     return read_dual(level, weights, of_sites, shape, options.threads)
 
 

@@ -6,7 +6,7 @@ in a window, and is saved with each result: there is no second list of defaults.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -81,12 +81,28 @@ class InversionOptions(BaseModel):
             "natural-neighbour interpolation of centroid displacements, then integration."
         ),
     )
-    solver: Literal["newton", "lbfgs"] = Field(
+    integration: Literal["mean", "y", "x"] = Field(
+        default="mean",
+        title="Integration",
+        description=(
+            "Of the centroid read-out only: integrate first along 'y' and then along x, first "
+            "along 'x', or take the 'mean' of both."
+        ),
+    )
+    solver: Literal["newton", "lbfgs", "quasi-newton"] = Field(
         default="newton",
         title="Solver",
         description=(
-            "'newton': multilevel damped Newton. 'lbfgs': limited-memory BFGS from zero weights, "
-            "as in the paper; slow, for comparison."
+            "'newton': damped Newton steps. 'lbfgs': limited-memory BFGS, as in the paper; slow, "
+            "for comparison. 'quasi-newton': BFGS with an n × n matrix, for few sites."
+        ),
+    )
+    stages: Literal["multi", "single"] = Field(
+        default="multi",
+        title="Stages",
+        description=(
+            "'multi': solve with few sites first and carry the potential over to more. "
+            "'single': all sites at once, from zero weights."
         ),
     )
     max_iterations: int = Field(
@@ -124,3 +140,35 @@ class InversionOptions(BaseModel):
         title="Threads",
         description="Threads of the kernels. Default: all cores. Results do not depend on it.",
     )
+
+    @classmethod
+    def paper(cls, **changes: Any) -> InversionOptions:
+        """Make the choices of the paper: 50 Lloyd steps, L-BFGS in one stage, centroids.
+
+        Parameters
+        ----------
+        **changes
+            Options to set otherwise.
+
+        Returns
+        -------
+        InversionOptions
+
+        References
+        ----------
+        Kasim et al., arXiv:1607.04179, section III.
+
+        Examples
+        --------
+        >>> InversionOptions.paper(n_sites=2000).solver
+        'lbfgs'
+        """
+        choices: dict[str, Any] = {
+            "lloyd_iterations": 50,
+            "lloyd_tolerance": 0.0,
+            "solver": "lbfgs",
+            "stages": "single",
+            "max_iterations": 10_000,
+            "readout": "centroid",
+        }
+        return cls(**{**choices, **changes})

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.memory import physical_memory
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 
 __all__ = ["Prepared", "checked_source", "number_of_sites", "prepare"]
@@ -164,20 +165,10 @@ def number_of_sites(shape: tuple[int, int], options: InversionOptions) -> int:
     """
     wanted = options.n_sites
     n_sites = min(shape[0] * shape[1], MAX_DEFAULT_SITES) if wanted is None else wanted
-    memory = _memory()
+    memory = physical_memory()
     if memory is not None and n_sites * _BYTES_PER_SITE > memory:
         raise InputError(
             f"{n_sites:,} sites need about {n_sites * _BYTES_PER_SITE / 1e9:.3g} GB, this "
             f"machine has {memory / 1e9:.3g} GB: use at most {memory // _BYTES_PER_SITE:,} sites"
         )
     return n_sites
-
-
-def _memory() -> int | None:
-    """Physical memory in bytes, where the system tells."""
-    try:
-        import os
-
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return None

@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
@@ -63,6 +65,8 @@ def read_centroids(
     site_displacement: Array,
     shape: tuple[int, int],
     threads: int | None = None,
+    *,
+    integration: Literal["mean", "y", "x"] = "mean",
 ) -> tuple[Array, Array]:
     """Interpolate the centroids' displacements and integrate them, as the paper does.
 
@@ -73,11 +77,13 @@ def read_centroids(
     ----------
     level, site_displacement, shape, threads
         See `read_dual`.
+    integration : {"mean", "y", "x"}
+        Integrate first along y and then along x, first along x, or take the mean of both.
 
     Returns
     -------
     potential : ndarray, shape (H, W)
-        The mean of integrating y first and x first, px²; zero in the mean over the border.
+        px², zero in the mean over the border.
     displacement : ndarray, shape (2, H, W)
         Natural-neighbour interpolation of the sites' displacements, px.
 
@@ -90,7 +96,7 @@ def read_centroids(
         RegularTriangulation(sites), site_displacement, _pixels(shape), threads=threads
     )
     displacement = np.ascontiguousarray(displacement.T).reshape(2, *shape)
-    potential = _integrated(displacement)
+    potential = _integrated(displacement, integration)
     return potential - border_mean(potential), displacement
 
 
@@ -108,11 +114,12 @@ def _moved_to_corners(sites: Array, shape: tuple[int, int]) -> Array:
     return moved
 
 
-def _integrated(displacement: Array) -> Array:
-    """Integrate minus the displacement along y then x, and along x then y; their mean."""
+def _integrated(displacement: Array, first: Literal["mean", "y", "x"]) -> Array:
+    """Integrate minus the displacement along one axis and then the other."""
     along_y = cumulative_trapezoid(displacement[0], axis=0, initial=0)
     along_x = cumulative_trapezoid(displacement[1], axis=1, initial=0)
     y_first = along_y[:, :1] + along_x
     x_first = along_x[:1, :] + along_y
-    mean: Array = -0.5 * (y_first + x_first)
-    return mean
+    share = {"y": 1.0, "x": 0.0, "mean": 0.5}[first]
+    potential: Array = -(share * y_first + (1 - share) * x_first)
+    return potential

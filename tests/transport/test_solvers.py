@@ -3,15 +3,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Reporter
+from napari_shadowinv.transport.descent import quasi_newton
+from napari_shadowinv.transport.newton import newton
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import plan_levels
-from napari_shadowinv.transport.solvers import _blurred, lbfgs, newton, solve
+from napari_shadowinv.transport.solvers import _blurred, solve
 
 
 def bright_spot(shape=(40, 50)):
@@ -53,16 +55,29 @@ def test_newton_converges_quadratically_near_the_solution(plan):
     assert residuals[2] < 0.05 * residuals[1]
 
 
-def test_newton_and_lbfgs_find_the_same_weights():
+@pytest.mark.parametrize("stages", ["single", "multi"])
+@pytest.mark.parametrize("solver", ["lbfgs", "quasi-newton"])
+def test_descent_finds_the_weights_that_newton_finds(solver, stages):
     plan = plan_levels(np.ones((30, 30)), 150, lloyd_iterations=20)
     y, x = np.indices((30, 30))
     image = 1 + 0.5 * np.sin(y / 5) * np.cos(x / 4)
     image /= image.mean()
-    options = InversionOptions(tolerance=1e-6)
-    by_newton = solve(plan.levels, image, options)[-1]
-    by_lbfgs = lbfgs(plan.levels[-1], image, options.model_copy(update={"max_iterations": 5000}))
-    assert by_lbfgs.converged
-    np.testing.assert_allclose(by_lbfgs.weights, by_newton.weights, atol=1e-4)
+    by_newton = solve(plan.levels, image, InversionOptions(tolerance=1e-6))[-1]
+    options = InversionOptions(tolerance=1e-6, max_iterations=5000, solver=solver, stages=stages)
+    by_descent = solve(plan.levels, image, options)[-1]
+    assert by_descent.converged
+    np.testing.assert_allclose(by_descent.weights, by_newton.weights, atol=1e-4)
+
+
+def test_a_matrix_that_does_not_fit_is_refused():
+    sites = np.random.default_rng(0).random((300_000, 2)) * 100 - 0.5
+    objective = TransportObjective(
+        RegularTriangulation(sites),
+        np.full(300_000, 1 / 30),
+        Density.from_image(np.ones((100, 100))),
+    )
+    with pytest.raises(InputError, match="use lbfgs, or at most"):
+        quasi_newton(objective, np.zeros(300_000), tolerance=1e-3, max_iterations=1)
 
 
 def test_an_exhausted_solver_says_how_far_it_got_and_why(plan):

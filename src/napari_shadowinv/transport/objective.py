@@ -4,6 +4,7 @@
     ∂f/∂w_i = T_i - S_i,   ∂²f/∂w_i∂w_j = -∫_{P_i ∩ P_j} I ds / (2 |r_i - r_j|)
 
 - f, its gradient and its Hessian at given weights: `TransportObjective`
+- what a solver returns: `Solution`
 
 References
 ----------
@@ -12,6 +13,8 @@ Paper, Eqs. 5 and 6; F. Aurenhammer, F. Hoffmann and B. Aronov, Algorithmica 20,
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,9 +22,34 @@ from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
-__all__ = ["TransportObjective"]
+__all__ = ["Solution", "TransportObjective"]
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Weights of one level and how they were reached.
+
+    Attributes
+    ----------
+    weights : ndarray, shape (n,)
+        Of mean zero, px².
+    residual : float
+        Largest relative flux error of a cell.
+    iterations : int
+        Steps of the solver.
+    converged : bool
+        Whether the residual is within the tolerance.
+    reason : str
+        Why it did not converge; empty if it did.
+    """
+
+    weights: Array
+    residual: float
+    iterations: int
+    converged: bool
+    reason: str = ""
 
 
 class TransportObjective:

@@ -1,0 +1,142 @@
+"""Damped Newton steps for the weights of one level.
+
+- solve from a start whose cells all hold flux: `newton`
+- make such a start of any weights: `with_full_cells`
+
+References
+----------
+J. Kitagawa, Q. Mérigot and B. Thibert, J. Eur. Math. Soc. 21, 2603 (2019).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.geometry._threads import available_threads
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.progress import Reporter
+from napari_shadowinv.transport.linear import solve_laplacian
+from napari_shadowinv.transport.objective import Solution, TransportObjective
+
+__all__ = ["newton", "with_full_cells"]
+
+Array = NDArray[np.float64]
+
+_SHORTEST_STEP = 1e-7
+_LINEAR_TOLERANCE = 1e-2
+_SHARES_OF_START = (0.999, 0.99, 0.9, 0.5)
+_LEAST_START = 1e-12  # of a mean cell's flux
+
+
+def newton(
+    objective: TransportObjective,
+    weights: Array,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    report: Reporter | None = None,
+) -> Solution:
+    """Solve T(w) = S by damped Newton steps that never empty a cell.
+
+    Parameters
+    ----------
+    objective : TransportObjective
+        The problem.
+    weights : ndarray, shape (n,)
+        Start; every cell must hold flux.
+    tolerance : float
+        Largest relative flux error allowed in any cell.
+    max_iterations : int
+        Most steps.
+    report : Reporter, optional
+        Told of each step.
+
+    Returns
+    -------
+    Solution
+    """
+    mass = objective.mass
+    diagram = objective.diagram(weights)
+    residual = objective.residual(diagram)
+    keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
+    iterations = 0
+    reason = f"the solver used all {max_iterations} iterations allowed"
+    while residual > tolerance and iterations < max_iterations:
+        message = f"{len(mass):,} sites, residual {residual:.2g}"
+        alive = partial(report or Reporter(), "transport", iterations, None, message)
+        alive()
+        gap = mass - diagram.masses
+        laplacian = diagram.laplacian()
+        del diagram  # the trial steps need its memory
+        try:
+            step = solve_laplacian(
+                laplacian, gap, _LINEAR_TOLERANCE, available_threads(objective.threads)
+            )
+        except RuntimeError as error:
+            reason = f"Newton's system cannot be solved: {error}"
+            break
+        del laplacian
+        damped = _damped_step(objective, weights, step, gap, keep * mass.mean(), alive)
+        if damped is None:
+            reason = "no step along Newton's direction lowers the error without emptying a cell"
+            break
+        weights, diagram = damped
+        residual = objective.residual(diagram)
+        iterations += 1
+    converged = residual <= tolerance
+    return Solution(
+        weights - weights.mean(), residual, iterations, converged, "" if converged else reason
+    )
+
+
+def _damped_step(
+    objective: TransportObjective,
+    weights: Array,
+    step: Array,
+    gap: Array,
+    least: float,
+    alive: Callable[[], None],
+) -> tuple[Array, PowerDiagram] | None:
+    """Halve the step until all cells keep some flux and the error falls."""
+    error = np.linalg.norm(gap)
+    share = 1.0
+    while share > _SHORTEST_STEP:
+        diagram = None  # one at a time: they are large
+        alive()
+        trial = weights + share * step
+        diagram = objective.diagram_if_full(trial)
+        if diagram is not None and diagram.masses.min() > least:
+            now = np.linalg.norm(objective.mass - diagram.masses)
+            if now < (1 - 0.1 * share) * error:
+                return trial, diagram
+        share /= 2
+    return None
+
+
+def with_full_cells(objective: TransportObjective, weights: Array) -> Array:
+    """Find weights near the given ones for which every cell holds some flux.
+
+    Hidden sites are lowered to where they just show; then a little of the zero weights,
+    for which every cell is round and full, is mixed in.
+
+    Parameters
+    ----------
+    objective : TransportObjective
+        The problem.
+    weights : ndarray, shape (n,)
+        Any weights, px².
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    shown = objective.triangulation.lower_hidden(weights)
+    for share in _SHARES_OF_START:
+        diagram = objective.diagram_if_full(share * shown)
+        if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
+            return share * shown
+    return np.zeros(len(weights))
