@@ -47,7 +47,7 @@ def measure(n_sites: int) -> dict[str, float]:
         plan = plan_sites(source, options)
         seconds["sites"].append(time.perf_counter() - start)
         for peak, noise in SHOTS:
-            image = prepare(toroid_case(peak, noise).image, source, options).floored
+            image = prepare(toroid_case(peak, noise).image, source, options).floored_image
             start = time.perf_counter()
             solution = solve(plan.levels, image, options)[-1]
             seconds[str(peak)].append(time.perf_counter() - start)

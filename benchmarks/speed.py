@@ -120,7 +120,7 @@ def main() -> None:
     print("|---|---|---|")
     for peak, noise in [(97, False), (194, True)]:
         case = toroid_case(peak, noise)
-        image = prepare(case.image, source, options).floored
+        image = prepare(case.image, source, options).floored_image
         weights = solve(plan.levels, image, options)[-1].weights
         hull = hull_seconds(plan, weights, repeat)
         works = {

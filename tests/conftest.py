@@ -52,6 +52,7 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         reprojection=reprojection,
         residual=image - reprojection,
         caustic=caustic,
+        mask=np.ones(shape, dtype=bool),
         report=Report(**{**facts, **report}),  # type: ignore[arg-type]
         options=InversionOptions(n_sites=17, tolerance=1e-3, seed=5, negative="clip"),
     )

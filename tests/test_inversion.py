@@ -155,6 +155,58 @@ def test_non_uniform_source_is_accounted_for(phantom):
     assert relative_error(invert(image).displacement, phantom.displacement) > 0.5
 
 
+def handwriting(shape):
+    """A crossed-out corner, away from the phantom's strongest field."""
+    y, x = np.indices(shape)
+    strokes = (np.abs(y - 0.8 * x) < 2.5) | (np.abs(y + 0.8 * x - 20) < 2.5)
+    return strokes & (x < 24)
+
+
+def test_masked_handwriting_does_not_poison_the_field(phantom, image):
+    ink = handwriting(SHAPE)
+    written = np.where(ink, 0.1, image)
+    poisoned = invert(written)
+    masked = invert(written, mask=~ink)
+    assert masked.report.converged
+    outside = np.broadcast_to(~ink, (2, *SHAPE))
+    true = phantom.displacement[outside]
+    assert relative_error(masked.displacement[outside], true) < 0.06
+    assert relative_error(poisoned.displacement[outside], true) > 0.25
+    assert not masked.residual[ink].any()
+    assert not masked.image[ink].any()
+    np.testing.assert_array_equal(masked.mask, ~ink)
+
+
+def test_what_masked_pixels_hold_does_not_matter(image):
+    ink = handwriting(SHAPE)
+    inversions = [
+        invert(np.where(ink, value, image), source=np.where(ink, other, 1.0), mask=~ink)
+        for value, other in ((0.0, 1.0), (np.nan, -5.0), (1e9, np.inf))
+    ]
+    for inversion in inversions[1:]:
+        np.testing.assert_array_equal(inversion.potential, inversions[0].potential)
+
+
+def test_a_plan_keeps_its_mask(image):
+    mask = ~handwriting(SHAPE)
+    plan = plan_sites(np.ones(SHAPE), mask=mask)
+    alone = invert(image, source=np.ones(SHAPE), mask=mask)
+    np.testing.assert_array_equal(invert(image, plan=plan).potential, alone.potential)
+
+
+@pytest.mark.parametrize(
+    ("mask", "says"),
+    [
+        (np.ones((20, 21), bool), r"mask has shape \(20, 21\), image \(20, 20\)"),
+        (np.ones((20, 20)), "float64, expected booleans"),
+        (np.zeros((20, 20), bool), "mask is false everywhere"),
+    ],
+)
+def test_a_bad_mask_is_one_clear_sentence(mask, says):
+    with pytest.raises(InputError, match=says):
+        invert(np.ones((20, 20)), mask=mask)
+
+
 def test_caustics_are_marked_where_the_map_folds():
     folding = ellipse_pair((80, 100), strength=4.0)
     inversion = invert(synthetic_image(folding.displacement))

@@ -13,10 +13,10 @@ def test_image_source_and_floored_image_have_one_flux():
     image, source = 1 + 1000 * rng.random((20, 30)), rng.random((20, 30))
     image[:3] = 0
     prepared = prepare(image, source, InversionOptions())
-    for values in (prepared.image, prepared.floored):
+    for values in (prepared.image, prepared.floored_image):
         assert values.sum() == pytest.approx(source.sum(), rel=1e-12)
     assert prepared.floored_pixels == (image < 1e-3 * image.mean()).sum() == 90
-    floor = prepared.floored.min() / prepared.floored.mean()
+    floor = prepared.floored_image.min() / prepared.floored_image.mean()
     assert floor == pytest.approx(1e-3, rel=1e-3)
 
 

@@ -19,7 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
-from napari_shadowinv.preprocess import Prepared, checked_source, number_of_sites, prepare
+from napari_shadowinv.preprocess import (
+    Prepared,
+    checked_mask,
+    checked_source,
+    masked_source,
+    number_of_sites,
+    prepare,
+)
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.readout import read_centroids, read_dual
 from napari_shadowinv.transport.sites import Level, SitePlan, plan_levels
@@ -110,6 +117,8 @@ class Inversion:
         ``image - reprojection``.
     caustic : ndarray of bool, shape (H, W)
         Where the map folds or its Jacobian is below the threshold.
+    mask : ndarray of bool, shape (H, W)
+        The pixels that were used; image, source, residual and caustic are 0 elsewhere.
     report : Report
         How it went.
     options : InversionOptions
@@ -127,6 +136,7 @@ class Inversion:
     reprojection: Array
     residual: Array
     caustic: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
     report: Report
     options: InversionOptions
 
@@ -168,6 +178,7 @@ def plan_sites(
     source: ArrayLike,
     options: InversionOptions | None = None,
     *,
+    mask: ArrayLike | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> SitePlan:
@@ -178,7 +189,10 @@ def plan_sites(
     source : array_like, shape (H, W)
         The undisturbed beam.
     options : InversionOptions, optional
-        Its `n_sites`, `lloyd_iterations`, `lloyd_tolerance`, `seed` and `threads` are used.
+        Its `n_sites`, `lloyd_iterations`, `lloyd_tolerance`, `floor`, `seed` and `threads` are
+        used.
+    mask : array_like of bool, shape (H, W), optional
+        See `invert`.
     on_progress, should_stop
         See `invert`.
 
@@ -195,7 +209,10 @@ def plan_sites(
         If `should_stop` returned true.
     """
     options = options or InversionOptions()
-    beam = checked_source(source)
+    usable = None if mask is None else checked_mask(mask, np.shape(source))
+    beam = checked_source(source, usable)
+    if usable is not None:
+        beam = masked_source(beam, usable, options)
     return plan_levels(
         beam,
         number_of_sites(beam.shape, options),
@@ -203,6 +220,7 @@ def plan_sites(
         lloyd_tolerance=options.lloyd_tolerance,
         seed=options.seed,
         threads=options.threads,
+        mask=usable,
         report=Reporter(on_progress, should_stop),
     )
 
@@ -211,6 +229,7 @@ def invert(
     image: ArrayLike,
     *,
     source: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
     options: InversionOptions | None = None,
     plan: SitePlan | None = None,
     on_progress: OnProgress | None = None,
@@ -225,10 +244,14 @@ def invert(
     source : array_like, shape (H, W), optional
         The undisturbed beam. Default: uniform. Image and source are brought to the same
         flux, so their units need not match.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel can be used. Others (obstructed, written on, beyond the film) carry
+        no flux on either side; the field there is only a smooth continuation.
     options : InversionOptions, optional
         Choices; the default suits most images.
     plan : SitePlan, optional
-        Sites prepared by `plan_sites`; its source is used, and `source` must be left out.
+        Sites prepared by `plan_sites`; its source and mask are used, and `source` and `mask`
+        must be left out.
     on_progress : callable, optional
         Receives a `napari_shadowinv.progress.Progress` now and then.
     should_stop : callable, optional
@@ -267,17 +290,25 @@ def invert(
 
     with stopwatch("prepare"):
         report("prepare", 0, 1)
-        if plan is not None and source is not None:
-            raise InputError("got both plan and source, expected one: a plan has its own source")
-        prepared = prepare(image, source if plan is None else plan.source, options)
+        if plan is not None:
+            if source is not None or mask is not None:
+                raise InputError(
+                    "got a plan and also a source or mask, expected one: a plan has its own"
+                )
+            source, mask = plan.source, plan.mask
+        prepared = prepare(image, source, options, mask)
         report("prepare", 1, 1)
     with stopwatch("sites"):
         if plan is None:
             plan = plan_sites(
-                prepared.source, options, on_progress=on_progress, should_stop=should_stop
+                prepared.source,
+                options,
+                mask=mask,
+                on_progress=on_progress,
+                should_stop=should_stop,
             )
     with stopwatch("transport"):
-        solutions = solve(plan.levels, prepared.floored, options, report)
+        solutions = solve(plan.levels, prepared.floored_image, options, report)
     with stopwatch("read-out"):
         report("read-out", 0, 2)
         level = plan.levels[-1]
@@ -297,8 +328,9 @@ def invert(
         site_mass=level.mass,
         site_displacement=of_sites,
         reprojection=reprojection,
-        residual=prepared.image - reprojection,
-        caustic=jacobian_determinant(displacement) < options.caustic_jacobian,
+        residual=np.where(prepared.mask, prepared.image - reprojection, 0.0),
+        caustic=(jacobian_determinant(displacement) < options.caustic_jacobian) & prepared.mask,
+        mask=prepared.mask,
         report=_report(prepared, plan, solutions, stopwatch.seconds, options),
         options=options,
     )

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +15,18 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.memory import physical_memory
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 
-__all__ = ["Prepared", "checked_source", "number_of_sites", "prepare"]
+__all__ = [
+    "Mask",
+    "Prepared",
+    "checked_mask",
+    "checked_source",
+    "masked_source",
+    "number_of_sites",
+    "prepare",
+]
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _SMALLEST_SIDE = 4
 _BYTES_PER_SITE = 2000  # measured peak of a whole inversion, rounded up
@@ -29,12 +39,13 @@ class Prepared:
 
     Attributes
     ----------
-    image : ndarray, shape (H, W)
-        Clipped where asked for, scaled to the flux of the source.
-    source : ndarray, shape (H, W)
-        The undisturbed beam.
-    floored : ndarray, shape (H, W)
-        `image` with every pixel at or above the floor, of the same flux.
+    image, source : ndarray, shape (H, W)
+        Clipped where asked for, the image scaled to the flux of the source; 0 where masked.
+    floored_image, floored_source : ndarray, shape (H, W)
+        The same as the transport sees them: dark pixels of the image raised to the floor,
+        masked pixels of both at the floor.
+    mask : ndarray of bool, shape (H, W)
+        The pixels that are used.
     clipped_pixels, floored_pixels : int
         How many pixels were negative, and how many, these included, below the floor.
     warnings : tuple of str
@@ -43,13 +54,20 @@ class Prepared:
 
     image: Array
     source: Array
-    floored: Array
+    floored_image: Array
+    floored_source: Array
+    mask: Mask
     clipped_pixels: int
     floored_pixels: int
     warnings: tuple[str, ...]
 
 
-def prepare(image: ArrayLike, source: ArrayLike | None, options: InversionOptions) -> Prepared:
+def prepare(
+    image: ArrayLike,
+    source: ArrayLike | None,
+    options: InversionOptions,
+    mask: ArrayLike | None = None,
+) -> Prepared:
     """Check an image and its source, and bring them to the same flux.
 
     Parameters
@@ -60,6 +78,9 @@ def prepare(image: ArrayLike, source: ArrayLike | None, options: InversionOption
         The undisturbed beam; uniform if None.
     options : InversionOptions
         Its `floor` and `negative` are used.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel can be used; others carry no flux on either side, and what they
+        hold, even NaN, does not matter.
 
     Returns
     -------
@@ -70,7 +91,9 @@ def prepare(image: ArrayLike, source: ArrayLike | None, options: InversionOption
     InputError
         If an array cannot be an image of a beam: wrong shape, not a number, negative, zero.
     """
-    values = _finite_image(image, "image")
+    shape = _plane(image, "image").shape
+    usable = np.ones(shape, bool) if mask is None else checked_mask(mask, shape)
+    values = _finite_image(image, "image", usable)
     negative = int((values < 0).sum())
     if negative and options.negative == "refuse":
         raise InputError(
@@ -83,22 +106,31 @@ def prepare(image: ArrayLike, source: ArrayLike | None, options: InversionOption
         raise InputError(
             "image has no positive pixel, expected a beam: check the file and its background"
         )
-    beam = np.full(values.shape, values.mean()) if source is None else checked_source(source)
-    if beam.shape != values.shape:
-        raise InputError(f"source has shape {beam.shape}, image {values.shape}: they must match")
+    if source is None:
+        beam = np.where(usable, values.sum() / usable.sum(), 0.0)
+    else:
+        beam = checked_source(source, usable)
     ratio = float(values.sum() / beam.sum())
     values = values / ratio
-    least = options.floor * values.mean()
+    least = options.floor * values.sum() / usable.sum()
     floored = np.maximum(values, least)
-    below = int((values < least).sum())
+    floored_source = masked_source(beam, usable, options)
+    below = int((values[usable] < least).sum())
     return Prepared(
         image=values,
         source=beam,
-        floored=floored * (beam.sum() / floored.sum()),
+        floored_image=floored * (floored_source.sum() / floored.sum()),
+        floored_source=floored_source,
+        mask=usable,
         clipped_pixels=negative,
         floored_pixels=below,
-        warnings=_warnings(ratio, negative, below, values.size),
+        warnings=_warnings(ratio, negative, below, int(usable.sum())),
     )
+
+
+def masked_source(source: Array, mask: Mask, options: InversionOptions) -> Array:
+    """Return a source with its masked pixels at the floor, so that cells fill the image."""
+    return np.where(mask, source, options.floor * source[mask].mean())
 
 
 def _warnings(ratio: float, clipped: int, floored: int, size: int) -> tuple[str, ...]:
@@ -118,9 +150,29 @@ def _warnings(ratio: float, clipped: int, floored: int, size: int) -> tuple[str,
     return tuple(warnings)
 
 
-def checked_source(source: ArrayLike) -> Array:
-    """Return a source as floats, or raise an `InputError` that says what is wrong with it."""
-    beam = _finite_image(source, "source")
+def checked_source(source: ArrayLike, mask: Mask | None = None) -> Array:
+    """Return a source as floats, 0 where masked, or raise an `InputError` that says what is wrong.
+
+    Parameters
+    ----------
+    source : array_like, shape (H, W)
+        The undisturbed beam.
+    mask : ndarray of bool, shape (H, W), optional
+        The pixels that are used, of the image's shape.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+
+    Raises
+    ------
+    InputError
+        If the source is of another shape, not a number, negative or zero everywhere.
+    """
+    found = _plane(source, "source").shape
+    if mask is not None and found != mask.shape:
+        raise InputError(f"source has shape {found}, image {mask.shape}: they must match")
+    beam = _finite_image(source, "source", np.ones(found, bool) if mask is None else mask)
     if (beam < 0).any():
         raise InputError(
             f"source has {int((beam < 0).sum())} negative pixels, expected none: "
@@ -131,7 +183,22 @@ def checked_source(source: ArrayLike) -> Array:
     return beam
 
 
-def _finite_image(values: ArrayLike, name: str) -> Array:
+def checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Mask:
+    """Return a mask as booleans, or raise an `InputError` that says what is wrong with it."""
+    usable = np.asarray(mask)
+    if usable.shape != shape:
+        raise InputError(f"mask has shape {usable.shape}, image {shape}: they must match")
+    if usable.dtype != bool:
+        raise InputError(
+            f"mask has values of type {usable.dtype}, expected booleans, "
+            "true where a pixel can be used: compare it with something first"
+        )
+    if not usable.any():
+        raise InputError("mask is false everywhere, expected true where a pixel can be used")
+    return usable
+
+
+def _plane(values: ArrayLike, name: str) -> NDArray[Any]:
     array = np.asarray(values)
     if array.ndim != 2:
         raise InputError(
@@ -145,12 +212,16 @@ def _finite_image(values: ArrayLike, name: str) -> Array:
         )
     if array.dtype.kind not in "buif":
         raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
-    array = np.array(array, dtype=np.float64)
+    return array
+
+
+def _finite_image(values: ArrayLike, name: str, mask: Mask) -> Array:
+    array = np.where(mask, _plane(values, name), 0.0).astype(np.float64)
     bad = int((~np.isfinite(array)).sum())
     if bad:
         raise InputError(
             f"{name} has {bad} pixels that are NaN or infinite, expected none: "
-            "replace them, for instance by the median of their neighbours"
+            "mask them, or replace them, for instance by the median of their neighbours"
         )
     return array
 

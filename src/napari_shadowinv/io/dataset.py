@@ -60,6 +60,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "reprojection": (_PLANE, "flux/px²", "Image that the displacement makes of the source"),
     "residual": (_PLANE, "flux/px²", "Image minus re-projection"),
     "caustic": (_PLANE, "1", "The map folds, or its Jacobian is below the threshold"),
+    "mask": (_PLANE, "1", "Pixels that were used"),
 }
 
 

@@ -117,10 +117,13 @@ class SitePlan:
         The source that the sites stand for.
     levels : tuple of Level
         Coarse to fine.
+    mask : ndarray of bool, shape (H, W), or None
+        Where the source is known; elsewhere it only keeps the cells together.
     """
 
     source: Array
     levels: tuple[Level, ...]
+    mask: NDArray[np.bool_] | None = None
 
 
 @njit(nogil=True, cache=True)
@@ -248,6 +251,7 @@ def plan_levels(
     lloyd_tolerance: float = 0.0,
     seed: int = 0,
     threads: int | None = None,
+    mask: NDArray[np.bool_] | None = None,
     report: Reporter | None = None,
 ) -> SitePlan:
     """Spread the sites of all levels over a source.
@@ -260,6 +264,8 @@ def plan_levels(
         Sites of the finest level; each coarser one has a quarter.
     lloyd_iterations, lloyd_tolerance, seed, threads
         See `lloyd` and `sample_sites`.
+    mask : ndarray of bool, shape (H, W), optional
+        Kept with the plan.
     report : Reporter, optional
         Told of each step.
 
@@ -291,7 +297,7 @@ def plan_levels(
             report=report_step,
         )
         levels.append(_level(sites, density, steps, threads))
-    return SitePlan(source, tuple(levels))
+    return SitePlan(source, tuple(levels), mask)
 
 
 def _level(sites: Array, density: Density, steps: int, threads: int | None) -> Level:
