@@ -1,0 +1,45 @@
+"""Objects whose potential and displacement are known exactly.
+
+- the paper's experiment and its toroidal magnetic field: `paper_setup`, `toroid`
+- the structures of its Fig. 6: `four_toroids`, `cosine_ellipses`, `focusing_pair`,
+  `opposite_pair`, `coaxial_line`
+- a plasma wave, probed by light: `wakefield`, `wakefield_setup`, `plasma_wavelength`
+- building blocks, round or elliptical: `gaussian_blob`, `cosine_toroid`; phantoms are
+  added with ``+``
+- an object that no flip, shift or swap of axes leaves as it is: `ellipse_pair`
+- what they are: `Phantom`
+"""
+
+from napari_shadowinv.physics.phantoms._phantom import Phantom
+from napari_shadowinv.physics.phantoms._scenes import (
+    coaxial_line,
+    cosine_ellipses,
+    ellipse_pair,
+    focusing_pair,
+    four_toroids,
+    opposite_pair,
+    paper_setup,
+)
+from napari_shadowinv.physics.phantoms._shapes import cosine_toroid, gaussian_blob, toroid
+from napari_shadowinv.physics.phantoms._wakefield import (
+    plasma_wavelength,
+    wakefield,
+    wakefield_setup,
+)
+
+__all__ = [
+    "Phantom",
+    "coaxial_line",
+    "cosine_ellipses",
+    "cosine_toroid",
+    "ellipse_pair",
+    "focusing_pair",
+    "four_toroids",
+    "gaussian_blob",
+    "opposite_pair",
+    "paper_setup",
+    "plasma_wavelength",
+    "toroid",
+    "wakefield",
+    "wakefield_setup",
+]

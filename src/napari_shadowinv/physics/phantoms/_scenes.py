@@ -1,0 +1,347 @@
+"""The paper's experiment, and the objects that it puts into it.
+
+The layouts are read off the paper's Fig. 6, which gives no numbers. At `strength` 1 the
+first caustics have just formed in `paper_setup` on 200 × 200 pixels: the Jacobian's
+minimum is a little below zero, as for the paper's toroid of 194 MG µm.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.phantoms._phantom import (
+    Center,
+    FloatArray,
+    Phantom,
+    offsets,
+    require_finite,
+    require_positive,
+)
+from napari_shadowinv.physics.phantoms._shapes import (
+    Radii,
+    cosine_toroid,
+    gaussian_blob,
+    outward_displacement,
+    toroid,
+)
+from napari_shadowinv.physics.setup import ProtonSetup
+
+# Peak in MG µm, radii in shares of the image's smaller side, centre in shares of height
+# and width, angle in rad.
+Part = tuple[float, Radii, tuple[float, float], float]
+
+_FOUR_TOROIDS: tuple[Part, ...] = (
+    (135.0, 0.07, (0.31, 0.30), 0.0),
+    (75.0, 0.05, (0.30, 0.69), 0.0),
+    (100.0, 0.06, (0.69, 0.32), 0.0),
+    (125.0, 0.08, (0.67, 0.67), 0.0),
+)
+_COSINE_ELLIPSES: tuple[Part, ...] = (
+    (64.0, (0.24, 0.14), (0.37, 0.31), 0.35),
+    (62.0, (0.14, 0.24), (0.66, 0.67), 0.20),
+)
+_FOCUSING_PAIR: tuple[Part, ...] = (
+    (-63.0, (0.12, 0.07), (0.5, 0.38), 0.2),
+    (-63.0, (0.12, 0.07), (0.5, 0.61), -0.2),
+)
+_OPPOSITE_PAIR: tuple[Part, ...] = (
+    (154.0, 0.08, (0.5, 0.33), 0.0),
+    (-68.0, 0.08, (0.5, 0.67), 0.0),
+)
+
+
+def paper_setup() -> ProtonSetup:
+    """Return the experiment of the paper's benchmark.
+
+    Returns
+    -------
+    ProtonSetup
+        Protons of 14.7 MeV, 1.3 mm from source to object, 2 cm on to the detector, pixels
+        of 1.5 µm in the object plane: 200 pixels are ten times the toroid's σ of 30 µm.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Section IV A.
+
+    Examples
+    --------
+    >>> paper_setup().magnification
+    16.38
+    """
+    return ProtonSetup(
+        energy=14.7,
+        source_object_distance=1.3e-3,
+        object_image_distance=2e-2,
+        pixel_size=1.5e-6,
+    )
+
+
+def four_toroids(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
+    """Four Gaussian toroids of different strength and size, all counter-clockwise.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Height and width of the image; positions and radii scale with it.
+    setup : ProtonSetup
+        The beam.
+    strength : float, default 1
+        Factor on the fields, whose largest peak is then 135 MG µm.
+
+    Returns
+    -------
+    Phantom
+        Potential and displacement.
+
+    Raises
+    ------
+    InputError
+        If the shape is not positive, or the strength is not finite.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Fig. 6 (a).
+    """
+    return _toroids(_FOUR_TOROIDS, shape, setup, strength)
+
+
+def cosine_ellipses(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
+    """Two elliptical toroids whose potentials are cos² up to a rim, counter-clockwise.
+
+    Parameters
+    ----------
+    shape, setup, strength
+        See `four_toroids`; the peak fields are 64 and 62 MG µm.
+
+    Returns
+    -------
+    Phantom
+        Potential and displacement.
+
+    Raises
+    ------
+    InputError
+        If the shape is not positive, or the strength is not finite.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Fig. 6 (b).
+    """
+    side = _side(shape, setup, strength)
+    parts = [
+        cosine_toroid(shape, setup, strength * peak, _times(radii, side), _at(share, shape), angle)
+        for peak, radii, share, angle in _COSINE_ELLIPSES
+    ]
+    return _sum(parts)
+
+
+def focusing_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
+    """Two elliptical Gaussian toroids close together, clockwise: they focus protons.
+
+    Parameters
+    ----------
+    shape, setup, strength
+        See `four_toroids`; the peak fields are 63 MG µm.
+
+    Returns
+    -------
+    Phantom
+        Potential and displacement.
+
+    Raises
+    ------
+    InputError
+        If the shape is not positive, or the strength is not finite.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Fig. 6 (c).
+    """
+    return _toroids(_FOCUSING_PAIR, shape, setup, strength)
+
+
+def opposite_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
+    """Gaussian toroids of opposite direction: counter-clockwise left, clockwise right.
+
+    Parameters
+    ----------
+    shape, setup, strength
+        See `four_toroids`; the peak fields are 154 and 68 MG µm, as it takes less to make
+        rays meet than to drive them apart until they meet others.
+
+    Returns
+    -------
+    Phantom
+        Potential and displacement.
+
+    Raises
+    ------
+    InputError
+        If the shape is not positive, or the strength is not finite.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Fig. 6 (d).
+    """
+    return _toroids(_OPPOSITE_PAIR, shape, setup, strength)
+
+
+def coaxial_line(
+    shape: tuple[int, int],
+    setup: ProtonSetup,
+    peak: float = 60.0,
+    radii: tuple[float, float, float] = (21e-6, 66e-6, 78e-6),
+    center: Center = None,
+) -> tuple[Phantom, NDArray[np.bool_]]:
+    """Coaxial line along the beam: a field between two conductors that stop the beam.
+
+    The currents of the two conductors are equal and opposite, and uniform inside each. So
+    the field rises ∝ r in the inner conductor, falls ∝ 1/r between the two and to zero
+    within the outer one, and is zero outside.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Height and width of the image.
+    setup : ProtonSetup
+        The beam.
+    peak : float, default 60
+        Path-integrated field at the inner conductor's surface in MG µm; positive deflects
+        positive charges outwards.
+    radii : tuple of float
+        Radius of the inner conductor, inner and outer radius of the outer one, in m.
+    center : tuple of float, optional
+        Centre (y, x) in px. Default: the image's centre.
+
+    Returns
+    -------
+    phantom : Phantom
+        Potential and displacement, inside the conductors too.
+    obstructed : ndarray of bool, shape (H, W)
+        Pixels whose centres are in a conductor: there the source of the image is dark.
+
+    Raises
+    ------
+    InputError
+        If the radii are not positive and increasing, or a number is not finite.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Fig. 6 (e).
+
+    Examples
+    --------
+    >>> phantom, obstructed = coaxial_line((200, 200), paper_setup())
+    >>> bool(obstructed[100, 100]), float(phantom.potential[0, 0])
+    (True, 0.0)
+    """
+    require_finite(peak=peak)
+    if len(radii) != 3 or not (np.isfinite(radii).all() and 0 < radii[0] < radii[1] < radii[2]):
+        raise InputError(f"radii are {radii}: expected three that are positive and increase, in m")
+    inner, outer, rim = (radius / setup.object_pixel_size for radius in radii)
+    y, x = offsets(shape, center)
+    r = np.hypot(y, x)
+    enclosed = outward_displacement(setup, peak) * inner  # d = enclosed / r between the two
+    share, potential = _coaxial_profile(r, inner, outer, rim)
+    obstructed = (r < inner) | ((r > outer) & (r < rim))
+    return Phantom(enclosed * potential, enclosed * np.stack([share * y, share * x])), obstructed
+
+
+def _coaxial_profile(
+    r: FloatArray, inner: float, outer: float, rim: float
+) -> tuple[FloatArray, FloatArray]:
+    """Current inside r over r², and the integral of current over r from r outwards.
+
+    The current is that of the inner conductor's, 1.
+    """
+    s = np.clip(r, outer, rim)
+    wall = rim**2 - outer**2
+    # ∫ (c² - s²) / (wall s) ds from s to c, with c the rim
+    in_wall = (rim**2 * np.log(rim / s) - (rim**2 - s**2) / 2) / wall
+    between = np.log(outer / np.clip(r, inner, outer))
+    in_core = np.clip(1 - (r / inner) ** 2, 0, None) / 2
+    current = np.where(r < outer, 1.0, (rim**2 - s**2) / wall)
+    share = current / np.maximum(r, inner) ** 2
+    return share, in_core + between + in_wall
+
+
+def ellipse_pair(shape: tuple[int, int], strength: float = 1.0) -> Phantom:
+    """Two different elliptical blobs off the centre, turned, of opposite sign.
+
+    No symmetry of the square maps it onto itself: an inversion that mixes up axes, signs or
+    half pixels cannot get it right.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Height and width of the image; the blobs scale with the smaller one.
+    strength : float, default 1
+        Factor on both amplitudes. At 1 the Jacobian is between 0.5 and 2.5; folds form
+        from about 2.4.
+
+    Returns
+    -------
+    Phantom
+        Potential and displacement.
+
+    Raises
+    ------
+    InputError
+        If the shape is not positive, or the strength is not finite.
+    """
+    height, width = shape
+    unit = min(height, width) / 100
+    first = gaussian_blob(
+        shape,
+        45.0 * strength * unit**2,
+        (7.0 * unit, 12.0 * unit),
+        (0.37 * height, 0.42 * width),
+        0.5,
+    )
+    second = gaussian_blob(
+        shape,
+        -15.0 * strength * unit**2,
+        (10.0 * unit, 6.0 * unit),
+        (0.63 * height, 0.66 * width),
+        0.3,
+    )
+    return first + second
+
+
+def _toroids(
+    parts: tuple[Part, ...], shape: tuple[int, int], setup: ProtonSetup, strength: float
+) -> Phantom:
+    side = _side(shape, setup, strength)
+    return _sum(
+        [
+            toroid(shape, setup, strength * peak, _times(sigma, side), _at(share, shape), angle)
+            for peak, sigma, share, angle in parts
+        ]
+    )
+
+
+def _side(shape: tuple[int, int], setup: ProtonSetup, strength: float) -> float:
+    """Length of the image's smaller side in m."""
+    require_finite(strength=strength)
+    require_positive("smaller side of the image", min(shape), "px")
+    return min(shape) * setup.object_pixel_size
+
+
+def _times(radii: Radii, length: float) -> Radii:
+    if isinstance(radii, tuple):
+        return length * radii[0], length * radii[1]
+    return length * radii
+
+
+def _at(share: tuple[float, float], shape: tuple[int, int]) -> tuple[float, float]:
+    """Pixel at a share of height and width, counted from the image's edge."""
+    return share[0] * shape[0] - 0.5, share[1] * shape[1] - 0.5
+
+
+def _sum(parts: list[Phantom]) -> Phantom:
+    total, *others = parts
+    for other in others:
+        total = total + other
+    return total

@@ -1,0 +1,170 @@
+"""A laser-driven density wave in a plasma, seen from the side by a short pulse of light."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import constants
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.phantoms._phantom import (
+    Center,
+    FloatArray,
+    Phantom,
+    offsets,
+    require_finite,
+    require_positive,
+)
+from napari_shadowinv.physics.setup import OpticalSetup
+
+PAPER_DENSITY = 1.65e25
+"""Density of the paper's plasma in electrons per m³."""
+
+
+def wakefield_setup() -> OpticalSetup:
+    """Return an optical probe of the paper's plasma wave.
+
+    Returns
+    -------
+    OpticalSetup
+        Collimated light of 810 nm, as in the paper. The image is of a plane 20 µm behind
+        the wave, at 0.25 µm per pixel. The paper gives neither distance nor pixel; farther
+        behind, diffraction at a wave of 8 µm would no longer be small.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Section V.
+    """
+    return OpticalSetup(wavelength=810e-9, object_image_distance=20e-6, pixel_size=0.25e-6)
+
+
+def plasma_wavelength(density: float) -> float:
+    """Wavelength 2πc/ω_p of the density wave in a cold plasma.
+
+    Parameters
+    ----------
+    density : float
+        Electron density n₀ in m⁻³.
+
+    Returns
+    -------
+    float
+        Wavelength in m.
+
+    Raises
+    ------
+    InputError
+        If the density is not positive.
+
+    Examples
+    --------
+    >>> round(plasma_wavelength(1.65e25) * 1e6, 2)
+    8.22
+    """
+    require_positive("density", density, "electrons per m³")
+    squared = density * constants.e**2 / (constants.m_e * constants.epsilon_0)
+    return float(2 * math.pi * constants.c / math.sqrt(squared))
+
+
+def wakefield(
+    shape: tuple[int, int],
+    setup: OpticalSetup,
+    amplitude: float = 0.8,
+    *,
+    density: float = PAPER_DENSITY,
+    width: float = 6e-6,
+    length: float = 14e-6,
+    curvature_radius: float = 20e-6,
+    center: Center = None,
+) -> Phantom:
+    """Density wave along x with curved wavefronts, round about its axis.
+
+    The wave's relative density is
+
+        Δn/n₀ = A exp(-ρ²/2w² - ξ²/2ℓ²) cos(k_p (ξ - ρ²/2R)),
+
+    with ξ the distance from the centre along x, ρ² = y² + z² and k_p = 2π over the plasma's
+    wavelength. The beam travels along z. In a strong wave that a laser drives towards +x
+    the fast electrons on the axis are heavier and the wave is longer there, so its fronts
+    lag behind on the axis, as a positive R makes them.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Height and width of the image.
+    setup : OpticalSetup
+        The probe.
+    amplitude : float, default 0.8
+        Amplitude A of Δn/n₀ in the centre; below 1 the density stays positive.
+    density : float, default 1.65e25
+        Density n₀ of the undisturbed plasma in m⁻³.
+    width, length : float
+        Radii w across and ℓ along the wave in m.
+    curvature_radius : float
+        Radius R of the wavefronts on the axis in m; negative bends them the other way,
+        infinite makes them plane.
+    center : tuple of float, optional
+        Centre (y, x) in px. Default: the image's centre.
+
+    Returns
+    -------
+    Phantom
+        Potential and displacement; `OpticalSetup.relative_density_modulation` of the
+        potential is the exact integral ∫Δn/n₀ dz.
+
+    Raises
+    ------
+    InputError
+        If a length or the density is not positive, or the amplitude is not finite.
+
+    Notes
+    -----
+    A Gaussian with a complex width keeps its form when it is integrated:
+    with s = 1/2w² + i k_p/2R,
+
+        ∫Δn/n₀ dz = A exp(-ξ²/2ℓ²) Re[√(π/s) exp(i k_p ξ - s y²)].
+
+    The potential is that of a thin plasma, Φ = n₀/2n_c ∫Δn/n₀ dz, the first order of the
+    paper's Eq. 11 in n₀/n_c, which is 1 % for the paper's plasma and probe.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Section V, Eqs. 11 and 12.
+
+    Examples
+    --------
+    >>> setup = wakefield_setup()
+    >>> wave = wakefield((240, 400), setup)
+    >>> modulation = setup.relative_density_modulation(wave.potential, 1.65e25)
+    >>> round(float(modulation.max()) * 1e6, 1)  # µm
+    9.2
+    """
+    require_finite(amplitude=amplitude)
+    require_positive("width", width, "m")
+    require_positive("length", length, "m")
+    if curvature_radius == 0 or math.isnan(curvature_radius):
+        raise InputError(f"curvature_radius is {curvature_radius}: it must not be 0, in m")
+    wave_number = 2 * math.pi / plasma_wavelength(density)
+    y, xi = (setup.object_pixel_size * offset for offset in offsets(shape, center))
+    s = complex(1 / (2 * width**2), wave_number / (2 * curvature_radius))
+    integral = amplitude * np.sqrt(np.pi / s) * np.exp(1j * wave_number * xi - s * y**2)
+    integral *= np.exp(-(xi**2) / (2 * length**2))
+    slope_x = integral * (1j * wave_number - xi / length**2)
+    return _thin_plasma(setup, density, integral.real, (integral * -2 * s * y).real, slope_x.real)
+
+
+def _thin_plasma(
+    setup: OpticalSetup,
+    density: float,
+    integral: FloatArray,
+    slope_y: FloatArray,
+    slope_x: FloatArray,
+) -> Phantom:
+    """Phantom of ∫Δn/n₀ dz (m) and its derivatives per metre."""
+    per_metre = density / (2 * setup.critical_density)
+    slopes = np.stack([slope_y, slope_x])
+    return Phantom(
+        setup.normalized_potential(per_metre * integral),
+        setup.displacement(-per_metre * slopes),
+    )
