@@ -1,0 +1,527 @@
+"""Estimates of the undisturbed beam, from an image that the object has already modulated.
+
+An inversion needs the source: the image that the beam would make without the object. Where
+none was recorded, or the beam changes from shot to shot, it has to be guessed from the shot.
+
+- the beam is flat, or nothing is known: `uniform_source`
+- the beam is a Gaussian spot: `gaussian_source`
+- the beam varies slowly, in no known way: `polynomial_source`, `low_pass_source`
+- the beam has edges that matter: `total_variation_source`
+- the object covers a known part of the image: `interpolated_source`
+
+Each takes an image ``[y, x]`` and returns one of the same shape that is positive everywhere
+and has the same flux over the usable pixels. A `mask` is True where a pixel is usable; the
+others (dead areas, handwriting, a shadow) may hold anything, NaN too, and are filled in.
+
+What an estimate takes for the beam is lost from the object, and the other way round. The
+choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179, section V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.fft import dctn, idctn
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import least_squares
+from scipy.sparse.linalg import LinearOperator, cg
+from skimage.restoration import denoise_tv_chambolle
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.filters import (
+    checked_integer,
+    checked_number,
+    checked_pixels,
+    fit_polynomial,
+)
+
+__all__ = [
+    "gaussian_source",
+    "interpolated_source",
+    "low_pass_source",
+    "polynomial_source",
+    "total_variation_source",
+    "uniform_source",
+]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# As a share of the mean: the floor to which an inversion raises an image's dark pixels.
+_FLOOR = 1e-3
+_NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal noise
+_MOST_FITTED_PIXELS = 2**16
+_MOST_FITS = 10
+_LEAST_SUPPORT = 1e-6
+_COARSEST_SIDE = 32
+_FILL_WIDTH = 5.0
+_FILL_TOLERANCE = 1e-6
+
+# It comes without types.
+_denoised: Callable[..., FloatArray] = denoise_tv_chambolle
+
+
+def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatArray:
+    """Flat beam with the mean of the image.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; counts or any linear measure of fluence.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel is usable. Default: everywhere.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The same number everywhere, in the unit of `image`.
+
+    Raises
+    ------
+    InputError
+        If image and mask cannot be used, or the image has no flux.
+
+    Examples
+    --------
+    >>> uniform_source([[1, 2], [3, 6]])
+    array([[3., 3.], [3., 3.]])
+    """
+    values, usable = _beam_pixels(image, mask)
+    return np.full(values.shape, values[usable].mean())
+
+
+def gaussian_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatArray:
+    """Elliptical Gaussian plus a constant, fitted to the image.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; counts or any linear measure of fluence.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel is usable. Default: everywhere.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The fitted beam, in the unit of `image`.
+
+    Raises
+    ------
+    InputError
+        If image and mask cannot be used, or the image has no flux.
+
+    Notes
+    -----
+    Least squares with the soft L1 loss, whose unit is the median absolute deviation of the
+    residuals, found by fitting again until it stays: modulation stronger than that counts
+    in proportion, not squared. Centre, both widths, tilt, height and constant are free; the
+    last two are not negative. Large images are averaged in blocks for the fit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:40, :50]
+    >>> beam = 3 + 7 * np.exp(-((y - 18) ** 2) / 200 - (x - 30) ** 2 / 300)
+    >>> float(abs(gaussian_source(beam) / beam - 1).max()) < 1e-4
+    True
+    """
+    values, usable = _beam_pixels(image, mask)
+    side, mean = max(values.shape), values[usable].mean()
+    y, x, sample = _samples(values / mean, usable)
+    parameters = _fitted_gaussian(y / side, x / side, sample)
+    rows, columns = (np.arange(n) / side for n in values.shape)
+    beam = mean * _gaussian(parameters, rows[:, None], columns)
+    return _with_flux_of(beam, values, usable)
+
+
+def polynomial_source(
+    image: ArrayLike, *, degree: int = 2, mask: ArrayLike | None = None
+) -> FloatArray:
+    """Polynomial in y and x, fitted to the image and little moved by its modulation.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; counts or any linear measure of fluence.
+    degree : int, default 2
+        Total degree of the polynomial in y and x, from 0 to 10.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel is usable. Default: everywhere.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The fitted beam in the unit of `image`; where the polynomial falls below 0.001 of the
+        image's mean, it is that.
+
+    Raises
+    ------
+    InputError
+        If image and mask cannot be used, the image has no flux, the degree is out of range,
+        or there are fewer usable pixels than coefficients.
+
+    See Also
+    --------
+    napari_shadowinv.filters.remove_background : flatten an image by the same fit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> ramp = np.linspace(1, 3, 50) * np.ones((50, 1))
+    >>> float(abs(polynomial_source(ramp, degree=1) - ramp).max()) < 1e-12
+    True
+    """
+    values, usable = _beam_pixels(image, mask)
+    return _with_flux_of(fit_polynomial(values, degree, mask=usable), values, usable)
+
+
+def low_pass_source(image: ArrayLike, width: float, *, mask: ArrayLike | None = None) -> FloatArray:
+    """The image, blurred until the object is gone.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; counts or any linear measure of fluence.
+    width : float
+        Standard deviation of the Gaussian blur in px; a few times the size of the object.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel is usable. Default: everywhere.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The blurred image in its own unit: at each pixel the mean of the usable pixels around
+        it, weighted by the Gaussian. Its border is mirrored.
+
+    Raises
+    ------
+    InputError
+        If image and mask cannot be used, the image has no flux, or the width is not positive.
+
+    Notes
+    -----
+    Where no usable pixel is within reach, the width is doubled until there is one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> shot = 5 + np.random.default_rng(0).normal(size=(60, 60))
+    >>> float(low_pass_source(shot, 10.0).std()) < 0.05
+    True
+    """
+    values, usable = _beam_pixels(image, mask)
+    width = checked_number("width", width, above=0, unit="px")
+    beam, support = _masked_blur(values, usable, width)
+    while not support.all():
+        width *= 2
+        wider, reached = _masked_blur(values, usable, width)
+        beam, support = np.where(support, beam, wider), support | reached
+    return _with_flux_of(beam, values, usable)
+
+
+def total_variation_source(
+    image: ArrayLike,
+    *,
+    weight: float = 2.0,
+    iterations: int = 1000,
+    mask: ArrayLike | None = None,
+) -> FloatArray:
+    """The image without small structures, but with its edges.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; counts or any linear measure of fluence.
+    weight : float, default 2
+        How much is taken away, in px: a disc of radius r px is lowered by 2·weight/r of the
+        image's mean. So it takes c·r/2 to remove a disc of contrast c.
+    iterations : int, default 1000
+        Most steps of the minimisation; an object of radius r px needs about r² of them.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel is usable. Default: everywhere. The others are first filled as by
+        `interpolated_source`.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The smoothed image, in its own unit.
+
+    Raises
+    ------
+    InputError
+        If image and mask cannot be used, the image has no flux, or the weight or the number
+        of iterations is not positive.
+
+    References
+    ----------
+    A. Chambolle, "An algorithm for total variation minimization and applications", Journal
+    of Mathematical Imaging and Vision 20, 89 (2004).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> shot = np.where(np.arange(60) < 30, 2.0, 4.0) + np.zeros((60, 1))
+    >>> shot[10:14, 10:14] = 3.0
+    >>> beam = total_variation_source(shot, weight=0.5)
+    >>> bool(abs(beam[10:14, 10:14] - 2).max() < 0.1), bool(beam[40, 30] - beam[40, 29] > 1.8)
+    (True, True)
+    """
+    values, usable = _beam_pixels(image, mask)
+    weight = checked_number("weight", weight, above=0, unit="px")
+    iterations = checked_integer("iterations", iterations, least=1)
+    filled = values if usable.all() else _filled(values, usable, _FILL_WIDTH, power=2)
+    mean = values[usable].mean()
+    beam = mean * _denoised(filled / mean, weight=weight, eps=1e-7, max_num_iter=iterations)
+    return _with_flux_of(beam, values, usable)
+
+
+def interpolated_source(
+    image: ArrayLike,
+    mask: ArrayLike,
+    *,
+    width: float = _FILL_WIDTH,
+    kind: Literal["biharmonic", "laplace"] = "biharmonic",
+) -> FloatArray:
+    """The image itself, with the part that the object covers filled in from around it.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; counts or any linear measure of fluence.
+    mask : array_like of bool, shape (H, W)
+        True where the image shows the bare beam, False where the object is.
+    width : float, default 5
+        Length in px over which the surroundings are smoothed before they are continued, so
+        that noise next to the gap does not spread into it. Wider gaps need wider smoothing.
+    kind : {"biharmonic", "laplace"}, default "biharmonic"
+        "biharmonic" continues slope and curvature of the beam: for gaps inside the image.
+        "laplace" never leaves the range of the surroundings: for gaps at the image's edge.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The beam in the unit of `image`; where the mask is true, the image itself.
+
+    Raises
+    ------
+    InputError
+        If image and mask cannot be used, the image has no flux, the width is not positive, or
+        the kind unknown.
+
+    Notes
+    -----
+    The filling u minimises ∑(u - image)² over the usable pixels + width²ᵖ ∑ u(-Δ)ᵖu over
+    all, with p = 2 (a thin plate) or p = 1 (a membrane) and mirrored borders, by conjugate
+    gradients preconditioned with the discrete cosine transform, from coarse to fine.
+
+    References
+    ----------
+    D. Garcia, "Robust smoothing of gridded data in one and higher dimensions with missing
+    values", Computational Statistics & Data Analysis 54, 1167 (2010).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:48, :64]
+    >>> beam = 100 * np.exp(-((y - 20) ** 2 + (x - 30) ** 2) / 2000)
+    >>> mask = np.hypot(y - 24, x - 34) > 8
+    >>> shot = np.where(mask, beam, 0)
+    >>> float(abs(interpolated_source(shot, mask, width=2.0) / beam - 1).max()) < 0.01
+    True
+    """
+    if kind not in ("biharmonic", "laplace"):
+        raise InputError(f"kind is {kind!r}, expected 'biharmonic' or 'laplace'")
+    values, usable = _beam_pixels(image, mask)
+    width = checked_number("width", width, above=0, unit="px")
+    power = 2 if kind == "biharmonic" else 1
+    beam = np.where(usable, values, _filled(values, usable, width, power))
+    return _with_flux_of(beam, values, usable)
+
+
+def _beam_pixels(image: ArrayLike, mask: ArrayLike | None) -> tuple[FloatArray, BoolArray]:
+    """Values and usable pixels of an image that has flux."""
+    values, usable = checked_pixels(image, mask)
+    flux = values[usable].sum()
+    if flux <= 0:
+        raise InputError(
+            f"image has a flux of {flux:.4g} over its usable pixels, expected a positive one: "
+            "check the file and its background"
+        )
+    return values, usable
+
+
+def _with_flux_of(beam: FloatArray, values: FloatArray, usable: BoolArray) -> FloatArray:
+    """A beam made positive and given the flux of an image over its usable pixels."""
+    mean = values[usable].mean()
+    positive = np.maximum(beam, _FLOOR * mean)
+    return np.asarray(positive * (mean / positive[usable].mean()))
+
+
+def _samples(values: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Positions y, x and means of blocks of usable pixels, few enough for a fit."""
+    block = int(np.ceil(np.sqrt(values.size / _MOST_FITTED_PIXELS)))
+    share = _block_means(usable.astype(np.float64), block)
+    means = _block_means(np.where(usable, values, 0.0), block)
+    # A block is taken only if it is whole: the middle of a part of it lies elsewhere.
+    # A mask so fine that no block is whole leaves the fullest.
+    y, x = np.nonzero(share >= share.max())
+    middle = (block - 1) / 2
+    rows, columns = (np.asarray(axis * block + middle, dtype=np.float64) for axis in (y, x))
+    return rows, columns, np.asarray(means[y, x] / share[y, x])
+
+
+def _block_means(values: FloatArray, block: int) -> FloatArray:
+    """Means over square blocks; incomplete ones at the far edges are padded by mirroring."""
+    padding = [(0, -side % block) for side in values.shape]
+    padded = np.pad(values, padding, mode="symmetric")
+    height, width = padded.shape
+    blocks = padded.reshape(height // block, block, width // block, block)
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def _fitted_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
+    """Parameters of `_gaussian` that fit samples, by repeated robust least squares."""
+    parameters = _first_gaussian(y, x, sample)
+    # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
+    parameters = _refitted(parameters, y, x, sample, loss="linear", scale=1.0)
+    scale = 0.0
+    for _ in range(_MOST_FITS):
+        residual = _gaussian(parameters, y, x) - sample
+        previous, scale = scale, max(_NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
+        if abs(scale - previous) < 1e-2 * scale:
+            break
+        parameters = _refitted(parameters, y, x, sample, loss="soft_l1", scale=scale)
+    return parameters
+
+
+def _refitted(
+    parameters: FloatArray,
+    y: FloatArray,
+    x: FloatArray,
+    sample: FloatArray,
+    *,
+    loss: Literal["linear", "soft_l1"],
+    scale: float,
+) -> FloatArray:
+    """Parameters of `_gaussian` nearest to samples, in the sense of a loss of some scale."""
+    least = np.full(len(parameters), -np.inf)
+    least[:2] = 0  # height and constant
+    fit = least_squares(
+        lambda p: _gaussian(p, y, x) - sample,
+        parameters,
+        jac=lambda p: _gaussian_slopes(p, y, x),
+        bounds=(least, np.inf),
+        loss=loss,
+        f_scale=scale,
+        x_scale="jac",
+        max_nfev=200,
+    )
+    return np.asarray(fit.x)
+
+
+def _first_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
+    """Parameters of `_gaussian` from the moments of what rises above the dark corners."""
+    constant, peak = (float(level) for level in np.percentile(sample, [2, 98]))
+    weights = np.maximum(sample - constant, 0) + 1e-9
+    centre_y, centre_x = np.average(y, weights=weights), np.average(x, weights=weights)
+    widths = [
+        max(float(np.sqrt(np.average((axis - centre) ** 2, weights=weights))), 1e-3)
+        for axis, centre in ((y, centre_y), (x, centre_x))
+    ]
+    height = max(peak - constant, 1e-3)
+    return np.array(
+        [height, max(constant, 1e-3), centre_y, centre_x, 1 / widths[0], 0.0, 1 / widths[1]]
+    )
+
+
+def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
+    """Height · exp(-½(u² + v²)) + constant, with u = a·dy + b·dx and v = c·dx.
+
+    The factors of the inverse covariance, unlike its entries, may take any value.
+    """
+    height, constant, centre_y, centre_x, a, b, c = parameters
+    u = a * (y - centre_y) + b * (x - centre_x)
+    v = c * (x - centre_x)
+    return np.asarray(height * np.exp(-0.5 * (u**2 + v**2)) + constant)
+
+
+def _gaussian_slopes(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
+    """Derivatives of `_gaussian` with respect to its parameters, shape (samples, 7)."""
+    height, _, centre_y, centre_x, a, b, c = parameters
+    dy, dx = y - centre_y, x - centre_x
+    u, v = a * dy + b * dx, c * dx
+    bell = np.exp(-0.5 * (u**2 + v**2))
+    slopes = [
+        bell,
+        np.ones_like(bell),
+        height * bell * u * a,
+        height * bell * (u * b + v * c),
+        -height * bell * u * dy,
+        -height * bell * u * dx,
+        -height * bell * v * dx,
+    ]
+    return np.stack(slopes, axis=1)
+
+
+def _masked_blur(
+    values: FloatArray, usable: BoolArray, width: float
+) -> tuple[FloatArray, BoolArray]:
+    """Blur of the usable pixels, and where there was enough of them to tell."""
+    support = np.asarray(gaussian_filter(usable.astype(np.float64), width, mode="reflect"))
+    blurred = gaussian_filter(np.where(usable, values, 0.0), width, mode="reflect")
+    return blurred / np.maximum(support, _LEAST_SUPPORT), support >= _LEAST_SUPPORT
+
+
+def _filled(values: FloatArray, usable: BoolArray, width: float, power: int) -> FloatArray:
+    """Smoothing spline through the usable pixels, continued over the others."""
+    mean = values[usable].mean()
+    known = np.where(usable, values / mean, 0.0)
+    return np.asarray(_spline(known, usable.astype(np.float64), width, power) * mean)
+
+
+def _spline(known: FloatArray, share: FloatArray, width: float, power: int) -> FloatArray:
+    """Minimise ∑ share·(u - value)² + width^2p ∑ u(-Δ)ᵖu, `known` being share·value."""
+    squares = [4 * np.sin(0.5 * np.pi * np.arange(side) / side) ** 2 for side in known.shape]
+    roughness = (width**2 * np.add.outer(*squares)) ** power
+
+    def stiffness(flat: FloatArray) -> FloatArray:
+        u = flat.reshape(known.shape)
+        bent = idctn(roughness * dctn(u, norm="ortho"), norm="ortho")
+        return np.asarray(share * u + bent).ravel()
+
+    typical = float(share.mean())
+
+    def nearly_inverse(flat: FloatArray) -> FloatArray:
+        coefficients = dctn(flat.reshape(known.shape), norm="ortho") / (typical + roughness)
+        return np.asarray(idctn(coefficients, norm="ortho")).ravel()
+
+    shape = (known.size, known.size)
+    solution, _ = cg(
+        LinearOperator(shape, matvec=stiffness, dtype=np.float64),
+        known.ravel(),
+        x0=_coarse_spline(known, share, width, power).ravel(),
+        M=LinearOperator(shape, matvec=nearly_inverse, dtype=np.float64),
+        rtol=_FILL_TOLERANCE,
+        maxiter=500,
+    )
+    return np.asarray(solution.reshape(known.shape))
+
+
+def _coarse_spline(known: FloatArray, share: FloatArray, width: float, power: int) -> FloatArray:
+    """First guess of `_spline`, from pixels twice as large."""
+    if min(known.shape) < _COARSEST_SIDE:
+        return np.full(known.shape, known.sum() / share.sum())
+    coarse = _spline(_block_means(known, 2), _block_means(share, 2), width / 2, power)
+    height, length = known.shape
+    return _doubled(_doubled(coarse, height).T, length).T
+
+
+def _doubled(coarse: FloatArray, side: int) -> FloatArray:
+    """Rows twice as many, cut to `side`, linear between the middles of the coarse ones."""
+    padded = np.pad(coarse, [(1, 1), (0, 0)], mode="edge")
+    near, before, after = padded[1:-1], padded[:-2], padded[2:]
+    rows = np.stack([0.75 * near + 0.25 * before, 0.75 * near + 0.25 * after], axis=1)
+    return np.asarray(rows.reshape(-1, coarse.shape[1])[:side])
