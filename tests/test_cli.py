@@ -134,6 +134,32 @@ def test_source_setup_and_options_are_used(folder: Path, shot: Path) -> None:
     assert "MG·µm" in result.stdout
 
 
+def test_a_mask_keeps_unusable_pixels_out(
+    folder: Path, shot: Path, refused: Callable[..., None]
+) -> None:
+    usable = np.full((24, 32), 255, np.uint8)
+    usable[:6, :8] = 0
+    iio.imwrite(folder / "mask.png", usable)
+    image = np.load(shot)
+    image[:6, :8] = 1e4
+    np.save(shot, image)
+    assert shadowinv("invert", shot, "--mask", folder / "mask.png", "-q").exit_code == 0
+    written = inversion_from_dataset(read(folder / "shot.shadowinv"))
+    np.testing.assert_array_equal(written.mask, usable > 0)
+    np.testing.assert_array_equal(
+        written.potential, invert(np.load(shot), mask=usable > 0).potential
+    )
+    iio.imwrite(folder / "small.png", usable[1:])
+    refused(
+        "invert",
+        shot,
+        "--mask",
+        folder / "small.png",
+        "--overwrite",
+        names=("small.png", "(23, 32)"),
+    )
+
+
 def test_bin_sums_and_widens_pixels(folder: Path) -> None:
     image = 100 * synthetic_image(gaussian_blob((50, 63), 20.0, 8.0).displacement)
     np.save("fine.npy", image)

@@ -228,15 +228,15 @@ def test_toml_mistakes_name_file_and_line(tmp_path: Path) -> None:
 
 
 def test_bins_sum_counts_and_widen_pixels(proton_setup: Any) -> None:
-    mask = np.zeros((6, 9), bool)
-    mask[0, 0] = True
+    mask = np.ones((6, 9), bool)
+    mask[0, 0] = False
     shot = Radiograph(RAMP.astype(float), setup=proton_setup, mask=mask, source=np.ones((6, 9)))
     binned = shot.binned(2)
     assert binned.image.shape == (3, 4)
     assert binned.image.sum() == RAMP[:6, :8].sum()
     assert binned.image[1, 2] == RAMP[2:4, 4:6].sum()
     assert binned.mask is not None
-    assert np.argwhere(binned.mask).tolist() == [[0, 0]]
+    assert np.argwhere(~binned.mask).tolist() == [[0, 0]]
     assert binned.source is not None
     assert (binned.source == 4).all()
     assert binned.setup is not None

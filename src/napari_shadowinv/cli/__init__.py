@@ -117,6 +117,10 @@ def invert(
         typer.Argument(help="TIFF, PNG, BMP, JPEG, NPY or pradformat HDF5.", show_default=False),
     ],
     source: SourceFile = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option("--mask", help="Picture of the image's size, 0 where a pixel is unusable."),
+    ] = None,
     setup: SetupFile = None,
     options: Annotated[
         Path | None, typer.Option("--options", help="TOML file with inversion options.")
@@ -161,10 +165,10 @@ def invert(
 
     result, figure = result_and_figure(image, out, report)
     check_outputs({result: RESULT_SUFFIXES, figure: FIGURE_SUFFIXES}, overwrite)
-    protect([result, figure], [image, source, setup, options])
+    protect([result, figure], [image, source, mask, setup, options])
     flags = {"n_sites": n_sites, "threads": threads, "seed": seed}
     chosen = options_from(options, flags, clip_negative)
-    experiment = experiment_from(image, source, setup, channel, bin_)
+    experiment = experiment_from(image, source, setup, channel, bin_, mask)
     if result.suffix.lower() in (".h5", ".hdf5"):
         check_pradformat_setup(experiment.setup)
     inversion = inverted(experiment, chosen, quiet)

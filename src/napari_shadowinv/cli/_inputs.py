@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,13 +43,20 @@ def options_from(
 
 
 def experiment_from(
-    image: Path, source: Path | None, setup: Path | None, channel: str | None, factor: int
+    image: Path,
+    source: Path | None,
+    setup: Path | None,
+    channel: str | None,
+    factor: int,
+    mask: Path | None = None,
 ) -> Experiment:
     """Read what is to be inverted, binned alike."""
     from napari_shadowinv.io import binned_setup, read_radiograph, read_toml
 
     entries = None if setup is None else read_toml(setup)
     shot = read_radiograph(image, channel=channel)
+    if mask is not None:
+        shot = _masked(shot, mask)
     beam = None if source is None else read_radiograph(source, channel=channel)
     geometry = shot.setup
     if entries is not None:
@@ -57,6 +64,18 @@ def experiment_from(
     if geometry is not None:
         geometry = binned_setup(geometry, factor)
     return Experiment(shot.binned(factor), None if beam is None else beam.binned(factor), geometry)
+
+
+def _masked(shot: Radiograph, path: Path) -> Radiograph:
+    """Give a shot the mask from a picture in which unusable pixels are 0."""
+    from napari_shadowinv.io import read_radiograph
+
+    usable = read_radiograph(path, channel="mean").image != 0
+    if usable.shape != shot.image.shape:
+        raise InputError(
+            f"{path}: mask has shape {usable.shape}, image {shot.image.shape}: they must match"
+        )
+    return replace(shot, mask=usable)
 
 
 def setup_from(path: Path) -> Setup:

@@ -28,6 +28,7 @@ def inverted(experiment: Experiment, options: InversionOptions, quiet: bool = Fa
             return invert(
                 shot.image,
                 source=None if source is None else source.image,
+                mask=shot.mask,
                 options=options,
                 on_progress=show,
                 should_stop=should_stop,

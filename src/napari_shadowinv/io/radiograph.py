@@ -38,7 +38,7 @@ class Radiograph:
     source : ndarray, shape (H, W), or None
         The undisturbed beam.
     mask : ndarray of bool, shape (H, W), or None
-        True where the image cannot be trusted.
+        True where a pixel can be used.
     """
 
     image: NDArray[np.float64]
@@ -61,7 +61,7 @@ class Radiograph:
         -------
         Radiograph
             A smaller one, with ``bin`` and ``cropped`` (rows, columns) in its metadata. A
-            block is masked if any of its pixels is.
+            block can be used if all its pixels can.
 
         Raises
         ------
@@ -88,7 +88,7 @@ class Radiograph:
             source=None if self.source is None else _blocks(self.source, factor).sum(axis=(1, 3)),
             mask=None
             if self.mask is None
-            else np.asarray(_blocks(self.mask, factor).any(axis=(1, 3))),
+            else np.asarray(_blocks(self.mask, factor).all(axis=(1, 3))),
             setup=None if self.setup is None else binned_setup(self.setup, factor),
             metadata={
                 **self.metadata,
