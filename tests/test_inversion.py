@@ -9,6 +9,7 @@ from napari_shadowinv import (
     InversionOptions,
     invert,
     plan_sites,
+    read,
     synthetic_image,
 )
 from napari_shadowinv.physics.forward import jacobian_determinant
@@ -349,3 +350,17 @@ def test_the_donut_is_retrieved(shared_data):
     assert inversion.report.converged
     assert 100 * abs(peak(inversion.displacement) / peak(true) - 1) <= 1.5
     assert 100 * relative_error(inversion.displacement, true) <= 2.4
+
+
+def test_a_real_plume_with_its_real_reference_is_explained(shared_data):
+    folder = shared_data / "burner" / "data"
+    shot = read(folder / "Image_20241017221829851.bmp").binned(2)
+    reference = read(folder / "Image_00000.bmp").binned(2)
+    inversion = invert(shot.image, source=reference.image)
+    assert inversion.report.converged
+    assert inversion.report.n_sites == 576 * 464
+    unexplained = inversion.residual.std() / reference.image.mean()
+    modulation = (inversion.image - reference.image).std() / reference.image.mean()
+    assert unexplained < 0.01
+    assert modulation > 0.05
+    assert 2 < peak(inversion.displacement) < 4
