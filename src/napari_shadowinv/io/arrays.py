@@ -32,9 +32,10 @@ def read_npy(path: Path) -> NDArray[Any]:
         If it is damaged or holds anything but real numbers.
     """
     try:
-        array = np.asarray(np.load(path, allow_pickle=False))
+        # Mapped first: a header that promises too much then fails before memory is asked for.
+        array = np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
     except (ValueError, EOFError, OSError, SyntaxError) as error:
-        if "allow_pickle" in str(error):
+        if "Python objects" in str(error):
             raise FileFormatError(
                 f"{path} holds Python objects: expected an array of numbers; "
                 "save it again with array.astype(float)"

@@ -13,14 +13,23 @@ import hashlib
 import os
 import secrets
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from napari_shadowinv.errors import FileFormatError
 
-__all__ = ["READABLE", "check_output", "kind_of", "replacing", "sha256"]
+__all__ = [
+    "READABLE",
+    "check_output",
+    "kind_of",
+    "replacing",
+    "sha256",
+]
 
-READABLE = "TIFF, PNG, BMP, JPEG, NPY, pradformat HDF5 or .shadowinv"
+READABLE = (
+    "TIFF, PNG, BMP, JPEG, NPY, MATLAB, PCO .b16, Princeton .spe, pradformat HDF5, .shadowinv, "
+    "or numbers as .txt, .csv or .dat"
+)
 
 _READABLE_SIGNATURES: dict[bytes, str] = {
     b"II*\x00": "tiff",
@@ -32,7 +41,15 @@ _READABLE_SIGNATURES: dict[bytes, str] = {
     b"\xff\xd8\xff": "jpeg",
     b"\x93NUMPY": "npy",
     b"\x89HDF\r\n\x1a\n": "hdf5",
+    b"MATLAB": "mat",
+    b"PCO-": "b16",
+    b"pco-": "b16",
 }
+
+_TEXT_SUFFIXES = (".txt", ".csv", ".dat", ".asc")
+
+# Where Princeton's header keeps two numbers that are always the same, and these.
+_SPE_MARKS = ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55"))
 
 _OTHER_SIGNATURES: dict[bytes, str] = {
     b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
@@ -41,12 +58,13 @@ _OTHER_SIGNATURES: dict[bytes, str] = {
     b"GIF8": "a GIF picture",
     b"SIMPLE  =": "a FITS file",
     b"CDF": "a NetCDF 3 file",
-    b"MATLAB": "a MATLAB file",
 }
 
 
 def kind_of(path: str | Path) -> str:
     """Tell the kind of a file from its content; its name may lie.
+
+    Numbers as text have no mark: they need one of the usual endings too.
 
     Parameters
     ----------
@@ -56,7 +74,8 @@ def kind_of(path: str | Path) -> str:
     Returns
     -------
     str
-        ``"tiff"``, ``"png"``, ``"bmp"``, ``"jpeg"``, ``"npy"`` or ``"hdf5"``.
+        ``"tiff"``, ``"png"``, ``"bmp"``, ``"jpeg"``, ``"npy"``, ``"hdf5"``, ``"mat"``, ``"b16"``,
+        ``"spe"`` or ``"text"``.
 
     Raises
     ------
@@ -70,9 +89,33 @@ def kind_of(path: str | Path) -> str:
     for signature, kind in _READABLE_SIGNATURES.items():
         if head.startswith(signature):
             return kind
+    if is_spe(path):
+        return "spe"
+    if path.suffix.lower() in _TEXT_SUFFIXES and _is_text(head):
+        return "text"
     raise FileFormatError(
         f"{path} is {_describe(head)}: expected {READABLE}; export the image to one of these"
     )
+
+
+def is_spe(path: Path) -> bool:
+    """Tell whether a file is SPE by the marks inside its header, or else by its name.
+
+    Parameters
+    ----------
+    path : Path
+        A file.
+
+    Returns
+    -------
+    bool
+        True for a file with either mark, and for one that is named ``.spe`` and no text: the
+        oldest programs left the marks out.
+    """
+    with path.open("rb") as file:
+        head = file.read(4100)
+    marked = any(head[at : at + len(mark)] == mark for at, mark in _SPE_MARKS)
+    return marked or (path.suffix.lower() == ".spe" and not _is_text(head[:64]))
 
 
 def _first_bytes(path: Path, count: int = 64) -> bytes:
@@ -95,12 +138,22 @@ def _describe(head: bytes) -> str:
     for signature, text in _OTHER_SIGNATURES.items():
         if head.startswith(signature):
             return text
-    with suppress(UnicodeDecodeError):
+    return "a text file" if _is_text(head) else "not an image that can be recognised"
+
+
+def _is_text(head: bytes) -> bool:
+    try:
         # Incremental, because the last character may have been cut in two.
-        text = codecs.getincrementaldecoder("utf-8")().decode(head)
-        if all(character.isprintable() or character.isspace() for character in text):
-            return "a text file"
-    return "not an image that can be recognised"
+        text = codecs.getincrementaldecoder("utf-8-sig")().decode(head)
+    except UnicodeDecodeError:
+        # Comments that Windows wrote, such as µm in latin-1.
+        text = head.decode("latin-1")
+        return _is_plain(text) and text[0] in "#%"
+    return _is_plain(text)
+
+
+def _is_plain(text: str) -> bool:
+    return all(character.isprintable() or character.isspace() for character in text)
 
 
 def sha256(path: str | Path) -> str:

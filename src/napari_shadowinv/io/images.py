@@ -1,13 +1,13 @@
 """Pictures: TIFF with 8, 16 or 32 bits, PNG, BMP and JPEG.
 
-- read: `read_picture`
+- read one of these, or a plane of another family of formats: `read_picture`
 - write a plane: `write_tiff`, `write_png`
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.camera import read_b16, read_spe
+from napari_shadowinv.io.matlab import read_mat
+from napari_shadowinv.io.promises import DEFLATE_RATIO, check_promise
+from napari_shadowinv.io.text import read_text
 
 __all__ = ["read_picture", "write_png", "write_tiff"]
 
@@ -43,8 +47,8 @@ def read_picture(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
         If the file is damaged or holds anything else than one picture.
     """
     try:
-        array, metadata = _read_tiff(path) if kind == "tiff" else _read_other(path, kind)
-    except (FileFormatError, MemoryError):
+        array, metadata = _reader(kind)(path)
+    except (FileFormatError, InputError, MemoryError):
         raise
     except Exception as error:
         # Decoders raise whatever comes: struct.error, zlib.error, KeyError, SyntaxError …
@@ -54,6 +58,22 @@ def read_picture(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
         ) from error
     _check(path, kind, array)
     return array, metadata
+
+
+# LZW at its best packs two and a half times as well as zlib.
+_TIFF_RATIO = 3 * DEFLATE_RATIO
+
+
+def _reader(kind: str) -> Callable[[Path], tuple[NDArray[Any], dict[str, Any]]]:
+    readers: dict[str, Callable[[Path], tuple[NDArray[Any], dict[str, Any]]]] = {
+        "tiff": _read_tiff,
+        "png": _read_png,
+        "mat": read_mat,
+        "text": read_text,
+        "b16": read_b16,
+        "spe": read_spe,
+    }
+    return readers.get(kind, _read_eight_bits)
 
 
 def _one_line(error: BaseException) -> str:
@@ -137,14 +157,18 @@ def _check_complete(path: Path, page: Any) -> None:
             f"{path} is cut short: its TIFF header promises {max(ends, default=0)} bytes, found "
             f"{size}; copy it again"
         )
+    held = sum(page.databytecounts)
+    packing = 1 if page.compression.name == "NONE" else _TIFF_RATIO
+    check_promise(path, "TIFF", page.size * page.bitspersample // 8, packing * held)
 
 
 def _apply_palette(array: NDArray[Any], palette: NDArray[np.uint16]) -> NDArray[np.uint16]:
     return np.moveaxis(palette[:, array], 0, -1)
 
 
-def _read_other(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
-    bits = _png_bits(path) if kind == "png" else 8
+def _read_png(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+    with path.open("rb") as file:
+        bits = file.read(25)[24]
     array = _read_with_pillow(path)
     if bits == 16 and array.dtype.itemsize == 1:
         raise FileFormatError(
@@ -154,17 +178,19 @@ def _read_other(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
     return array, {"bits": bits}
 
 
+def _read_eight_bits(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+    return _read_with_pillow(path), {"bits": 8}
+
+
 def _read_with_pillow(path: Path) -> NDArray[Any]:
     import imageio.v3 as iio
 
     # A file object, because imageio would believe the name.
-    with path.open("rb") as file:
-        return np.asarray(iio.imread(file, plugin="pillow", index=0))
-
-
-def _png_bits(path: Path) -> int:
-    with path.open("rb") as file:
-        return file.read(25)[24]
+    with path.open("rb") as file, iio.imopen(file, "r", plugin="pillow") as picture:
+        height, width = picture.properties(index=0).shape[:2]
+        # A pixel has one bit at least.
+        check_promise(path, "picture", height * width // 8, DEFLATE_RATIO * path.stat().st_size)
+        return np.asarray(picture.read(index=0))
 
 
 def write_tiff(path: Path, plane: NDArray[Any], pixel_size: float | None = None) -> None:

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.dataset import FORMAT, dataset_from_field, displacement_from_potential
+from napari_shadowinv.io.promises import load_dataset
 
 if TYPE_CHECKING:
     import xarray
@@ -139,8 +140,10 @@ def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]
 
     try:
         with h5py.File(path, "r") as file:
-            return {name: np.asarray(file[name][()]) for name in names if name in file}
-    except (OSError, RuntimeError, KeyError, TypeError) as error:
+            return {name: load_dataset(path, file[name]) for name in names if name in file}
+    except FileFormatError:
+        raise
+    except (OSError, RuntimeError, KeyError, TypeError, AttributeError) as error:
         raise FileFormatError(
             f"{path} begins as pradformat but its data are damaged or cut short: expected a "
             "complete file; copy it again"

@@ -19,6 +19,7 @@ from napari_shadowinv.io.arrays import read_npy
 from napari_shadowinv.io.dataset import read_result
 from napari_shadowinv.io.files import kind_of, sha256
 from napari_shadowinv.io.images import read_picture
+from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5, read_mat
 from napari_shadowinv.io.pradformat import is_result, read_pradformat
 from napari_shadowinv.io.radiograph import Radiograph, to_grey
 
@@ -32,17 +33,22 @@ __all__ = ["read", "read_dataset", "read_radiograph", "read_toml"]
 _COMPLETE = {"energy", "source_object_distance", "object_image_distance"}
 
 
-def read(path: str | Path, *, channel: str | int | None = None) -> Radiograph | xarray.Dataset:
+def read(
+    path: str | Path, *, channel: str | int | None = None, variable: str | None = None
+) -> Radiograph | xarray.Dataset:
     """Read an image or a result.
 
     Parameters
     ----------
     path : str or Path
-        TIFF (8, 16 or 32 bits, one page), PNG, BMP, JPEG, NPY, a pradformat radiograph or
-        inversion, or a ``.shadowinv`` result.
+        TIFF (8, 16 or 32 bits, one page), PNG, BMP, JPEG, NPY, MATLAB (version 5 to 7.3),
+        PCO ``.b16``, Princeton ``.spe`` (one frame), numbers as text (``.txt``, ``.csv``,
+        ``.dat``), a pradformat radiograph or inversion, or a ``.shadowinv`` result.
     channel : {"red", "green", "blue", "mean"} or int, optional
         What to take of a colour image. An image whose channels are all equal is grey
         and needs no choice.
+    variable : str, optional
+        Name of the array to take from a MATLAB file that holds several.
 
     Returns
     -------
@@ -54,10 +60,18 @@ def read(path: str | Path, *, channel: str | int | None = None) -> Radiograph | 
     FileFormatError
         If the file is missing, empty, damaged or of a kind that cannot be read.
     InputError
-        If it is a colour image and no channel, or one that it has not, was chosen.
+        If it is a colour image and no channel, or one that it has not, was chosen; the
+        same for the variables of a MATLAB file.
     """
     path = Path(path)
-    kind = kind_of(path)
+    kind = _family(path)
+    if kind == "mat":
+        return _radiograph(path, kind, *read_mat(path, variable))
+    if variable is not None:
+        raise InputError(
+            f"{path} is no MATLAB file (its kind is {kind!r}): variable {variable!r} means nothing "
+            "here; leave it out"
+        )
     if kind == "hdf5":
         content = read_result(path) if is_result(path) else read_pradformat(path)
         if not isinstance(content, tuple):
@@ -78,6 +92,16 @@ def read(path: str | Path, *, channel: str | int | None = None) -> Radiograph | 
     return _radiograph(path, kind, grey, {"dtype": str(array.dtype), **metadata})
 
 
+def _family(path: Path) -> str:
+    """Kind of a file, with MATLAB's HDF5 told from other HDF5 by what is in it."""
+    kind = kind_of(path)
+    if kind == "hdf5" and is_mat73(path):
+        return "mat"
+    if kind == "mat" and is_other_hdf5(path):
+        return "hdf5"
+    return kind
+
+
 def _radiograph(path: Path, kind: str, array: NDArray[Any], metadata: dict[str, Any]) -> Radiograph:
     described = {
         "kind": kind,
@@ -90,11 +114,17 @@ def _radiograph(path: Path, kind: str, array: NDArray[Any], metadata: dict[str, 
         raise FileFormatError(
             f"{path} holds {array.dtype} pixels: expected whole or real numbers; convert them"
         )
+    if not np.isfinite(array).any():
+        raise FileFormatError(
+            f"{path} holds no finite pixel: expected an image; check how it was saved"
+        )
+    source = metadata.get("source")
     return Radiograph(
         image=np.ascontiguousarray(array, dtype=np.float64),
         setup=_complete_setup(path, metadata.get("geometry", {})),
         path=path,
-        metadata=described,
+        metadata={name: value for name, value in described.items() if name != "source"},
+        source=None if source is None else np.ascontiguousarray(source, dtype=np.float64),
     )
 
 
@@ -107,7 +137,9 @@ def _complete_setup(path: Path, geometry: dict[str, Any]) -> ProtonSetup | None:
     return validated(ProtonSetup, geometry, str(path))
 
 
-def read_radiograph(path: str | Path, *, channel: str | int | None = None) -> Radiograph:
+def read_radiograph(
+    path: str | Path, *, channel: str | int | None = None, variable: str | None = None
+) -> Radiograph:
     """Read an image; a result is an error.
 
     Parameters
@@ -116,6 +148,8 @@ def read_radiograph(path: str | Path, *, channel: str | int | None = None) -> Ra
         As for `read`.
     channel : {"red", "green", "blue", "mean"} or int, optional
         What to take of a colour image.
+    variable : str, optional
+        Name of the array to take from a MATLAB file.
 
     Returns
     -------
@@ -127,7 +161,7 @@ def read_radiograph(path: str | Path, *, channel: str | int | None = None) -> Ra
     FileFormatError, InputError
         As `read`, and if the file holds a result.
     """
-    content = read(path, channel=channel)
+    content = read(path, channel=channel, variable=variable)
     if not isinstance(content, Radiograph):
         raise FileFormatError(
             f"{path} is the result of an inversion: expected an image; give the image that it "

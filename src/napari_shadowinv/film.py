@@ -1,0 +1,297 @@
+"""Radiochromic film: from the scan to the dose that the beam left.
+
+- a table of doses and the pixels that they gave: `Calibration`, `Calibration.from_csv`
+- how much darker than unexposed film: `net_optical_density`
+- the dose in every pixel, and where the table does not reach: `dose`
+
+Film darkens with dose; the net optical density log10(unexposed / exposed) does not depend
+on the scanner's gain, so a table can serve scans of another day if unexposed film was
+scanned with them. Fluence is proportional to dose as long as the particles of a layer lose
+about the same energy in it.
+
+References
+----------
+Devic et al., "Precise radiochromic film dosimetry using a flat-bed document scanner",
+Medical Physics 32, 2245 (2005).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.film_table import read_film_table
+
+__all__ = ["Calibration", "DoseMap", "dose", "net_optical_density"]
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+_CHANNELS = ("red", "green", "blue")
+
+
+class DoseMap(NamedTuple):
+    """Dose in every pixel of a film.
+
+    Attributes
+    ----------
+    dose : ndarray of float64, shape (H, W)
+        Dose in Gy, held at the nearer end of the calibrated range outside of it.
+    outside : ndarray of bool, shape (H, W)
+        True where the film is lighter or darker than any that was calibrated.
+    """
+
+    dose: FloatArray
+    outside: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Pixels of films that received known doses.
+
+    Attributes
+    ----------
+    doses : ndarray, shape (n,)
+        Doses in Gy.
+    pixels : ndarray, shape (n, 3)
+        Mean red, green and blue pixel of each film.
+    background : ndarray, shape (3,)
+        Pixel of unexposed film in the same scan; the lightest of `pixels` if it is not given.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two films, or a value is not positive.
+
+    Examples
+    --------
+    >>> grey = np.array([[40000.0], [4000.0], [400.0]])
+    >>> film = Calibration(np.array([1.0, 10.0, 100.0]), np.repeat(grey, 3, axis=1))
+    >>> film.optical_density([1.0, 10.0, 100.0])
+    array([0., 1., 2.])
+    >>> film.dose_range()
+    (1.0, 100.0)
+    """
+
+    doses: FloatArray
+    pixels: FloatArray
+    background: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        doses, pixels = np.asarray(self.doses, float), np.asarray(self.pixels, float)
+        if doses.ndim != 1 or len(doses) < 2 or pixels.shape != (len(doses), 3):
+            raise InputError(
+                f"a calibration has doses of shape {doses.shape} and pixels of shape "
+                f"{pixels.shape}: expected (n,) and (n, 3), two films at least"
+            )
+        background = np.asarray(self.background, float)
+        if background.size == 0:
+            background = pixels.max(axis=0)
+        if background.shape != (3,):
+            raise InputError(
+                f"the calibration's background has shape {background.shape}: expected one pixel "
+                "for red, green and blue"
+            )
+        for name, values in (("doses", doses), ("pixels", pixels), ("background", background)):
+            if not (np.isfinite(values) & (values > 0)).all():
+                raise InputError(f"a calibration's {name} must be positive numbers; correct them")
+            # Frozen, but what was given may have been lists.
+            object.__setattr__(self, name, values)
+
+    @classmethod
+    def from_csv(
+        cls,
+        path: str | Path,
+        *,
+        background: ArrayLike | None = None,
+        dose_range: tuple[float, float] = (0.0, np.inf),
+    ) -> Calibration:
+        """Read a table with a film in each row.
+
+        Parameters
+        ----------
+        path : str or Path
+            The table, as `read_film_table` reads it.
+        background : array_like, shape (3,), optional
+            Pixel of unexposed film.
+        dose_range : tuple of float
+            Smallest and largest dose in Gy of the rows to use. Tables are often continued by
+            extrapolation; leave that part out here.
+        """
+        table = read_film_table(path)
+        used = table[(table[:, 0] >= dose_range[0]) & (table[:, 0] <= dose_range[1])]
+        if len(used) < 2:
+            raise InputError(
+                f"{path} has {len(used)} films between {dose_range[0]:g} and {dose_range[1]:g} Gy: "
+                "expected two at least; widen dose_range"
+            )
+        empty = np.empty(0) if background is None else np.asarray(background, float)
+        return cls(used[:, 0], used[:, 1:], empty)
+
+    def curve(self, channel: str = "red") -> tuple[FloatArray, FloatArray]:
+        """Return the calibration of one channel as a curve that rises everywhere.
+
+        Returns
+        -------
+        density, dose : ndarray, shape (m,)
+            Net optical density and dose in Gy, both strictly increasing. Neighbours that noise
+            put in the wrong order count as one film, with their mean density and geometric
+            mean dose.
+        """
+        from scipy.optimize import isotonic_regression
+
+        column = _channel(channel)
+        order = np.argsort(self.doses, kind="stable")
+        logarithms = np.log10(self.doses[order])
+        density = np.log10(self.background[column] / self.pixels[order, column])
+        blocks = isotonic_regression(density).blocks
+        count = np.diff(blocks)
+        density = np.add.reduceat(density, blocks[:-1]) / count
+        if len(density) < 2:
+            raise InputError(
+                f"the calibration's {channel} channel does not darken with dose: expected lower "
+                "pixels for larger doses; choose another channel or check the table"
+            )
+        return density, 10 ** (np.add.reduceat(logarithms, blocks[:-1]) / count)
+
+    def dose_range(self, channel: str = "red") -> tuple[float, float]:
+        """Return the smallest and the largest dose in Gy that a channel can tell."""
+        doses = self.curve(channel)[1]
+        return float(doses[0]), float(doses[-1])
+
+    def optical_density(self, doses: ArrayLike, channel: str = "red") -> FloatArray:
+        """Return the net optical density that doses in Gy give, held at the range's ends.
+
+        It is linear in the logarithm of the dose between films; `dose` is its inverse.
+        """
+        density, known = self.curve(channel)
+        logarithms = np.log10(np.asarray(doses, float))
+        return np.asarray(np.interp(logarithms, np.log10(known), density))
+
+
+def net_optical_density(
+    scan: ArrayLike, background: float | Sequence[float] | ArrayLike, channel: str = "red"
+) -> FloatArray:
+    """Return how much darker a film is than unexposed film: log10(unexposed / exposed).
+
+    Parameters
+    ----------
+    scan : array_like, shape (H, W, 3) or (H, W, 4) or (H, W)
+        Scan of the film in transmission, or one channel of it.
+    background : float or array_like, shape (3,) or (H', W', 3)
+        Pixel of unexposed film, one for each channel, or a scan of it: then the median of
+        its middle half in height and width counts, since its rim shows the scanner's bed.
+    channel : {"red", "green", "blue"}
+        Which channel; the red one sees small doses best.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        Net optical density: 0 for unexposed film, infinite for a black pixel.
+
+    Raises
+    ------
+    InputError
+        If a shape does not fit, or a value is negative or no number.
+
+    Examples
+    --------
+    >>> net_optical_density([[1000, 100]], 1000.0)
+    array([[0., 1.]])
+    """
+    plane = _plane(np.asarray(scan), channel, "scan")
+    unexposed = _unexposed(np.asarray(background), channel)
+    with np.errstate(divide="ignore"):
+        density: FloatArray = np.log10(unexposed) - np.log10(plane)
+    return density
+
+
+def _plane(scan: NDArray[Any], channel: str, name: str) -> FloatArray:
+    column = _channel(channel)
+    is_colour = scan.ndim == 3 and scan.shape[-1] in (3, 4)
+    if scan.size == 0 or not (scan.ndim == 2 or is_colour):
+        raise InputError(
+            f"the {name} has shape {scan.shape}: expected (height, width) or (height, width, 3)"
+        )
+    plane = np.asarray(scan[..., column] if is_colour else scan, dtype=np.float64)
+    if not (np.isfinite(plane) & (plane >= 0)).all():
+        raise InputError(f"the {name} holds negative pixels or NaN: expected grey levels")
+    return plane
+
+
+def _unexposed(background: NDArray[Any], channel: str) -> float:
+    if background.ndim == 0:
+        value = float(background)
+    elif background.shape == (3,):
+        value = float(background[_channel(channel)])
+    else:
+        plane = _plane(background, channel, "background")
+        top, left = (length // 4 for length in plane.shape)
+        middle = plane[top : len(plane) - top, left : plane.shape[1] - left]
+        value = float(np.median(middle))
+    if not (np.isfinite(value) and value > 0):
+        raise InputError(f"the background is {value:g}: expected the pixel of unexposed film, > 0")
+    return value
+
+
+def _channel(channel: str) -> int:
+    if channel not in _CHANNELS:
+        raise InputError(f'channel is {channel!r}: expected "red", "green" or "blue"')
+    return _CHANNELS.index(channel)
+
+
+def dose(
+    scan: ArrayLike,
+    calibration: Calibration,
+    *,
+    background: float | Sequence[float] | ArrayLike | None = None,
+    channel: str = "red",
+) -> DoseMap:
+    """Return the dose in every pixel of a film.
+
+    Parameters
+    ----------
+    scan : array_like, shape (H, W, 3) or (H, W, 4) or (H, W)
+        Scan of the film, as for `net_optical_density`.
+    calibration : Calibration
+        Table for this kind of film.
+    background : float or array_like, optional
+        Unexposed film, as for `net_optical_density`. The calibration's own if not given: then
+        the scan must have been made with the same scanner and settings.
+    channel : {"red", "green", "blue"}
+        Which channel. Red tells small doses, green and blue larger ones.
+
+    Returns
+    -------
+    DoseMap
+        Dose in Gy, and where it lies outside of the calibrated range.
+
+    Raises
+    ------
+    InputError
+        As `net_optical_density`, and if a scan with 8 bits comes without its background.
+
+    Examples
+    --------
+    >>> grey = np.array([[40000.0], [4000.0], [400.0]])
+    >>> film = Calibration(np.array([1.0, 10.0, 100.0]), np.repeat(grey, 3, axis=1))
+    >>> dose([[4000, 400, 40]], film)
+    DoseMap(dose=array([[ 10., 100., 100.]]), outside=array([[False, False,  True]]))
+    """
+    if background is None and np.asarray(scan).dtype == np.uint8:
+        raise InputError(
+            "the scan has 8 bits and no background was given, though calibrations have 16: give "
+            "the scan of unexposed film as background"
+        )
+    unexposed = calibration.background if background is None else background
+    density = net_optical_density(scan, unexposed, channel)
+    known, doses = calibration.curve(channel)
+    # Rounding of the logarithms must not put the films of the table themselves outside.
+    slack = 1e-12
+    outside = (density < known[0] - slack) | (density > known[-1] + slack)
+    return DoseMap(10 ** np.interp(density, known, np.log10(doses)), outside)

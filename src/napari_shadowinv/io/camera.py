@@ -1,0 +1,146 @@
+"""Raw frames as scientific cameras save them.
+
+- PCO's ``.b16``: `read_b16`
+- Princeton Instruments' ``.spe``, versions 2.x and 3.0: `read_spe`
+
+References
+----------
+pco.edge User Manual, appendix A4, Image File Formats.
+
+Teledyne Princeton Instruments, SPE 3.0 File Format Specification, 4411-0140 (2019).
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.io.promises import check_promise
+
+__all__ = ["read_b16", "read_spe"]
+
+_B16_HEADER = 24
+_B16_EXTENDED_HEADER = 128
+
+_SPE_HEADER = 4100
+_SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 5: "<f8", 6: "u1", 8: "<u4"}
+_SPE_REGION = re.compile(rb'<DataBlock\b[^>]*\btype="Region"[^>]*>')
+# The footer of one frame has some kilobytes.
+_LONGEST_FOOTER = 2_000_000
+
+
+def read_b16(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Read a frame of a PCO camera.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    array : ndarray of uint16, shape (H, W)
+        Counts.
+    metadata : dict
+        ``bits``.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged or cut short, or of a colour camera.
+    """
+    with path.open("rb") as file:
+        header = file.read(_B16_EXTENDED_HEADER)
+    check_promise(path, "PCO", _B16_HEADER, len(header))
+    _, start, width, height, extended = struct.unpack("<5i", header[4:_B16_HEADER])
+    if start < _B16_HEADER:
+        raise FileFormatError(
+            f"{path} is damaged: its PCO header claims to have {start} bytes, expected "
+            f"{_B16_HEADER} at least; copy it again"
+        )
+    is_colour = struct.unpack_from("<i", header, 24)[0] == 1 if len(header) >= 28 else False
+    if extended == -1 and start >= _B16_EXTENDED_HEADER and is_colour:
+        raise FileFormatError(
+            f"{path} comes from a colour camera, whose pixels see different colours: expected a "
+            "monochrome frame; convert it to grey TIFF"
+        )
+    return _frame(path, "PCO", start, (height, width), np.dtype("<u2")), {"bits": 16}
+
+
+def read_spe(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Read the only frame of a file of WinSpec, WinView or LightField.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    array : ndarray, shape (H, W)
+        Counts in the file's own dtype.
+    metadata : dict
+        ``bits``; ``version`` of the format.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged, cut short or no SPE, or holds several frames or regions.
+    """
+    with path.open("rb") as file:
+        header = file.read(_SPE_HEADER)
+    check_promise(path, "SPE", _SPE_HEADER, len(header))
+    shape = (_number(header, "H", 656), _number(header, "H", 42))
+    frames, version = _number(header, "i", 1446), _number(header, "f", 1992)
+    dtype = _SPE_TYPES.get(_number(header, "h", 108))
+    if dtype is None:
+        raise FileFormatError(
+            f"{path} is no SPE file or damaged: its data type is {_number(header, 'h', 108)}, "
+            f"expected one of {', '.join(map(str, _SPE_TYPES))}; export it as TIFF"
+        )
+    if frames != 1:
+        raise FileFormatError(
+            f"{path} holds {frames} frames: expected one radiograph per file; save the frame that "
+            "you want on its own"
+        )
+    if version >= 3:
+        _check_footer(path, _number(header, "Q", 678))
+    array = _frame(path, "SPE", _SPE_HEADER, shape, np.dtype(dtype))
+    return array, {"bits": 8 * array.dtype.itemsize, "version": round(version, 2)}
+
+
+def _number(header: bytes, code: str, offset: int) -> Any:
+    return struct.unpack_from(f"<{code}", header, offset)[0]
+
+
+def _check_footer(path: Path, start: int) -> None:
+    """Refuse several regions: one after another they are no picture."""
+    check_promise(path, "SPE", start, path.stat().st_size)
+    with path.open("rb") as file:
+        file.seek(start)
+        regions = len(_SPE_REGION.findall(file.read(_LONGEST_FOOTER)))
+    if regions > 1:
+        raise FileFormatError(
+            f"{path} holds {regions} regions of the sensor: expected one; export the one that you "
+            "want as TIFF"
+        )
+
+
+def _frame(
+    path: Path, header: str, start: int, shape: tuple[int, int], dtype: np.dtype[Any]
+) -> NDArray[Any]:
+    height, width = shape
+    if min(shape) < 1:
+        raise FileFormatError(
+            f"{path} is damaged: its {header} header tells a frame of {height}×{width} pixels; "
+            "copy or save it again"
+        )
+    count = height * width
+    check_promise(path, header, start + count * dtype.itemsize, path.stat().st_size)
+    return np.fromfile(path, dtype, count=count, offset=start).reshape(shape)

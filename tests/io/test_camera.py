@@ -1,0 +1,109 @@
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.io import read_radiograph
+
+RAMP = np.arange(6 * 9).reshape(6, 9)
+FOOTER = b'<SpeFormat version="3.0"><DataFormat><DataBlock type="Frame" count="1">%b</DataBlock>'
+REGION = b'<DataBlock type="Region" count="1" width="9" height="6" size="108" />'
+
+
+def save_b16(path: Path, pixels: np.ndarray[Any, Any], comment: bytes = b"", **told: int) -> Path:
+    start = 128 + len(comment)
+    height, width = pixels.shape
+    fields = {
+        "size": start + pixels.nbytes,
+        "start": start,
+        "width": width,
+        "height": height,
+        "extended": -1,
+        "colour": 0,
+        **told,
+    }
+    header = b"PCO-" + struct.pack("<6i", *fields.values())
+    path.write_bytes(header.ljust(128, b"\0") + comment + pixels.astype("<u2").tobytes())
+    return path
+
+
+def save_spe(
+    path: Path,
+    pixels: np.ndarray[Any, Any],
+    code: int,
+    footer: bytes = b"",
+    marked: bool = True,
+    **told: int,
+) -> Path:
+    header = bytearray(4100)
+    fields = {"width": pixels.shape[-1], "height": pixels.shape[-2], "frames": 1, **told}
+    struct.pack_into("<H", header, 42, fields["width"])
+    struct.pack_into("<H", header, 656, fields["height"])
+    struct.pack_into("<i", header, 1446, fields["frames"])
+    struct.pack_into("<h", header, 108, code)
+    struct.pack_into("<f", header, 1992, 3.0 if footer else 2.5)
+    if footer:
+        struct.pack_into("<Q", header, 678, fields.get("offset", 4100 + pixels.nbytes))
+    if marked:
+        struct.pack_into("<i", header, 2996, 0x01234567)
+        struct.pack_into("<H", header, 4098, 0x5555)
+    path.write_bytes(bytes(header) + pixels.tobytes() + footer)
+    return path
+
+
+@pytest.mark.parametrize("comment", [b"", b"shot 17, f/2"])
+@pytest.mark.parametrize("name", ["shot.b16", "shot.tif"])
+def test_b16_comes_back(tmp_path: Path, name: str, comment: bytes) -> None:
+    pixels = (RAMP * 1213).astype(np.uint16)
+    radiograph = read_radiograph(save_b16(tmp_path / name, pixels, comment))
+    np.testing.assert_array_equal(radiograph.image, pixels)
+    assert radiograph.metadata["kind"] == "b16"
+    assert radiograph.metadata["bits"] == 16
+
+
+def test_b16_with_the_basic_header(tmp_path: Path) -> None:
+    path = tmp_path / "shot.b16"
+    header = b"PCO-" + struct.pack("<5i", 24 + 108, 24, 9, 6, 0)
+    path.write_bytes(header + RAMP.astype("<u2").tobytes())
+    np.testing.assert_array_equal(read_radiograph(path).image, RAMP)
+    # The first pixel stands where the extended header would tell a colour camera.
+    path.write_bytes(header + (RAMP * 0 + [1, 0, 0] * 3).astype("<u2").tobytes())
+    assert read_radiograph(path).image[0, 0] == 1
+
+
+@pytest.mark.parametrize(
+    ("code", "dtype"),
+    [(0, "<f4"), (1, "<i4"), (2, "<i2"), (3, "<u2"), (5, "<f8"), (6, "u1"), (8, "<u4")],
+)
+@pytest.mark.parametrize("footer", [b"", FOOTER % REGION])
+def test_spe_comes_back(tmp_path: Path, footer: bytes, code: int, dtype: str) -> None:
+    pixels = (RAMP * 3 - (40 if dtype in ("<f4", "<i4", "<i2", "<f8") else 0)).astype(dtype)
+    radiograph = read_radiograph(save_spe(tmp_path / "shot.spe", pixels, code, footer))
+    np.testing.assert_array_equal(radiograph.image, pixels)
+    assert radiograph.metadata["kind"] == "spe"
+    assert radiograph.metadata["version"] == (3.0 if footer else 2.5)
+
+
+def test_spe_is_known_by_its_marks_or_its_name(tmp_path: Path) -> None:
+    pixels = RAMP.astype("<u2")
+    assert read_radiograph(save_spe(tmp_path / "shot.dat", pixels, 3)).image[1, 2] == 11
+    assert read_radiograph(save_spe(tmp_path / "a.SPE", pixels, 3, marked=False)).image[1, 2] == 11
+    with pytest.raises(FileFormatError, match="not an image that can be recognised"):
+        read_radiograph(save_spe(tmp_path / "shot.bin", pixels, 3, marked=False))
+
+
+def test_several_frames_and_regions_are_refused(tmp_path: Path) -> None:
+    pixels = np.ones((4, 6, 9), "<u2")
+    with pytest.raises(FileFormatError, match="holds 4 frames: expected one"):
+        read_radiograph(save_spe(tmp_path / "a.spe", pixels, 3, frames=4))
+    with pytest.raises(FileFormatError, match="holds 2 regions"):
+        read_radiograph(save_spe(tmp_path / "b.spe", pixels[0], 3, FOOTER % (2 * REGION)))
+
+
+def test_colour_camera_is_refused(tmp_path: Path) -> None:
+    path = save_b16(tmp_path / "shot.b16", RAMP.astype(np.uint16), colour=1)
+    with pytest.raises(FileFormatError, match="colour camera"):
+        read_radiograph(path)

@@ -1,0 +1,135 @@
+import struct
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io.files import sha256
+
+RAMP = np.arange(6 * 9).reshape(6, 9)
+
+
+def save_73(path: Path, arrays: dict[str, np.ndarray[Any, Any]], userblock: int = 512) -> Path:
+    """Write what MATLAB's save -v7.3 does: columns first, marked arrays, its name in front."""
+    with h5py.File(path, "w", userblock_size=userblock) as file:
+        for name, array in arrays.items():
+            stored = array.astype(np.uint8) if array.dtype == bool else array
+            file[name] = stored.T
+            names = {"float64": b"double", "float32": b"single", "bool": b"logical"}
+            native = str(array.dtype.newbyteorder("="))
+            mark = names.get(native, native.encode())
+            file[name].attrs["MATLAB_class"] = np.bytes_(mark)
+    if userblock:
+        content = path.read_bytes()
+        head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+        path.write_bytes(head.ljust(userblock, b"\0") + content[userblock:])
+    return path
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "u4", "i2", "i4", "i8", "f4", "f8", "?", ">u2"])
+@pytest.mark.parametrize("layout", ["5", "7", "7.3"])
+def test_array_comes_back(tmp_path: Path, layout: str, dtype: str) -> None:
+    path = tmp_path / "shot.mat"
+    values = (RAMP % 7 * 5).astype(dtype)
+    if layout == "7.3":
+        save_73(path, {"shot": values})
+    else:
+        savemat(path, {"shot": values}, do_compression=layout == "7")
+    radiograph = read_radiograph(path)
+    np.testing.assert_array_equal(radiograph.image, values)
+    assert radiograph.image.dtype == np.float64
+    assert radiograph.metadata["variable"] == "shot"
+    assert radiograph.metadata["kind"] == "mat"
+    assert radiograph.metadata["bits"] == 8 * np.dtype(dtype).itemsize
+    assert radiograph.metadata["sha256"] == sha256(path)
+
+
+@pytest.mark.parametrize("layout", ["5", "7", "7.3"])
+def test_scalars_vectors_and_stacks_are_no_candidates(tmp_path: Path, layout: str) -> None:
+    path = tmp_path / "shot.mat"
+    held = {"a": np.ones((1, 1)), "b": np.ones((1, 9)), "c": np.ones((2, 3, 4)), "shot": RAMP * 0.5}
+    if layout == "7.3":
+        save_73(path, held)
+    else:
+        others = {"note": "film 3", "s": {"x": RAMP}, "cell": np.array([1, "a"], dtype=object)}
+        savemat(path, {**others, **held}, do_compression=layout == "7")
+    np.testing.assert_array_equal(read_radiograph(path).image, RAMP / 2)
+
+
+@pytest.mark.parametrize("layout", ["5", "7", "7.3"])
+def test_several_candidates_are_listed_and_chosen(tmp_path: Path, layout: str) -> None:
+    path = tmp_path / "shot.mat"
+    held = {"shot": RAMP * 0.5, "beam": np.ones((4, 5), np.uint16), "z": np.ones((1, 3))}
+    if layout == "7.3":
+        save_73(path, held)
+    else:
+        savemat(path, held, do_compression=layout == "7")
+    with pytest.raises(InputError, match="holds 2 images: choose one with variable") as error:
+        read_radiograph(path)
+    assert "'shot' (6×9 double)" in str(error.value)
+    assert "'beam' (4×5 uint16)" in str(error.value)
+    np.testing.assert_array_equal(read_radiograph(path, variable="beam").image, np.ones((4, 5)))
+    for wrong in ("z", "Shot", "__header__"):
+        with pytest.raises(InputError, match=f"no numeric plane '{wrong}': it holds "):
+            read_radiograph(path, variable=wrong)
+
+
+def test_variable_of_another_kind_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", RAMP)
+    with pytest.raises(InputError, match="is no MATLAB file"):
+        read_radiograph(tmp_path / "a.npy", variable="shot")
+
+
+def test_long_names_and_many_zeros_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "shot.mat"
+    name = "a" * 31
+    savemat(path, {name: np.zeros((2000, 1000))}, do_compression=True)
+    assert path.stat().st_size < 20_000
+    assert read_radiograph(path, variable=name).image.shape == (2000, 1000)
+
+
+def test_big_endian_file_comes_back(tmp_path: Path) -> None:
+    def element(kind: int, content: bytes) -> bytes:
+        return struct.pack(">II", kind, len(content)) + content.ljust(-(-len(content) // 8) * 8)
+
+    body = element(6, struct.pack(">II", 6, 0)) + element(5, struct.pack(">ii", 6, 9))
+    # A short name shares its tag; doubles that are whole are kept in two bytes.
+    body += struct.pack(">HH4s", 4, 1, b"shot") + element(4, RAMP.T.astype(">u2").tobytes())
+    path = tmp_path / "shot.mat"
+    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\x01\x00MI" + element(14, body))
+    radiograph = read_radiograph(path)
+    np.testing.assert_array_equal(radiograph.image, RAMP)
+    assert radiograph.metadata["bits"] == 64
+
+
+def test_complex_values_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "shot.mat"
+    savemat(path, {"shot": RAMP * 1j})
+    with pytest.raises(FileFormatError, match=r"6×9 complex double\): expected"):
+        read_radiograph(path)
+
+
+def test_matlab_marks_make_a_mat_file_of_plain_hdf5(tmp_path: Path) -> None:
+    path = save_73(tmp_path / "shot.h5", {"shot": RAMP.astype(float)}, userblock=0)
+    radiograph = read_radiograph(path)
+    assert radiograph.metadata["kind"] == "mat"
+    np.testing.assert_array_equal(radiograph.image, RAMP)
+
+
+@pytest.mark.parametrize("userblock", [0, 512])
+def test_pradformat_stays_pradformat(tmp_path: Path, userblock: int) -> None:
+    path = save_73(tmp_path / "shot.mat", {"image": RAMP.astype(float)}, userblock)
+    head = path.read_bytes()[:userblock]
+    with h5py.File(path, "a") as file:
+        file.attrs["object_type"] = "radiograph"
+        file.attrs["pixel_width"] = 1e-4
+    assert path.read_bytes()[:userblock] == head
+    radiograph = read_radiograph(path)
+    assert radiograph.metadata["kind"] == "pradformat"
+    # pradformat stores rows first.
+    np.testing.assert_array_equal(radiograph.image, RAMP.T)

@@ -1,0 +1,137 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io.files import kind_of
+from napari_shadowinv.physics.setup import ProtonSetup
+
+VALUES = np.random.default_rng(3).normal(0, 1e3, (5, 7))
+
+
+def lines(path: Path, *rows: str) -> Path:
+    path.write_text("\n".join(rows), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("delimiter", [" ", ",", ", ", "\t", "   "])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("suffix", [".txt", ".csv", ".dat", ".TXT"])
+def test_savetxt_comes_back(tmp_path: Path, suffix: str, newline: str, delimiter: str) -> None:
+    path = tmp_path / f"shot{suffix}"
+    np.savetxt(path, VALUES, delimiter=delimiter, newline=newline, fmt="%.17g", header="a shot")
+    radiograph = read_radiograph(path)
+    np.testing.assert_array_equal(radiograph.image, VALUES)
+    assert radiograph.metadata["kind"] == "text"
+    assert radiograph.setup is None
+
+
+def test_byte_order_mark_blank_lines_and_last_commas(tmp_path: Path) -> None:
+    path = tmp_path / "shot.csv"
+    path.write_bytes(b"\xef\xbb\xbf1,2,\r\n\r\n3,4e1,\r\n\r\n")
+    np.testing.assert_array_equal(read_radiograph(path).image, [[1, 2], [3, 40]])
+
+
+@pytest.mark.parametrize(
+    "comments",
+    [
+        (
+            "# source_object_distance = 0.014",
+            "# object_image_distance = 0.2",
+            "# pixel_size = 1e-5",
+            "# energy = 14.7",
+        ),
+        (
+            "% Source-object distance: 1.4 cm",
+            "% OBJECT IMAGE DISTANCE (mm): 200",
+            "% pixel size: 10 µm",
+            "% energy: 14700 keV",
+        ),
+        ("# s2r_cm 1.4", "# s2d_cm 21.4", "# bin_um 152.857142857", "# Ep_MeV 14.7"),
+    ],
+)
+def test_comments_tell_the_setup(tmp_path: Path, comments: tuple[str, ...]) -> None:
+    path = lines(tmp_path / "shot.txt", "# PROBLEM, run 3: 2019-05-01", *comments, "1 2", "3 4")
+    setup = read_radiograph(path).setup
+    assert isinstance(setup, ProtonSetup)
+    assert setup.energy == pytest.approx(14.7)
+    assert setup.source_object_distance == pytest.approx(0.014)
+    assert setup.object_image_distance == pytest.approx(0.2)
+    assert setup.object_pixel_size == pytest.approx(1e-5)
+
+
+def test_latin_comment_and_part_of_a_setup(tmp_path: Path) -> None:
+    path = tmp_path / "shot.txt"
+    path.write_bytes("# pixel_size = 25 µm\n1 2\n3 4\n".encode("latin-1"))
+    radiograph = read_radiograph(path)
+    assert radiograph.setup is None
+    assert radiograph.metadata["geometry"] == {"pixel_size": pytest.approx(25e-6)}
+
+
+def test_comments_in_prose_tell_nothing(tmp_path: Path) -> None:
+    comments = ("# energy 3 of 5 shots", "# bin 4", "# shot 17", "# taken: 12:30", "#" * 3_000_000)
+    path = lines(tmp_path / "shot.txt", *comments, "1 2", "3 4")
+    assert read_radiograph(path).metadata["geometry"] == {}
+
+
+def test_pradreader_stacks_image_and_reference(tmp_path: Path) -> None:
+    path = tmp_path / "input.txt"
+    with path.open("w") as file:
+        file.write("# flux2D (5, 7)\n# flux2D_ref (5, 7)\n# x-mask 0 % - 100 %\n")
+        np.savetxt(file, VALUES, delimiter=",", fmt="%.17g")
+        np.savetxt(file, VALUES + 1, delimiter=",", fmt="%.17g")
+    radiograph = read_radiograph(path)
+    np.testing.assert_array_equal(radiograph.image, VALUES)
+    assert radiograph.source is not None
+    np.testing.assert_array_equal(radiograph.source, VALUES + 1)
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (("# a", "1 2 3", "", "4 5"), r"line 4 has 2 numbers, the first row 3"),
+        (("1 2", "3 four"), r"line 2 has 'four'"),
+        (("1,2", "3,"), r"line 2 has 1 numbers"),
+        (("1,2", ",3"), r"line 2 has ''"),
+        (("1,5 2,5", "3,5 4,5"), r"line 1 has '5 2': expected numbers with a decimal point"),
+        (("x,y,z", "1,2,3"), r"line 1 has 'x'"),
+        (("1 2 3",), r"holds 1 rows of 3 numbers: expected an image"),
+        (("# nothing", ""), r"holds no numbers"),
+        (("# energy = 14.7 cm", "1 2"), r"line 1 has '14.7 cm' for energy"),
+        (("# pixel size: 3 apples", "1 2"), r"line 1 has '3 apples' for pixel_size"),
+    ],
+)
+def test_mistakes_are_named_with_their_line(
+    tmp_path: Path, rows: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(FileFormatError, match=message):
+        read_radiograph(lines(tmp_path / "shot.csv", *rows))
+
+
+def test_impossible_setup_is_named(tmp_path: Path) -> None:
+    path = lines(
+        tmp_path / "shot.txt",
+        "# source_object_distance = 0.01",
+        "# object_image_distance = 0.2",
+        "# pixel_size = 1e-5",
+        "# energy = 0",
+        "1 2",
+        "3 4",
+    )
+    with pytest.raises(InputError, match=r"shot\.txt: 'energy' is 0"):
+        read_radiograph(path)
+
+
+def test_text_with_the_ending_of_a_picture_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="is a text file"):
+        kind_of(lines(tmp_path / "shot.tif", "1 2", "3 4"))
+
+
+def test_published_example(shared_data: Path) -> None:
+    path = shared_data / "prns" / "target-example.txt"
+    image = read_radiograph(path).image
+    assert image.shape == (128, 128)
+    assert image.mean() == pytest.approx(1, rel=1e-3)
+    np.testing.assert_array_equal(image, np.loadtxt(path))
