@@ -9,7 +9,7 @@ vectors beside it do not count. Fields of structs and entries of cells are not s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,11 @@ __all__ = ["is_mat73", "is_other_hdf5", "read_mat"]
 _HDF5_OFFSET = 512
 # Attributes of pradformat and of .shadowinv, which MATLAB's save does not write.
 _FOREIGN_MARKS = {"object_type", "format"}
+
+
+def _is_foreign(attributes: Container[str]) -> bool:
+    # by name: walking all attributes of a damaged file may never end
+    return any(mark in attributes for mark in _FOREIGN_MARKS)
 
 
 def is_mat73(path: Path) -> bool:
@@ -45,7 +50,7 @@ def is_mat73(path: Path) -> bool:
     try:
         with h5py.File(path, "r") as file:
             marked = any("MATLAB_class" in item.attrs for item in file.values())
-            return marked and not _FOREIGN_MARKS & set(file.attrs)
+            return marked and not _is_foreign(file.attrs)
     except (OSError, RuntimeError, KeyError, AttributeError):
         return False
 
@@ -67,7 +72,7 @@ def is_other_hdf5(path: Path) -> bool:
 
     try:
         with h5py.File(path, "r") as file:
-            return bool(_FOREIGN_MARKS & set(file.attrs))
+            return _is_foreign(file.attrs)
     except (OSError, RuntimeError, KeyError):
         return False
 

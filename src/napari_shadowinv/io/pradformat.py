@@ -73,12 +73,41 @@ def is_result(path: Path) -> bool:
     return str(_root_attributes(path).get("format", "")).startswith(FORMAT)
 
 
+# They are looked up by name: walking all attributes of a damaged file may never end.
+_ATTRIBUTES = (
+    "format",
+    "object_type",
+    "radiograph_type",
+    "inversion_type",
+    "pradformat_version",
+    "pixel_width",
+    "pixel_width_ax2",
+    "dr",
+    "dr_ax2",
+    "scale_factor",
+    "source_object_dist",
+    "object_image_dist",
+    "source_distance",
+    "ROI_distance",
+    "spec_name",
+    "spec_mass",
+    "spec_charge",
+    "spec_energy",
+    "label",
+    "description",
+    "experiment_date",
+    "file_date",
+    "radiograph_filename",
+)
+
+
 def _root_attributes(path: Path) -> dict[str, Any]:
     import h5py
 
     try:
         with h5py.File(path, "r") as file:
-            return {name: _plain(value) for name, value in file.attrs.items()}
+            known = [name for name in _ATTRIBUTES if name in file.attrs]
+            return {name: _plain(file.attrs[name]) for name in known}
     except (OSError, RuntimeError, KeyError) as error:
         raise FileFormatError(
             f"{path} begins as HDF5 but is damaged or cut short: expected a complete file; "

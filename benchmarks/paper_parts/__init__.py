@@ -1,0 +1,1 @@
+"""The parts of `paper.py`: shots, measurements, drawing, figures and the page."""
