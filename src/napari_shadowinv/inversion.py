@@ -245,8 +245,10 @@ def invert(
         The undisturbed beam. Default: uniform. Image and source are brought to the same
         flux, so their units need not match.
     mask : array_like of bool, shape (H, W), optional
-        True where a pixel can be used. Others (obstructed, written on, beyond the film) carry
-        no flux on either side; the field there is only a smooth continuation.
+        True where a pixel of the detector can be used. Others (written on, saturated, beyond
+        the film) carry no flux on either side; the field there is only a smooth
+        continuation. What stands in the beam belongs into `source`, as zeros, instead: its
+        shadow moves with the rays.
     options : InversionOptions, optional
         Choices; the default suits most images.
     plan : SitePlan, optional
