@@ -56,17 +56,17 @@ def _power_centres(
 
 
 @njit(nogil=True, cache=True)
-def _list_edges(vertices: Indices, neighbors: Indices, edges: Indices) -> int:
+def _list_edges(vertices: Indices, neighbors: Indices, pairs: Indices, sides: Indices) -> int:
     """List each inner edge once as (site a, site b, triangle left of ab, the other)."""
     count = 0
     for t in range(vertices.shape[0]):
         for k in range(3):
             other = neighbors[t, k]
             if other > t:
-                edges[count, 0] = vertices[t, (k + 1) % 3]
-                edges[count, 1] = vertices[t, (k + 2) % 3]
-                edges[count, 2] = t
-                edges[count, 3] = other
+                pairs[count, 0] = vertices[t, (k + 1) % 3]
+                pairs[count, 1] = vertices[t, (k + 2) % 3]
+                sides[count, 0] = t
+                sides[count, 1] = other
                 count += 1
     return count
 
@@ -75,7 +75,7 @@ def _list_edges(vertices: Indices, neighbors: Indices, edges: Indices) -> int:
 def _integrate_edges(
     start: int,
     stop: int,
-    edges: Indices,
+    sides: Indices,
     centres: Array,
     image: Array,
     sums: Array,
@@ -84,8 +84,8 @@ def _integrate_edges(
 ) -> None:
     """Walk each border; columns of `integrals`: flux, mass, moments y and x, inertia."""
     for e in range(start, stop):
-        left = edges[e, 2]
-        right = edges[e, 3]
+        left = sides[e, 0]
+        right = sides[e, 1]
         flux, mass, moment_y, moment_x, inertia = walk_edge(
             image,
             sums,
@@ -161,7 +161,7 @@ def _laplacian(
 class _Edges:
     """The borders between cells and the integrals along them."""
 
-    ends: Indices
+    pairs: Indices
     integrals: Array
 
 
@@ -230,27 +230,33 @@ class PowerDiagram:
         return centres
 
     def _integrate(self) -> _Edges:
-        triangulation = self._triangulation
-        ends = np.empty((3 * len(triangulation.vertices) // 2 + 3, 4), np.int32)
-        count = _list_edges(triangulation.vertices, triangulation.neighbors, ends)
-        ends = ends[:count]
+        pairs, sides = self._list_edges()
+        count = len(pairs)
         integrals = np.empty((count, 5 if self._with_moments else 2))
         in_ranges(
             _integrate_edges,
             count,
             self._threads,
-            ends,
+            sides,
             self.vertices,
             self._density.image,
             self._density.sums,
             self._with_moments,
             integrals,
         )
-        return _Edges(ends, integrals)
+        return _Edges(pairs, integrals)
+
+    def _list_edges(self) -> tuple[Indices, Indices]:
+        """The two sites of each inner edge, and the triangles left and right of it."""
+        vertices, neighbors = self._triangulation.vertices, self._triangulation.neighbors
+        most = 3 * len(vertices) // 2 + 3
+        pairs, sides = np.empty((most, 2), np.int32), np.empty((most, 2), np.int32)
+        count = _list_edges(vertices, neighbors, pairs, sides)
+        return pairs[:count], sides[:count]
 
     def _cell_sums(self, column: int) -> Array:
         sums = np.zeros(self.n_sites)
-        _sum_over_cells(self._edges.ends, self._edges.integrals, column, sums)
+        _sum_over_cells(self._edges.pairs, self._edges.integrals, column, sums)
         return sums
 
     @cached_property
@@ -290,7 +296,7 @@ class PowerDiagram:
     @property
     def edges(self) -> Indices:
         """Pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside."""
-        return self._edges.ends[:, :2]
+        return self._edges.pairs
 
     @property
     def edge_fluxes(self) -> Array:
@@ -304,20 +310,21 @@ class PowerDiagram:
         rows sum to zero.
         """
         values, columns, starts = _laplacian(
-            self._triangulation.points, self.n_sites, self._edges.ends, self._edges.integrals
+            self._triangulation.points, self.n_sites, self._edges.pairs, self._edges.integrals
         )
         return csr_array((values, columns, starts), shape=(self.n_sites, self.n_sites))
 
     def cell(self, site: int) -> Array:
         """Return the corners of a site's cell, counter-clockwise in (y, x), shape (k, 2).
 
-        Cells at the rim reach far beyond the image. An empty cell has no corners.
+        Cells at the rim reach far beyond the image. An empty cell has no corners. To be asked
+        before the triangulation is updated.
         """
-        ends = self._edges.ends
+        pairs, sides = self._list_edges()
         around = {}
-        for a, b, left, right in ends[(ends[:, 0] == site) | (ends[:, 1] == site)]:
-            around.update({right: left} if a == site else {left: right})
-            _ = b
+        for k in np.flatnonzero((pairs == site).any(axis=1)):
+            left, right = sides[k]
+            around.update({right: left} if pairs[k, 0] == site else {left: right})
         if not around:
             return np.empty((0, 2))
         first = triangle = next(iter(around))
