@@ -140,11 +140,11 @@ def _warnings(ratio: float, clipped: int, floored: int, size: int) -> tuple[str,
             f"the image's flux is {ratio:.3g} times the source's; it was scaled to match"
         )
     if clipped:
-        warnings.append(f"{clipped} negative pixels ({clipped / size:.2%}) were set to zero")
+        warnings.append(f"negative pixels set to zero: {clipped} ({clipped / size:.2%})")
     dark = floored - clipped
     if dark > 0:
         warnings.append(
-            f"{dark} dark pixels ({dark / size:.2%}) were raised to the floor; "
+            f"dark pixels raised to the floor: {dark} ({dark / size:.2%}); "
             "the field inside dark areas is not reliable"
         )
     return tuple(warnings)
