@@ -12,7 +12,8 @@ demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
 
 test: lint
-	$(BIN)/python -m pytest
+	@sh .ci/need-display
+	xvfb-run -a -s "-screen 0 2560x1440x24" $(BIN)/python -m pytest
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
