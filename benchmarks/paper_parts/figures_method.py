@@ -16,6 +16,7 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram, power_diagram
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.readout import read_centroids
 from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.sites import Level, lloyd, plan_levels, sample_sites
 from paper_parts.drawing import (
     GREY,
@@ -88,8 +89,9 @@ def explain_diagrams(axes: Axes) -> None:
 def draw_lloyd(panels: Sequence[Axes], shape: tuple[int, int], density: Density) -> None:
     sites = np.random.default_rng(3).uniform(4, 96, size=(9, 2)) - 0.5
     for letter, axes, steps in zip("defg", panels, (0, 1, 3, 30), strict=True):
-        moved, _ = lloyd(sites, density, iterations=steps)
-        diagram = power_diagram(moved, density)
+        triangulation = RegularTriangulation(sites, region=density.region)
+        diagram, _ = lloyd(triangulation, density, iterations=steps)
+        moved = triangulation.sites
         draw_cells(axes, diagram, shape, GREY, facecolors="#eef3f8")
         draw_sites(axes, moved, "black", 24)
         y, x = diagram.centroids.T

@@ -234,6 +234,45 @@ def test_repaired_equals_rebuilt(seed: int) -> None:
 
 
 @few
+@given(seed=seeds, kind=st.sampled_from(KINDS), weighted=st.booleans())
+def test_moved_equals_rebuilt(seed: int, kind: str, weighted: bool) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 300))
+    sites = rng.random((n, 2))
+    weights = rng.random(n) / (4 * n) if weighted else np.zeros(n)
+    region = [[0.0, 0.0], [1.0, 1.0]]
+    triangulation = RegularTriangulation(sites, weights, region=region)
+    for step in (1e-3, 0.3, 3.0):
+        sites = np.clip(sites + step / np.sqrt(n) * rng.normal(size=(n, 2)), 0, 1)
+        triangulation.move(sites)
+        fresh = RegularTriangulation(sites, weights, region=region)
+        np.testing.assert_array_equal(triangulation.points, fresh.points)
+        if len(np.unique(sites, axis=0)) == n:  # of duplicates any may be the vertex
+            np.testing.assert_array_equal(triangulation.hidden, fresh.hidden)
+            assert triangles(triangulation) == triangles(fresh)
+    degenerate = np.resize(random_sites(kind, rng), (n, 2))
+    triangulation.move(degenerate)
+    assert_triangulation(triangulation)
+    if not weighted:
+        visible = degenerate[~triangulation.hidden]
+        assert len(visible) == len(np.unique(degenerate, axis=0))
+        assert len(visible) == len(np.unique(visible, axis=0))
+
+
+def test_small_moves_are_repaired_not_rebuilt(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(12)
+    sites = rng.random((2000, 2))
+    triangulation = RegularTriangulation(sites, region=[[0, 0], [1, 1]])
+    moved = np.clip(sites + 0.001 * rng.normal(size=(2000, 2)), 0, 1)
+    fresh = RegularTriangulation(moved, region=[[0, 0], [1, 1]])
+    twin = triangulation.copy()
+    monkeypatch.setattr(RegularTriangulation, "_build", None)
+    triangulation.move(moved)
+    assert triangles(triangulation) == triangles(fresh)
+    np.testing.assert_array_equal(twin.sites, sites)
+
+
+@few
 @given(seed=seeds)
 def test_stopped_repair_keeps_all_sites_and_can_go_on(seed: int) -> None:
     rng = np.random.default_rng(seed)

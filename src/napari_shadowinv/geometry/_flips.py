@@ -41,7 +41,18 @@ from napari_shadowinv.geometry._predicates import (
     turn,
 )
 
-__all__ = ["DONE", "EXHAUSTED", "HIDDEN", "REMOVE", "STOP", "build", "raise_hidden", "repair"]
+__all__ = [
+    "DONE",
+    "EXHAUSTED",
+    "HIDDEN",
+    "REMOVE",
+    "STOP",
+    "build",
+    "insert",
+    "raise_hidden",
+    "repair",
+    "restore",
+]
 
 # What to do with a vertex that is proven hidden.
 REMOVE = 0
@@ -120,7 +131,7 @@ def _give_way(mesh: Mesh, h: int, g: int, reflex_a: bool) -> None:
 
 
 @kernel
-def _restore(mesh: Mesh) -> int:
+def restore(mesh: Mesh) -> int:
     """Flip until the stack is empty.
 
     After an insertion into a regular triangulation only edges opposite to the new vertex can
@@ -228,7 +239,7 @@ def _sweep(mesh: Mesh) -> int:
                 marked = _mark_irregular(mesh, t)
             if marked:
                 counters[EVERYWHERE] = 1
-                status = _restore(mesh)
+                status = restore(mesh)
                 if status != DONE:
                     return status
             t += 1
@@ -284,7 +295,7 @@ def _outweighs(mesh: Mesh, v: int, u: int) -> bool:
 
 
 @kernel
-def _insert(mesh: Mesh, v: int, certainty: float) -> int:
+def insert(mesh: Mesh, v: int, certainty: float) -> int:
     """Insert site v where its power cell is not empty.
 
     `certainty` in units of the error bound: 1 lets in a site that may touch the lower hull
@@ -309,7 +320,7 @@ def _insert(mesh: Mesh, v: int, certainty: float) -> int:
         else:
             split_edge(mesh, h, v)
     mesh.counters[EVERYWHERE] = 0
-    return _restore(mesh)
+    return restore(mesh)
 
 
 @kernel_that_allocates
@@ -320,7 +331,7 @@ def _return_hidden(mesh: Mesh) -> int:
     """
     for v in range(mesh.hidden.size):
         if mesh.hidden[v]:
-            status = _insert(mesh, v, -1.0)
+            status = insert(mesh, v, -1.0)
             if status != DONE:
                 return status
     return DONE
@@ -368,7 +379,7 @@ def _insert_on_hull(mesh: Mesh, v: int) -> int:
         return DONE
     height = precise_excess(mesh.points, mesh.weights, a, b, c, v)
     mesh.weights[v] += max(height, 0.0)
-    return _insert(mesh, v, np.inf)
+    return insert(mesh, v, np.inf)
 
 
 @kernel_that_allocates
@@ -466,7 +477,7 @@ def build(mesh: Mesh) -> int:
     _start(mesh)
     status = DONE
     for v in insertion_order(mesh.hidden.size):
-        status = _insert(mesh, v, 1.0)
+        status = insert(mesh, v, 1.0)
         if status != DONE:
             break
     if status == DONE and mesh.counters[OVERFLOW] == 1:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from napari_shadowinv.geometry._kernel import kernel
 
 __all__ = [
+    "CROSS_BOUND",
     "FLIP",
     "LEGAL",
     "REFLEX_A",

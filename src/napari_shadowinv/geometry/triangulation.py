@@ -1,6 +1,6 @@
 """Regular triangulations that follow their weights: the dual of a power diagram.
 
-- triangulate weighted sites, or repair for new weights: `RegularTriangulation`
+- triangulate weighted sites, or repair for new weights or places: `RegularTriangulation`
 - raise the weights of sites with empty cells until they count:
   `RegularTriangulation.lower_hidden`
 - sort sites so that neighbours are close in memory: `hilbert_order`
@@ -10,7 +10,7 @@ Two sites are joined by an edge where their cells touch; a site with an empty ce
 hidden and no vertex. Equivalently, the triangles are the lower convex hull of the sites
 lifted to the heights (|r|² - w) / 2.
 
-After a change of weights, each edge that has become irregular is flipped; if it cannot be,
+After a change of weights or places, each edge that has become irregular is flipped; if it cannot be,
 then one of its ends is hidden. So flipping finishes or proves an empty cell, and costs
 little when little has changed.
 
@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import _flips
 from napari_shadowinv.geometry._hilbert import hilbert_permutation
+from napari_shadowinv.geometry._relocation import relocate
 from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Mesh, neighbors_of
 
 __all__ = ["RegularTriangulation", "hilbert_order"]
@@ -167,6 +168,7 @@ class RegularTriangulation:
         points, self._ghost_distance = _with_ghosts(
             given if self._order is None else given[order], region
         )
+        self._region = region
         self._mesh = Mesh(
             points=points,
             weights=np.zeros(n + 4),
@@ -240,7 +242,7 @@ class RegularTriangulation:
             If the weights are not finite or not of shape (n,).
         """
         self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
-        self._forget_triangles()
+        self._forget()
         status = _flips.repair(self._mesh, _flips.STOP if stop_when_hidden else _flips.REMOVE)
         if status != _flips.EXHAUSTED:
             return bool(status == _flips.DONE)
@@ -250,6 +252,39 @@ class RegularTriangulation:
             return False
         self._mesh = fresh._mesh
         return True
+
+    def move(self, sites: ArrayLike) -> None:
+        """Repair the triangulation for new places of the sites; their weights stay.
+
+        Cheap where the neighbours of most sites stay the same, as in a step of Lloyd's; else as
+        dear as a new triangulation. Copies made before keep the old places. Of sites that come
+        to the same place with the same weight any one may become the vertex.
+
+        Parameters
+        ----------
+        sites : array_like, shape (n, 2)
+            New positions (y, x).
+
+        Raises
+        ------
+        InputError
+            If the sites are not finite or not as many as before.
+        """
+        given = _checked_points(sites)
+        n = self._mesh.hidden.size
+        if len(given) != n:
+            raise InputError(f"got {len(given)} sites to move {n} sites to: expected as many")
+        targets = given if self._order is None else given[self._order]
+        points, self._ghost_distance = _with_ghosts(targets, self._region)
+        same_ghosts = np.array_equal(points[n:], self._mesh.points[n:])
+        self._forget()
+        if same_ghosts:
+            self._mesh = self._mesh._replace(points=self._mesh.points.copy())
+            if relocate(self._mesh, targets) == _flips.DONE:
+                return
+        self._mesh = self._mesh._replace(points=points)
+        self._weigh_ghosts()
+        self._build()
 
     def lower_hidden(self, weights: ArrayLike) -> NDArray[np.float64]:
         """Raise the weights of hidden sites by the least that makes their cells count.
@@ -288,7 +323,7 @@ class RegularTriangulation:
             ghosts = self._mesh.weights[-1]
             if _flips.raise_hidden(self._mesh) == _flips.EXHAUSTED:
                 raise RuntimeError(self._exhausted())
-            self._forget_triangles()
+            self._forget()
             # The ghosts follow if the lightest sites were raised; then a site may hide again.
             self._weigh_ghosts()
             if ghosts != self._mesh.weights[-1]:
@@ -300,6 +335,7 @@ class RegularTriangulation:
         twin = object.__new__(RegularTriangulation)
         twin._order = self._order
         twin._ghost_distance = self._ghost_distance
+        twin._region = self._region
         twin._mesh = Mesh(
             points=self._mesh.points,
             weights=self._mesh.weights.copy(),
@@ -340,6 +376,6 @@ class RegularTriangulation:
         given[self._order] = values[: self._order.size]
         return given
 
-    def _forget_triangles(self) -> None:
-        for name in ("weights", "hidden", "vertices", "neighbors"):
+    def _forget(self) -> None:
+        for name in ("points", "weights", "hidden", "vertices", "neighbors"):
             self.__dict__.pop(name, None)

@@ -76,7 +76,7 @@ class Level:
     Attributes
     ----------
     sites : ndarray, shape (n, 2)
-        Positions, in the order of a Hilbert curve.
+        Positions; neighbours in the plane are near in the order, mostly.
     mass : ndarray, shape (n,)
         Flux of the source in each site's Voronoi cell, S(V_i) of the paper.
     centroids : ndarray, shape (n, 2)
@@ -183,27 +183,27 @@ def sample_sites(source: Array, n_sites: int, seed: int = 0) -> Array:
 
 
 def lloyd(
-    sites: Array,
+    triangulation: RegularTriangulation,
     source: Density,
     *,
     iterations: int,
     tolerance: float = 0.0,
     threads: int | None = None,
     report: Callable[[int, int], None] | None = None,
-) -> tuple[Array, int]:
+) -> tuple[PowerDiagram, int]:
     """Move each site to the centroid of its Voronoi cell, again and again.
 
     Parameters
     ----------
-    sites : ndarray, shape (n, 2)
-        Start.
+    triangulation : RegularTriangulation
+        Of the sites, without weights; it is moved along with them.
     source : Density
         Weighs the centroids.
     iterations : int
         Most steps.
     tolerance : float
-        The steps end when the root mean square move is below this, in units of the
-        mean spacing of the sites.
+        The steps end when the root mean square distance of sites from centroids is below
+        this, in units of the mean spacing of the sites.
     threads : int, optional
         Threads of the kernels.
     report : callable, optional
@@ -211,8 +211,8 @@ def lloyd(
 
     Returns
     -------
-    sites : ndarray, shape (n, 2)
-        Where the sites are now.
+    diagram : PowerDiagram
+        Of the sites where they are now, with moments.
     steps : int
         Steps that were made.
 
@@ -220,23 +220,19 @@ def lloyd(
     ----------
     Paper, section II.C, and lines 6–10 of its algorithm.
     """
-    spacing = _spacing(source.shape, len(sites))
-    for step in range(iterations):
-        diagram = PowerDiagram(
-            RegularTriangulation(sites, region=source.region),
-            source,
-            with_moments=True,
-            threads=threads,
-        )
+    near = tolerance * _spacing(source.shape, len(triangulation.sites))
+    step = 0
+    while True:
+        diagram = PowerDiagram(triangulation, source, with_moments=True, threads=threads)
         centroids = diagram.centroids
+        away = np.sqrt(((centroids - triangulation.sites) ** 2).sum(axis=1).mean())
+        if step == iterations or away < near:
+            return diagram, step
         del diagram  # before the next one is made: they are large
-        move = centroids - sites
-        sites = centroids
+        triangulation.move(centroids)
+        step += 1
         if report is not None:
-            report(step + 1, len(sites))
-        if np.sqrt((move**2).sum(axis=1).mean()) < tolerance * spacing:
-            return sites, step + 1
-    return sites, iterations
+            report(step, len(centroids))
 
 
 def _spacing(shape: tuple[int, int], n: int) -> float:
@@ -287,31 +283,25 @@ def plan_levels(
             report("sites", done, total, f"{count:,} sites, Lloyd relaxation")
 
     for count in reversed(counts):
-        sites = sample_sites(source, count, seed)
-        sites, steps = lloyd(
-            sites,
+        triangulation = RegularTriangulation(
+            sample_sites(source, count, seed), region=density.region
+        )
+        diagram, steps = lloyd(
+            triangulation,
             density,
             iterations=lloyd_iterations,
             tolerance=lloyd_tolerance,
             threads=threads,
             report=report_step,
         )
-        levels.append(_level(sites, density, steps, threads))
+        level = Level(
+            sites=triangulation.sites,
+            mass=diagram.masses,
+            centroids=diagram.centroids,
+            triangulation=triangulation,
+            shape=density.shape,
+            lloyd_iterations=steps,
+        )
+        del diagram
+        levels.append(level)
     return SitePlan(source, tuple(levels), mask)
-
-
-def _level(sites: Array, density: Density, steps: int, threads: int | None) -> Level:
-    # Lloyd's steps disturb the order; neighbours in the plane should be neighbours in memory
-    triangulation = RegularTriangulation(sites[hilbert_order(sites)], region=density.region)
-    sites = triangulation.sites
-    diagram = PowerDiagram(triangulation, density, with_moments=True, threads=threads)
-    mass, centroids = diagram.masses, diagram.centroids
-    del diagram
-    return Level(
-        sites=sites,
-        mass=mass,
-        centroids=centroids,
-        triangulation=triangulation,
-        shape=density.shape,
-        lloyd_iterations=steps,
-    )
