@@ -10,9 +10,9 @@ Two sites are joined by an edge where their cells touch; a site with an empty ce
 hidden and no vertex. Equivalently, the triangles are the lower convex hull of the sites
 lifted to the heights (|r|² - w) / 2.
 
-After a change of weights or places, each edge that has become irregular is flipped; if it cannot be,
-then one of its ends is hidden. So flipping finishes or proves an empty cell, and costs
-little when little has changed.
+After a change of weights or places, each edge that has become irregular is flipped; if it
+cannot be, then one of its ends is hidden. So flipping finishes or proves an empty cell, and
+costs little when little has changed.
 
 References
 ----------
@@ -31,8 +31,8 @@ from numpy.typing import ArrayLike, NDArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import _flips
 from napari_shadowinv.geometry._hilbert import hilbert_permutation
-from napari_shadowinv.geometry._relocation import relocate
 from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Mesh, neighbors_of
+from napari_shadowinv.geometry._relocation import relocate
 
 __all__ = ["RegularTriangulation", "hilbert_order"]
 

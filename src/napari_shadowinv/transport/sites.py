@@ -207,7 +207,7 @@ def lloyd(
     threads : int, optional
         Threads of the kernels.
     report : callable, optional
-        Told the number of each step and the number of sites.
+        Told before each step how many were made, and the number of sites.
 
     Returns
     -------
@@ -223,6 +223,8 @@ def lloyd(
     near = tolerance * _spacing(source.shape, len(triangulation.sites))
     step = 0
     while True:
+        if report is not None:
+            report(step, len(triangulation.sites))
         diagram = PowerDiagram(triangulation, source, with_moments=True, threads=threads)
         centroids = diagram.centroids
         away = np.sqrt(((centroids - triangulation.sites) ** 2).sum(axis=1).mean())
@@ -231,8 +233,6 @@ def lloyd(
         del diagram  # before the next one is made: they are large
         triangulation.move(centroids)
         step += 1
-        if report is not None:
-            report(step, len(centroids))
 
 
 def _spacing(shape: tuple[int, int], n: int) -> float:
