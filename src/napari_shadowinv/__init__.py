@@ -2,6 +2,7 @@
 
 - invert an image: `invert`, with `InversionOptions`; the answer is an `Inversion`
 - share sites between shots with one source: `plan_sites`
+- how far the image's noise moves its field: `uncertainty`
 - what a deflection means in SI units: `ProtonSetup`, `OpticalSetup`
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
 - read and write files: `read`, `write`
@@ -16,6 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from napari_shadowinv.error_bars import Uncertainty, uncertainty
     from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
     from napari_shadowinv.inversion import Inversion, Report, invert, plan_sites
     from napari_shadowinv.io import Radiograph, read, write
@@ -36,11 +38,13 @@ __all__ = [
     "ProtonSetup",
     "Radiograph",
     "Report",
+    "Uncertainty",
     "invert",
     "plan_sites",
     "poisson_invert",
     "read",
     "synthetic_image",
+    "uncertainty",
     "write",
 ]
 
@@ -55,11 +59,13 @@ _HOME = {
     "ProtonSetup": "physics.setup",
     "Radiograph": "io",
     "Report": "inversion",
+    "Uncertainty": "error_bars",
     "invert": "inversion",
     "plan_sites": "inversion",
     "poisson_invert": "physics.poisson",
     "read": "io",
     "synthetic_image": "physics.forward",
+    "uncertainty": "error_bars",
     "write": "io",
 }
 

@@ -28,7 +28,7 @@ from napari_shadowinv.preprocess import (
     prepare,
 )
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
-from napari_shadowinv.readout import read_centroids, read_dual
+from napari_shadowinv.readout import read_out
 from napari_shadowinv.transport.sites import Level, SitePlan, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, solve
 
@@ -323,7 +323,7 @@ def invert(
         level = plan.levels[-1]
         weights, of_sites = solutions[-1].weights, solutions[-1].displacement
         height, width = prepared.image.shape
-        potential, displacement = _read_out(level, weights, of_sites, (height, width), options)
+        potential, displacement = read_out(level, weights, of_sites, (height, width), options)
         report("read-out", 1, 2)
         reprojection = synthetic_image(displacement, prepared.source, threads=options.threads)
         report("read-out", 2, 2)
@@ -354,21 +354,6 @@ def _weights_of(start: Inversion, level: Level) -> Array:
             "make both with the same plan, source, mask and options"
         )
     return start.weights
-
-
-def _read_out(
-    level: Level,
-    weights: Array,
-    of_sites: Array,
-    shape: tuple[int, int],
-    options: InversionOptions,
-) -> tuple[Array, Array]:
-    """Potential and displacement at the pixels, by the read-out that the options name."""
-    if options.readout == "centroid":
-        return read_centroids(
-            level, of_sites, shape, options.threads, integration=options.integration
-        )
-    return read_dual(level, weights, of_sites, shape, options.threads)
 
 
 def _report(

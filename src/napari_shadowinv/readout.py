@@ -1,5 +1,6 @@
 """From the weights of the sites to the potential and displacement at every pixel.
 
+- by the way that the options name: `read_out`
 - from the dual variables, without any integration: `read_dual` (default)
 - the paper's way, from the cells' centroids: `read_centroids`
 """
@@ -14,13 +15,44 @@ from scipy.integrate import cumulative_trapezoid
 
 from napari_shadowinv.geometry.natural_neighbor import natural_neighbor
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.potential import potential_surface
 from napari_shadowinv.transport.sites import Level
 
-__all__ = ["read_centroids", "read_dual"]
+__all__ = ["read_centroids", "read_dual", "read_out"]
 
 Array = NDArray[np.float64]
+
+
+def read_out(
+    level: Level,
+    weights: Array,
+    site_displacement: Array,
+    shape: tuple[int, int],
+    options: InversionOptions,
+) -> tuple[Array, Array]:
+    """Potential and displacement at the pixels, by the read-out that the options name.
+
+    Parameters
+    ----------
+    level, weights, site_displacement, shape
+        See `read_dual`.
+    options : InversionOptions
+        Its `readout`, `integration` and `threads` are used.
+
+    Returns
+    -------
+    potential : ndarray, shape (H, W)
+        px².
+    displacement : ndarray, shape (2, H, W)
+        px.
+    """
+    if options.readout == "centroid":
+        return read_centroids(
+            level, site_displacement, shape, options.threads, integration=options.integration
+        )
+    return read_dual(level, weights, site_displacement, shape, options.threads)
 
 
 def read_dual(

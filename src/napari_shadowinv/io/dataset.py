@@ -2,6 +2,7 @@
 
 - label everything, with units: `dataset_from_inversion`
 - the same for a field of other origin: `dataset_from_field`
+- an inversion with the scatter that noise gives it: `dataset_from_uncertainty`
 - the way back: `inversion_from_dataset`, `setup_from_dataset`
 - one file for all of it (NetCDF4, ``.shadowinv``): `write_result`, `read_result`
 - say which files it was made from: `provenance`
@@ -26,6 +27,7 @@ from napari_shadowinv.io.radiograph import Radiograph
 if TYPE_CHECKING:
     import xarray
 
+    from napari_shadowinv.error_bars import Uncertainty
     from napari_shadowinv.inversion import Inversion, Report
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
@@ -33,6 +35,7 @@ __all__ = [
     "FORMAT",
     "dataset_from_field",
     "dataset_from_inversion",
+    "dataset_from_uncertainty",
     "displacement_from_potential",
     "inversion_from_dataset",
     "provenance",
@@ -150,6 +153,62 @@ def dataset_from_field(
         attrs["setup"] = setup.model_dump_json()
     height, width = displacement.shape[1:]
     return xr.Dataset(variables, coords=_coordinates(height, width, setup), attrs=attrs)
+
+
+def dataset_from_uncertainty(
+    uncertainty: Uncertainty,
+    setup: ProtonSetup | OpticalSetup | None = None,
+    *,
+    attributes: Mapping[str, str] | None = None,
+) -> xarray.Dataset:
+    """Label an inversion and the scatter of its noisy samples.
+
+    Parameters
+    ----------
+    uncertainty : Uncertainty
+        The result.
+    setup : ProtonSetup or OpticalSetup, optional
+        Adds the fields and their deviations in SI units, and coordinates in metres.
+    attributes : mapping of str to str, optional
+        More attributes, such as those of `provenance`.
+
+    Returns
+    -------
+    xarray.Dataset
+        As of `dataset_from_inversion`, with ``potential_mean`` and ``displacement_mean``, and a
+        ``…_std`` beside each potential, displacement and field. How the samples were made is a
+        JSON text in the attribute ``uncertainty``.
+    """
+    samples = ("n", "noise", "tolerance", "iterations", "residuals", "converged", "warnings")
+    history = json.dumps({name: getattr(uncertainty, name) for name in samples})
+    dataset = dataset_from_inversion(
+        uncertainty.inversion, setup, attributes={"uncertainty": history, **(attributes or {})}
+    )
+    means = {
+        "potential": uncertainty.potential_mean,
+        "displacement": uncertainty.displacement_mean,
+    }
+    deviations = {
+        "potential": uncertainty.potential_std,
+        "displacement": uncertainty.displacement_std,
+    }
+    if setup is not None:
+        fields = _fields(deviations["displacement"], deviations["potential"], setup)
+        # each is its argument times a number, perhaps negative, perhaps with axes exchanged
+        deviations |= {name: np.abs(field[1]) for name, field in fields.items()}
+
+    def beside(name: str, what: str, values: NDArray[np.float64]) -> tuple[Any, ...]:
+        field = dataset[name]
+        long_name = f"{field.attrs['long_name']}, {what} of noisy samples"
+        return field.dims, values, _labels(field.attrs["units"], long_name)
+
+    return dataset.assign(
+        {f"{name}_mean": beside(name, "mean", values) for name, values in means.items()}
+        | {
+            f"{name}_std": beside(name, "standard deviation", values)
+            for name, values in deviations.items()
+        }
+    )
 
 
 def displacement_from_potential(potential: ArrayLike) -> NDArray[np.float64]:

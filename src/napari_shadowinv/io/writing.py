@@ -16,6 +16,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.arrays import write_npy
 from napari_shadowinv.io.dataset import (
     dataset_from_inversion,
+    dataset_from_uncertainty,
     provenance,
     setup_from_dataset,
     write_result,
@@ -28,6 +29,7 @@ from napari_shadowinv.io.radiograph import Radiograph
 if TYPE_CHECKING:
     import xarray
 
+    from napari_shadowinv.error_bars import Uncertainty
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
@@ -41,7 +43,7 @@ _SITE_COLUMNS = "y_px,x_px,weight_px2,mass,displacement_y_px,displacement_x_px"
 
 def write(
     path: str | Path,
-    result: Inversion | xarray.Dataset | NDArray[Any],
+    result: Inversion | Uncertainty | xarray.Dataset | NDArray[Any],
     *,
     setup: ProtonSetup | OpticalSetup | None = None,
     shot: Radiograph | None = None,
@@ -56,7 +58,7 @@ def write(
         For a result: ``.shadowinv`` for all of it, ``.h5`` for pradformat, ``.csv`` for the
         sites. For an image: ``.tif`` (float32), ``.npy``, ``.png`` (16 bits, its largest
         value white).
-    result : Inversion or xarray.Dataset or ndarray of shape (H, W)
+    result : Inversion or Uncertainty or xarray.Dataset or ndarray of shape (H, W)
         What to write.
     setup : ProtonSetup or OpticalSetup, optional
         Adds SI units; pradformat needs it. A dataset brings its own.
@@ -96,16 +98,19 @@ def write(
 
 
 def _dataset(
-    result: Inversion | xarray.Dataset,
+    result: Inversion | Uncertainty | xarray.Dataset,
     setup: ProtonSetup | OpticalSetup | None,
     shot: Radiograph | None,
     source: Radiograph | None,
 ) -> xarray.Dataset:
+    from napari_shadowinv.error_bars import Uncertainty
     from napari_shadowinv.inversion import Inversion
 
     origin = provenance(shot, source)
     if isinstance(result, Inversion):
         return dataset_from_inversion(result, setup, attributes=origin)
+    if isinstance(result, Uncertainty):
+        return dataset_from_uncertainty(result, setup, attributes=origin)
     return result.assign_attrs(origin)
 
 
