@@ -31,6 +31,7 @@ from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.memory import physical_memory
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocess import prepare
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.readout import read_out
@@ -246,15 +247,14 @@ class _Sampling:
     def sample(self, seed: np.random.SeedSequence, report: Reporter) -> _Sample:
         """Invert one noisy image, without what the image alone needs (re-projection, caustics)."""
         image = self._image(seed)
-        solution = solve(self.plan.levels, image, self.options, report, start=self.start)[-1]
-        potential, displacement = read_out(
-            self.plan.levels[-1],
-            solution.weights,
-            solution.displacement,
-            self.plan.source.shape,
-            self.options,
+        plan = self.plan
+        solution = solve(
+            plan.levels, image, self.options, report, start=self.start, outside=plan.outside
+        )[-1]
+        potential, displacement = (
+            plan.within(values) for values in read_out(plan, solution, self.options)
         )
-        return _Sample(potential, displacement, solution)
+        return _Sample(potential - border_mean(potential), displacement, solution)
 
     def to_tolerance_of_noise(self, seed: np.random.SeedSequence) -> _Sampling:
         """Ask of the solver no more than what matters beside the flux errors that noise makes.

@@ -10,8 +10,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,18 +19,21 @@ from numpy.typing import ArrayLike, NDArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
+from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocess import (
     Prepared,
     checked_mask,
     checked_source,
+    margin_around,
     masked_source,
     number_of_sites,
     prepare,
 )
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.readout import read_out
-from napari_shadowinv.transport.sites import Level, SitePlan, plan_levels
-from napari_shadowinv.transport.solvers import LevelSolution, solve
+from napari_shadowinv.transport.outside import Outside, crossings
+from napari_shadowinv.transport.sites import SitePlan, plan_levels
+from napari_shadowinv.transport.solvers import LevelSolution, fitted_flux, solve
 
 if TYPE_CHECKING:
     import xarray
@@ -70,6 +73,11 @@ class Report:
         Time of each stage: prepare, sites, transport, read-out.
     warnings : tuple of str
         What the user should know before trusting the result.
+    flux_scale : float
+        What the image was divided by to bring it to the units of the source.
+    flux_left, flux_entered : dict of str to float
+        With a free boundary the flux that crossed each side of the image (top, bottom, left,
+        right), as a share of the source's flux in the image; else empty.
     """
 
     converged: bool
@@ -83,6 +91,9 @@ class Report:
     levels: tuple[tuple[int, int, float], ...]
     seconds: dict[str, float]
     warnings: tuple[str, ...]
+    flux_scale: float = 1.0
+    flux_left: dict[str, float] = field(default_factory=dict)
+    flux_entered: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -189,8 +200,8 @@ def plan_sites(
     source : array_like, shape (H, W)
         The undisturbed beam.
     options : InversionOptions, optional
-        Its `n_sites`, `lloyd_iterations`, `lloyd_tolerance`, `floor`, `seed` and `threads` are
-        used.
+        Its `n_sites`, `lloyd_iterations`, `lloyd_tolerance`, `floor`, `boundary`, `margin`,
+        `seed` and `threads` are used.
     mask : array_like of bool, shape (H, W), optional
         See `invert`.
     on_progress, should_stop
@@ -213,16 +224,21 @@ def plan_sites(
     beam = checked_source(source, usable)
     if usable is not None:
         beam = masked_source(beam, usable, options)
-    return plan_levels(
-        beam,
-        number_of_sites(beam.shape, options),
+    n_sites = number_of_sites(beam.shape, options)
+    outside = None
+    if options.boundary == "free":
+        outside = Outside.around(beam, margin_around(beam.shape, options), usable)
+        n_sites = round(n_sites * outside.beam.sum() / beam.sum())
+    plan = plan_levels(
+        beam if outside is None else outside.beam,
+        n_sites,
         lloyd_iterations=options.lloyd_iterations,
         lloyd_tolerance=options.lloyd_tolerance,
         seed=options.seed,
         threads=options.threads,
-        mask=usable,
         report=Reporter(on_progress, should_stop),
     )
+    return replace(plan, source=beam, mask=usable, outside=outside)
 
 
 def invert(
@@ -303,6 +319,7 @@ def invert(
                 raise InputError(
                     "got a plan and also a source or mask, expected one: a plan has its own"
                 )
+            _check_boundary(plan, options)
             source, mask = plan.source, plan.mask
         prepared = prepare(image, source, options, mask)
         report("prepare", 1, 1)
@@ -316,38 +333,105 @@ def invert(
                 should_stop=should_stop,
             )
     with stopwatch("transport"):
-        weights = None if start is None else _weights_of(start, plan.levels[-1])
-        solutions = solve(plan.levels, prepared.floored_image, options, report, start=weights)
+        if plan.outside is not None and options.flux == "fit":
+            image_flux = fitted_flux(
+                plan.levels, prepared.floored_image, plan.outside, options, report
+            )
+            scale = prepared.flux_scale / image_flux
+            prepared = prepare(image, source, options, mask, flux_scale=scale)
+        weights = None if start is None else _weights_of(start, plan)
+        solutions = solve(
+            plan.levels,
+            prepared.floored_image,
+            options,
+            report,
+            start=weights,
+            outside=plan.outside,
+        )
     with stopwatch("read-out"):
-        report("read-out", 0, 2)
-        level = plan.levels[-1]
-        weights, of_sites = solutions[-1].weights, solutions[-1].displacement
-        height, width = prepared.image.shape
-        potential, displacement = read_out(level, weights, of_sites, (height, width), options)
-        report("read-out", 1, 2)
-        reprojection = synthetic_image(displacement, prepared.source, threads=options.threads)
-        report("read-out", 2, 2)
+        fields = _read_fields(plan, prepared, solutions[-1], options, report)
+    level = plan.levels[-1]
+    caustic = jacobian_determinant(fields.displacement) < options.caustic_jacobian
     return Inversion(
         image=prepared.image,
         source=prepared.source,
-        potential=potential,
-        displacement=displacement,
-        sites=level.sites,
-        weights=weights,
+        potential=fields.potential,
+        displacement=fields.displacement,
+        sites=level.sites - plan.margin,
+        weights=solutions[-1].weights,
         site_mass=level.mass,
-        site_displacement=of_sites,
-        reprojection=reprojection,
-        residual=np.where(prepared.mask, prepared.image - reprojection, 0.0),
-        caustic=(jacobian_determinant(displacement) < options.caustic_jacobian) & prepared.mask,
+        site_displacement=solutions[-1].displacement,
+        reprojection=fields.reprojection,
+        residual=np.where(prepared.mask, prepared.image - fields.reprojection, 0.0),
+        caustic=caustic & prepared.mask,
         mask=prepared.mask,
-        report=_report(prepared, plan, solutions, stopwatch.seconds, options),
+        report=_report(prepared, plan, solutions, fields, stopwatch.seconds, options),
         options=options,
     )
 
 
-def _weights_of(start: Inversion, level: Level) -> Array:
-    """Return the weights to start from, if they belong to the sites of this level."""
-    found, expected = start.sites, level.sites
+def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:
+    made_for = "closed" if plan.outside is None else "free"
+    if options.boundary != made_for:
+        raise InputError(
+            f"plan was made for a {made_for} boundary and options say '{options.boundary}': "
+            "make the plan with the same options"
+        )
+    if plan.outside is not None and plan.margin != margin_around(plan.source.shape, options):
+        raise InputError(
+            f"plan has a margin of {plan.margin} px and options ask for "
+            f"{margin_around(plan.source.shape, options)} px: make the plan with the same options"
+        )
+
+
+class _Fields(NamedTuple):
+    """What is read off the weights, at the image's pixels."""
+
+    potential: Array
+    displacement: Array
+    reprojection: Array
+    flux_left: dict[str, float]
+    flux_entered: dict[str, float]
+
+
+def _read_fields(
+    plan: SitePlan,
+    prepared: Prepared,
+    solution: LevelSolution,
+    options: InversionOptions,
+    report: Reporter,
+) -> _Fields:
+    report("read-out", 0, 2)
+    potential, displacement = read_out(plan, solution, options)
+    report("read-out", 1, 2)
+    left: dict[str, float] = {}
+    entered: dict[str, float] = {}
+    if plan.outside is None:
+        reprojection = synthetic_image(displacement, prepared.source, threads=options.threads)
+    else:
+        image_part = np.zeros_like(plan.outside.beam)
+        plan.within(image_part)[:] = prepared.source
+        margin_part = plan.outside.beam.copy()
+        plan.within(margin_part)[:] = 0
+        from_image = synthetic_image(displacement, image_part, threads=options.threads)
+        from_margin = synthetic_image(displacement, margin_part, threads=options.threads)
+        reprojection = plan.within(from_image + from_margin)
+        left, entered = crossings(from_image, from_margin, plan.outside)
+    report("read-out", 2, 2)
+    inner = plan.within(potential)
+    return _Fields(
+        np.ascontiguousarray(inner - border_mean(inner)),
+        np.ascontiguousarray(plan.within(displacement)),
+        np.ascontiguousarray(reprojection),
+        left,
+        entered,
+    )
+
+
+def _weights_of(start: Inversion, plan: SitePlan) -> Array:
+    """Return the weights to start from, if they belong to the finest sites of this plan."""
+    level = plan.levels[-1]
+    found, expected = start.sites + plan.margin, level.sites
     if found.shape != expected.shape or np.abs(found - expected).max() > 1e-3 * level.spacing:
         raise InputError(
             f"start has {len(found):,} sites that are not the {len(expected):,} of this inversion: "
@@ -360,6 +444,7 @@ def _report(
     prepared: Prepared,
     plan: SitePlan,
     solutions: list[LevelSolution],
+    fields: _Fields,
     seconds: dict[str, float],
     options: InversionOptions,
 ) -> Report:
@@ -386,4 +471,7 @@ def _report(
         ),
         seconds=seconds,
         warnings=warnings,
+        flux_scale=prepared.flux_scale,
+        flux_left=fields.flux_left,
+        flux_entered=fields.flux_entered,
     )

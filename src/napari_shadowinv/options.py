@@ -6,9 +6,9 @@ in a window, and is saved with each result: there is no second list of defaults.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
 
@@ -119,6 +119,41 @@ class InversionOptions(BaseModel):
             "(left over from background subtraction) become zero, and are counted in the report."
         ),
     )
+    boundary: Literal["closed", "free"] = Field(
+        default="closed",
+        title="Boundary",
+        description=(
+            "'closed': no flux crosses the image's edge, as in the paper. 'free': flux may leave "
+            "and enter, and the object's potential fades beyond the edge."
+        ),
+    )
+    margin: int | None = Field(
+        default=None,
+        ge=2,
+        title="Margin (px)",
+        description=(
+            "Of the free boundary: pixels beyond each edge that flux may come from; they get sites "
+            "of their own. Default: a twentieth of the image's shorter side."
+        ),
+    )
+    decay_length: float | None = Field(
+        default=None,
+        gt=0,
+        title="Decay length (px)",
+        description=(
+            "Of the free boundary: distance over which the potential fades beyond the edge, of the "
+            "order of the object's size there. Default: the margin."
+        ),
+    )
+    flux: Literal["conserve", "known", "fit"] = Field(
+        default="conserve",
+        title="Flux",
+        description=(
+            "Of the free boundary: 'conserve': as much flux enters as leaves, so image and source "
+            "may have any units. 'known': image and source have the same exposure and units. "
+            "'fit': find the exposure for which the flux at the edge moves least."
+        ),
+    )
     caustic_jacobian: float = Field(
         default=0.2,
         ge=0,
@@ -140,6 +175,20 @@ class InversionOptions(BaseModel):
         title="Threads",
         description="Threads of the kernels. Default: all cores. Results do not depend on it.",
     )
+
+    @model_validator(mode="after")
+    def _boundary_fits_the_rest(self) -> Self:
+        if self.boundary == "closed" and self.flux != "conserve":
+            raise ValueError(
+                f"flux is '{self.flux}' and boundary 'closed', expected 'conserve': where nothing "
+                "crosses the edge the flux is that of the source; use boundary='free'"
+            )
+        if self.boundary == "free" and self.solver != "newton":
+            raise ValueError(
+                f"solver is '{self.solver}' and boundary 'free', expected solver='newton': the "
+                "others know closed boundaries only"
+            )
+        return self
 
     @classmethod
     def paper(cls, **changes: Any) -> InversionOptions:

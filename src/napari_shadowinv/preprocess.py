@@ -20,6 +20,7 @@ __all__ = [
     "Prepared",
     "checked_mask",
     "checked_source",
+    "margin_around",
     "masked_source",
     "number_of_sites",
     "prepare",
@@ -29,13 +30,15 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SMALLEST_SIDE = 4
+_LEAST_MARGIN = 4
+_MARGIN_SHARE = 0.05  # of the image's shorter side
 _BYTES_PER_SITE = 2000  # measured peak of a whole inversion, rounded up
 _NOTABLE_FLUX_CHANGE = 0.05
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """An image and a source of the same flux.
+    """An image and a source, of the same flux unless the image's is known.
 
     Attributes
     ----------
@@ -48,6 +51,8 @@ class Prepared:
         The pixels that are used.
     clipped_pixels, floored_pixels : int
         How many pixels were negative, and how many, these included, below the floor.
+    flux_scale : float
+        What the image was divided by.
     warnings : tuple of str
         What the user should know.
     """
@@ -59,6 +64,7 @@ class Prepared:
     mask: Mask
     clipped_pixels: int
     floored_pixels: int
+    flux_scale: float
     warnings: tuple[str, ...]
 
 
@@ -67,6 +73,8 @@ def prepare(
     source: ArrayLike | None,
     options: InversionOptions,
     mask: ArrayLike | None = None,
+    *,
+    flux_scale: float | None = None,
 ) -> Prepared:
     """Check an image and its source, and bring them to the same flux.
 
@@ -77,10 +85,13 @@ def prepare(
     source : array_like, shape (H, W), optional
         The undisturbed beam; uniform if None.
     options : InversionOptions
-        Its `floor` and `negative` are used.
+        Its `floor`, `negative` and `flux` are used.
     mask : array_like of bool, shape (H, W), optional
         True where a pixel can be used; others carry no flux on either side, and what they
         hold, even NaN, does not matter.
+    flux_scale : float, optional
+        Divide the image by this. Default: what gives it the flux of the source, or 1 where
+        `options.flux` says that it is known.
 
     Returns
     -------
@@ -111,7 +122,9 @@ def prepare(
     else:
         beam = checked_source(source, usable)
     ratio = float(values.sum() / beam.sum())
-    values = values / ratio
+    conserved = flux_scale is None and options.flux != "known"
+    scale = ratio if conserved else flux_scale or 1.0
+    values = values / scale
     least = options.floor * values.sum() / usable.sum()
     floored = np.maximum(values, least)
     floored_source = masked_source(beam, usable, options)
@@ -119,12 +132,13 @@ def prepare(
     return Prepared(
         image=values,
         source=beam,
-        floored_image=floored * (floored_source.sum() / floored.sum()),
+        floored_image=floored * (floored_source.sum() / floored.sum() if conserved else 1.0),
         floored_source=floored_source,
         mask=usable,
         clipped_pixels=negative,
         floored_pixels=below,
-        warnings=_warnings(ratio, negative, below, int(usable.sum())),
+        flux_scale=scale,
+        warnings=_warnings(ratio if scale != 1.0 else 1.0, negative, below, int(usable.sum())),
     )
 
 
@@ -224,6 +238,12 @@ def _finite_image(values: ArrayLike, name: str, mask: Mask) -> Array:
             "mask them, or replace them, for instance by the median of their neighbours"
         )
     return array
+
+
+def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
+    """Return the pixels beyond each edge that sites cover where the boundary is free."""
+    default = max(_LEAST_MARGIN, round(_MARGIN_SHARE * min(shape)))
+    return default if options.margin is None else options.margin
 
 
 def number_of_sites(shape: tuple[int, int], options: InversionOptions) -> int:

@@ -18,7 +18,8 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.potential import potential_surface
-from napari_shadowinv.transport.sites import Level
+from napari_shadowinv.transport.sites import Level, SitePlan
+from napari_shadowinv.transport.solvers import LevelSolution
 
 __all__ = ["read_centroids", "read_dual", "read_out"]
 
@@ -26,18 +27,16 @@ Array = NDArray[np.float64]
 
 
 def read_out(
-    level: Level,
-    weights: Array,
-    site_displacement: Array,
-    shape: tuple[int, int],
-    options: InversionOptions,
+    plan: SitePlan, solution: LevelSolution, options: InversionOptions
 ) -> tuple[Array, Array]:
     """Potential and displacement at the pixels, by the read-out that the options name.
 
     Parameters
     ----------
-    level, weights, site_displacement, shape
-        See `read_dual`.
+    plan : SitePlan
+        The sites; with a margin, the result covers it too.
+    solution : LevelSolution
+        Of the plan's finest level.
     options : InversionOptions
         Its `readout`, `integration` and `threads` are used.
 
@@ -48,11 +47,14 @@ def read_out(
     displacement : ndarray, shape (2, H, W)
         px.
     """
+    level = plan.levels[-1]
+    weights, displacement = solution.weights, solution.displacement
+    threads = options.threads
     if options.readout == "centroid":
         return read_centroids(
-            level, site_displacement, shape, options.threads, integration=options.integration
+            level, displacement, level.shape, threads, integration=options.integration
         )
-    return read_dual(level, weights, site_displacement, shape, options.threads)
+    return read_dual(level, weights, displacement, level.shape, threads)
 
 
 def read_dual(

@@ -267,3 +267,24 @@ def test_factorisation_takes_over_where_iterations_do_not_suffice(
     monkeypatch.setattr(linear, "LaplacianSolver", Lazy)
     assert Lazy(laplacian).solve(right, 1e-6)[2] > 1e-6
     assert residual(laplacian, solve_laplacian(laplacian, right, 1e-6), right) <= 1e-6
+
+
+@pytest.mark.parametrize("n", [50, 5000])
+@pytest.mark.parametrize("strength", [1e-3, 1.0, 1e3])
+def test_a_ground_makes_the_system_regular(n: int, strength: float) -> None:
+    laplacian = independent_contrast(n)
+    ground = np.where(np.arange(n) % 7 == 0, strength, 0.0)
+    right = np.random.default_rng(2).random(n)  # its sum flows off through the ground
+    exact = splu((laplacian + diags_array(ground)).tocsc()).solve(right)
+    found = solve_laplacian(laplacian, right, 1e-10, ground=ground)
+    np.testing.assert_allclose(found, exact, rtol=1e-5, atol=1e-7 * np.abs(exact).max())
+    assert ground @ found == pytest.approx(right.sum(), rel=1e-6)
+
+
+def test_grounded_multigrid_needs_few_iterations() -> None:
+    laplacian = unit_delaunay(20_000)
+    ground = np.where(np.arange(20_000) < 3000, 0.05, 0.0)
+    right = np.random.default_rng(3).normal(size=20_000)
+    _, iterations, residual = LaplacianSolver(laplacian, ground).solve(right, 1e-8)
+    assert residual <= 1e-8
+    assert iterations < 40

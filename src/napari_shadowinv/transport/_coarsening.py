@@ -241,8 +241,15 @@ def _compose(start: int, stop: int, groups: Indices, parents: Indices) -> None:
         groups[i] = parents[groups[i]]
 
 
-def build_hierarchy(laplacian: csr_array) -> Hierarchy:
+def build_hierarchy(laplacian: csr_array, ground: Array | None = None) -> Hierarchy:
     """Group nodes, and groups of nodes, until few are left.
+
+    Parameters
+    ----------
+    laplacian : csr_array, shape (n, n)
+        The graph Laplacian.
+    ground : ndarray, shape (n,), optional
+        Conductance from each node to a ground at potential 0; none by default.
 
     Raises
     ------
@@ -260,17 +267,30 @@ def build_hierarchy(laplacian: csr_array) -> Hierarchy:
         laplacian.data.astype(np.float64, copy=False),
         network,
     )
+    _tie_to_ground(network, 0, ground)
     bounds = [0, n]
     while bounds[-1] - bounds[-2] > _COARSEST:
         network, last = _add_level(network, parents, bounds[-2], bounds[-1])
+        if ground is not None:
+            groups = parents[bounds[-2] : bounds[-1]] - bounds[-1]
+            ground = np.bincount(groups, ground, last - bounds[-1]).astype(np.float64)
+            _tie_to_ground(network, bounds[-1], ground)
         bounds.append(last)
     return Hierarchy(
         np.array(bounds, np.int64),
         _choose_second_steps(network, bounds),
         network,
         parents,
-        _invert_coarsest(network, bounds[-2], bounds[-1]),
+        _invert_coarsest(network, bounds[-2], bounds[-1], grounded=ground is not None),
     )
+
+
+def _tie_to_ground(network: Network, start: int, ground: Array | None) -> None:
+    """Add conductances to a ground at potential 0; the nodes from `start` on have them."""
+    if ground is not None:
+        nodes = slice(start, start + len(ground))
+        network.degrees[nodes] += ground
+        network.inverse_degrees[nodes] = 1.0 / network.degrees[nodes]
 
 
 def _add_level(network: Network, parents: Indices, start: int, stop: int) -> tuple[Network, int]:
@@ -320,8 +340,8 @@ def _choose_second_steps(network: Network, bounds: list[int]) -> NDArray[np.bool
     return twice
 
 
-def _invert_coarsest(network: Network, start: int, stop: int) -> Array:
-    """Invert the last level's Laplacian, with constants made regular."""
+def _invert_coarsest(network: Network, start: int, stop: int, *, grounded: bool) -> Array:
+    """Invert the last level's Laplacian; without a ground, with constants made regular."""
     entries = slice(network.starts[start], network.starts[stop])
     graph = csr_array(
         (
@@ -333,7 +353,9 @@ def _invert_coarsest(network: Network, start: int, stop: int) -> Array:
     )
     require_connected(graph)
     degrees = network.degrees[start:stop]
-    regular = np.diag(degrees) - graph.toarray() + (degrees.mean() or 1.0) / (stop - start)
+    regular = np.diag(degrees) - graph.toarray()
+    if not grounded:
+        regular += (degrees.mean() or 1.0) / (stop - start)
     inverse: Array = np.linalg.inv(regular)
     return inverse
 

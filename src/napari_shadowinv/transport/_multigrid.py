@@ -176,12 +176,13 @@ def _cycle(hierarchy: Hierarchy, vectors: _Vectors) -> None:
 
 
 @njit(nogil=True, cache=True)
-def _turn(n: int, share: float, vectors: _Vectors) -> None:
+def _turn(n: int, share: float, grounded: bool, vectors: _Vectors) -> None:
     """Make the next direction from the correction and a share of the last direction."""
     total = 0.0
-    for i in range(n):
-        total += vectors.correction[i]
-    # the Laplacian forgets a constant only up to rounding
+    if not grounded:
+        for i in range(n):
+            total += vectors.correction[i]
+    # without a ground the Laplacian forgets a constant, but only up to rounding
     mean = total / n
     for i in range(n):
         vectors.direction[i] = vectors.correction[i] - mean - share * vectors.direction[i]
@@ -204,6 +205,9 @@ class LaplacianSolver:
     laplacian : csr_array, shape (n, n)
         Symmetric, nothing positive off the diagonal, rows sum to zero. Columns may come in
         any order; neighbours should be near in the numbering for speed.
+    ground : ndarray, shape (n,), optional
+        Conductance from each node to a ground at potential 0, added to the diagonal; not zero
+        everywhere.
     threads : int
         Most threads to use. Results do not depend on it.
 
@@ -221,10 +225,13 @@ class LaplacianSolver:
     array([1.5, 0.5, 0. ])
     """
 
-    def __init__(self, laplacian: csr_array, *, threads: int = 1) -> None:
+    def __init__(
+        self, laplacian: csr_array, ground: Array | None = None, *, threads: int = 1
+    ) -> None:
         self._n = int(laplacian.shape[0])
+        self._grounded = ground is not None
         self._threads = threads
-        self._hierarchy = build_hierarchy(laplacian)
+        self._hierarchy = build_hierarchy(laplacian, ground)
         nodes = int(self._hierarchy.bounds[-1])
         self._vectors = _Vectors(*(np.zeros(nodes) for _ in _Vectors._fields))
 
@@ -236,7 +243,7 @@ class LaplacianSolver:
         Parameters
         ----------
         right : ndarray, shape (n,)
-            Right side; its mean is ignored.
+            Right side; without a ground its mean is ignored.
         tolerance : float
             Norm of the residual to reach, relative to the right side's.
         max_iterations : int
@@ -245,13 +252,13 @@ class LaplacianSolver:
         Returns
         -------
         solution : ndarray, shape (n,)
-            Of mean zero.
+            Without a ground of mean zero.
         iterations : int
             Iterations done.
         residual : float
             Relative norm of the residual, more than `tolerance` if it was not reached.
         """
-        right = right - right.mean()
+        right = self._centred(right)
         scale = self._norm(right)
         solution: Array = np.zeros(self._n)
         if scale == 0.0:
@@ -271,7 +278,11 @@ class LaplacianSolver:
                 relative = self._renew_residual(right, solution) / scale
             if not energy > 0.0:
                 break
-        return solution - solution.mean(), iterations, relative
+        return self._centred(solution), iterations, relative
+
+    def _centred(self, values: Array) -> Array:
+        """Take off the constant that a network without a ground does not feel."""
+        return values if self._grounded else values - values.mean()
 
     def _iterate(self, solution: Array, energy: float) -> float:
         """Do one step of flexible conjugate gradients; return its direction's energy."""
@@ -279,7 +290,7 @@ class LaplacianSolver:
         vectors = self._vectors
         _cycle(self._hierarchy, vectors)
         share = _dot(0, n, vectors.correction, vectors.direction_product) / energy
-        _turn(n, share, vectors)
+        _turn(n, share, self._grounded, vectors)
         self._multiply(vectors.direction, vectors.direction_product)
         energy = _dot(0, n, vectors.direction, vectors.direction_product)
         if energy > 0.0:

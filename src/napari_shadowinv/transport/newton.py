@@ -16,10 +16,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.progress import Reporter
-from napari_shadowinv.transport.linear import solve_laplacian
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 
 __all__ = ["newton", "with_full_cells"]
@@ -76,9 +74,7 @@ def newton(
         laplacian = diagram.laplacian()
         del diagram  # the trial steps need its memory
         try:
-            step = solve_laplacian(
-                laplacian, gap, _LINEAR_TOLERANCE, available_threads(objective.threads)
-            )
+            step = objective.newton_step(laplacian, weights, gap, _LINEAR_TOLERANCE)
         except RuntimeError as error:
             reason = f"Newton's system cannot be solved: {error}"
             break
@@ -93,9 +89,8 @@ def newton(
         residual = objective.residual(diagram)
         iterations += 1
     converged = residual <= tolerance
-    return Solution(
-        weights - weights.mean(), residual, iterations, converged, "" if converged else reason
-    )
+    reason = "" if converged else reason
+    return Solution(objective.in_gauge(weights), residual, iterations, converged, reason)
 
 
 def _damped_step(

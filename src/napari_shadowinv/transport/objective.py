@@ -17,10 +17,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
+from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.transport.linear import solve_laplacian
 
 __all__ = ["Solution", "TransportObjective"]
 
@@ -34,7 +37,7 @@ class Solution:
     Attributes
     ----------
     weights : ndarray, shape (n,)
-        Of mean zero, px².
+        px²; of mean zero, but where the boundary is free.
     residual : float
         Largest relative flux error of a cell.
     iterations : int
@@ -84,14 +87,49 @@ class TransportObjective:
         """Return the power diagram for `weights`; empty cells are allowed."""
         self.triangulation.update(weights)
         return PowerDiagram(
-            self.triangulation, self.image, with_moments=with_moments, threads=self.threads
+            self.triangulation,
+            self.image_for(weights),
+            with_moments=with_moments,
+            threads=self.threads,
         )
 
     def diagram_if_full(self, weights: Array) -> PowerDiagram | None:
         """Return the power diagram for `weights`, or None as soon as a cell proves empty."""
         if not self.triangulation.update(weights, stop_when_hidden=True):
             return None
-        return PowerDiagram(self.triangulation, self.image, threads=self.threads)
+        return PowerDiagram(self.triangulation, self.image_for(weights), threads=self.threads)
+
+    def image_for(self, weights: Array) -> Density:
+        """Return the image that the cells divide among themselves."""
+        return self.image
+
+    def newton_step(
+        self, laplacian: csr_array, weights: Array, gap: Array, tolerance: float
+    ) -> Array:
+        """Return the change of the weights that closes the gap to first order.
+
+        Parameters
+        ----------
+        laplacian : csr_array, shape (n, n)
+            Of the diagram for these weights.
+        weights : ndarray, shape (n,)
+            Where the step starts, px².
+        gap : ndarray, shape (n,)
+            Flux that each cell lacks.
+        tolerance : float
+            Relative residual of the linear system.
+
+        Raises
+        ------
+        RuntimeError
+            The cells fall into groups with no flux between them.
+        """
+        return solve_laplacian(laplacian, gap, tolerance, available_threads(self.threads))
+
+    def in_gauge(self, weights: Array) -> Array:
+        """Fix the constant that the weights are known up to: their mean is zero."""
+        centred: Array = weights - weights.mean()
+        return centred
 
     def value_and_gradient(self, weights: Array) -> tuple[float, Array]:
         """Return f(w) and its gradient T - S (paper, Eqs. 5 and 6).

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -24,6 +25,9 @@ from napari_shadowinv.geometry.interpolation import mirrored_across_border
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 from napari_shadowinv.progress import Reporter
+
+if TYPE_CHECKING:
+    from napari_shadowinv.transport.outside import Outside
 
 __all__ = ["Level", "SitePlan", "lloyd", "plan_levels", "sample_sites"]
 
@@ -119,11 +123,24 @@ class SitePlan:
         Coarse to fine.
     mask : ndarray of bool, shape (H, W), or None
         Where the source is known; elsewhere it only keeps the cells together.
+    outside : Outside or None
+        The margin around the image that the sites cover too, where the boundary is free; the
+        levels' coordinates are then those of image and margin.
     """
 
     source: Array
     levels: tuple[Level, ...]
     mask: NDArray[np.bool_] | None = None
+    outside: Outside | None = None
+
+    @property
+    def margin(self) -> int:
+        """Pixels by which the levels' coordinates exceed those of the image."""
+        return 0 if self.outside is None else self.outside.margin
+
+    def within(self, values: Array) -> Array:
+        """Return the image's part of an array that covers what the levels cover."""
+        return values if self.outside is None else self.outside.within(values)
 
 
 @njit(nogil=True, cache=True)

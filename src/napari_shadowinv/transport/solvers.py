@@ -22,16 +22,20 @@ from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.descent import lbfgs, quasi_newton
 from napari_shadowinv.transport.newton import newton, with_full_cells
 from napari_shadowinv.transport.objective import Solution, TransportObjective
+from napari_shadowinv.transport.outside import OpenObjective, Outside
 from napari_shadowinv.transport.potential import potential_surface
 from napari_shadowinv.transport.sites import Level
 
-__all__ = ["LevelSolution", "solve"]
+__all__ = ["LevelSolution", "fitted_flux", "solve"]
 
 Array = NDArray[np.float64]
 
 _COARSE_TOLERANCE = 3e-2
 _BLURS = (4.0, 2.0, 1.0, 0.5)
 _WARM_STEPS = 10
+_SITES_OF_FIT = 4500
+_STEPS_OF_FIT = (0.03, 0.01)
+_REACH_OF_FIT = 4.0  # steps
 _SHORTEST_WARM_STEP = 0.1  # where steps must be shorter, starting afresh is faster
 
 
@@ -69,6 +73,7 @@ def solve(
     report: Reporter | None = None,
     *,
     start: Array | None = None,
+    outside: Outside | None = None,
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
@@ -79,7 +84,7 @@ def solve(
     levels : tuple of Level
         Coarse to fine.
     image : ndarray, shape (H, W)
-        Positive everywhere, with the flux of the source.
+        Positive everywhere; without an `outside` with the flux of the source.
     options : InversionOptions
         Solver, stages, tolerance, most iterations, threads.
     report : Reporter, optional
@@ -87,6 +92,8 @@ def solve(
     start : ndarray, shape (n,), optional
         Weights of the finest level that solve a similar image, px². Where they lead nowhere
         they have no influence on the answer.
+    outside : Outside, optional
+        The margin that the levels cover too; without one no flux crosses the image's edge.
 
     Returns
     -------
@@ -100,9 +107,9 @@ def solve(
     """
     if options.stages == "single":
         levels = levels[-1:]
-    density = Density.from_image(image)
+    target = _Target(image, outside, options)
     if start is not None:
-        nearby = _solve_from(start, levels[-1], density, options, report)
+        nearby = _solve_from(start, levels[-1], target, options, report)
         if nearby is not None:
             return [nearby]
     solutions: list[LevelSolution] = []
@@ -110,10 +117,10 @@ def solve(
         if number > 0:
             weights = _prolong(levels[number - 1], solutions[-1], level, options.threads)
         elif options.solver == "newton":
-            weights = _coarsest_start(level, image, options, report)
+            weights = _coarsest_start(level, target, options, report)
         else:
             weights = np.zeros(len(level.sites))
-        objective = _objective(level, density, options)
+        objective = target.objective(level)
         finest = level is levels[-1]
         tolerance = options.tolerance if finest else max(options.tolerance, _COARSE_TOLERANCE)
         solution = _solve_level(objective, weights, options, tolerance, report)
@@ -121,15 +128,62 @@ def solve(
     return solutions
 
 
+def fitted_flux(
+    levels: tuple[Level, ...],
+    image: Array,
+    outside: Outside,
+    options: InversionOptions,
+    report: Reporter | None = None,
+) -> float:
+    """Find the factor on an image of unknown exposure that moves the flux at the edge least.
+
+    A wrong factor drives flux across the whole edge: the displacement there grows in
+    proportion to the error, on top of what the object does. Few sites suffice to see it.
+
+    Parameters
+    ----------
+    levels, image, outside, options, report
+        See `solve`; the image with the flux of the source.
+
+    Returns
+    -------
+    float
+        About 1.
+    """
+    few = tuple(level for level in levels if len(level.sites) <= _SITES_OF_FIT) or levels[:1]
+    factor = 1.0
+    for step in _STEPS_OF_FIT:
+        moves = [
+            _move_at_edge(
+                few[-1], solve(few, trial * image, options, report, outside=outside)[-1], outside
+            )
+            for trial in (factor * (1 - step), factor, factor * (1 + step))
+        ]
+        curvature = moves[0] - 2 * moves[1] + moves[2]
+        lowest = 0.5 * (moves[0] - moves[2]) / curvature if curvature > 0 else 0.0
+        factor *= 1 + step * float(np.clip(lowest, -_REACH_OF_FIT, _REACH_OF_FIT))
+    return factor
+
+
+def _move_at_edge(level: Level, solution: LevelSolution, outside: Outside) -> float:
+    """Return the mean square displacement of the sites along the image's edge."""
+    height, width = level.shape
+    y, x = level.sites.T - outside.margin
+    inwards = np.min([y, height - 2 * outside.margin - 1 - y], axis=0)
+    inwards = np.minimum(inwards, np.min([x, width - 2 * outside.margin - 1 - x], axis=0))
+    at_edge = np.abs(inwards + 0.5) < level.spacing
+    return float((solution.displacement[at_edge] ** 2).sum(axis=1).mean())
+
+
 def _solve_from(
     start: Array,
     level: Level,
-    image: Density,
+    target: _Target,
     options: InversionOptions,
     report: Reporter | None,
 ) -> LevelSolution | None:
     """Solve one level from given weights, or return None where that gets nowhere soon."""
-    objective = _objective(level, image, options)
+    objective = target.objective(level)
     if options.solver == "newton":
         solution = newton(
             objective,
@@ -144,10 +198,23 @@ def _solve_from(
     return LevelSolution.of_level(level, objective, solution) if solution.converged else None
 
 
-def _objective(level: Level, image: Density, options: InversionOptions) -> TransportObjective:
-    return TransportObjective(
-        level.triangulation.copy(), level.mass, image, threads=options.threads
-    )
+@dataclass(frozen=True)
+class _Target:
+    """Where the flux goes."""
+
+    image: Array
+    outside: Outside | None
+    options: InversionOptions
+
+    def objective(self, level: Level, blur: float = 0.0) -> TransportObjective:
+        """Pose the problem for the sites of a level and an image blurred by so many px."""
+        image = _blurred(self.image, blur) if blur else self.image
+        threads = self.options.threads
+        if self.outside is not None:
+            decay_length = self.options.decay_length or self.outside.margin
+            return OpenObjective(level, image, self.outside, decay_length, threads=threads)
+        density = Density.from_image(image)
+        return TransportObjective(level.triangulation.copy(), level.mass, density, threads=threads)
 
 
 def _solve_level(
@@ -171,13 +238,12 @@ def _solve_level(
 
 
 def _coarsest_start(
-    level: Level, image: Array, options: InversionOptions, report: Reporter | None
+    level: Level, target: _Target, options: InversionOptions, report: Reporter | None
 ) -> Array:
     """Follow the solution from a blurred image to a sharp one."""
     weights = np.zeros(len(level.sites))
     for blur in _BLURS:
-        blurred = Density.from_image(_blurred(image, blur * level.spacing))
-        objective = _objective(level, blurred, options)
+        objective = target.objective(level, blur * level.spacing)
         weights = _solve_level(objective, weights, options, _COARSE_TOLERANCE, report).weights
     return weights
 
