@@ -185,9 +185,10 @@ def _solve_from(
     """Solve one level from given weights, or return None where that gets nowhere soon."""
     objective = target.objective(level)
     if options.solver == "newton":
+        shown = objective.triangulation.update(start, stop_when_hidden=True)
         solution = newton(
             objective,
-            with_full_cells(objective, start, unchanged_first=True),
+            start if shown else with_full_cells(objective, start),
             tolerance=options.tolerance,
             max_iterations=min(_WARM_STEPS, options.max_iterations),
             shortest_step=_SHORTEST_WARM_STEP,
