@@ -105,8 +105,8 @@ def main() -> None:
 
     print(f"{arguments.n_sites:,} sites, {arguments.n} samples, noise of {SIGMA:.0%}\n")
     print(
-        "| image | threads | invert, s | error bars, s | in inversions, by wall time | by processor "
-        "time | one sample | steps of the inversion (finest level) | of a sample |"
+        "| image | threads | invert, s | error bars, s | in inversions, by wall time "
+        "| by processor time | one sample | steps of the inversion (finest level) | of a sample |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     for peak in (97, 194):

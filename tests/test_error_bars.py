@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from pathlib import Path
 
@@ -289,3 +290,17 @@ def test_a_file_keeps_the_error_bars(tmp_path: Path, found, optical_setup: Optic
     np.testing.assert_array_equal(dataset["displacement_std"], found.displacement_std)
     np.testing.assert_array_equal(dataset["potential"], found.inversion.potential)
     assert json.loads(dataset.attrs["uncertainty"])["noise"] == "Poisson, gain 1"
+
+
+def test_the_page_about_error_bars_works_as_it_stands_there(tmp_path: Path, monkeypatch):
+    page = Path(__file__).parents[1] / "docs" / "uncertainty.md"
+    text = page.read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(block, page.name, "exec"), names)
+    assert (tmp_path / "shot.shadowinv").exists()
+    middle = names["found"].potential_std[24:40, 24:40]  # type: ignore[attr-defined]
+    assert 0.3 * middle.mean() < names["error_bar"] < 1.5 * middle.mean()  # type: ignore[operator]
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        assert (page.parent / target).exists(), target
