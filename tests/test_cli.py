@@ -1,3 +1,4 @@
+import json
 import os
 import signal
 import subprocess
@@ -6,6 +7,7 @@ import textwrap
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import h5py
 import imageio.v3 as iio
@@ -13,9 +15,14 @@ import numpy as np
 import pytest
 import tifffile
 import xarray as xr
+from scipy.io import savemat
 from typer.testing import CliRunner, Result
 
+from napari_shadowinv import filters, sources
 from napari_shadowinv.cli import app
+from napari_shadowinv.cli._inputs import Experiment, experiment_from
+from napari_shadowinv.cli._preparing import Preparation
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.io import inversion_from_dataset, read, setup_from_dataset
 from napari_shadowinv.io.files import sha256
@@ -71,6 +78,11 @@ def refused(folder: Path) -> Callable[..., None]:
         assert content(folder) == before
 
     return run
+
+
+def read_experiment(image: str, factor: int = 1, **given: Any) -> Experiment:
+    files = {"source": None, "setup": None, "channel": None, **given}
+    return experiment_from(Path(image), factor=factor, **files)
 
 
 def dataset(path: str | Path) -> xr.Dataset:
@@ -372,6 +384,289 @@ def test_forward_refuses_what_is_no_field(folder: Path, refused: Callable[..., N
     np.save("d.npy", np.zeros((2, 24, 32)))
     np.save("beam.npy", np.ones((9, 9)))
     refused("forward", "d.npy", "--source", "beam.npy", names=("(9, 9)", "(24, 32)"))
+
+
+LOW_ENERGY_TOML = PROTON_TOML.replace("14.7", "3.0")
+
+
+def test_forward_to_another_energy(folder: Path, shot: Path) -> None:
+    (folder / "high.toml").write_text(PROTON_TOML)
+    (folder / "low.toml").write_text(LOW_ENERGY_TOML)
+    shadowinv("invert", shot, "--setup", "high.toml")
+    displacement = dataset("shot.shadowinv")["displacement"].values
+    arguments = ["forward", "shot.shadowinv", "--setup", "low.toml", "--out"]
+    result = shadowinv(*arguments, "low.npy")
+    assert result.exit_code == 0, result.output
+    assert "as if a magnetic field alone deflected" in result.stdout
+    assert "3 MeV proton" in result.stdout
+    # Momenta in MeV/c, from T (T + 2 m c²).
+    ratio = (14.7 * (14.7 + 2 * 938.27209) / (3.0 * (3.0 + 2 * 938.27209))) ** 0.5
+    np.testing.assert_allclose(np.load("low.npy"), synthetic_image(ratio * displacement), 1e-6)
+    result = shadowinv(*arguments, "e.npy", "--deflector", "electric-field")
+    ratio *= ratio * (3.0 + 938.27209) / (14.7 + 938.27209)
+    np.testing.assert_allclose(np.load("e.npy"), synthetic_image(ratio * displacement), 1e-6)
+
+
+def test_forward_to_other_pixels_keeps_what_is_seen(folder: Path) -> None:
+    (folder / "first.toml").write_text(PROTON_TOML)
+    (folder / "second.toml").write_text(PROTON_TOML.replace("1e-5", "5e-6"))
+    np.save("d.npy", BLOB.displacement)
+    arguments = ["--made-with", "first.toml", "--setup", "second.toml", "--out", "fine.tif"]
+    result = shadowinv("forward", "d.npy", *arguments)
+    assert result.exit_code == 0, result.output
+    fine = tifffile.imread("fine.tif")
+    assert fine.shape == (48, 64)
+    blocks = fine.reshape(24, 2, 32, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(blocks, synthetic_image(BLOB.displacement), atol=2e-3)
+    with tifffile.TiffFile("fine.tif") as tiff:
+        tags = tiff.pages[0].aspage().tags
+        pixels, units = tags["XResolution"].value
+        # Pixels per centimetre of the second experiment.
+        assert pixels / units == pytest.approx(1e-2 / 5e-6, rel=1e-6)
+
+
+def test_forward_says_which_experiments_do_not_fit(
+    folder: Path, refused: Callable[..., None]
+) -> None:
+    np.save("d.npy", BLOB.displacement)
+    (folder / "high.toml").write_text(PROTON_TOML)
+    (folder / "low.toml").write_text(LOW_ENERGY_TOML)
+    light = 'kind = "optical"\nwavelength = 5e-7\nobject_image_distance = 0.1\npixel_size = 1e-5\n'
+    (folder / "green.toml").write_text(light)
+    (folder / "red.toml").write_text(light.replace("5e-7", "7e-7"))
+    both = ["forward", "d.npy", "--made-with", "high.toml", "--setup"]
+    refused(*both, "green.toml", names=("kind 'proton'", "kind 'optical'"))
+    refused(*both, "low.toml", "--deflector", "gravity", names=("'gravity'", "magnetic field"))
+    refused("forward", "d.npy", "--deflector", "plasma", names="--made-with")
+    refused("forward", "d.npy", "--source-variable", "beam", names="it needs --source")
+    colours = ["forward", "d.npy", "--made-with", "green.toml", "--setup", "red.toml"]
+    refused(*colours, names=("wavelengths differ", "'plasma'"))
+    assert shadowinv(*colours, "--deflector", "plasma", "--out", "red.npy").exit_code == 0
+    expected = synthetic_image((7 / 5) ** 2 * BLOB.displacement)
+    np.testing.assert_allclose(np.load("red.npy"), expected, rtol=1e-9)
+
+
+def test_variables_of_matlab_and_hdf5(folder: Path, refused: Callable[..., None]) -> None:
+    source = np.tile(np.linspace(90, 110, 32), (24, 1))
+    image = synthetic_image(BLOB.displacement, source)
+    savemat("shots.mat", {"shot": image, "beam": source, "phi": BLOB.potential})
+    with h5py.File("shots.h5", "w") as file:
+        file.update({"day/shot": image, "day/beam": source, "day/d": BLOB.displacement})
+    expected = invert(image, source=source).displacement
+    for name, group in (("shots.mat", ""), ("shots.h5", "day/")):
+        refused("invert", name, "--overwrite", names=(name, "variable", f"{group}shot"))
+        refused("info", name, "--variable", "shop", names=(name, "'shop'", f"{group}beam"))
+        arguments = ["--variable", f"{group}shot", "--source-variable", f"{group}beam"]
+        result = shadowinv("invert", name, *arguments, "--overwrite")
+        assert result.exit_code == 0, result.output
+        np.testing.assert_array_equal(dataset("shots.shadowinv")["displacement"], expected)
+    arguments = ["--source-variable", "beam", "--out", "again.shadowinv"]
+    refused("invert", "shots.shadowinv", *arguments, names="is the result")
+    from_mat = shadowinv("forward", "shots.mat", "--variable", "phi", "--out", "a.npy")
+    from_h5 = shadowinv("forward", "shots.h5", "--variable", "day/d", "--out", "b.npy")
+    assert (from_mat.exit_code, from_h5.exit_code) == (0, 0), from_mat.output + from_h5.output
+    np.testing.assert_allclose(np.load("b.npy"), synthetic_image(BLOB.displacement))
+    np.testing.assert_allclose(np.load("a.npy"), np.load("b.npy"), atol=0.05)
+    text = " ".join(shadowinv("info", "shots.mat").stdout.split())
+    for words in (
+        "'shot' (24×32 double)",
+        "'beam' (24×32 double)",
+        "3: choose one with --variable",
+    ):
+        assert words in text
+    text = " ".join(shadowinv("info", "shots.mat", "--variable", "beam").stdout.split())
+    assert "90, 100, 110" in text
+    text = " ".join(shadowinv("info", "shots.h5", "--variable", "day/d").stdout.split())
+    assert "(2, 24, 32)" in text
+    refused("info", "shots.h5", "--variable", "day", names=("no array 'day'", "day/beam"))
+
+
+GEOMETRY_TEXT = "# source_object_distance = 1 cm\n# object_image_distance = 30 cm\n# bin_um = 310\n"
+
+
+def test_geometry_in_a_text_image_is_used_and_shown(folder: Path) -> None:
+    rows = "\n".join(
+        " ".join(f"{v:.6f}" for v in row) for row in synthetic_image(BLOB.displacement)
+    )
+    (folder / "half.txt").write_text(GEOMETRY_TEXT + rows)
+    (folder / "all.txt").write_text(GEOMETRY_TEXT + "# Ep_MeV = 14.7\n" + rows)
+    text = " ".join(shadowinv("info", "half.txt").stdout.split())
+    assert "numbers as text" in text
+    assert "source object distance (m) 0.01" in text
+    assert "not the energy; give it with --setup" in text
+    text = " ".join(shadowinv("info", "all.txt").stdout.split())
+    assert "14.7 MeV proton, magnification 31, pixel 10 µm at the object" in text
+    # What the file leaves out comes from the setup, with and without a kind.
+    for entries in ("energy = 14.7\n", 'kind = "proton"\nenergy = 14.7\n'):
+        (folder / "energy.toml").write_text(entries)
+        setup = read_experiment("half.txt", setup=Path("energy.toml")).setup
+        assert isinstance(setup, ProtonSetup)
+        assert (setup.energy, setup.object_image_distance) == (14.7, 0.3)
+        assert setup.object_pixel_size == pytest.approx(1e-5)
+    light = "wavelength = 5e-7\nsource_object_distance = inf\n"
+    (folder / "light.toml").write_text(light)
+    seen = read_experiment("all.txt", setup=Path("light.toml")).setup
+    assert isinstance(seen, OpticalSetup)
+    assert (seen.object_image_distance, seen.magnification) == (0.3, 1)
+
+
+def test_reference_in_a_text_image_is_the_source(folder: Path) -> None:
+    source = np.tile(np.linspace(90, 110, 32), (24, 1))
+    image = synthetic_image(BLOB.displacement, source)
+    rows = [" ".join(f"{v:.9f}" for v in row) for row in np.concatenate([image, source])]
+    (folder / "both.txt").write_text("\n".join(["# flux2D (24, 32)", *rows]))
+    assert shadowinv("invert", "both.txt").exit_code == 0
+    np.testing.assert_allclose(dataset("both.shadowinv")["source"], source, rtol=1e-9)
+    chosen = Preparation(source_from="uniform")
+    estimate = read_experiment("both.txt", preparation=chosen).source
+    assert estimate is not None
+    assert np.ptp(estimate.image) == 0
+    with pytest.raises(InputError, match="holds its own source, and the image is to be flattened"):
+        read_experiment("both.txt", preparation=Preparation(high_pass=3))
+
+
+def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
+    y, x = np.mgrid[:24, :32]
+    beam = 100 * np.exp(-((y - 10) ** 2 + (x - 18) ** 2) / 500)
+    image = synthetic_image(BLOB.displacement, beam)
+    np.save("shot.npy", image)
+    bare = np.hypot(y - 10, x - 18) > 9
+    iio.imwrite("bare.png", bare.astype(np.uint8))
+    usable = np.ones((24, 32), np.uint8)
+    usable[:4, :5] = 0
+    iio.imwrite("usable.png", usable)
+    mask = usable > 0
+    choices: tuple[tuple[dict[str, Any], dict[str, Path], np.ndarray], ...] = (
+        ({"source_from": "uniform"}, {}, sources.uniform_source(image)),
+        (
+            {"source_from": "gaussian"},
+            {"source_mask": Path("bare.png")},
+            sources.gaussian_source(image, mask=bare),
+        ),
+        (
+            {"source_from": "polynomial", "source_degree": 3},
+            {},
+            sources.polynomial_source(image, degree=3),
+        ),
+        (
+            {"source_from": "low-pass", "source_width": 4},
+            {},
+            sources.low_pass_source(image, 4.0),
+        ),
+        (
+            {"source_from": "total-variation", "source_weight": 0.5},
+            {"mask": Path("usable.png")},
+            sources.total_variation_source(image, weight=0.5, mask=mask),
+        ),
+        (
+            {"source_from": "interpolated", "source_width": 2},
+            {"source_mask": Path("bare.png"), "mask": Path("usable.png")},
+            sources.interpolated_source(image, bare & mask, width=2.0),
+        ),
+    )
+    for choice, files, expected in choices:
+        chosen = Preparation.model_validate(choice)
+        estimate = read_experiment("shot.npy", preparation=chosen, **files).source
+        assert estimate is not None
+        np.testing.assert_array_equal(estimate.image, expected)
+    result = shadowinv("invert", "shot.npy", "--source-from", "total-variation")
+    assert "estimated from the image: total-variation" in " ".join(result.stdout.split())
+    saved = dataset("shot.shadowinv")
+    np.testing.assert_array_equal(saved["source"], sources.total_variation_source(image))
+    assert json.loads(saved.attrs["source_preparation"]) == {"source_from": "total-variation"}
+
+
+def test_filters_are_those_of_the_library(folder: Path) -> None:
+    ramp = np.tile(np.linspace(80, 120, 64), (48, 1))
+    image = synthetic_image(gaussian_blob((48, 64), 12.0, 8.0).displacement, ramp)
+    image += np.random.default_rng(0).normal(size=image.shape)
+    image[7, 9] = 400
+    np.save("shot.npy", image)
+    np.save("beam.npy", ramp)
+    clean, hot, dead = filters.remove_hot_pixels(image, threshold=6.0)
+    assert (hot.sum(), dead.sum()) == (1, 0)
+    blocks = clean.reshape(24, 2, 32, 2).sum(axis=(1, 3))
+    expected = filters.low_pass(filters.remove_background(blocks, 1), 1.5)
+    flags = ["--hot-pixels", 6, "--bin", 2, "--background-degree", 1, "--low-pass", 1.5]
+    result = shadowinv("invert", "shot.npy", *flags)
+    assert result.exit_code == 0, result.output
+    assert "1 hot and 0 dead pixels replaced" in " ".join(result.stdout.split())
+    saved = dataset("shot.shadowinv")
+    np.testing.assert_allclose(
+        saved["image"], expected * saved["source"].mean().item() / expected.mean()
+    )
+    assert json.loads(saved.attrs["input_preparation"]) == {
+        "hot_pixels": 6.0,
+        "background_degree": 1,
+        "low_pass": 1.5,
+    }
+    assert "hot_pixels" in shadowinv("info", "shot.shadowinv").stdout
+    # The same from a file, where a flag wins.
+    (folder / "options.toml").write_text(
+        "n_sites = 300\n[prepare]\nhot_pixels = 6\nbackground_degree = 1\nlow_pass = 9\n"
+    )
+    arguments = ["--options", "options.toml", "--bin", 2, "--low-pass", 1.5, "--overwrite"]
+    assert shadowinv("invert", "shot.npy", *arguments).exit_code == 0
+    again = dataset("shot.shadowinv")
+    np.testing.assert_array_equal(again["image"], saved["image"])
+    assert inversion_from_dataset(again).options.n_sites == 300
+    # A measured source is blurred as its shot is.
+    chosen = Preparation(low_pass=2)
+    beam = read_experiment("shot.npy", source=Path("beam.npy"), preparation=chosen).source
+    assert beam is not None
+    np.testing.assert_array_equal(beam.image, filters.low_pass(ramp, 2.0))
+
+
+def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
+    usable = np.ones((24, 32), np.uint8)
+    usable[:5, :6] = 0
+    iio.imwrite("usable.png", usable)
+    chosen = Preparation(low_pass=2, hot_pixels=6, background_degree=1)
+    images = []
+    for junk in (0.0, 1e5, np.nan):
+        image = np.load(shot)
+        image[:5, :6] = junk
+        np.save(shot, image)
+        prepared = read_experiment(shot.name, mask=Path("usable.png"), preparation=chosen).shot
+        images.append(prepared.image)
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_array_equal(images[0], images[2])
+    assert shadowinv("invert", shot, "--mask", "usable.png", "--low-pass", 2).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "names"),
+    [
+        (["--source-from", "gausian"], ("'source_from' is 'gausian'", "'gaussian'")),
+        (["--source-from", "low-pass"], "needs --source-width"),
+        (["--source-from", "interpolated"], "needs --source-mask"),
+        (["--source-from", "gaussian", "--source", "shot.npy"], "choose one of them"),
+        (["--source-from", "gaussian", "--source-degree", 3], ("--source-degree", "polynomial")),
+        (["--source-weight", 2], ("--source-weight", "total-variation")),
+        (["--source-mask", "shot.npy"], ("--source-mask", "--source-from")),
+        (["--source", "shot.npy", "--background-degree", 0], ("--source", "--background-degree")),
+        (["--source", "shot.npy", "--high-pass", 3], ("--source", "--high-pass")),
+        (["--hot-pixels", 0], ("'hot_pixels' is 0", "greater than 0")),
+        (["--low-pass", -1], ("'low_pass' is -1", "greater than 0")),
+        (["--background-degree", 11], ("'background_degree' is 11", "at most 10")),
+        (["--variable", "shot"], ("shot.npy", "no MATLAB file nor HDF5")),
+    ],
+)
+def test_choices_that_make_no_sense_are_refused(
+    shot: Path, refused: Callable[..., None], flags: list[object], names: str | tuple[str, ...]
+) -> None:
+    refused("invert", shot, *flags, names=names)
+
+
+def test_mistakes_in_the_prepare_table_are_named(
+    folder: Path, shot: Path, refused: Callable[..., None]
+) -> None:
+    for text, names in (
+        ("[prepare]\nhot_pixel = 6\n", ("[prepare]", "'hot_pixel'", "'hot_pixels'")),
+        ("prepare = 6\n", ("[prepare]", "received 6")),
+    ):
+        (folder / "options.toml").write_text(text)
+        refused("invert", shot, "--options", "options.toml", names=("options.toml", *names))
 
 
 def test_info_tells_what_is_inside(folder: Path) -> None:

@@ -211,6 +211,30 @@ def test_hdf5_of_another_kind_is_refused(tmp_path: Path) -> None:
         read(path)
 
 
+def test_any_hdf5_gives_the_array_that_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with h5py.File(path, "w") as file:
+        file["time"] = np.arange(4.0)
+        file["shots/3/image"] = RAMP
+        file["shots/beam"] = (RAMP + 1).astype(np.uint16)
+        file["note"] = "film 3"
+        file["stack"] = np.zeros((2, 6, 9))
+    with pytest.raises(FileFormatError, match=r"name one .* 'shots/beam' \(6×9 uint16\)"):
+        read(path)
+    for name, expected in (("shots/3/image", RAMP), ("shots/beam", RAMP + 1)):
+        radiograph = read_radiograph(path, variable=name)
+        np.testing.assert_array_equal(radiograph.image, expected)
+        assert radiograph.metadata["variable"] == name
+    for wrong in ("shot", "shots", "note"):
+        with pytest.raises(InputError, match=f"no array '{wrong}': it holds 'shots/beam'"):
+            read(path, variable=wrong)
+    with pytest.raises(FileFormatError, match=r"'stack' with shape \(2, 6, 9\)"):
+        read(path, variable="stack")
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(FileFormatError, match="damaged or cut short"):
+        read(path, variable="shots/3/image")
+
+
 def test_image_is_no_result(tmp_path: Path) -> None:
     path = tmp_path / "shot.npy"
     np.save(path, RAMP)

@@ -144,6 +144,36 @@ def test_round_trip_of_the_magnetic_field(proton: ProtonSetup, unit: str) -> Non
     np.testing.assert_allclose(proton.path_integrated_b(displacement, unit), field)
 
 
+def test_round_trip_of_the_electric_field(proton: ProtonSetup) -> None:
+    field = np.random.default_rng(1).normal(size=(2, 4, 5))
+    displacement = proton.displacement_from_path_integrated_e(field)
+    np.testing.assert_allclose(proton.path_integrated_e(displacement), field, rtol=1e-14)
+    # A field along +x pushes a proton to +x.
+    assert proton.displacement_from_path_integrated_e([0.0, 1.0])[1] > 0
+
+
+def test_round_trips_of_the_line_integrals_of_light(optical: OpticalSetup) -> None:
+    phi = np.random.default_rng(2).normal(size=(4, 5))
+    for there, back in (
+        (optical.line_integrated_log_index, optical.normalized_potential_from_log_index),
+        (optical.line_integrated_density, optical.normalized_potential_from_density),
+        (
+            lambda phi: optical.relative_density_modulation(phi, 1.65e25),
+            lambda integral: optical.normalized_potential_from_modulation(integral, 1.65e25),
+        ),
+    ):
+        np.testing.assert_allclose(back(there(phi)), phi, rtol=1e-14)
+
+
+def test_potential_in_metres_gives_the_displacement_in_pixels(proton: ProtonSetup) -> None:
+    y, x = np.mgrid[:7, :9].astype(float)
+    displacement = proton.displacement_from_potential(proton.potential(3 * y**2 - y * x))
+    # Differences of second order are exact for a parabola, at the border too.
+    np.testing.assert_allclose(displacement, [x - 6 * y, y], atol=1e-12)
+    with pytest.raises(InputError, match=r"potential has shape \(7,\)"):
+        proton.displacement_from_potential(np.zeros(7))
+
+
 def test_megagauss_micrometres(proton: ProtonSetup) -> None:
     """1 MG is 100 T and 1 µm is 1e-6 m."""
     displacement = np.ones((2, 2, 2))
@@ -196,6 +226,8 @@ def test_density_gives_the_refractive_index_that_made_the_potential(optical: Opt
 def test_density_must_be_positive(optical: OpticalSetup, density: float) -> None:
     with pytest.raises(InputError, match=r"density is .* must be positive"):
         optical.relative_density_modulation(1.0, density)
+    with pytest.raises(InputError, match=r"density is .* must be positive"):
+        optical.normalized_potential_from_modulation(1.0, density)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from napari_shadowinv.cli._demo import compared_fields, demo_table, simulated_shot, write_demo
+from napari_shadowinv.cli._forward import predicted, seen_with
 from napari_shadowinv.cli._guard import alarm_unless_converged, guarded
 from napari_shadowinv.cli._info import described
 from napari_shadowinv.cli._inputs import (
@@ -83,13 +84,26 @@ Channel = Annotated[
     str | None,
     typer.Option(help="Of a colour image: red, green, blue, mean or a number from 0."),
 ]
+Variable = Annotated[
+    str | None,
+    typer.Option(
+        "--variable",
+        metavar="NAME",
+        help="Array to take from a MATLAB file with several images, or from an HDF5 file.",
+    ),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 
-_INVERT_EPILOG = """
+_FILTERS = "Filters before the inversion"
+_ESTIMATES = "Source estimated from the image (docs/sources.md)"
+
+_INVERT_EPILOG = r"""
 [bold]Examples[/bold]
 shadowinv invert shot.tif
 shadowinv invert shot.tif --source reference.tif --setup setup.toml --bin 4
 shadowinv invert film.tif --channel red --clip-negative --out film.h5
+shadowinv invert shots.mat --variable shot3 --source-variable beam
+shadowinv invert shot.tif --hot-pixels 6 --source-from polynomial --source-degree 2
 
 [bold]setup.toml[/bold]
 kind = "proton"                  # or "optical"
@@ -102,6 +116,10 @@ detector_pixel_size = 145e-6     # m; or pixel_size at the object
 n_sites = 100000
 tolerance = 1e-4
 floor = 1e-3
+\[prepare]                        # the filters and estimates above, with _ for -
+hot_pixels = 6                   # standard deviations
+source_from = "total-variation"
+source_weight = 2                # px
 
 [bold]Exit codes[/bold]
 0 done; 2 a mistake in what was given, nothing is written;
@@ -114,7 +132,13 @@ floor = 1e-3
 def invert(
     image: Annotated[
         Path,
-        typer.Argument(help="TIFF, PNG, BMP, JPEG, NPY or pradformat HDF5.", show_default=False),
+        typer.Argument(
+            help=(
+                "TIFF, PNG, BMP, JPEG, NPY, MATLAB, text, PCO .b16, SPE or HDF5 (pradformat, or "
+                "with --variable)."
+            ),
+            show_default=False,
+        ),
     ],
     source: SourceFile = None,
     mask: Annotated[
@@ -132,6 +156,14 @@ def invert(
         int, typer.Option("--bin", help="Sum blocks of so many pixels squared first.")
     ] = 1,
     channel: Channel = None,
+    variable: Variable = None,
+    source_variable: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Array with the undisturbed beam, in the file of --source or else of the image.",
+        ),
+    ] = None,
     clip_negative: Annotated[
         bool, typer.Option("--clip-negative", help="Set negative pixels to zero and count them.")
     ] = False,
@@ -154,6 +186,89 @@ def invert(
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Print nothing but errors and alarms.")
     ] = False,
+    source_from: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ESTIMATE",
+            help=(
+                "Guess the undisturbed beam from the (filtered) image: uniform, gaussian, "
+                "polynomial, low-pass, total-variation or interpolated."
+            ),
+            rich_help_panel=_ESTIMATES,
+        ),
+    ] = None,
+    source_degree: Annotated[
+        int | None,
+        typer.Option(
+            help="For polynomial: total degree in y and x, 0 to 10. Default: 2.",
+            rich_help_panel=_ESTIMATES,
+        ),
+    ] = None,
+    source_weight: Annotated[
+        float | None,
+        typer.Option(
+            help=(
+                "For total-variation: in px (after --bin); c·r/2 removes a disc of contrast c and "
+                "radius r px. Default: 2."
+            ),
+            rich_help_panel=_ESTIMATES,
+        ),
+    ] = None,
+    source_width: Annotated[
+        float | None,
+        typer.Option(
+            help=(
+                "For low-pass and interpolated: standard deviation of the blur in px (after "
+                "--bin). Default for interpolated: 5."
+            ),
+            rich_help_panel=_ESTIMATES,
+        ),
+    ] = None,
+    source_mask: Annotated[
+        Path | None,
+        typer.Option(
+            help="Picture of the image's size, 0 where the object hides the bare beam.",
+            rich_help_panel=_ESTIMATES,
+        ),
+    ] = None,
+    hot_pixels: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEVIATIONS",
+            help=(
+                "Replace hot and dead pixels that differ from their neighbours' median by more "
+                "standard deviations of the noise; 6 suits most. Before --bin."
+            ),
+            rich_help_panel=_FILTERS,
+        ),
+    ] = None,
+    background_degree: Annotated[
+        int | None,
+        typer.Option(
+            metavar="DEGREE",
+            help="Divide the image by a polynomial fitted to it, total degree 0 to 10.",
+            rich_help_panel=_FILTERS,
+        ),
+    ] = None,
+    high_pass: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PX",
+            help="Take away structures much larger than this width in px (after --bin).",
+            rich_help_panel=_FILTERS,
+        ),
+    ] = None,
+    low_pass: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PX",
+            help=(
+                "Blur image and source by a Gaussian of this standard deviation in px (after "
+                "--bin)."
+            ),
+            rich_help_panel=_FILTERS,
+        ),
+    ] = None,
 ) -> None:
     """Retrieve the deflection potential of one image.
 
@@ -165,10 +280,38 @@ def invert(
 
     result, figure = result_and_figure(image, out, report)
     check_outputs({result: RESULT_SUFFIXES, figure: FIGURE_SUFFIXES}, overwrite)
-    protect([result, figure], [image, source, mask, setup, options])
+    protect([result, figure], [image, source, mask, setup, options, source_mask])
+    from napari_shadowinv.cli._preparing import TABLE, preparation_from
+
     flags = {"n_sites": n_sites, "threads": threads, "seed": seed}
-    chosen = options_from(options, flags, clip_negative)
-    experiment = experiment_from(image, source, setup, channel, bin_, mask)
+    chosen = options_from(options, flags, clip_negative, other_tables=(TABLE,))
+    preparation = preparation_from(
+        options,
+        {
+            "hot_pixels": hot_pixels,
+            "background_degree": background_degree,
+            "high_pass": high_pass,
+            "low_pass": low_pass,
+            "source_from": source_from,
+            "source_degree": source_degree,
+            "source_weight": source_weight,
+            "source_width": source_width,
+        },
+        has_source=source is not None or source_variable is not None,
+        has_source_mask=source_mask is not None,
+    )
+    experiment = experiment_from(
+        image,
+        source,
+        setup,
+        channel,
+        bin_,
+        mask,
+        variable=variable,
+        source_variable=source_variable,
+        preparation=preparation,
+        source_mask=source_mask,
+    )
     if result.suffix.lower() in (".h5", ".hdf5"):
         check_pradformat_setup(experiment.setup)
     inversion = inverted(experiment, chosen, quiet)
@@ -178,15 +321,32 @@ def invert(
     alarm_unless_converged(inversion.report, result)
 
 
-@app.command()
+_FORWARD_EPILOG = """
+[bold]Examples[/bold]
+shadowinv forward shot.shadowinv
+shadowinv forward shot.shadowinv --setup lower_energy.toml
+shadowinv forward shot.shadowinv --setup lower_energy.toml --deflector electric-field
+shadowinv forward d.npy --made-with first.toml --setup second.toml
+
+[bold]Another experiment[/bold]
+A deflection belongs to its beam. What both experiments have in common is the object's line
+integral, so say what deflects: a magnetic field (∫B dl, angles go with charge / momentum;
+the default for particles), an electric field (∫E dl, with charge / (momentum velocity)), a
+plasma (∫n dz, with the wavelength squared) or a refractive index (∫ln η dz, alike but for
+dispersion). Both images have the same middle; the predicted one has the pixels of --setup
+and covers what is known.
+"""
+
+
+@app.command(epilog=_FORWARD_EPILOG)
 @guarded
 def forward(
     field: Annotated[
         Path,
         typer.Argument(
             help=(
-                ".shadowinv or pradformat result, or NPY with a displacement (2, H, W) in px "
-                "or a potential (H, W) in px²."
+                ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) with a "
+                "displacement (2, H, W) in px or a potential (H, W) in px²."
             ),
             show_default=False,
         ),
@@ -194,9 +354,41 @@ def forward(
     source: SourceFile = None,
     setup: Annotated[
         Path | None,
-        typer.Option("--setup", help="TOML file; its pixel size is stored in the TIFF."),
+        typer.Option(
+            "--setup",
+            help=(
+                "TOML file with the experiment to predict, such as another energy. Default: that "
+                "of the field."
+            ),
+        ),
     ] = None,
+    made_with: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML file with the experiment that the field is from, if its file does not tell."
+        ),
+    ] = None,
+    deflector: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHAT",
+            help=(
+                "What deflects, if --setup is another experiment: magnetic-field, electric-field, "
+                "plasma or refractive-index."
+            ),
+        ),
+    ] = None,
+    dispersion: Annotated[
+        float,
+        typer.Option(
+            help="For a refractive index: ln η at the new wavelength over that at the old one."
+        ),
+    ] = 1.0,
     channel: Channel = None,
+    variable: Variable = None,
+    source_variable: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Array to take from the source's file.")
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -209,36 +401,42 @@ def forward(
     overwrite: Overwrite = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
 ) -> None:
-    """Predict the image that a displacement makes of a source.
+    """Predict the image that a displacement makes of a source, here or in another experiment.
 
-    Without --source, a result's own source is used, or a uniform one.
+    Without --source, a result's own source is used, or a uniform one; in another experiment a
+    uniform one.
     """
     from napari_shadowinv.io import read_radiograph, write
     from napari_shadowinv.io.writing import IMAGE_SUFFIXES
 
     path = Path(f"{field.stem}_image.tif") if out is None else out
     check_outputs({path: IMAGE_SUFFIXES}, overwrite)
-    protect([path], [field, source, setup])
-    geometry = None if setup is None else setup_from(setup)
-    displacement, beam, own_geometry = field_from(field)
+    protect([path], [field, source, setup, made_with])
+    if source_variable is not None and source is None:
+        raise InputError("received --source-variable: it needs --source, the file to look in")
+    seen = None if setup is None else setup_from(setup)
+    told = None if made_with is None else setup_from(made_with)
+    known = seen_with(field_from(field, variable), seen, told, deflector, dispersion)
+    beam = known.source
     if source is not None:
-        beam = read_radiograph(source, channel=channel).image
-    from napari_shadowinv.physics.forward import synthetic_image
-
-    image = synthetic_image(displacement, beam)
-    write(path, image, setup=geometry or own_geometry, overwrite=overwrite)
+        beam = read_radiograph(source, channel=channel, variable=source_variable).image
+    image, note = predicted(known, beam)
+    write(path, image, setup=known.seen, overwrite=overwrite)
     if not quiet:
         kept = image.sum() / (image.size if beam is None else beam.sum())
         say(f"Wrote {path}: {size_text(image)}, {kept:.2%} of the flux lands inside the image")
+        if note:
+            say(note)
 
 
 @app.command()
 @guarded
 def info(
     file: Annotated[Path, typer.Argument(help="An image or a result.", show_default=False)],
+    variable: Variable = None,
 ) -> None:
     """Tell what a file is and what is in it."""
-    say(described(file))
+    say(described(file, variable))
 
 
 @app.command()

@@ -24,25 +24,52 @@ if TYPE_CHECKING:
     from napari_shadowinv.io import Radiograph
 
 
-def described(path: Path) -> Table:
+def described(path: Path, variable: str | None = None) -> Table:
     """Tell what a file is and what is in it."""
-    return two_columns(str(path), _rows(path))
+    return two_columns(str(path), _rows(path, variable))
 
 
-def _rows(path: Path) -> Rows:
+def _rows(path: Path, variable: str | None) -> Rows:
     from napari_shadowinv.io import Radiograph, read
     from napari_shadowinv.io.arrays import read_npy
     from napari_shadowinv.io.files import kind_of
+    from napari_shadowinv.io.hdf5 import read_hdf5
+    from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5
 
     kind = kind_of(path)
-    if kind == "npy":
+    is_mat = is_mat73(path) if kind == "hdf5" else kind == "mat" and not is_other_hdf5(path)
+    if is_mat:
+        return _matlab_rows(path, variable)
+    if variable is not None and kind in ("hdf5", "mat"):
+        array = read_hdf5(path, variable)
+        return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
+    if kind == "npy" and variable is None:
         return [("kind", "NPY array"), *_array_rows(read_npy(path))]
-    if kind != "hdf5":
+    if kind == "text" or variable is not None:
+        return _radiograph_rows(read(path, variable=variable))
+    if kind not in ("hdf5", "mat"):
         return _picture_rows(path, kind)
     content = read(path)
     if isinstance(content, Radiograph):
         return _radiograph_rows(content)
     return _result_rows(content)
+
+
+def _matlab_rows(path: Path, variable: str | None) -> Rows:
+    """The image of a MATLAB file, or a list to choose from."""
+    from napari_shadowinv.io.matlab import mat_variables, read_mat
+
+    held = mat_variables(path)
+    rows = [
+        ("kind", "MATLAB file"),
+        ("variables", ", ".join(map(str, held)) or "none"),
+    ]
+    images = [item for item in held if item.is_image]
+    if variable is None and len(images) != 1:
+        advice = "choose one with --variable" if images else "none that is an image"
+        return [*rows, ("images", f"{len(images)}: {advice}")]
+    array, metadata = read_mat(path, variable)
+    return [*rows, ("image", metadata["variable"]), *_array_rows(array)]
 
 
 def _picture_rows(path: Path, kind: str) -> Rows:
@@ -55,13 +82,19 @@ def _picture_rows(path: Path, kind: str) -> Rows:
     return rows + _array_rows(array)
 
 
-def _radiograph_rows(shot: Radiograph) -> Rows:
-    return [
-        ("kind", "pradformat radiograph"),
+def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> Rows:
+    from napari_shadowinv.io import Radiograph
+
+    assert isinstance(shot, Radiograph)
+    geometry = shot.metadata.get("geometry", {})
+    names = {"text": "numbers as text", "pradformat": "pradformat radiograph"}
+    rows = [
+        ("kind", names.get(str(shot.metadata["kind"]), str(shot.metadata["kind"]))),
         *_array_rows(shot.image),
-        *_geometry_rows(shot.metadata["geometry"]),
-        ("setup", setup_text(shot.setup, shot)),
     ]
+    if shot.source is not None:
+        rows.append(("source", "in the same file, below the image"))
+    return [*rows, *_geometry_rows(geometry), ("setup", setup_text(shot.setup, shot))]
 
 
 def _geometry_rows(geometry: Mapping[str, Any]) -> Rows:
@@ -103,7 +136,14 @@ def _result_rows(dataset: xarray.Dataset) -> Rows:
         ("created", str(dataset.attrs["created"])),
         *[
             (name.replace("_", " "), str(dataset.attrs[name]))
-            for name in ("input_file", "input_sha256", "source_file", "source_sha256")
+            for name in (
+                "input_file",
+                "input_sha256",
+                "input_preparation",
+                "source_file",
+                "source_sha256",
+                "source_preparation",
+            )
             if name in dataset.attrs
         ],
         *experiment,

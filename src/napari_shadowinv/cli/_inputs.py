@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from napari_shadowinv.cli._preparing import Preparation
     from napari_shadowinv.io import Radiograph
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.physics.setup import Setup
@@ -28,14 +29,19 @@ class Experiment:
 
 
 def options_from(
-    path: Path | None, flags: Mapping[str, Any], clip_negative: bool
+    path: Path | None,
+    flags: Mapping[str, Any],
+    clip_negative: bool,
+    *,
+    other_tables: Collection[str] = (),
 ) -> InversionOptions:
-    """Options from a file, with flags on top."""
+    """Options from a file, with flags on top; `other_tables` of the file are for others to read."""
     from napari_shadowinv.io import read_toml
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.validation import validated
 
-    chosen = {} if path is None else read_toml(path)
+    content = {} if path is None else read_toml(path)
+    chosen = {name: value for name, value in content.items() if name not in other_tables}
     chosen |= {name: value for name, value in flags.items() if value is not None}
     if clip_negative:
         chosen["negative"] = "clip"
@@ -49,33 +55,73 @@ def experiment_from(
     channel: str | None,
     factor: int,
     mask: Path | None = None,
+    *,
+    variable: str | None = None,
+    source_variable: str | None = None,
+    preparation: Preparation | None = None,
+    source_mask: Path | None = None,
 ) -> Experiment:
-    """Read what is to be inverted, binned alike."""
+    """Read what is to be inverted, binned alike and prepared as asked for."""
     from napari_shadowinv.io import binned_setup, read_radiograph, read_toml
 
     entries = None if setup is None else read_toml(setup)
-    shot = read_radiograph(image, channel=channel)
+    shot = read_radiograph(image, channel=channel, variable=variable)
     if mask is not None:
-        shot = _masked(shot, mask)
-    beam = None if source is None else read_radiograph(source, channel=channel)
+        shot = replace(shot, mask=_picture_mask(mask, shot, "mask"))
     geometry = shot.setup
     if entries is not None:
         geometry = _setup(entries, shot.metadata.get("geometry", {}), str(setup))
     if geometry is not None:
         geometry = binned_setup(geometry, factor)
-    return Experiment(shot.binned(factor), None if beam is None else beam.binned(factor), geometry)
+    beam = None
+    if source is not None:
+        beam = read_radiograph(source, channel=channel, variable=source_variable)
+    elif source_variable is not None:
+        beam = read_radiograph(image, channel=channel, variable=source_variable)
+    elif shot.source is not None and (preparation is None or preparation.source_from is None):
+        # Some files hold the image with and without the object.
+        if preparation is not None and preparation.flattens:
+            raise InputError(
+                f"{image} holds its own source, and the image is to be flattened: leave the filter "
+                "out, or put --source-from uniform in place of that source"
+            )
+        beam = replace(shot, image=shot.source, source=None, mask=None)
+    bare = None if source_mask is None else _picture_mask(source_mask, shot, "source mask")
+    shot, beam = _prepared(shot, beam, factor, preparation, bare)
+    return Experiment(shot, beam, geometry)
 
 
-def _masked(shot: Radiograph, path: Path) -> Radiograph:
-    """Give a shot the mask from a picture in which unusable pixels are 0."""
+def _prepared(
+    shot: Radiograph,
+    beam: Radiograph | None,
+    factor: int,
+    preparation: Preparation | None,
+    bare: NDArray[np.bool_] | None,
+) -> tuple[Radiograph, Radiograph | None]:
+    """Filter a shot and its source, broken pixels before they are summed and the rest after."""
+    if preparation is None:
+        return shot.binned(factor), None if beam is None else beam.binned(factor)
+    from napari_shadowinv.cli._preparing import estimated, filtered, repaired
+
+    whole = bare
+    if bare is not None:
+        whole = replace(shot, mask=bare).binned(factor).mask
+    shot = filtered(repaired(shot, preparation).binned(factor), preparation)
+    if beam is None:
+        return shot, estimated(shot, preparation, whole)
+    return shot, filtered(repaired(beam, preparation).binned(factor), preparation, is_source=True)
+
+
+def _picture_mask(path: Path, shot: Radiograph, name: str) -> NDArray[np.bool_]:
+    """Mask from a picture of the shot's size, in which what must not be looked at is 0."""
     from napari_shadowinv.io import read_radiograph
 
-    usable = read_radiograph(path, channel="mean").image != 0
+    usable: NDArray[np.bool_] = read_radiograph(path, channel="mean").image != 0
     if usable.shape != shot.image.shape:
         raise InputError(
-            f"{path}: mask has shape {usable.shape}, image {shot.image.shape}: they must match"
+            f"{path}: {name} has shape {usable.shape}, image {shot.image.shape}: they must match"
         )
-    return replace(shot, mask=usable)
+    return usable
 
 
 def setup_from(path: Path) -> Setup:
@@ -89,35 +135,71 @@ def _setup(entries: Mapping[str, Any], known: Mapping[str, Any], where: str) -> 
     """Setup from a file's entries; what they leave out comes from the image's own file."""
     from napari_shadowinv.physics.setup import setup_from_dict
 
-    if entries.get("kind", known.get("kind")) != known.get("kind"):
+    if "kind" in known and entries.get("kind", known["kind"]) != known["kind"]:
         known = {}
+    elif known and "kind" not in known:
+        # A text image tells distances, and of particles the energy, but not what flew.
+        kind = "optical" if "wavelength" in entries else "proton"
+        known = {**known, "kind": entries.get("kind", kind)}
+        if known["kind"] == "optical":
+            known.pop("energy", None)
     pixel_sizes = {"pixel_size", "detector_pixel_size"}
     if pixel_sizes & entries.keys():
         known = {name: value for name, value in known.items() if name not in pixel_sizes}
     return setup_from_dict({**known, **entries}, where)
 
 
-def field_from(
-    path: Path,
-) -> tuple[NDArray[np.float64], NDArray[np.float64] | None, Setup | None]:
-    """Displacement, and where the file has them its source and setup."""
+@dataclass(frozen=True)
+class Field:
+    """A displacement in px, and where the file has them the source and setup that made it."""
+
+    displacement: NDArray[np.float64]
+    source: NDArray[np.float64] | None = None
+    setup: Setup | None = None
+
+
+def field_from(path: Path, variable: str | None = None) -> Field:
+    """Displacement from a result, or from an array of px or px²."""
     from napari_shadowinv.io import read_dataset, setup_from_dataset
     from napari_shadowinv.io.arrays import read_npy
-    from napari_shadowinv.io.dataset import displacement_from_potential
     from napari_shadowinv.io.files import kind_of
 
     kind = kind_of(path)
+    if variable is not None or kind == "mat":
+        return Field(_displacement(path, _named_array(path, variable)))
     if kind == "hdf5":
         dataset = read_dataset(path)
         source = dataset["source"].values if "source" in dataset else None
-        return dataset["displacement"].values, source, setup_from_dataset(dataset)
-    array = read_npy(path) if kind == "npy" else None
-    if array is not None and array.ndim == 2:
-        return displacement_from_potential(array), None, None
-    if array is not None and array.ndim == 3 and array.shape[0] == 2:
-        return array.astype(float), None, None
-    found = f"a {kind.upper()} picture" if array is None else f"an array of shape {array.shape}"
-    raise FileFormatError(
+        return Field(dataset["displacement"].values, source, setup_from_dataset(dataset))
+    if kind == "npy":
+        return Field(_displacement(path, read_npy(path)))
+    raise _no_field(path, f"a {kind.upper()} picture")
+
+
+def _named_array(path: Path, variable: str | None) -> NDArray[Any]:
+    """Plane of a MATLAB file, or array of any HDF5 file."""
+    from napari_shadowinv.io import read_radiograph
+    from napari_shadowinv.io.files import kind_of
+    from napari_shadowinv.io.hdf5 import read_hdf5
+    from napari_shadowinv.io.matlab import is_mat73
+
+    if variable is not None and kind_of(path) == "hdf5" and not is_mat73(path):
+        return read_hdf5(path, variable)
+    return read_radiograph(path, variable=variable).image
+
+
+def _displacement(path: Path, array: NDArray[Any]) -> NDArray[np.float64]:
+    from napari_shadowinv.io.dataset import displacement_from_potential
+
+    if array.ndim == 2:
+        return displacement_from_potential(array)
+    if array.ndim == 3 and array.shape[0] == 2:
+        return array.astype(float)
+    raise _no_field(path, f"an array of shape {array.shape}")
+
+
+def _no_field(path: Path, found: str) -> FileFormatError:
+    return FileFormatError(
         f"{path} is {found}: expected a .shadowinv result, or NPY with a displacement "
         "(2, height, width) in px or a potential (height, width) in px²"
     )

@@ -50,7 +50,8 @@ def summary(inversion: Inversion, experiment: Experiment, written: list[Path]) -
     shot, source, setup = experiment.shot, experiment.source, experiment.setup
     rows = [
         ("image", f"{shot.path}, {size_text(inversion.image)}{_binning_text(shot)}"),
-        ("source", "uniform" if source is None else str(source.path)),
+        *[("prepared", note) for note in shot.metadata.get("notes", ())],
+        ("source", _source_text(source)),
         ("setup", setup_text(setup, shot)),
         *inversion_rows(inversion, setup),
         *closing_rows(inversion.report, written),
@@ -116,13 +117,36 @@ def setup_text(setup: Setup | None, shot: Radiograph | None = None) -> str:
             f"pixel {setup.object_pixel_size * 1e6:.4g} µm at the object"
         )
     if shot is not None and shot.metadata.get("geometry"):
-        return "none: the file tells the geometry but not the energy; give it with --setup"
+        missing = _missing(shot.metadata["geometry"])
+        return f"none: the file tells the geometry but not the {missing}; give it with --setup"
     return "none: results in pixels; give --setup for SI units"
+
+
+def _missing(geometry: Mapping[str, Any]) -> str:
+    """What a file leaves out of a setup."""
+    needed = {
+        "energy": "energy",
+        "source_object_distance": "distance from source to object",
+        "object_image_distance": "distance from object to image",
+    }
+    missing = [words for name, words in needed.items() if name not in geometry]
+    if not {"pixel_size", "detector_pixel_size"} & geometry.keys():
+        missing.append("pixel size")
+    return ", nor the ".join(missing)
 
 
 def size_text(array: NDArray[Any]) -> str:
     """Height and width are given as people do, width first."""
     return f"{array.shape[1]} × {array.shape[0]} px (width × height)"
+
+
+def _source_text(source: Radiograph | None) -> str:
+    if source is None:
+        return "uniform"
+    notes = "; ".join(source.metadata.get("notes", ()))
+    if source.path is None:
+        return f"estimated from the image: {notes}"
+    return f"{source.path}, {notes}" if notes else str(source.path)
 
 
 def _binning_text(shot: Radiograph) -> str:

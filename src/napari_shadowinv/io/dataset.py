@@ -317,10 +317,14 @@ def provenance(shot: Radiograph | None, source: Radiograph | None = None) -> dic
     Returns
     -------
     dict of str to str
-        ``input_file``, ``input_sha256``, ``source_file``, ``source_sha256``, as far as known.
+        ``input_file``, ``input_sha256``, ``source_file``, ``source_sha256``, as far as known, and
+        what was done before the inversion as JSON, ``input_preparation`` and
+        ``source_preparation``.
     """
     found: dict[str, str] = {}
     for role, radiograph in (("input", shot), ("source", source)):
+        if radiograph is not None and radiograph.metadata.get("preparation"):
+            found[f"{role}_preparation"] = json.dumps(radiograph.metadata["preparation"])
         if radiograph is not None and radiograph.path is not None:
             found[f"{role}_file"] = radiograph.path.name
             if "sha256" in radiograph.metadata:

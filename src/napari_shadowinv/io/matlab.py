@@ -1,6 +1,7 @@
 """MATLAB's MAT-files, version 5 to 7 (its own layout) and 7.3 (HDF5).
 
 - the one image of a file, or the variable that the user names: `read_mat`
+- what there is to choose from: `mat_variables`
 - tell MATLAB 7.3 from other HDF5 files: `is_mat73`, `is_other_hdf5`
 
 An image is a numeric array with two rows and two columns at least, so that scalars and
@@ -20,7 +21,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.mat5 import Variable, damaged, variables_5
 from napari_shadowinv.io.promises import load_dataset
 
-__all__ = ["is_mat73", "is_other_hdf5", "read_mat"]
+__all__ = ["is_mat73", "is_other_hdf5", "mat_variables", "read_mat"]
 
 _HDF5_OFFSET = 512
 # Attributes of pradformat and of .shadowinv, which MATLAB's save does not write.
@@ -101,8 +102,7 @@ def read_mat(path: Path, variable: str | None = None) -> tuple[NDArray[Any], dic
     InputError
         If it holds several and none was named, or the name is not that of an image.
     """
-    variables = _variables_73(path) if _is_hdf5(path) else variables_5(path)
-    chosen = _choose(path, variables, variable)
+    chosen = _choose(path, mat_variables(path), variable)
     try:
         array = chosen.load()
     except (FileFormatError, MemoryError):
@@ -116,6 +116,27 @@ def read_mat(path: Path, variable: str | None = None) -> tuple[NDArray[Any], dic
             "plane of whole or real numbers; take its real part or modulus, and save that"
         )
     return array, {"variable": chosen.name, "bits": 8 * array.dtype.itemsize, "geometry": {}}
+
+
+def mat_variables(path: Path) -> list[Variable]:
+    """List the variables of a MAT-file, without their values.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    list of Variable
+        In the file's order; `Variable.is_image` tells which could be an image.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged.
+    """
+    return _variables_73(path) if _is_hdf5(path) else variables_5(path)
 
 
 def _is_hdf5(path: Path) -> bool:

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.dataset import FORMAT, dataset_from_field, displacement_from_potential
+from napari_shadowinv.io.hdf5 import held_arrays
 from napari_shadowinv.io.promises import load_dataset
 
 if TYPE_CHECKING:
@@ -158,9 +159,11 @@ def read_pradformat(path: Path) -> tuple[NDArray[Any], dict[str, Any]] | xarray.
     if kind == "inversion":
         return _read_inversion(path, attributes)
     found = f"the object type {kind!r}" if kind else "no attribute 'object_type'"
+    held = ", ".join(held_arrays(path))
+    advice = f"name one of its arrays with variable, of {held}" if held else "export it as TIFF"
     raise FileFormatError(
         f"{path} is an HDF5 file with {found}: expected a pradformat radiograph or inversion, or "
-        "a .shadowinv result; export the image as TIFF or NPY"
+        f"a .shadowinv result; {advice}"
     )
 
 

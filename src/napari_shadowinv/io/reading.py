@@ -18,6 +18,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.arrays import read_npy
 from napari_shadowinv.io.dataset import read_result
 from napari_shadowinv.io.files import kind_of, sha256
+from napari_shadowinv.io.hdf5 import read_hdf5
 from napari_shadowinv.io.images import read_picture
 from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5, read_mat
 from napari_shadowinv.io.pradformat import is_result, read_pradformat
@@ -48,7 +49,8 @@ def read(
         What to take of a colour image. An image whose channels are all equal is grey
         and needs no choice.
     variable : str, optional
-        Name of the array to take from a MATLAB file that holds several.
+        Name of the array to take from a MATLAB file that holds several, or from any HDF5
+        file, with its groups: ``"shots/3/image"``.
 
     Returns
     -------
@@ -61,17 +63,19 @@ def read(
         If the file is missing, empty, damaged or of a kind that cannot be read.
     InputError
         If it is a colour image and no channel, or one that it has not, was chosen; the
-        same for the variables of a MATLAB file.
+        same for the variables of a MATLAB or HDF5 file.
     """
     path = Path(path)
     kind = _family(path)
     if kind == "mat":
         return _radiograph(path, kind, *read_mat(path, variable))
-    if variable is not None:
+    if variable is not None and kind != "hdf5":
         raise InputError(
-            f"{path} is no MATLAB file (its kind is {kind!r}): variable {variable!r} means nothing "
-            "here; leave it out"
+            f"{path} is no MATLAB file nor HDF5 (its kind is {kind!r}): variable {variable!r} "
+            "means nothing here; leave it out"
         )
+    if variable is not None:
+        return _named_plane(path, variable)
     if kind == "hdf5":
         content = read_result(path) if is_result(path) else read_pradformat(path)
         if not isinstance(content, tuple):
@@ -90,6 +94,17 @@ def read(
     if array.ndim == 3 and channel is not None:
         metadata["channel"] = channel
     return _radiograph(path, kind, grey, {"dtype": str(array.dtype), **metadata})
+
+
+def _named_plane(path: Path, variable: str) -> Radiograph:
+    """One array of an HDF5 file, whatever else the file is."""
+    array = read_hdf5(path, variable)
+    if array.ndim != 2 or array.size == 0:
+        raise FileFormatError(
+            f"{path} holds {variable!r} with shape {array.shape}: expected an image of shape "
+            "(height, width); choose or save one plane"
+        )
+    return _radiograph(path, "hdf5", array, {"variable": variable})
 
 
 def _family(path: Path) -> str:
@@ -149,7 +164,7 @@ def read_radiograph(
     channel : {"red", "green", "blue", "mean"} or int, optional
         What to take of a colour image.
     variable : str, optional
-        Name of the array to take from a MATLAB file.
+        Name of the array to take from a MATLAB or HDF5 file.
 
     Returns
     -------

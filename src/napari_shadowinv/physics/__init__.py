@@ -2,6 +2,7 @@
 
 - the experiment and unit conversions: `setup`
 - the image that a displacement makes: `forward`
+- the same object in another experiment: `projection`
 - the linear inversion, for comparison: `poisson`
 - test objects with exact fields: `phantoms`
 """
@@ -15,6 +16,11 @@ from napari_shadowinv.physics.phantoms import (
     toroid,
 )
 from napari_shadowinv.physics.poisson import border_mean, poisson_invert
+from napari_shadowinv.physics.projection import (
+    project,
+    project_potential,
+    transferred_displacement,
+)
 from napari_shadowinv.physics.setup import (
     OpticalSetup,
     ProtonSetup,
@@ -33,7 +39,10 @@ __all__ = [
     "jacobian_determinant",
     "paper_setup",
     "poisson_invert",
+    "project",
+    "project_potential",
     "setup_from_dict",
     "synthetic_image",
     "toroid",
+    "transferred_displacement",
 ]

@@ -4,10 +4,16 @@
 - get it back from a file's content: `setup_from_dict`
 - convert pixels to SI and back: `BeamSetup.deflection_angle`, `BeamSetup.displacement`,
   `BeamSetup.potential`, `BeamSetup.normalized_potential`
+- from a potential in SI to a displacement in pixels: `BeamSetup.displacement_from_potential`
 - path-integrated fields of particles: `ProtonSetup.path_integrated_b`,
-  `ProtonSetup.path_integrated_e`
+  `ProtonSetup.path_integrated_e`; back: `ProtonSetup.displacement_from_path_integrated_b`,
+  `ProtonSetup.displacement_from_path_integrated_e`
 - line integrals of light: `OpticalSetup.line_integrated_log_index`,
-  `OpticalSetup.line_integrated_density`, `OpticalSetup.relative_density_modulation`
+  `OpticalSetup.line_integrated_density`, `OpticalSetup.relative_density_modulation`; back:
+  `OpticalSetup.normalized_potential_from_log_index`,
+  `OpticalSetup.normalized_potential_from_density`,
+  `OpticalSetup.normalized_potential_from_modulation`
+- the same object in another experiment: `napari_shadowinv.physics.projection`
 
 Displacements d and potentials φ are in pixels of the object plane, px and px². With the
 pixel's side p, the distance L from object to detector and the magnification M, the
@@ -243,6 +249,32 @@ class BeamSetup(BaseModel):
         """
         return _scaled(potential, 1 / (self.object_pixel_size * self._angle_per_pixel))
 
+    def displacement_from_potential(self, potential: ArrayLike) -> FloatArray:
+        """Displacement in pixels of a potential in SI units, d = -∇φ.
+
+        Parameters
+        ----------
+        potential : array_like, shape (H, W)
+            Potential Φ in m at the centres of this setup's pixels.
+
+        Returns
+        -------
+        ndarray, shape (2, H, W)
+            Displacement in px of the object plane, axis order (y, x), by differences that
+            are of second order up to the border.
+
+        Raises
+        ------
+        InputError
+            If the potential is no plane or too small to have a gradient.
+        """
+        plane = self.normalized_potential(potential)
+        if plane.ndim != 2 or min(plane.shape) < 3:
+            raise InputError(
+                f"potential has shape {plane.shape}: expected (height, width), 3 pixels at least"
+            )
+        return -np.stack([np.gradient(plane, axis=axis, edge_order=2) for axis in (0, 1)])
+
 
 class ProtonSetup(BeamSetup):
     """A beam of charged particles through an object, onto a film or a plate.
@@ -388,6 +420,27 @@ class ProtonSetup(BeamSetup):
         angle = self.deflection_angle(_vector("displacement", displacement))
         return angle * (self.momentum * self.velocity / self.particle.charge)
 
+    def displacement_from_path_integrated_e(self, field: ArrayLike) -> FloatArray:
+        """Displacement by an electric field; the inverse of `path_integrated_e`.
+
+        Parameters
+        ----------
+        field : array_like, shape (2, ...)
+            (∫E_y dz, ∫E_x dz) in V.
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Displacement in px of the object plane, axis order (y, x).
+
+        Raises
+        ------
+        InputError
+            If the field has not two components.
+        """
+        volts = _vector("field", field)
+        return self.displacement(volts * (self.particle.charge / (self.momentum * self.velocity)))
+
 
 class OpticalSetup(BeamSetup):
     """A beam of light through a transparent object, onto a detector.
@@ -455,6 +508,21 @@ class OpticalSetup(BeamSetup):
         """
         return -self.potential(phi)
 
+    def normalized_potential_from_log_index(self, integral: ArrayLike) -> FloatArray:
+        """Potential φ of a refracting object; the inverse of `line_integrated_log_index`.
+
+        Parameters
+        ----------
+        integral : array_like
+            ∫ln η dz in m.
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Normalised potential in px².
+        """
+        return -self.normalized_potential(integral)
+
     def line_integrated_density(self, phi: ArrayLike) -> FloatArray:
         """Electron density of a thin plasma integrated along the beam: ∫n dz = 2 n_c Φ.
 
@@ -481,6 +549,21 @@ class OpticalSetup(BeamSetup):
         """
         return 2 * self.critical_density * self.potential(phi)
 
+    def normalized_potential_from_density(self, integral: ArrayLike) -> FloatArray:
+        """Potential φ of a thin plasma; the inverse of `line_integrated_density`.
+
+        Parameters
+        ----------
+        integral : array_like
+            ∫n dz in m⁻².
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Normalised potential in px².
+        """
+        return self.normalized_potential(integral) / (2 * self.critical_density)
+
     def relative_density_modulation(self, phi: ArrayLike, density: float) -> FloatArray:
         """Modulation of a plasma's density, relative to its mean: ∫Δn/n₀ dz.
 
@@ -506,9 +589,33 @@ class OpticalSetup(BeamSetup):
         Kasim et al., arXiv:1607.04179, Section V; see `line_integrated_density` for the
         factor of 2.
         """
-        if not (density > 0 and math.isfinite(density)):
-            raise InputError(f"density is {density:g}: it must be positive, in electrons per m³")
-        return self.line_integrated_density(phi) / density
+        return self.line_integrated_density(phi) / _positive_density(density)
+
+    def normalized_potential_from_modulation(
+        self, modulation: ArrayLike, density: float
+    ) -> FloatArray:
+        """Potential φ of a modulated plasma; the inverse of `relative_density_modulation`.
+
+        Parameters
+        ----------
+        modulation : array_like
+            ∫Δn/n₀ dz in m.
+        density : float
+            Density n₀ of the undisturbed plasma in m⁻³.
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Normalised potential in px².
+
+        Raises
+        ------
+        InputError
+            If the density is not positive and finite.
+        """
+        return self.normalized_potential_from_density(
+            _scaled(modulation, _positive_density(density))
+        )
 
 
 Setup = Annotated[ProtonSetup | OpticalSetup, Field(discriminator="kind")]
@@ -575,6 +682,12 @@ def _vector(name: str, values: ArrayLike) -> FloatArray:
             f"{name} has shape {field.shape}: expected (2, ...), the y component first"
         )
     return field
+
+
+def _positive_density(density: float) -> float:
+    if not (density > 0 and math.isfinite(density)):
+        raise InputError(f"density is {density:g}: it must be positive, in electrons per m³")
+    return density
 
 
 def _tesla_metres(unit: str) -> float:

@@ -1,0 +1,341 @@
+"""One object in two experiments: invert a shot of one, predict the image of the other.
+
+- the displacement in another experiment: `transferred_displacement`
+- the image there, from a displacement: `project`; from a potential in SI: `project_potential`
+- what bends the beam, and so what both experiments have in common: `Deflector`
+
+A deflection angle a, and with it the potential Φ in m, belongs to a beam: other energies bend by
+other angles. What belongs to the object, and is the same for all beams, is a line integral:
+
+=================  ===========================  ==========================================
+deflector          of the object                angle of a beam
+=================  ===========================  ==========================================
+magnetic field     ∫B dl (T m)                  ∝ q / p
+electric field     ∫E dl (V)                    ∝ q / (p v)
+plasma             ∫n dz (m⁻²)                  ∝ 1 / n_c, so ∝ λ²
+refractive index   ∫ln η dz (m)                 the same, apart from dispersion
+=================  ===========================  ==========================================
+
+Momentum p and velocity v are relativistic. Distances, magnification and pixels of both
+experiments may differ too: both look at the same point of the object with the middle of
+their images. The object is thin: rays go straight through it, whatever their direction.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import make_interp_spline
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+__all__ = [
+    "Deflector",
+    "default_deflector",
+    "project",
+    "project_potential",
+    "transferred_displacement",
+]
+
+FloatArray = NDArray[np.float64]
+AnySetup = ProtonSetup | OpticalSetup
+
+Deflector = Literal["magnetic field", "electric field", "plasma", "refractive index"]
+
+_OF_PARTICLES: tuple[Deflector, ...] = ("magnetic field", "electric field")
+_OF_LIGHT: tuple[Deflector, ...] = ("plasma", "refractive index")
+# A cubic spline needs four samples.
+_SMALLEST_SIDE = 4
+# Share of a pixel by which rounding may put an image's edge beyond the other's.
+_SLACK = 1e-6
+# Pixels that differ by less are the same ones, divided and multiplied by a magnification.
+_SAME = 1e-9
+
+
+def project(
+    displacement: ArrayLike,
+    made_with: AnySetup,
+    setup: AnySetup,
+    *,
+    deflector: Deflector | None = None,
+    dispersion: float = 1.0,
+    source: ArrayLike | None = None,
+    shape: tuple[int, int] | None = None,
+    rays_per_pixel: int = 16,
+    threads: int | None = None,
+) -> FloatArray:
+    """Image that an object makes in another experiment.
+
+    Parameters
+    ----------
+    displacement : array_like, shape (2, H, W)
+        Displacement in px of `made_with`, axis order (y, x), such as `Inversion.displacement`.
+    made_with, setup : ProtonSetup or OpticalSetup
+        The experiment that the displacement belongs to, and the one to predict.
+    deflector, dispersion, shape
+        See `transferred_displacement`.
+    source : array_like, shape (H', W'), optional
+        Flux of each pixel of `setup` without the object; gives the shape if that is left out.
+        Default: 1.
+    rays_per_pixel, threads
+        See `synthetic_image`.
+
+    Returns
+    -------
+    ndarray of float64, shape (H', W')
+        Flux of each pixel of the predicted image, in the unit of the source.
+
+    Raises
+    ------
+    InputError
+        As `transferred_displacement` and `synthetic_image`.
+
+    Examples
+    --------
+    In its own experiment, a field makes the image that it was found in:
+
+    >>> from napari_shadowinv.physics.phantoms import paper_setup, toroid
+    >>> setup = paper_setup()
+    >>> truth = toroid((60, 60), setup, peak=20, sigma=15e-6).displacement
+    >>> bool((project(truth, setup, setup) == synthetic_image(truth)).all())
+    True
+    """
+    if source is not None and shape is None:
+        height, width = np.shape(source)[:2] if np.ndim(source) == 2 else (0, 0)
+        shape = (height, width)
+    moved = transferred_displacement(
+        displacement, made_with, setup, deflector=deflector, dispersion=dispersion, shape=shape
+    )
+    return synthetic_image(moved, source, rays_per_pixel=rays_per_pixel, threads=threads)
+
+
+def project_potential(
+    potential: ArrayLike,
+    made_with: AnySetup,
+    setup: AnySetup,
+    *,
+    deflector: Deflector | None = None,
+    dispersion: float = 1.0,
+    source: ArrayLike | None = None,
+    shape: tuple[int, int] | None = None,
+    rays_per_pixel: int = 16,
+    threads: int | None = None,
+) -> FloatArray:
+    """Image that a potential in SI units makes, in its own or in another experiment.
+
+    Parameters
+    ----------
+    potential : array_like, shape (H, W)
+        Potential Φ in m at the centres of the pixels of `made_with`, as its `potential` gives
+        it; `displacement_from_potential` takes the gradient.
+    made_with, setup : ProtonSetup or OpticalSetup
+        The experiment that the potential belongs to, and the one to predict.
+    deflector, dispersion, source, shape, rays_per_pixel, threads
+        See `project`.
+
+    Returns
+    -------
+    ndarray of float64, shape (H', W')
+        Flux of each pixel of the predicted image, in the unit of the source.
+
+    Raises
+    ------
+    InputError
+        As `project`, and if the potential is no plane.
+    """
+    return project(
+        made_with.displacement_from_potential(potential),
+        made_with,
+        setup,
+        deflector=deflector,
+        dispersion=dispersion,
+        source=source,
+        shape=shape,
+        rays_per_pixel=rays_per_pixel,
+        threads=threads,
+    )
+
+
+def transferred_displacement(
+    displacement: ArrayLike,
+    made_with: AnySetup,
+    setup: AnySetup,
+    *,
+    deflector: Deflector | None = None,
+    dispersion: float = 1.0,
+    shape: tuple[int, int] | None = None,
+) -> FloatArray:
+    """Displacement that the same object makes in another experiment.
+
+    Parameters
+    ----------
+    displacement : array_like, shape (2, H, W)
+        Displacement in px of `made_with`, axis order (y, x).
+    made_with, setup : ProtonSetup or OpticalSetup
+        The experiment that the displacement belongs to, and the other one.
+    deflector : {"magnetic field", "electric field", "plasma", "refractive index"}, optional
+        What bends the beam. Default: see `default_deflector`.
+    dispersion : float, default 1
+        For a refractive index: ln η at the wavelength of `setup` over that of `made_with`.
+    shape : tuple of int, optional
+        Height and width of the other image in its own pixels. Default: as many as the known
+        field covers; the same as before if the pixels are.
+
+    Returns
+    -------
+    ndarray, shape (2, H', W')
+        Displacement in px of `setup`, interpolated by cubic splines unless both images have
+        the same pixels.
+
+    Raises
+    ------
+    InputError
+        If one experiment uses particles and the other light, the deflector does not bend the
+        beam or has to be told, the displacement has another shape, or the other image is
+        larger than the known field.
+
+    Examples
+    --------
+    Slower protons are deflected more, by the ratio of the momenta in a magnetic field:
+
+    >>> from napari_shadowinv.physics.phantoms import paper_setup
+    >>> setup = paper_setup()
+    >>> slow = setup.model_copy(update={"energy": 3.0})
+    >>> float(transferred_displacement(np.ones((2, 4, 4)), setup, slow)[0, 0, 0])
+    2.22
+    """
+    field = _checked_field(displacement)
+    factor = _angle_ratio(made_with, setup, deflector, dispersion)
+    ratio = setup.object_pixel_size / made_with.object_pixel_size
+    old = (field.shape[1], field.shape[2])
+    size = _shape(old, ratio) if shape is None else _checked_shape(shape, old, ratio, setup)
+    # One factor, so that nothing changes, not even by rounding, where nothing differs.
+    factor *= float(made_with.deflection_angle(1.0) / setup.deflection_angle(1.0))
+    if size == old and math.isclose(ratio, 1, rel_tol=_SAME):
+        return factor * field
+    return factor * _resampled(field, size, ratio)
+
+
+def default_deflector(made_with: AnySetup, setup: AnySetup) -> Deflector:
+    """What is taken to bend the beam if nobody says so.
+
+    Parameters
+    ----------
+    made_with, setup : ProtonSetup or OpticalSetup
+        Two experiments.
+
+    Returns
+    -------
+    str
+        A magnetic field for particles; for light a refractive index, if the wavelength is the
+        same: then a plasma comes to the same.
+
+    Raises
+    ------
+    InputError
+        If the wavelengths differ: then it has to be told. Also if one experiment uses
+        particles and the other light.
+    """
+    if isinstance(made_with, ProtonSetup) and isinstance(setup, ProtonSetup):
+        return "magnetic field"
+    if not (isinstance(made_with, OpticalSetup) and isinstance(setup, OpticalSetup)):
+        raise InputError(
+            f"the field was measured with a setup of kind {made_with.kind!r} and is to be seen "
+            f"with kind {setup.kind!r}: expected both alike; what bends light does not tell how "
+            "particles fly"
+        )
+    if made_with.wavelength != setup.wavelength:
+        raise InputError(
+            f"the wavelengths differ ({made_with.wavelength:g} and {setup.wavelength:g} m) and no "
+            "deflector is told: choose 'plasma' (angles grow with the wavelength squared) or "
+            "'refractive index' (they stay, apart from dispersion)"
+        )
+    return "refractive index"
+
+
+def _angle_ratio(
+    made_with: AnySetup, setup: AnySetup, deflector: Deflector | None, dispersion: float
+) -> float:
+    """Deflection angle in the new experiment over that in the old one."""
+    if not (math.isfinite(dispersion) and dispersion != 0):
+        raise InputError(f"dispersion is {dispersion:g}: it must be a finite number, not 0")
+    usual = default_deflector(made_with, setup) if deflector is None else deflector
+    if usual not in get_args(Deflector):
+        raise InputError(
+            f"deflector is {usual!r}: it must be one of {', '.join(get_args(Deflector))}"
+        )
+    if dispersion != 1 and usual != "refractive index":
+        raise InputError(f"dispersion is {dispersion:g}, but a {usual} has none: leave it out")
+    if isinstance(made_with, ProtonSetup) and isinstance(setup, ProtonSetup):
+        _require(usual, _OF_PARTICLES, "particles")
+        ratio = setup.particle.charge / made_with.particle.charge
+        ratio *= made_with.momentum / setup.momentum
+        return ratio * made_with.velocity / setup.velocity if usual == "electric field" else ratio
+    if isinstance(made_with, OpticalSetup) and isinstance(setup, OpticalSetup):
+        _require(usual, _OF_LIGHT, "light")
+        if usual == "plasma":
+            return made_with.critical_density / setup.critical_density
+        return dispersion
+    default_deflector(made_with, setup)  # says why not
+    raise AssertionError("unreachable")
+
+
+def _require(deflector: Deflector, possible: tuple[Deflector, ...], beam: str) -> None:
+    if deflector not in possible:
+        raise InputError(
+            f"deflector is {deflector!r}, but the beam is {beam}: expected "
+            f"{' or '.join(map(repr, possible))}"
+        )
+
+
+def _checked_field(displacement: ArrayLike) -> FloatArray:
+    field = np.asarray(displacement, dtype=np.float64)
+    if field.ndim != 3 or field.shape[0] != 2 or min(field.shape[1:]) < _SMALLEST_SIDE:
+        raise InputError(
+            f"displacement has shape {field.shape}: expected (2, height, width), the y component "
+            f"first, {_SMALLEST_SIDE} pixels at least"
+        )
+    return field
+
+
+def _shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
+    """As many pixels of the new size as lie within the old image."""
+    height, width = (math.floor(n / ratio + _SLACK) for n in old)
+    if min(height, width) < _SMALLEST_SIDE:
+        raise InputError(
+            f"the known field covers {height} × {width} pixels of the other setup: expected "
+            f"{_SMALLEST_SIDE} × {_SMALLEST_SIDE} at least; check the pixel sizes"
+        )
+    return height, width
+
+
+def _checked_shape(
+    shape: tuple[int, int], old: tuple[int, int], ratio: float, setup: AnySetup
+) -> tuple[int, int]:
+    if len(shape) != 2 or min(shape) < _SMALLEST_SIDE:
+        raise InputError(
+            f"the other image has shape {tuple(shape)}: expected (height, width), "
+            f"{_SMALLEST_SIDE} pixels at least"
+        )
+    most = _shape(old, ratio)
+    if shape[0] > most[0] or shape[1] > most[1]:
+        raise InputError(
+            f"the other image has shape {tuple(shape)} with pixels of "
+            f"{setup.object_pixel_size * 1e6:.4g} µm at the object, but the field is known on "
+            f"{most} of these only: crop the source or the shape to that"
+        )
+    return int(shape[0]), int(shape[1])
+
+
+def _resampled(field: FloatArray, shape: tuple[int, int], ratio: float) -> FloatArray:
+    """A field at the centres of other pixels, `ratio` times as wide, about the same middle."""
+    for axis, count in enumerate(shape, start=1):
+        old = np.arange(field.shape[axis]) - (field.shape[axis] - 1) / 2
+        new = (np.arange(count) - (count - 1) / 2) * ratio
+        field = make_interp_spline(old, field, k=3, axis=axis)(new)
+    return field

@@ -1,0 +1,180 @@
+"""The same object in two experiments."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
+from napari_shadowinv.physics.projection import (
+    project,
+    project_potential,
+    transferred_displacement,
+)
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+SHAPE = (48, 56)
+FAST = paper_setup()
+SLOW = FAST.model_copy(update={"energy": 3.0})
+GREEN = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=12e-6)
+RED = GREEN.model_copy(update={"wavelength": 633e-9})
+# Rest energies in MeV (CODATA), independent of the package's constants.
+REST = {"proton": 938.27208816, "deuteron": 1875.61294257, "alpha": 3727.3794066}
+
+
+def momentum(kinetic: float, rest: float) -> float:
+    """Of a relativistic particle, p c in MeV."""
+    return math.sqrt(kinetic * (kinetic + 2 * rest))
+
+
+def velocity(kinetic: float, rest: float) -> float:
+    """In units of the speed of light: p c / E."""
+    return momentum(kinetic, rest) / (kinetic + rest)
+
+
+@pytest.fixture(scope="module")
+def field() -> np.ndarray:
+    return np.random.default_rng(3).normal(size=(2, *SHAPE))
+
+
+def test_in_its_own_experiment_nothing_changes(field: np.ndarray) -> None:
+    np.testing.assert_array_equal(transferred_displacement(field, FAST, FAST), field)
+    truth = toroid(SHAPE, FAST, 20.0, 10e-6).displacement
+    source = np.linspace(1, 2, truth[0].size).reshape(SHAPE)
+    np.testing.assert_array_equal(
+        project(truth, FAST, FAST, source=source), synthetic_image(truth, source)
+    )
+
+
+def test_magnetic_deflection_goes_with_one_over_the_momentum(field: np.ndarray) -> None:
+    ratio = momentum(14.7, REST["proton"]) / momentum(3.0, REST["proton"])
+    np.testing.assert_allclose(transferred_displacement(field, FAST, SLOW), ratio * field, 1e-9)
+    # The paper's root of the energies' ratio is another number.
+    assert ratio != pytest.approx(math.sqrt(14.7 / 3.0), rel=2e-3)
+
+
+def test_electric_deflection_goes_with_one_over_momentum_and_velocity(field: np.ndarray) -> None:
+    rest = REST["proton"]
+    ratio = momentum(14.7, rest) * velocity(14.7, rest) / momentum(3.0, rest) / velocity(3.0, rest)
+    moved = transferred_displacement(field, FAST, SLOW, deflector="electric field")
+    np.testing.assert_allclose(moved, ratio * field, rtol=1e-9)
+
+
+def test_other_particles_have_other_momentum_and_charge(field: np.ndarray) -> None:
+    alpha = FAST.model_copy(update={"energy": 3.5, "species": "alpha"})
+    ratio = 2 * momentum(14.7, REST["proton"]) / momentum(3.5, REST["alpha"])
+    np.testing.assert_allclose(transferred_displacement(field, FAST, alpha), ratio * field, 1e-8)
+
+
+@pytest.mark.parametrize("deflector", ["magnetic field", "electric field"])
+def test_the_line_integrated_field_is_what_both_have_in_common(
+    field: np.ndarray, deflector: str
+) -> None:
+    other = ProtonSetup(
+        energy=3.0,
+        source_object_distance=0.02,
+        object_image_distance=0.3,
+        detector_pixel_size=FAST.object_pixel_size * 16,
+    )
+    assert other.object_pixel_size == pytest.approx(FAST.object_pixel_size, rel=1e-12)
+    moved = transferred_displacement(field, FAST, other, deflector=deflector, shape=SHAPE)
+    name = "path_integrated_b" if deflector == "magnetic field" else "path_integrated_e"
+    np.testing.assert_allclose(
+        getattr(other, name)(moved),
+        getattr(FAST, name)(field),
+        rtol=1e-9,
+        # The spline between pixels whose sizes differ by rounding.
+        atol=1e-9 * np.abs(getattr(FAST, name)(field)).max(),
+    )
+
+
+def test_there_and_back_is_exact(field: np.ndarray) -> None:
+    other = SLOW.model_copy(update={"object_image_distance": 0.5, "source_object_distance": 0.07})
+    there = transferred_displacement(field, FAST, other)
+    np.testing.assert_allclose(transferred_displacement(there, other, FAST), field, rtol=1e-13)
+
+
+def test_light_in_a_plasma_and_in_a_gas(field: np.ndarray) -> None:
+    plasma = transferred_displacement(field, GREEN, RED, deflector="plasma")
+    np.testing.assert_allclose(plasma, field * (633 / 532) ** 2, rtol=1e-12)
+    glass = transferred_displacement(
+        field, GREEN, RED, deflector="refractive index", dispersion=0.98
+    )
+    np.testing.assert_allclose(glass, 0.98 * field, rtol=1e-13)
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.8, 1.5, 2.0])
+def test_other_pixels_see_the_same_field_in_metres(ratio: float) -> None:
+    """Off-centre, asymmetric: an exact field drawn in both pixels."""
+    pixel = ratio * FAST.object_pixel_size
+    other = FAST.model_copy(update={"pixel_size": pixel})
+    shape = tuple(math.floor(n / ratio) for n in SHAPE)
+    sigma = (9e-6, 13e-6)
+    offset = np.array([4.0, -3.0])  # px of the first experiment, from the middle
+
+    def drawn(setup: ProtonSetup, size: tuple[int, ...], scale: float) -> np.ndarray:
+        center = (np.array(size) - 1) / 2 + offset / scale
+        return toroid(size, setup, 40.0, sigma, tuple(center), 0.4).displacement
+
+    moved = transferred_displacement(drawn(FAST, SHAPE, 1.0), FAST, other)
+    expected = drawn(other, shape, ratio)
+    assert moved.shape == expected.shape
+    assert np.abs(moved - expected).max() < 1e-3 * np.abs(expected).max()
+    angle, true_angle = other.deflection_angle(moved), other.deflection_angle(expected)
+    np.testing.assert_allclose(angle, true_angle, atol=1e-3 * np.abs(true_angle).max())
+
+
+def test_cubic_fields_are_resampled_exactly_up_to_the_border() -> None:
+    fine = FAST.model_copy(update={"pixel_size": FAST.object_pixel_size / 3})
+    y, x = (np.arange(n) - (n - 1) / 2 for n in (12, 15))
+    field = np.stack([y[:, None] ** 3 - x, y[:, None] * x**2])
+    v, u = ((np.arange(3 * n) - (3 * n - 1) / 2) / 3 for n in (12, 15))
+    expected = 3 * np.stack([v[:, None] ** 3 - u, v[:, None] * u**2])
+    np.testing.assert_allclose(transferred_displacement(field, FAST, fine), expected, atol=1e-9)
+
+
+def test_an_exact_field_predicts_the_exact_image_of_another_energy() -> None:
+    measured = toroid((80, 80), FAST, 40.0, 15e-6).displacement
+    expected = synthetic_image(toroid((80, 80), SLOW, 40.0, 15e-6).displacement)
+    np.testing.assert_allclose(project(measured, FAST, SLOW), expected, rtol=1e-9)
+
+
+def test_a_potential_in_metres_makes_the_image() -> None:
+    blob = gaussian_blob((60, 70), 60.0, 9.0, (27, 40))
+    image = project_potential(GREEN.potential(blob.potential), GREEN, GREEN)
+    # Differences of second order: (1/σ)² / 6 of the displacement.
+    np.testing.assert_allclose(image, synthetic_image(blob.displacement), atol=0.03)
+
+
+def test_source_gives_the_shape_of_the_image() -> None:
+    source = np.full((20, 24), 7.0)
+    image = project(np.zeros((2, *SHAPE)), FAST, FAST, source=source)
+    np.testing.assert_allclose(image, source)
+    with pytest.raises(InputError, match=r"\(60, 24\) .* known on \(48, 56\)"):
+        project(np.zeros((2, *SHAPE)), FAST, FAST, source=np.ones((60, 24)))
+
+
+def test_what_cannot_be_transferred_is_said(field: np.ndarray) -> None:
+    with pytest.raises(InputError, match="kind 'proton' and is to be seen with kind 'optical'"):
+        transferred_displacement(field, FAST, GREEN)
+    with pytest.raises(InputError, match=r"wavelengths differ .* choose 'plasma'"):
+        transferred_displacement(field, GREEN, RED)
+    with pytest.raises(InputError, match="'plasma', but the beam is particles"):
+        transferred_displacement(field, FAST, SLOW, deflector="plasma")
+    with pytest.raises(InputError, match="'magnetic field', but the beam is light"):
+        transferred_displacement(field, GREEN, RED, deflector="magnetic field")
+    with pytest.raises(InputError, match="deflector is 'gravity': it must be one of magnetic"):
+        transferred_displacement(field, FAST, SLOW, deflector="gravity")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="dispersion is 2, but a plasma has none"):
+        transferred_displacement(field, GREEN, RED, deflector="plasma", dispersion=2.0)
+    with pytest.raises(InputError, match="dispersion is nan"):
+        transferred_displacement(field, GREEN, RED, dispersion=math.nan)
+    with pytest.raises(InputError, match=r"displacement has shape \(48, 56\)"):
+        transferred_displacement(field[0], FAST, SLOW)
+    coarse = FAST.model_copy(update={"pixel_size": 1e-4})
+    with pytest.raises(InputError, match="covers 0 × 0 pixels of the other setup"):
+        transferred_displacement(field, FAST, coarse)
