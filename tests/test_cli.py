@@ -237,6 +237,22 @@ def test_negative_pixels_are_clipped_counted_and_reported(folder: Path) -> None:
     assert "3 clipped" in " ".join(result.stdout.split())
 
 
+def test_free_boundary_is_chosen_reported_and_kept(folder: Path) -> None:
+    large = synthetic_image(gaussian_blob((64, 64), 20.0, 6.0, (32, 12)).displacement)
+    np.save("shot.npy", large[10:-10, 10:-10])
+    result = shadowinv("invert", "shot.npy", "--boundary", "free", "--margin", "6")
+    assert result.exit_code == 0, result.output
+    inversion = inversion_from_dataset(dataset("shot.shadowinv"))
+    assert inversion.options.boundary == "free"
+    assert inversion.options.margin == 6
+    assert inversion.report.flux_left["left"] > 0.001
+    text = " ".join(result.stdout.split())
+    assert f"left {inversion.report.flux_left['left']:.2%}" in text
+    refused = shadowinv("invert", "shot.npy", "--flux", "known", "--out", "other.shadowinv")
+    assert refused.exit_code == 2
+    assert "flux is 'known' and boundary 'closed'" in " ".join(refused.stderr.split())
+
+
 def test_unconverged_result_is_written_with_an_alarm(folder: Path) -> None:
     np.save("shot.npy", synthetic_image(gaussian_blob((32, 32), 60.0, 4.0).displacement))
     (folder / "few.toml").write_text("max_iterations = 1\ntolerance = 1e-9\n")

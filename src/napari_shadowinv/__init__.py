@@ -5,6 +5,7 @@
 - how far the image's noise moves its field: `uncertainty`
 - what a deflection means in SI units: `ProtonSetup`, `OpticalSetup`
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
+- predict the image of the same object in another experiment: `project`, `project_potential`
 - read and write files: `read`, `write`
 
 Arrays are ``[y, x]``, vectors in axis order (y, x), a pixel's centre is at its integer
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.poisson import poisson_invert
+    from napari_shadowinv.physics.projection import project, project_potential
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
     from napari_shadowinv.progress import Progress
 
@@ -42,6 +44,8 @@ __all__ = [
     "invert",
     "plan_sites",
     "poisson_invert",
+    "project",
+    "project_potential",
     "read",
     "synthetic_image",
     "uncertainty",
@@ -63,6 +67,8 @@ _HOME = {
     "invert": "inversion",
     "plan_sites": "inversion",
     "poisson_invert": "physics.poisson",
+    "project": "physics.projection",
+    "project_potential": "physics.projection",
     "read": "io",
     "synthetic_image": "physics.forward",
     "uncertainty": "error_bars",

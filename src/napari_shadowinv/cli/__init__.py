@@ -95,6 +95,7 @@ Variable = Annotated[
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 
 _FILTERS = "Filters before the inversion"
+_BOUNDARY = "Flux across the image's edge (docs/boundary.md)"
 _ESTIMATES = "Source estimated from the image (docs/sources.md)"
 
 _INVERT_EPILOG = r"""
@@ -186,6 +187,31 @@ def invert(
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Print nothing but errors and alarms.")
     ] = False,
+    boundary: Annotated[
+        str | None,
+        typer.Option(
+            help="'closed': nothing crosses the edge. 'free': flux may leave and enter.",
+            rich_help_panel=_BOUNDARY,
+        ),
+    ] = None,
+    margin: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PX",
+            help="Of the free boundary: pixels beyond each edge that flux may come from.",
+            rich_help_panel=_BOUNDARY,
+        ),
+    ] = None,
+    flux: Annotated[
+        str | None,
+        typer.Option(
+            help=(
+                "Of the free boundary: 'conserve' (units of image and source may differ), 'known' "
+                "(same exposure) or 'fit'."
+            ),
+            rich_help_panel=_BOUNDARY,
+        ),
+    ] = None,
     source_from: Annotated[
         str | None,
         typer.Option(
@@ -283,7 +309,14 @@ def invert(
     protect([result, figure], [image, source, mask, setup, options, source_mask])
     from napari_shadowinv.cli._preparing import TABLE, preparation_from
 
-    flags = {"n_sites": n_sites, "threads": threads, "seed": seed}
+    flags = {
+        "n_sites": n_sites,
+        "threads": threads,
+        "seed": seed,
+        "boundary": boundary,
+        "margin": margin,
+        "flux": flux,
+    }
     chosen = options_from(options, flags, clip_negative, other_tables=(TABLE,))
     preparation = preparation_from(
         options,

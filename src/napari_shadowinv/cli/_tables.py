@@ -78,7 +78,20 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
             f"{report.clipped_pixels} clipped",
         ),
         ("caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
+        *crossing_rows(report),
         *peak_rows(inversion.displacement, setup),
+    ]
+
+
+def crossing_rows(report: Report) -> Rows:
+    """The flux that crossed the edge, side by side, where the boundary was free."""
+    return [
+        (name, ", ".join(f"{side} {share:.2%}" for side, share in shares.items()))
+        for name, shares in (
+            ("flux left", report.flux_left),
+            ("flux entered", report.flux_entered),
+        )
+        if shares
     ]
 
 
