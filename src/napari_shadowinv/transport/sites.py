@@ -12,6 +12,7 @@ Paper, sections II.C and III: rejection, then weighted Lloyd relaxation.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import mirrored_across_border
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
@@ -264,7 +266,6 @@ def plan_levels(
     lloyd_tolerance: float = 0.0,
     seed: int = 0,
     threads: int | None = None,
-    mask: NDArray[np.bool_] | None = None,
     report: Reporter | None = None,
 ) -> SitePlan:
     """Spread the sites of all levels over a source.
@@ -277,10 +278,8 @@ def plan_levels(
         Sites of the finest level; each coarser one has a quarter.
     lloyd_iterations, lloyd_tolerance, seed, threads
         See `lloyd` and `sample_sites`.
-    mask : ndarray of bool, shape (H, W), optional
-        Kept with the plan.
     report : Reporter, optional
-        Told of each step.
+        Told of each step of the finest level.
 
     Returns
     -------
@@ -291,15 +290,8 @@ def plan_levels(
     counts = [n_sites]
     while counts[-1] > COARSEST:
         counts.append(max(4, counts[-1] // RATIO))
-    levels: list[Level] = []
 
-    def report_step(step: int, count: int) -> None:
-        if report is not None:
-            done = len(levels) * lloyd_iterations + step
-            total = len(counts) * lloyd_iterations
-            report("sites", done, total, f"{count:,} sites, Lloyd relaxation")
-
-    for count in reversed(counts):
+    def level(count: int, tell: Callable[[int, int], None] | None = None) -> Level:
         triangulation = RegularTriangulation(
             sample_sites(source, count, seed), region=density.region
         )
@@ -309,9 +301,9 @@ def plan_levels(
             iterations=lloyd_iterations,
             tolerance=lloyd_tolerance,
             threads=threads,
-            report=report_step,
+            report=tell,
         )
-        level = Level(
+        return Level(
             sites=triangulation.sites,
             mass=diagram.masses,
             centroids=diagram.centroids,
@@ -319,6 +311,15 @@ def plan_levels(
             shape=density.shape,
             lloyd_iterations=steps,
         )
-        del diagram
-        levels.append(level)
-    return SitePlan(source, tuple(levels), mask)
+
+    def tell(step: int, count: int) -> None:
+        if report is not None:
+            report("sites", step, lloyd_iterations, f"{count:,} sites, Lloyd relaxation")
+
+    if available_threads(threads) == 1:
+        coarse = [level(count) for count in counts[:0:-1]]
+        return SitePlan(source, (*coarse, level(n_sites, tell)))
+    with ThreadPoolExecutor(1) as pool:  # beside the finest level, which takes three times as long
+        others = pool.submit(lambda: [level(count) for count in counts[:0:-1]])
+        finest = level(n_sites, tell)
+        return SitePlan(source, (*others.result(), finest))
