@@ -63,8 +63,8 @@ def counted(image: np.ndarray, options: InversionOptions) -> tuple[Inversion, Si
     repair = _flips.repair
     try_weights = TransportObjective.diagram_if_full
 
-    def counting_repair(mesh, policy):
-        status = repair(mesh, policy)
+    def counting_repair(mesh, *arguments):
+        status = repair(mesh, *arguments)
         count.flips += int(mesh.counters[FLIPS])
         return status
 

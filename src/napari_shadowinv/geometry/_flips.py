@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from napari_shadowinv.geometry._hilbert import insertion_order
 from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
@@ -49,6 +50,7 @@ __all__ = [
     "STOP",
     "build",
     "insert",
+    "look_for_irregular",
     "raise_hidden",
     "repair",
     "restore",
@@ -171,23 +173,16 @@ def restore(mesh: Mesh) -> int:
 
 
 @kernel
-def _mark_irregular(mesh: Mesh, t: int) -> bool:
-    """Push the edges of triangle t that may be irregular, unless the neighbour looks at them.
+def _irregular_edges(mesh: Mesh, t: int) -> int:
+    """Find the edges of an inner triangle that may be irregular: bit k for the one opposite to k.
 
-    The triangle's own part of the determinant serves for its three edges.
+    Edges that the neighbour has to look at are left out. The triangle's own part of the
+    determinant serves for its three edges.
     """
     corners, twins, points, weights = mesh.corners, mesh.twins, mesh.points, mesh.weights
-    n = mesh.hidden.size
     e = 3 * t
     i, j, k = corners[e], corners[e + 1], corners[e + 2]
-    marked = False
-    if i >= n or j >= n or k >= n:
-        for h in range(e, e + 3):
-            g = twins[h]
-            if g > h and _state(mesh, h, g) != LEGAL:
-                push(mesh, h)
-                marked = True
-        return marked
+    found = 0
     x0, y0, w0 = points[i, 0], points[i, 1], weights[i]
     ax, ay, a_gain = points[j, 0] - x0, points[j, 1] - y0, weights[j] - w0
     bx, by, b_gain = points[k, 0] - x0, points[k, 1] - y0, weights[k] - w0
@@ -216,21 +211,56 @@ def _mark_irregular(mesh: Mesh, t: int) -> bool:
                 + b_size * (abs(ax * qy) + abs(ay * qx))
             )
             if height < LIFT_BOUND * size:
+                found |= 1 << (h - e)
+    return found
+
+
+@kernel
+def _is_inner(mesh: Mesh, t: int) -> bool:
+    n = mesh.hidden.size
+    i, j, k = mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2]
+    return bool(i < n and j < n and k < n)
+
+
+@kernel
+def _mark_irregular(mesh: Mesh, t: int) -> bool:
+    """Push the edges of triangle t that may be irregular, unless the neighbour looks at them."""
+    marked = False
+    edges = _irregular_edges(mesh, t) if _is_inner(mesh, t) else 7
+    for h in range(3 * t, 3 * t + 3):
+        if edges >> (h - 3 * t) & 1:
+            g = mesh.twins[h]
+            if g > h and (_is_inner(mesh, t) or _state(mesh, h, g) != LEGAL):
                 push(mesh, h)
                 marked = True
     return marked
 
 
 @kernel
-def _sweep(mesh: Mesh) -> int:
-    """Make every edge locally regular; the sites stay those that are in."""
+def look_for_irregular(start: int, stop: int, mesh: Mesh, suspects: NDArray[np.bool_]) -> None:
+    """Tell which triangles may have an irregular edge; those at the ghosts always may.
+
+    Nothing else is written, so several ranges of triangles can be looked at at once.
+    """
+    for t in range(start, stop):
+        suspects[t] = not _is_inner(mesh, t) or _irregular_edges(mesh, t) != 0
+
+
+@kernel
+def _sweep(mesh: Mesh, suspects: NDArray[np.bool_]) -> int:
+    """Make every edge locally regular; the sites stay those that are in.
+
+    Triangles known to be no `suspects` are passed over at first; those that a flip makes have
+    their edges looked at anyway.
+    """
     counters = mesh.counters
+    known = suspects.size
     counters[OVERFLOW] = 1
     while counters[OVERFLOW] == 1:
         counters[OVERFLOW] = 0
         t = 0
         while t < counters[SIZE]:
-            if mesh.corners[3 * t] < 0:
+            if mesh.corners[3 * t] < 0 or (t < known and not suspects[t]):
                 marked = False
             elif counters[POLICY] == RAISE:
                 push_triangle(mesh, t)
@@ -243,6 +273,7 @@ def _sweep(mesh: Mesh) -> int:
                 if status != DONE:
                     return status
             t += 1
+        known = 0
     return DONE
 
 
@@ -338,7 +369,7 @@ def _return_hidden(mesh: Mesh) -> int:
 
 
 @kernel_that_allocates
-def repair(mesh: Mesh, policy: int) -> int:
+def repair(mesh: Mesh, policy: int, suspects: NDArray[np.bool_]) -> int:
     """Make the triangulation regular for the weights in `mesh`.
 
     Parameters
@@ -347,6 +378,8 @@ def repair(mesh: Mesh, policy: int) -> int:
         The triangulation; any valid one.
     policy : int
         REMOVE hidden sites, or STOP at the first.
+    suspects : ndarray of bool
+        What `look_for_irregular` has found, or empty.
 
     Returns
     -------
@@ -357,11 +390,11 @@ def repair(mesh: Mesh, policy: int) -> int:
     mesh.counters[FLIPS] = 0
     mesh.counters[RAISES] = 0
     mesh.counters[POLICY] = policy
-    status = _sweep(mesh)
+    status = _sweep(mesh, suspects)
     if status == DONE:
         status = _return_hidden(mesh)
     if status == DONE and mesh.counters[OVERFLOW] == 1:
-        status = _sweep(mesh)
+        status = _sweep(mesh, suspects[:0])
     compact(mesh)
     return status
 
@@ -409,7 +442,7 @@ def raise_hidden(mesh: Mesh) -> int:
             return EXHAUSTED
     on_hull = mesh.weights.copy()
     mesh.counters[POLICY] = RAISE
-    if _sweep(mesh) == EXHAUSTED:
+    if _sweep(mesh, np.empty(0, np.bool_)) == EXHAUSTED:
         mesh.weights[:] = on_hull
     compact(mesh)
     return DONE
@@ -481,7 +514,7 @@ def build(mesh: Mesh) -> int:
         if status != DONE:
             break
     if status == DONE and mesh.counters[OVERFLOW] == 1:
-        status = _sweep(mesh)
+        status = _sweep(mesh, np.empty(0, np.bool_))
     compact(mesh)
     _sort_triangles(mesh)
     return status

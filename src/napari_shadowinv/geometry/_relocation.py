@@ -84,7 +84,7 @@ def relocate(mesh: Mesh, targets: NDArray[np.float64]) -> int:
     mesh.points[:n] = targets
     while _stay_behind(mesh, origins, strays):
         pass
-    if strays.sum() > _MOST_STRAYS * n or repair(mesh, REMOVE) != DONE:
+    if strays.sum() > _MOST_STRAYS * n or repair(mesh, REMOVE, strays[:0]) != DONE:
         return EXHAUSTED
     status = _take_out(mesh, strays)
     for v in range(n):

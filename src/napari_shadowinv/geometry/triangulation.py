@@ -33,6 +33,7 @@ from napari_shadowinv.geometry import _flips
 from napari_shadowinv.geometry._hilbert import hilbert_permutation
 from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Mesh, neighbors_of
 from napari_shadowinv.geometry._relocation import relocate
+from napari_shadowinv.geometry._threads import in_ranges
 
 __all__ = ["RegularTriangulation", "hilbert_order"]
 
@@ -219,7 +220,9 @@ class RegularTriangulation:
         """Triangle across the edge opposite to each corner, shape (m, 3); -1 if there is none."""
         return _read_only(neighbors_of(self._mesh).reshape(-1, 3))
 
-    def update(self, weights: ArrayLike, *, stop_when_hidden: bool = False) -> bool:
+    def update(
+        self, weights: ArrayLike, *, stop_when_hidden: bool = False, threads: int = 1
+    ) -> bool:
         """Repair the triangulation for new weights.
 
         Parameters
@@ -230,6 +233,8 @@ class RegularTriangulation:
             Whether to stop as soon as a site that is in the triangulation is proven hidden. It
             then stays a valid triangulation with all those sites, irregular for now, from
             which the next update starts.
+        threads : int
+            Threads that look for irregular edges; the flips themselves take one.
 
         Returns
         -------
@@ -243,7 +248,10 @@ class RegularTriangulation:
         """
         self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
         self._forget()
-        status = _flips.repair(self._mesh, _flips.STOP if stop_when_hidden else _flips.REMOVE)
+        suspects = np.empty(self._mesh.counters[SIZE], np.bool_)
+        in_ranges(_flips.look_for_irregular, suspects.size, threads, self._mesh, suspects)
+        policy = _flips.STOP if stop_when_hidden else _flips.REMOVE
+        status = _flips.repair(self._mesh, policy, suspects)
         if status != _flips.EXHAUSTED:
             return bool(status == _flips.DONE)
         fresh = self.copy()

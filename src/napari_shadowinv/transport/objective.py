@@ -85,7 +85,7 @@ class TransportObjective:
 
     def diagram(self, weights: Array, *, with_moments: bool = False) -> PowerDiagram:
         """Return the power diagram for `weights`; empty cells are allowed."""
-        self.triangulation.update(weights)
+        self.triangulation.update(weights, threads=available_threads(self.threads))
         return PowerDiagram(
             self.triangulation,
             self.image_for(weights),
@@ -95,7 +95,8 @@ class TransportObjective:
 
     def diagram_if_full(self, weights: Array) -> PowerDiagram | None:
         """Return the power diagram for `weights`, or None as soon as a cell proves empty."""
-        if not self.triangulation.update(weights, stop_when_hidden=True):
+        threads = available_threads(self.threads)
+        if not self.triangulation.update(weights, stop_when_hidden=True, threads=threads):
             return None
         return PowerDiagram(self.triangulation, self.image_for(weights), threads=self.threads)
 
