@@ -5,6 +5,7 @@
 - what a deflection means in SI units: `ProtonSetup`, `OpticalSetup`
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
 - read and write files: `read`, `write`
+- show a result in a napari viewer: `add_inversion`
 
 Arrays are ``[y, x]``, vectors in axis order (y, x), a pixel's centre is at its integer
 index, and lengths are object-plane pixels unless a setup makes them SI.
@@ -16,6 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import add_inversion
     from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
     from napari_shadowinv.inversion import Inversion, Report, invert, plan_sites
     from napari_shadowinv.io import Radiograph, read, write
@@ -36,6 +38,7 @@ __all__ = [
     "ProtonSetup",
     "Radiograph",
     "Report",
+    "add_inversion",
     "invert",
     "plan_sites",
     "poisson_invert",
@@ -55,6 +58,7 @@ _HOME = {
     "ProtonSetup": "physics.setup",
     "Radiograph": "io",
     "Report": "inversion",
+    "add_inversion": "_napari.layers",
     "invert": "inversion",
     "plan_sites": "inversion",
     "poisson_invert": "physics.poisson",
