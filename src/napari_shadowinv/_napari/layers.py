@@ -26,11 +26,17 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 __all__ = [
+    "CAUSTIC_KEYWORDS",
     "FullLayerData",
     "add_inversion",
     "add_layers",
+    "component_symbols",
+    "intensity_limits",
     "inversion_layers",
+    "opened",
     "result_layers",
+    "symmetric_limits",
+    "thinned_arrows",
 ]
 
 Array = NDArray[np.float64]
@@ -43,6 +49,12 @@ _SIGNED_MAP = "RdBu_r"
 _CAUSTIC_COLOUR = "#00e5ff"
 _ARROW_COLOUR = "#ffffff"
 """What colours mean is the same as in the report's figures."""
+
+CAUSTIC_KEYWORDS: dict[str, Any] = {
+    "colormap": {None: (0, 0, 0, 0), 1: _CAUSTIC_COLOUR},
+    "opacity": 0.5,
+    "visible": False,
+}
 
 _ARROWS_ALONG = 28
 _SHORTEST_ARROW = 0.05
@@ -193,7 +205,7 @@ class _Maker:
         self, plane: ArrayLike, role: str, title: str, unit: str, limits: tuple[float, float],
         colormap: str, **keywords: Any,
     ) -> FullLayerData:  # fmt: skip
-        choices = {"colormap": colormap, "contrast_limits": _open(limits), "visible": False}
+        choices = {"colormap": colormap, "contrast_limits": opened(limits), "visible": False}
         return self.layer(plane, "image", role, title, unit, **{**choices, **keywords})
 
 
@@ -260,7 +272,7 @@ def _intensities(make: _Maker, inversion: Inversion) -> list[FullLayerData]:
             inversion.reprojection, "reprojection", "re-projection", unit, limits, _INTENSITY_MAP
         ),
         make.image(
-            percent, "residual", "residual (% of mean)", "%", _symmetric(percent), _SIGNED_MAP
+            percent, "residual", "residual (% of mean)", "%", symmetric_limits(percent), _SIGNED_MAP
         ),
     ]
 
@@ -312,9 +324,7 @@ def _caustics(make: _Maker, inversion: Inversion) -> FullLayerData:
         "labels",
         "caustic",
         "caustics",
-        colormap={None: (0, 0, 0, 0), 1: _CAUSTIC_COLOUR},
-        opacity=0.5,
-        visible=False,
+        **CAUSTIC_KEYWORDS,
     )
 
 
@@ -385,7 +395,7 @@ def _sites(make: _Maker, inversion: Inversion) -> FullLayerData:
         features=features,
         face_color="displacement",
         face_colormap=_FIELD_MAP,
-        face_contrast_limits=_open((0.0, float(features["displacement"].max(initial=0.0)))),
+        face_contrast_limits=opened((0.0, float(features["displacement"].max(initial=0.0)))),
         border_width=0.0,
         size=0.7 * site_spacing(inversion) * every**0.5,
         symbol="disc",
@@ -432,15 +442,16 @@ def intensity_limits(image: NDArray[Any]) -> tuple[float, float]:
     dark, bright = (float(value) for value in np.percentile(finite, (0.1, _BRIGHTEST)))
     mean = float(finite.mean())
     high = min(bright, _LARGEST_INTENSITY * mean) if mean > 0 else bright
-    return _open((0.0 if 0 <= dark < 0.3 * high else dark, high))
+    return opened((0.0 if 0 <= dark < 0.3 * high else dark, high))
 
 
-def _symmetric(plane: Array) -> tuple[float, float]:
+def symmetric_limits(plane: Array) -> tuple[float, float]:
+    """Return limits around zero that a handful of pixels at a caustic cannot blow up."""
     limit = float(np.percentile(np.abs(plane), _BRIGHTEST))
     return -limit, limit
 
 
-def _open(limits: tuple[float, float]) -> tuple[float, float]:
-    """Make sure that there is something between two limits."""
+def opened(limits: tuple[float, float]) -> tuple[float, float]:
+    """Return limits with something between them, also where all values are one."""
     low, high = limits
     return (low, high) if high > low else (low, low + 1.0)
