@@ -23,10 +23,10 @@ from napari_shadowinv._napari.notices import MISTAKES, in_event_loop, show_mista
 from napari_shadowinv.errors import InputError, InversionCancelled
 
 if TYPE_CHECKING:
-    import napari
     import napari.layers
     import napari.types
 
+    import napari
     from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
@@ -136,12 +136,13 @@ def estimate_source(
 
 def _picked(layer: Any, viewer: Any) -> _Picked:
     """Take the plane that is shown of an image layer."""
+    from napari.layers import Image
+
     if layer is None:
         raise InputError("no layer is selected: select one image in the layer list")
-    if getattr(layer, "_type_string", "") != "image" or layer.rgb:
-        kind = (
-            "a colour image" if getattr(layer, "rgb", False) else f"of type {type(layer).__name__}"
-        )
+    if not isinstance(layer, Image) or layer.rgb:
+        is_colour = isinstance(layer, Image)
+        kind = "a colour image" if is_colour else f"of type {layer.__class__.__name__}"
         raise InputError(f"layer '{layer.name}' is {kind}: select a grey image")
     data = layer.data[0] if layer.multiscale else layer.data
     name = layer.name
@@ -175,39 +176,29 @@ def _work_beside(picked: _Picked, work: Work, title: str, viewer: Any) -> None:
 
     from napari_shadowinv._napari.layers import add_layers
 
-    worker: Any = None
+    bar = cancelable_progress(total=0, desc=title)
 
-    def should_stop() -> bool:
-        return worker is None or bool(worker.abort_requested)
-
-    def add(layers: list[FullLayerData] | None) -> None:
-        if layers:
+    def finish(outcome: tuple[list[FullLayerData], Exception | None]) -> None:
+        layers, error = outcome
+        bar.close()
+        if error is None:
             add_layers(viewer, layers)
+        elif isinstance(error, MISTAKES):
+            show_mistake(error)
+        elif not isinstance(error, InversionCancelled):
+            raise error
 
-    worker = create_worker(_unless_cancelled, work, picked, should_stop, _ignore_errors=True)
-    bar = cancelable_progress(total=0, desc=title, cancel_callback=worker.quit)
-    worker.returned.connect(add)
-    worker.errored.connect(_report)
-    worker.finished.connect(bar.close)
+    # An error must not leave the worker: what napari then does differs between its versions.
+    def run() -> tuple[list[FullLayerData], Exception | None]:
+        # A closing window asks its workers to stop; the cross only leaves a mark on the bar.
+        try:
+            return work(picked, lambda: bar.is_canceled or worker.abort_requested), None
+        except Exception as error:
+            return [], error
+
+    worker = create_worker(run)
+    worker.returned.connect(finish)
     worker.start()
-
-
-def _unless_cancelled(
-    work: Work, picked: _Picked, should_stop: ShouldStop
-) -> list[FullLayerData] | None:
-    try:
-        return work(picked, should_stop)
-    except InversionCancelled:
-        return None
-
-
-def _report(error: BaseException) -> None:
-    if isinstance(error, MISTAKES):
-        show_mistake(error)
-    else:
-        from napari.utils.notifications import notification_manager
-
-        notification_manager.receive_error(type(error), error, error.__traceback__)
 
 
 def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:

@@ -26,15 +26,16 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 __all__ = [
-    "CAUSTIC_KEYWORDS",
     "FullLayerData",
     "add_inversion",
     "add_layers",
+    "caustic_keywords",
     "component_symbols",
     "intensity_limits",
     "inversion_layers",
     "opened",
     "result_layers",
+    "show_scale_bar",
     "symmetric_limits",
     "thinned_arrows",
 ]
@@ -46,20 +47,15 @@ _INTENSITY_MAP = "gray"
 _POTENTIAL_MAP = "viridis"
 _FIELD_MAP = "inferno"
 _SIGNED_MAP = "RdBu_r"
-_CAUSTIC_COLOUR = "#00e5ff"
-_ARROW_COLOUR = "#ffffff"
-"""What colours mean is the same as in the report's figures."""
-
-CAUSTIC_KEYWORDS: dict[str, Any] = {
-    "colormap": {None: (0, 0, 0, 0), 1: _CAUSTIC_COLOUR},
-    "opacity": 0.5,
-    "visible": False,
-}
+# Both stand out of every colour of the field's map.
+_CAUSTIC_COLOUR = "#5dff5d"
+_ARROW_COLOUR = "#00c8ff"
 
 _ARROWS_ALONG = 28
 _SHORTEST_ARROW = 0.05
 _MOST_SITES_SHOWN = 200_000
 _BRIGHTEST = 99.7
+_ENOUGH_PIXELS = 100_000
 _LARGEST_INTENSITY = 3.5
 
 
@@ -146,15 +142,18 @@ def add_inversion(
 
     Examples
     --------
-    >>> import napari  # doctest: +SKIP
-    >>> viewer = napari.current_viewer()  # doctest: +SKIP
-    >>> add_inversion(viewer, inversion, setup, name="shot 7")  # doctest: +SKIP
+    >>> from napari.components import ViewerModel
+    >>> from napari_shadowinv import invert
+    >>> viewer = ViewerModel()
+    >>> layers = add_inversion(viewer, invert(np.ones((20, 20))), name="blank")
+    >>> [layer.name for layer in layers if layer.visible]
+    ['blank |d| (px)', 'blank arrows']
     """
     return add_layers(viewer, inversion_layers(inversion, setup, name=name, **keywords))
 
 
 def add_layers(viewer: Any, described: Sequence[FullLayerData]) -> list[Any]:
-    """Add described layers to a viewer and switch on the scale bar.
+    """Add described layers to a viewer, select the field and switch on the scale bar.
 
     Parameters
     ----------
@@ -172,10 +171,19 @@ def add_layers(viewer: Any, described: Sequence[FullLayerData]) -> list[Any]:
 
     added = [viewer.add_layer(Layer.create(*layer)) for layer in described]
     for layer in added:
-        if role_of(layer) == "field" and hasattr(layer, "colorbar"):
-            layer.colorbar.visible = True
-    viewer.scale_bar.visible = True
+        if role_of(layer) == "field":
+            # The status line then tells the field below the mouse.
+            viewer.layers.selection.active = layer
+            if hasattr(layer, "colorbar"):
+                layer.colorbar.visible = True
+    show_scale_bar(viewer)
     return added
+
+
+def show_scale_bar(viewer: Any) -> None:
+    """Switch on the scale bar of a viewer."""
+    overlays = getattr(getattr(viewer, "canvas", None), "overlays", viewer)  # napari before 0.9
+    overlays.scale_bar.visible = True
 
 
 @dataclass(frozen=True)
@@ -324,8 +332,18 @@ def _caustics(make: _Maker, inversion: Inversion) -> FullLayerData:
         "labels",
         "caustic",
         "caustics",
-        **CAUSTIC_KEYWORDS,
+        **caustic_keywords(),
     )
+
+
+def caustic_keywords() -> dict[str, Any]:
+    """Return how caustics look: one colour on nothing."""
+    from napari.utils.colormaps import CyclicLabelColormap
+    from napari.utils.colormaps.standardize_color import transform_color
+
+    # A dictionary of colours would do, but napari compiles code for it, for two seconds.
+    colours = transform_color(["transparent", _CAUSTIC_COLOUR])
+    return {"colormap": CyclicLabelColormap(colours), "opacity": 0.5, "visible": False}
 
 
 def _arrows(make: _Maker, displacement: Array) -> FullLayerData:
@@ -336,7 +354,7 @@ def _arrows(make: _Maker, displacement: Array) -> FullLayerData:
         data,
         "vectors",
         "arrows",
-        "displacement arrows",
+        "arrows",
         "px",
         features={"displacement": np.hypot(*data[:, 1].T)},
         vector_style="arrow",
@@ -436,7 +454,8 @@ def intensity_limits(image: NDArray[Any]) -> tuple[float, float]:
     tuple of float
         Lowest and highest value to tell apart.
     """
-    finite = image[np.isfinite(image)]
+    sample = _sample(image)
+    finite = sample[np.isfinite(sample)]
     if not finite.size:
         return 0.0, 1.0
     dark, bright = (float(value) for value in np.percentile(finite, (0.1, _BRIGHTEST)))
@@ -447,8 +466,14 @@ def intensity_limits(image: NDArray[Any]) -> tuple[float, float]:
 
 def symmetric_limits(plane: Array) -> tuple[float, float]:
     """Return limits around zero that a handful of pixels at a caustic cannot blow up."""
-    limit = float(np.percentile(np.abs(plane), _BRIGHTEST))
+    limit = float(np.percentile(np.abs(_sample(plane)), _BRIGHTEST))
     return -limit, limit
+
+
+def _sample(plane: NDArray[Any]) -> NDArray[Any]:
+    """Enough pixels of a large image for its limits."""
+    step = max(1, int(np.sqrt(plane.size / _ENOUGH_PIXELS)))
+    return plane[::step, ::step]
 
 
 def opened(limits: tuple[float, float]) -> tuple[float, float]:

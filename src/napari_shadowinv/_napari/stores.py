@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layers import (
-    CAUSTIC_KEYWORDS,
     FullLayerData,
+    caustic_keywords,
     component_symbols,
     intensity_limits,
     opened,
@@ -70,7 +70,7 @@ def _opened(path: Path) -> xarray.Dataset:
         raise FileFormatError(f"{path} does not exist: expected a folder made by an inversion")
     try:
         # Nothing in it is a time, whatever its units look like.
-        dataset: xr.Dataset = xr.open_zarr(path, decode_times=False, consolidated=None)
+        dataset: xr.Dataset = xr.open_zarr(path, decode_times=False, consolidated=False)
     except MemoryError:
         raise
     except Exception as error:
@@ -232,7 +232,7 @@ class _StoreLayers:
         if not self._is_run("caustic"):
             return []
         caustic = self._data("caustic").astype(np.uint8)
-        return [self._layer(caustic, "labels", "caustic", "caustics", "", **CAUSTIC_KEYWORDS)]
+        return [self._layer(caustic, "labels", "caustic", "caustics", "", **caustic_keywords())]
 
 
 def _field_of_unit_displacements(setup: Setup | None) -> NDArray[np.float64]:

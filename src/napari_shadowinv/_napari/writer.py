@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
@@ -41,10 +41,9 @@ def write_result(path: str, layers: Sequence[FullLayerData]) -> list[str]:
 
     Raises
     ------
-    InputError
-        If there is no layer of a result, or there are layers of several.
     FileFormatError
-        If the file cannot be written.
+        If there is no layer of a result, there are layers of several, or the file cannot be
+        written.
     """
     return _write(path, layers, (".shadowinv",))
 
@@ -64,10 +63,8 @@ def write_pradformat(path: str, layers: Sequence[FullLayerData]) -> list[str]:
 
     Raises
     ------
-    InputError
-        As `write_result`, and if the result is not that of a particle beam.
     FileFormatError
-        If the file cannot be written.
+        As `write_result`, and if the result is not that of a particle beam.
     """
     return _write(path, layers, (".h5", ".hdf5"))
 
@@ -87,15 +84,23 @@ def write_sites(path: str, layers: Sequence[FullLayerData]) -> list[str]:
 
     Raises
     ------
-    InputError
-        As `write_result`, and if the result has no sites.
     FileFormatError
-        If the file cannot be written.
+        As `write_result`, and if the result has no sites.
     """
     return _write(path, layers, (".csv",))
 
 
 def _write(path: str, layers: Sequence[FullLayerData], suffixes: tuple[str, ...]) -> list[str]:
+    try:
+        return _write_result(path, layers, suffixes)
+    except InputError as error:
+        # napari takes any ValueError of a writer for "no writer", and swallows what it says.
+        raise FileFormatError(str(error)) from error
+
+
+def _write_result(
+    path: str, layers: Sequence[FullLayerData], suffixes: tuple[str, ...]
+) -> list[str]:
     from napari_shadowinv._napari.saved import dataset_of_layers
     from napari_shadowinv.io import write
 
