@@ -132,10 +132,11 @@ def test_arrows_are_true_displacements_on_a_grid_that_can_be_read(
     arrows = by_role(add_inversion(viewer, solved))["arrows"]
     starts, steps = arrows.data[:, 0].astype(int), arrows.data[:, 1]
     np.testing.assert_array_equal(steps, solved.displacement[:, starts[:, 0], starts[:, 1]].T)
-    # Drawn, the longest is nearly as long as the distance to the next.
+    # Drawn, nearly all keep to their own place, and the longest reach to the next but one.
     spacing = np.diff(np.unique(starts[:, 1])).min()
-    longest = arrows.length * np.hypot(*steps.T).max()
-    assert 0.8 * spacing < longest < spacing
+    drawn = arrows.length * np.hypot(*steps.T) / spacing
+    assert np.percentile(drawn, 94) < 1
+    assert 0.9 < drawn.max() < 2
 
 
 @pytest.mark.parametrize("shape", [(64, 200), (700, 500), (20, 20)])

@@ -349,19 +349,21 @@ def caustic_keywords() -> dict[str, Any]:
 def _arrows(make: _Maker, displacement: Array) -> FullLayerData:
     """Displacements of few enough rays that each arrow can be seen."""
     data, spacing = thinned_arrows(displacement)
-    longest = float(np.hypot(*data[:, 1].T).max(initial=0.0))
+    lengths = np.hypot(*data[:, 1].T)
+    # Most arrows keep to their own place; the strongest reach to the next but one at most.
+    usual = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
     return make.layer(
         data,
         "vectors",
         "arrows",
         "arrows",
         "px",
-        features={"displacement": np.hypot(*data[:, 1].T)},
+        features={"displacement": lengths},
         vector_style="arrow",
         edge_color=_ARROW_COLOUR,
         edge_width=spacing / 9,
         # The data are displacements in px; only the drawing is stretched.
-        length=0.95 * spacing / longest if longest else 1.0,
+        length=float(0.95 * spacing / usual) if usual else 1.0,
         opacity=0.75,
     )
 
