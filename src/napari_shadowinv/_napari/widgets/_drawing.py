@@ -71,5 +71,5 @@ def _added(viewer: Any, image: Any, kind: str, data: Any, title: str) -> Any:
         keywords["ndim"] = 2
     layer = Layer.create(data, keywords, kind)
     viewer.layers.append(layer)
-    viewer.layers.selection = {layer}
+    viewer.layers.selection.active = layer
     return layer

@@ -59,6 +59,8 @@ class Editor(QWidget):
     """
 
     changed = Signal()
+    # Whether the value is shown with its unit, so that the label need not tell it.
+    shows_unit = False
 
     def __init__(self, inner: QWidget) -> None:
         super().__init__()
@@ -150,6 +152,8 @@ class _Slider(Editor):
 class _Quantity(Editor):
     """A number over many orders of magnitude, with its unit, as text."""
 
+    shows_unit = True
+
     def __init__(self, unit: str) -> None:
         super().__init__(QLineEdit())
         self._unit = unit
@@ -192,6 +196,7 @@ class _Optional(Editor):
     def __init__(self, editor: Editor) -> None:
         super().__init__(QCheckBox(_NOT_GIVEN))
         self.editor = editor
+        self.shows_unit = editor.shows_unit
         self.layout().addWidget(editor, 1)
         editor.setVisible(False)
         self.inner.toggled.connect(self._on_toggle)

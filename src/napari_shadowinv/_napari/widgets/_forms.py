@@ -90,7 +90,8 @@ class ModelForm(QWidget):
                 self._fixed[name] = get_args(field.annotation)[0]
                 continue
             editor = editor_for(field, (first or {}).get(name))
-            label = QLabel(unit_of_title(field.title or name)[0])
+            title = field.title or name
+            label = QLabel(unit_of_title(title)[0] if editor.shows_unit else title)
             for widget in (label, editor):
                 widget.setToolTip(_tooltip(field.description))
             layout.addRow(label, editor)

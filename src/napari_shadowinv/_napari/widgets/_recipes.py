@@ -120,11 +120,24 @@ class TotalVariationEstimate(Estimate):
         ),
         json_schema_extra={"slider": [0.05, 20.0]},
     )
+    iterations: int = Field(
+        default=1000,
+        ge=1,
+        title="Iterations",
+        description="Most steps; an object of radius r px needs about r² of them.",
+    )
 
     def source(self, image: Image, mask: Mask | None) -> Image:
         from napari_shadowinv.sources import total_variation_source
 
-        return total_variation_source(image, weight=self.weight, mask=mask)
+        return total_variation_source(
+            image, weight=self.weight, iterations=self.iterations, mask=mask
+        )
+
+    def coarser(self, factor: int) -> Estimate:
+        # A step reaches one pixel farther: fewer steps go as far in larger pixels.
+        steps = max(1, self.iterations // factor**2)
+        return super().coarser(factor).model_copy(update={"iterations": steps})
 
 
 class InterpolatedEstimate(Estimate):

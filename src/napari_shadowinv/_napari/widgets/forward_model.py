@@ -161,7 +161,8 @@ class ForwardModel(ToolPanel):
             "metadata": mark("image", unit, request.job.setup),
             **request.frame.keywords(),
         }
-        ResultLayers(self.viewer).show([(forecast.image, keywords, "image")])
+        ResultLayers(self.viewer, self).show([(forecast.image, keywords, "image")])
+        self.viewer.reset_view()
         self.warning.setText(forecast.warning)
         self.warning.setVisible(bool(forecast.warning))
 

@@ -5,35 +5,43 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from qtpy.QtCore import QTimer
 from qtpy.QtWidgets import QCheckBox
 
+from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.marks import role_of
-from napari_shadowinv._napari.widgets._base import ToolPanel, with_button
+from napari_shadowinv._napari.widgets._base import with_button
 from napari_shadowinv._napari.widgets._drawing import new_mask, new_shapes
 from napari_shadowinv._napari.widgets._estimating import SourceCache
 from napari_shadowinv._napari.widgets._forms import ModelForm, ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
-from napari_shadowinv._napari.widgets._messages import MISTAKES, reporting, tell_warning
+from napari_shadowinv._napari.widgets._live import LivePanel
+from napari_shadowinv._napari.widgets._messages import reporting, tell_warning
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, report_rows, section
 from napari_shadowinv._napari.widgets._picking import LayerPicker, LayerWatch
 from napari_shadowinv._napari.widgets._reading import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._recipes import FILTERS
-from napari_shadowinv._napari.widgets._results import ResultLayers, common_frame
-from napari_shadowinv._napari.widgets._runner import Outcome
+from napari_shadowinv._napari.widgets._results import ResultLayers, place_together, result_frame
 from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._sources import SourcePicker
 from napari_shadowinv._napari.widgets._toml import TomlButtons
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.progress import OnProgress, ShouldStop
 from napari_shadowinv.validation import validated
 
 if TYPE_CHECKING:
     import napari
+    from napari_shadowinv._napari.layers import FullLayerData
+    from napari_shadowinv.inversion import Inversion
 
 __all__ = ["InvertShot"]
 
-_SETTLE = 20  # ms; a few changes at once are one
 _PREVIEW_ROLES = ("potential", "field", "caustic")
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    inversion: Inversion
+    described: list[FullLayerData]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +52,28 @@ class _Request:
     image: Any
     companions: tuple[Any, ...]
     setup: Any
+    frame: Frame
     preview: bool
 
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> _Answer:
+        """Invert the shot and describe its layers, all of it beside the window."""
+        inversion = self.job.run(on_progress, should_stop)
+        from napari_shadowinv._napari.layers import inversion_layers
 
-class InvertShot(ToolPanel):
+        described = inversion_layers(
+            inversion,
+            self.setup,
+            name=f"{self.image.name} preview" if self.preview else self.image.name,
+            scale=self.frame.scale,
+            translate=self.frame.translate,
+            units=self.frame.units,
+        )
+        if self.preview:
+            described = [layer for layer in described if role_of(layer[1]) in _PREVIEW_ROLES]
+        return _Answer(inversion, described)
+
+
+class InvertShot(LivePanel):
     """Choose an image, press Run; all else has a default.
 
     Parameters
@@ -57,14 +83,18 @@ class InvertShot(ToolPanel):
     """
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(viewer, "invert-shot")
+        super().__init__(
+            viewer,
+            "invert-shot",
+            RunPanel("Invert shot", "Run", "Invert the image; the result comes as layers."),
+        )
         self._cache, self._estimates = PlanCache(), SourceCache()
-        self._previewed = ResultLayers(viewer)
+        self.previewed = ResultLayers(viewer, self)
         self._build()
         self._connect()
         self.restore(self._keeper.load())
-        self._ready = True
         self._on_image()
+        self._ready = True
 
     def _build(self) -> None:
         viewer = self.viewer
@@ -88,11 +118,9 @@ class InvertShot(ToolPanel):
         )
         self.options = ModelForm(InversionOptions, first={"n_sites": PREVIEW_SITES})
         self.option_files = TomlButtons("options", self._options_to_save, self._take_options)
-        self.live = QCheckBox("Live preview")
         self.live.setToolTip(
             f"<qt>The field follows every change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
-        self.panel = RunPanel("Invert shot", "Run", "Invert the image; the result comes as layers.")
         self.report = ReportTable()
 
         for row in (
@@ -111,12 +139,6 @@ class InvertShot(ToolPanel):
             self.column.addWidget(widget)
 
     def _connect(self) -> None:
-        self._settle = QTimer(self)
-        self._settle.setSingleShot(True)
-        self._settle.setInterval(_SETTLE)
-        self._settle.timeout.connect(self._preview)
-        self.panel.button.clicked.connect(lambda: self._run_or_cancel())
-        self.panel.runner.ended.connect(self._on_end)
         self.image.picked.connect(self._on_image)
         self._edits = LayerWatch((self.image, self.masks, self.crop, self.source.layers))
         self._edits.setParent(self)
@@ -129,9 +151,8 @@ class InvertShot(ToolPanel):
             self.cleaning.changed,
             self.options.changed,
             self.painted_is_unusable.toggled,
-            self.live.toggled,
         ):
-            signal.connect(self._on_change)
+            signal.connect(self.on_change)
 
     # What is kept, and what is asked for
 
@@ -153,13 +174,6 @@ class InvertShot(ToolPanel):
         self.painted_is_unusable.setChecked(bool(kept.get("painted_is_unusable", True)))
 
     def request(self, preview: bool = False) -> _Request:
-        """What the controls ask for.
-
-        Raises
-        ------
-        InputError
-            If there is no image, or anything else that cannot be used.
-        """
         layer = self.image.layer
         image = image_of(layer)
         job = ShotJob(
@@ -172,86 +186,38 @@ class InvertShot(ToolPanel):
             cache=self._cache,
             estimates=self._estimates,
         )
+        setup = self.setup.setup()
         companions = (self.masks.layer, self.crop.layer, self.source.layers.layer)
         return _Request(
             job.for_preview() if preview else job,
             layer,
             tuple(one for one in companions if one is not None and one is not layer),
-            self.setup.setup(),
+            setup,
+            result_frame(layer, setup, job.crop),
             preview,
         )
 
-    # Running
-
-    @reporting
-    def _run_or_cancel(self) -> None:
-        if self.panel.runner.running and not self._running_preview:
-            self.panel.cancel()
-            return
-        request = self.request()
-        self.report.setVisible(False)
-        self._running_preview = False
-        self.panel.run(request.job.run, request)
-
-    _running_preview = False
-
-    def _on_change(self) -> None:
+    def on_change(self) -> None:
         # A filter must not work unseen in a folded section.
         self._cleaning_section.setText(f"Filter first: {self.cleaning.choice.currentText()}")
-        self.keep()
-        if self._ready and self.live.isChecked():
-            self._settle.start()
+        super().on_change()
 
-    def _preview(self) -> None:
-        if self.panel.runner.running and not self._running_preview:
-            return
-        try:
-            request = self.request(preview=True)
-        except MISTAKES as error:
-            # Half a rectangle, half a number: no reason for a notification.
-            self.panel.say(str(error), problem=True)
-            return
-        self._running_preview = True
-        self.panel.run(request.job.run, request, quiet=True)
-
-    def _on_end(self, outcome: Outcome) -> None:
-        self._running_preview = self._running_preview and outcome.tag.preview
-        if outcome.value is None:
-            return
-        request = outcome.tag
-        self._show(outcome.value, request)
-        self.report.show_rows(report_rows(outcome.value))
-
-    @reporting
-    def _show(self, inversion: Any, request: _Request) -> None:
-        from napari_shadowinv._napari.layers import add_layers, inversion_layers
-
+    def show_result(self, value: _Answer, request: _Request) -> None:
+        self.report.show_rows(report_rows(value.inversion))
         image = request.image
         if image not in self.viewer.layers and not request.preview:
             tell_warning(
                 f"'{image.name}' was deleted while it was inverted; its result is shown all the "
                 "same"
             )
-        frame = common_frame(
-            self.viewer, image, request.setup, request.companions, request.job.crop
-        )
-        described = inversion_layers(
-            inversion,
-            request.setup,
-            name=f"{image.name} preview" if request.preview else image.name,
-            scale=frame.scale,
-            translate=frame.translate,
-            units=frame.units,
-        )
+        if request.setup is not None:
+            place_together(self.viewer, image, request.setup, request.companions)
         if request.preview:
-            self._previewed.show(
-                [layer for layer in described if role_of(layer[1]) in _PREVIEW_ROLES]
-            )
+            self.previewed.show(value.described, select=False)
             return
-        self._previewed.hide()
-        added = add_layers(self.viewer, described)
-        shown = [layer for layer in added if role_of(layer) == "field"]
-        self.viewer.layers.selection = set(shown)
+        self.previewed.hide()
+        self.results = ResultLayers(self.viewer, self)
+        self.results.show(value.described)
 
     # Layers
 
@@ -260,7 +226,7 @@ class InvertShot(ToolPanel):
         if layer is not None:
             self.source.follow(layer)
             self.setup.follow(layer)
-        self._on_change()
+        self.on_change()
 
     @reporting
     def _paint_mask(self) -> None:
