@@ -297,6 +297,20 @@ def test_a_store_opens_as_lazy_layers(
     assert [name for name, layer in layers.items() if layer.visible] == ["field"]
 
 
+def test_shots_that_are_marked_as_pending_are_not_looked_at(store: Path, solved: Inversion) -> None:
+    import xarray as xr
+
+    with xr.open_zarr(store, consolidated=False) as run:
+        marks = xr.Dataset({"status": ("shot", np.array([0, 0, 1], np.int8))}, attrs=run.attrs)
+    marks.to_zarr(store, mode="a", consolidated=False)
+    described = {role_of(keywords): keywords for _, keywords, _ in read_paths(str(store))}
+    strongest = np.hypot(*solved.displacement).max()
+    setup = setup_of(described["field"])
+    assert isinstance(setup, ProtonSetup)
+    factor = np.hypot(*setup.path_integrated_b([1.0, 0.0])) * 1e3
+    assert described["field"]["contrast_limits"][1] == pytest.approx(0.5 * factor * strongest)
+
+
 def test_a_damaged_store_is_one_sentence(store: Path) -> None:
     shutil.rmtree(store / "displacement")
     (store / "zarr.json").unlink()

@@ -7,6 +7,7 @@ before it is looked at.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["store_layers"]
 
 _SHOT = "shot"
+_DONE = 1  # as a store's variable "status" marks a shot
 
 
 def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
@@ -70,7 +72,9 @@ def _opened(path: Path) -> xarray.Dataset:
         raise FileFormatError(f"{path} does not exist: expected a folder made by an inversion")
     try:
         # Nothing in it is a time, whatever its units look like.
-        dataset: xr.Dataset = xr.open_zarr(path, decode_times=False, consolidated=False)
+        dataset: xr.Dataset = xr.open_zarr(
+            path, chunks={}, decode_times=False, mask_and_scale=False, consolidated=False
+        )
     except MemoryError:
         raise
     except Exception as error:
@@ -102,9 +106,12 @@ class _StoreLayers:
 
     def _first_done(self) -> int:
         displacement = self._dataset["displacement"]
-        for shot in range(displacement.sizes[_SHOT]):
+        shots: Iterable[int] = range(displacement.sizes[_SHOT])
+        if self._is_run("status"):
+            shots = np.flatnonzero(self._dataset["status"].values == _DONE)
+        for shot in shots:
             if np.isfinite(displacement[shot].values).all():
-                return shot
+                return int(shot)
         raise FileFormatError(f"{self._path} holds no finished shot yet: wait for the first one")
 
     def layers(self) -> list[FullLayerData]:
