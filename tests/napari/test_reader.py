@@ -307,7 +307,7 @@ def test_shots_that_are_marked_as_pending_are_not_looked_at(store: Path, solved:
     strongest = np.hypot(*solved.displacement).max()
     setup = setup_of(described["field"])
     assert isinstance(setup, ProtonSetup)
-    factor = np.hypot(*setup.path_integrated_b([1.0, 0.0])) * 1e3
+    factor = np.hypot(*setup.path_integrated_b([1.0, 0.0])) * 1e6  # half is below 1 mT·m
     assert described["field"]["contrast_limits"][1] == pytest.approx(0.5 * factor * strongest)
 
 
