@@ -7,6 +7,7 @@
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
 - predict the image of the same object in another experiment: `project`, `project_potential`
 - read and write files: `read`, `write`
+- show a result in a napari viewer: `add_inversion`
 
 Arrays are ``[y, x]``, vectors in axis order (y, x), a pixel's centre is at its integer
 index, and lengths are object-plane pixels unless a setup makes them SI.
@@ -18,6 +19,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import add_inversion
     from napari_shadowinv.error_bars import Uncertainty, uncertainty
     from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
     from napari_shadowinv.inversion import Inversion, Report, invert, plan_sites
@@ -41,6 +43,7 @@ __all__ = [
     "Radiograph",
     "Report",
     "Uncertainty",
+    "add_inversion",
     "invert",
     "plan_sites",
     "poisson_invert",
@@ -64,6 +67,7 @@ _HOME = {
     "Radiograph": "io",
     "Report": "inversion",
     "Uncertainty": "error_bars",
+    "add_inversion": "_napari.layers",
     "invert": "inversion",
     "plan_sites": "inversion",
     "poisson_invert": "physics.poisson",

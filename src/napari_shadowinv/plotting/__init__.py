@@ -3,13 +3,21 @@
 - all of one shot on a page: `report_figure`
 - fields side by side on one scale: `comparison_figure`
 - write a figure, whole or not at all: `save_figure`
-- the field that an experimenter asks for, in a handy unit: `shown_fields`
+- the field that an experimenter asks for, in a handy unit: `shown_fields`; the potential:
+  `shown_potential`
 
 The figures use matplotlib's objects and no pyplot, so they neither need a window nor
 disturb the figures of a notebook.
 """
 
 from napari_shadowinv.plotting._figures import comparison_figure, report_figure, save_figure
-from napari_shadowinv.plotting._units import ShownField, shown_fields
+from napari_shadowinv.plotting._units import ShownField, shown_fields, shown_potential
 
-__all__ = ["ShownField", "comparison_figure", "report_figure", "save_figure", "shown_fields"]
+__all__ = [
+    "ShownField",
+    "comparison_figure",
+    "report_figure",
+    "save_figure",
+    "shown_fields",
+    "shown_potential",
+]

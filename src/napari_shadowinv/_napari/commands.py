@@ -1,0 +1,250 @@
+"""One click on the selected image: what the menus *Layers > Measure* and *Filter* offer.
+
+- the whole inversion with its defaults: `invert_uniform`
+- before it: `remove_hot_pixels`, `high_pass`, and the beam by `estimate_source`
+
+Each makes new layers that lie on the selected one, keep its setup, and are named after it. A
+stack gives the shot that is shown. From a menu the work is done beside the window, with a
+cross to cancel it in napari's activity dock; from a script it is done at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv._napari.frame import Frame, frame_of
+from napari_shadowinv._napari.marks import setup_of
+from napari_shadowinv._napari.notices import MISTAKES, in_event_loop, show_mistake, told
+from napari_shadowinv.errors import InputError, InversionCancelled
+
+if TYPE_CHECKING:
+    import napari.layers
+    import napari.types
+
+    import napari
+    from napari_shadowinv._napari.layers import FullLayerData
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+__all__ = ["estimate_source", "high_pass", "invert_uniform", "remove_hot_pixels"]
+
+ShouldStop = Callable[[], bool]
+
+_HIGH_PASS_SHARE = 0.15
+
+
+@dataclass(frozen=True)
+class _Picked:
+    """The image that a command works on."""
+
+    image: NDArray[Any]
+    name: str
+    frame: Frame
+    setup: ProtonSetup | OpticalSetup | None
+
+
+def _nothing() -> list[Any]:
+    return []
+
+
+@told(otherwise=_nothing)
+def invert_uniform(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> list[napari.types.LayerDataTuple]:
+    """Invert the selected image against a uniform source, with the default options.
+
+    Parameters
+    ----------
+    layer : napari.layers.Image
+        A grey image, or a stack of them.
+    viewer : napari.Viewer, optional
+        Tells which shot of a stack is meant.
+
+    Returns
+    -------
+    list of (data, keywords, layer type)
+        The layers of the result. From a menu they come later, and this is empty.
+
+    Raises
+    ------
+    InputError
+        If no grey image is selected or it cannot be inverted; from a menu, the user is told.
+    """
+    return _begin(_picked(layer, viewer), _inverted, "Inverting", viewer)
+
+
+@told(otherwise=_nothing)
+def remove_hot_pixels(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> list[napari.types.LayerDataTuple]:
+    """Replace pixels that stand out of the noise by the median of their neighbours.
+
+    Parameters
+    ----------
+    layer, viewer
+        See `invert_uniform`.
+
+    Returns
+    -------
+    list of (data, keywords, layer type)
+        The repaired image, with the number of such pixels in its name.
+    """
+    return _begin(_picked(layer, viewer), _repaired, "Removing hot pixels from", viewer)
+
+
+@told(otherwise=_nothing)
+def high_pass(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> list[napari.types.LayerDataTuple]:
+    """Take away structures larger than some 0.15 of the image's shorter side; the mean stays.
+
+    Parameters
+    ----------
+    layer, viewer
+        See `invert_uniform`.
+
+    Returns
+    -------
+    list of (data, keywords, layer type)
+        The filtered image.
+    """
+    return _begin(_picked(layer, viewer), _high_passed, "Filtering", viewer)
+
+
+@told(otherwise=_nothing)
+def estimate_source(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> list[napari.types.LayerDataTuple]:
+    """Estimate the undisturbed beam as the image of least total variation near the selected one.
+
+    Parameters
+    ----------
+    layer, viewer
+        See `invert_uniform`.
+
+    Returns
+    -------
+    list of (data, keywords, layer type)
+        The estimate, to be chosen as the source of an inversion.
+    """
+    return _begin(_picked(layer, viewer), _beam, "Estimating the source of", viewer)
+
+
+def _picked(layer: Any, viewer: Any) -> _Picked:
+    """Take the plane that is shown of an image layer."""
+    from napari.layers import Image
+
+    if layer is None:
+        raise InputError("no layer is selected: select one image in the layer list")
+    if not isinstance(layer, Image) or layer.rgb:
+        is_colour = isinstance(layer, Image)
+        kind = "a colour image" if is_colour else f"of type {layer.__class__.__name__}"
+        raise InputError(f"layer '{layer.name}' is {kind}: select a grey image")
+    data = layer.data[0] if layer.multiscale else layer.data
+    name = layer.name
+    if data.ndim > 2:
+        at = _shown(viewer, data.ndim)
+        data, name = data[at], f"{name} {','.join(map(str, at))}"
+    return _Picked(np.asarray(data), name, frame_of(layer), setup_of(layer))
+
+
+def _shown(viewer: Any, ndim: int) -> tuple[int, ...]:
+    """Index of the plane that is shown, of a layer with more axes than y and x."""
+    if viewer is None:
+        return (0,) * (ndim - 2)
+    return tuple(int(step) for step in viewer.dims.current_step[-ndim:-2])
+
+
+Work = Callable[[_Picked, ShouldStop], "list[FullLayerData]"]
+
+
+def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
+    """Do the work at once, or beside a window."""
+    if viewer is None or not in_event_loop():
+        return list(work(picked, lambda: False))
+    _work_beside(picked, work, f"{doing} {picked.name}", viewer)
+    return []
+
+
+def _work_beside(picked: _Picked, work: Work, title: str, viewer: Any) -> None:
+    from napari.qt.threading import create_worker
+    from napari.utils import cancelable_progress
+
+    from napari_shadowinv._napari.layers import add_layers
+
+    bar = cancelable_progress(total=0, desc=title)
+
+    def finish(outcome: tuple[list[FullLayerData], Exception | None]) -> None:
+        layers, error = outcome
+        bar.close()
+        if error is None:
+            add_layers(viewer, layers)
+        elif isinstance(error, MISTAKES):
+            show_mistake(error)
+        elif not isinstance(error, InversionCancelled):
+            raise error
+
+    # An error must not leave the worker: what napari then does differs between its versions.
+    def run() -> tuple[list[FullLayerData], Exception | None]:
+        # A closing window asks its workers to stop; the cross only leaves a mark on the bar.
+        try:
+            return work(picked, lambda: bar.is_canceled or worker.abort_requested), None
+        except Exception as error:
+            return [], error
+
+    worker = create_worker(run)
+    worker.returned.connect(finish)
+    worker.start()
+
+
+def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+    from napari_shadowinv._napari.layers import inversion_layers
+    from napari_shadowinv.inversion import invert
+
+    inversion = invert(picked.image, should_stop=should_stop)
+    frame = picked.frame
+    return inversion_layers(
+        inversion,
+        picked.setup,
+        name=picked.name,
+        scale=frame.scale,
+        translate=frame.translate,
+        units=frame.units,
+    )
+
+
+def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+    from napari_shadowinv.filters import remove_hot_pixels as remove
+
+    image, hot, dead = remove(picked.image)
+    return [_filtered(picked, image, f"without {int((hot | dead).sum())} hot or dead pixels")]
+
+
+def _high_passed(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+    from napari_shadowinv.filters import high_pass as remove_large
+
+    width = _HIGH_PASS_SHARE * min(picked.image.shape)
+    return [_filtered(picked, remove_large(picked.image, width), f"high-pass σ={width:.3g} px")]
+
+
+def _beam(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+    from napari_shadowinv.sources import total_variation_source
+
+    source = total_variation_source(picked.image)
+    return [_filtered(picked, source, "source by total variation", role="source")]
+
+
+def _filtered(
+    picked: _Picked, image: NDArray[np.float64], title: str, role: str = "image"
+) -> FullLayerData:
+    from napari_shadowinv._napari.layers import intensity_limits
+    from napari_shadowinv._napari.shots import shot_layer
+
+    # The same limits show what a filter did.
+    limits = intensity_limits(picked.image)
+    name = f"{picked.name} {title}"
+    return shot_layer(image, name, picked.setup, limits, role, frame=picked.frame)

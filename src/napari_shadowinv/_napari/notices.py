@@ -1,0 +1,72 @@
+"""What napari's user is told: one sentence for a mistake, not a traceback.
+
+- whether somebody is looking: `in_event_loop`
+- a function whose user's mistakes become notifications: `told`; one such: `show_mistake`
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from napari_shadowinv.errors import InputError
+
+__all__ = ["MISTAKES", "in_event_loop", "show_mistake", "told"]
+
+MISTAKES = (InputError, OSError, MemoryError)
+"""What a user can mend; all else is a fault of the program, whose traceback is needed."""
+
+Answer = TypeVar("Answer")
+
+
+def in_event_loop() -> bool:
+    """Whether the call comes from a window: a menu, a dialog, napari's console.
+
+    A script that calls napari gets exceptions, as any Python function raises them.
+    """
+    if "qtpy" not in sys.modules:
+        return False
+    from qtpy.QtCore import QThread
+
+    thread = QThread.currentThread()
+    return thread is not None and thread.loopLevel() > 0
+
+
+def told(otherwise: Callable[[], Answer]) -> Callable[..., Callable[..., Answer]]:
+    """Turn a user's mistake into one notification, if a window is there to show it.
+
+    Parameters
+    ----------
+    otherwise : callable
+        Makes what the function returns then.
+
+    Returns
+    -------
+    callable
+        A decorator. In a script, the errors are raised as they are.
+    """
+
+    def decorate(function: Callable[..., Answer]) -> Callable[..., Answer]:
+        @functools.wraps(function)
+        def guarded(*args: Any, **kwargs: Any) -> Answer:
+            try:
+                return function(*args, **kwargs)
+            except MISTAKES as error:
+                if not in_event_loop():
+                    raise
+                show_mistake(error)
+                return otherwise()
+
+        return guarded
+
+    return decorate
+
+
+def show_mistake(error: BaseException) -> None:
+    """Show a mistake as one notification."""
+    from napari.utils.notifications import show_error
+
+    text = str(error) or "there is not enough memory for this"
+    show_error(text[:1].upper() + text[1:])

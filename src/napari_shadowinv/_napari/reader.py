@@ -1,0 +1,132 @@
+"""What napari opens with this plugin: `get_reader`.
+
+Results (``.shadowinv``, stores ``.shadowinv.zarr``), pradformat, and the radiographs that napari
+itself cannot read; folders and lists of shots become one lazy stack. Asking whether a file can
+be read imports neither napari nor a compiler and reads a header at most.
+"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from napari_shadowinv._napari.notices import told
+from napari_shadowinv.errors import FileFormatError
+
+if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import FullLayerData
+
+__all__ = ["get_reader", "read_paths"]
+
+_STORE_SUFFIX = ".shadowinv.zarr"
+_RESULT_SUFFIX = ".shadowinv"
+_HDF5_SUFFIXES = (".h5", ".hdf5")
+
+ReaderFunction = Callable[[str | Sequence[str]], "list[Any]"]
+
+
+def get_reader(path: str | Sequence[str]) -> ReaderFunction | None:
+    """Return what reads a path, None if this plugin cannot.
+
+    Parameters
+    ----------
+    path : str or sequence of str
+        A file, a folder, a pattern with ``*``, or a list of files to be stacked.
+
+    Returns
+    -------
+    callable or None
+        `read_paths`.
+    """
+    if not isinstance(path, str):
+        return read_paths if path and all(_is_image_name(Path(item)) for item in path) else None
+    if path.endswith(_STORE_SUFFIX) or Path(path).suffix.lower() == _RESULT_SUFFIX:
+        return read_paths
+    if "*" in path:
+        return read_paths if any(map(_is_image_name, _matches(path))) else None
+    return read_paths if _can_read(Path(path)) else None
+
+
+def _can_read(path: Path) -> bool:
+    from napari_shadowinv._napari.shots import images_in
+
+    if path.is_dir():
+        return bool(images_in(path))
+    if path.suffix.lower() in _HDF5_SUFFIXES:
+        return _is_ours(path)
+    return _is_image_name(path)
+
+
+def _is_image_name(path: Path) -> bool:
+    from napari_shadowinv._napari.shots import IMAGE_SUFFIXES
+
+    return path.suffix.lower() in IMAGE_SUFFIXES
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether HDF5 is pradformat or a result; much else has that ending."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            kind = file.attrs.get("object_type", b"")
+            return "format" in file.attrs or kind in ("radiograph", "inversion")
+    except (OSError, RuntimeError, KeyError):
+        return False
+
+
+@told(otherwise=lambda: [(None,)])  # napari's sign for: dealt with, and nothing to add
+def read_paths(path: str | Sequence[str]) -> list[Any]:
+    """Read a file, a folder or a list of files as layers.
+
+    Parameters
+    ----------
+    path : str or sequence of str
+        As for `get_reader`.
+
+    Returns
+    -------
+    list of (data, keywords, layer type)
+        The layers.
+
+    Raises
+    ------
+    FileFormatError, InputError
+        If a file cannot be read; in a window, the user is told instead.
+    """
+    from napari_shadowinv._napari.shots import images_in, stack_layers
+
+    if not isinstance(path, str):
+        return list(stack_layers([Path(item) for item in path]))
+    if path.rstrip("/").endswith(_STORE_SUFFIX):
+        from napari_shadowinv._napari.stores import store_layers
+
+        return list(store_layers(Path(path)))
+    if "*" in path:
+        return list(stack_layers(_matches(path)))
+    if Path(path).is_dir():
+        folder = Path(path)
+        images = images_in(folder)
+        if not images:
+            raise FileFormatError(f"{folder} holds no image: expected radiographs in it")
+        return list(stack_layers(images, folder.name))
+    return _read_file(Path(path))
+
+
+def _matches(pattern: str) -> list[Path]:
+    from napari_shadowinv._napari.shots import in_counting_order
+
+    return in_counting_order(Path(name) for name in glob.glob(pattern))
+
+
+def _read_file(path: Path) -> list[FullLayerData]:
+    from napari_shadowinv._napari.saved import layers_of_dataset
+    from napari_shadowinv._napari.shots import radiograph_layers
+    from napari_shadowinv.io import Radiograph, read
+
+    content = read(path)
+    if isinstance(content, Radiograph):
+        return radiograph_layers(content)
+    return layers_of_dataset(content, path.stem)

@@ -1,0 +1,137 @@
+"""Sample data: shots of known objects, made when they are asked for.
+
+- one object: `toroid`, `toroid_with_caustics`, `four_toroids`; with the shadow of what stands
+  in the beam: `coaxial_line`
+- a run of shots that change with time: `wakefield_run`
+
+Each shot carries its setup, and its undisturbed beam where that is not uniform.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv._napari.lazy import lazy_stack
+from napari_shadowinv._napari.shots import radiograph_layers, shot_layer
+
+if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import FullLayerData
+    from napari_shadowinv.physics.phantoms import Phantom
+    from napari_shadowinv.physics.setup import ProtonSetup
+
+__all__ = [
+    "coaxial_line",
+    "four_toroids",
+    "toroid",
+    "toroid_with_caustics",
+    "wakefield_run",
+]
+
+_SHAPE = (200, 200)
+_COUNTS = 400.0
+"""Mean counts of a pixel: 5 % of noise."""
+
+_TOROID_RADIUS = 30e-6
+_BELOW_CAUSTICS = 97.0
+_WITH_CAUSTICS = 194.0
+"""Peak fields of the paper's toroid in MG µm; the first caustics form at 194."""
+
+_RUN_SHAPE = (120, 320)
+_RUN_LENGTH = 20
+_RUN_COUNTS = 2500.0
+
+
+def toroid() -> list[FullLayerData]:
+    """Toroidal field of 97 MG µm, too weak for caustics, under a Gaussian beam."""
+    return _proton_shot("toroid", _toroid_of(_BELOW_CAUSTICS), _gaussian_beam())
+
+
+def toroid_with_caustics() -> list[FullLayerData]:
+    """Toroidal field of 194 MG µm, at which caustics form, under a uniform beam."""
+    return _proton_shot("toroid with caustics", _toroid_of(_WITH_CAUSTICS))
+
+
+def four_toroids() -> list[FullLayerData]:
+    """Four toroids of different strength and size under an uneven beam."""
+    from napari_shadowinv.physics import phantoms
+
+    setup = phantoms.paper_setup()
+    return _proton_shot("four toroids", phantoms.four_toroids(_SHAPE, setup, 0.8), _uneven_beam())
+
+
+def coaxial_line() -> list[FullLayerData]:
+    """Field between two conductors that stop the beam; the source holds their shadow."""
+    from napari_shadowinv.physics import phantoms
+
+    phantom, obstructed = phantoms.coaxial_line(_SHAPE, phantoms.paper_setup())
+    return _proton_shot("coaxial line", phantom, np.where(obstructed, 0.0, 1.0))
+
+
+def wakefield_run() -> list[FullLayerData]:
+    """Twenty optical shots of a plasma wave that moves, grows and fades; made when shown."""
+    from napari_shadowinv._napari.layers import intensity_limits
+    from napari_shadowinv.physics.phantoms import wakefield_setup
+
+    stack = lazy_stack(_wakefield_shot, range(_RUN_LENGTH), _RUN_SHAPE)
+    limits = intensity_limits(_wakefield_shot(_RUN_LENGTH // 2))
+    return [shot_layer(stack, "wakefield run", wakefield_setup(), limits)]
+
+
+def _toroid_of(peak: float) -> Phantom:
+    from napari_shadowinv.physics import phantoms
+
+    return phantoms.toroid(_SHAPE, phantoms.paper_setup(), peak, _TOROID_RADIUS)
+
+
+def _proton_shot(
+    name: str, phantom: Phantom, beam: NDArray[np.float64] | None = None
+) -> list[FullLayerData]:
+    from napari_shadowinv.io import Radiograph
+    from napari_shadowinv.physics.phantoms import paper_setup
+
+    setup: ProtonSetup = paper_setup()
+    source = None if beam is None else _COUNTS * beam
+    image = _counted(phantom, np.full(_SHAPE, _COUNTS) if source is None else source, seed=1)
+    return radiograph_layers(Radiograph(image, setup=setup, source=source), name)
+
+
+def _counted(phantom: Phantom, source: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+    """Image of a source through an object, with the noise of counting."""
+    from napari_shadowinv.physics.forward import synthetic_image
+
+    expected = synthetic_image(phantom.displacement, source)
+    return np.random.default_rng(seed).poisson(expected).astype(np.float64)
+
+
+def _places() -> tuple[NDArray[Any], NDArray[Any]]:
+    """Coordinates from -1 to 1 on both axes."""
+    y, x = (np.linspace(-1, 1, side) for side in _SHAPE)
+    return y[:, None], x[None, :]
+
+
+def _gaussian_beam() -> NDArray[np.float64]:
+    y, x = _places()
+    return np.asarray(0.25 + np.exp(-((y - 0.1) ** 2 + (x + 0.15) ** 2) / 1.4))
+
+
+def _uneven_beam() -> NDArray[np.float64]:
+    y, x = _places()
+    return np.asarray(1 + 0.3 * np.sin(2.3 * x + 0.4) * np.cos(1.7 * y - 0.3) + 0.15 * x)
+
+
+def _wakefield_shot(shot: int) -> NDArray[np.float64]:
+    """One moment: the wave comes in from the left, is strongest in the middle, and decays."""
+    from napari_shadowinv.physics.phantoms import wakefield, wakefield_setup
+
+    phase = shot / (_RUN_LENGTH - 1)
+    height, width = _RUN_SHAPE
+    wave = wakefield(
+        _RUN_SHAPE,
+        wakefield_setup(),
+        0.8 * np.sin(np.pi * (0.15 + 0.75 * phase)) ** 2,
+        center=((height - 1) / 2, width * (0.2 + 0.6 * phase)),
+    )
+    return _counted(wave, np.full(_RUN_SHAPE, _RUN_COUNTS), seed=shot)

@@ -1,0 +1,164 @@
+"""How layers looked, kept with a result, so that they come back as they were.
+
+- a result's layers from its dataset: `layers_of_dataset`
+- a result's dataset from its layers: `dataset_of_layers`
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv._napari.frame import frame_for
+from napari_shadowinv._napari.layers import FullLayerData, result_layers
+from napari_shadowinv._napari.marks import Result, role_of
+
+if TYPE_CHECKING:
+    import xarray
+
+    from napari_shadowinv.inversion import Inversion
+
+__all__ = ["dataset_of_layers", "layers_of_dataset"]
+
+_LOOKS = "napari_layers"
+_FLUX_RESIDUAL = "site_flux_residual"
+
+# Attributes that the dataset of a result makes anew.
+_OWN_ATTRIBUTES = {
+    "format",
+    "options",
+    "report",
+    "setup",
+    "package_version",
+    "created",
+    _LOOKS,
+}
+
+_PLACE = ("scale", "translate", "units")
+_KEPT: dict[str, tuple[str, ...]] = {
+    "image": ("colormap", "contrast_limits", "gamma", "interpolation2d"),
+    "labels": (),
+    "points": ("face_colormap", "face_contrast_limits"),
+    "vectors": ("length", "edge_width", "vector_style"),
+    "shapes": ("edge_width",),
+}
+_KEPT_BY_ALL = ("name", "visible", "opacity", "blending", *_PLACE)
+
+
+def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]:
+    """Describe the layers of a result that was read.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result of an inversion, or a field of other origin.
+    name : str
+        Name of the shot, where the dataset does not tell how its layers were called.
+
+    Returns
+    -------
+    list of (data, keywords, layer type)
+        The layers as they were saved. Those that were not saved with it are hidden.
+    """
+    from napari_shadowinv.io import inversion_from_dataset, setup_from_dataset
+
+    looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
+    setup = setup_from_dataset(dataset)
+    residual = dataset.get(_FLUX_RESIDUAL)
+    result = Result(
+        inversion_from_dataset(dataset) if "report" in dataset.attrs else dataset,
+        setup,
+        {key: value for key, value in dataset.attrs.items() if key not in _OWN_ATTRIBUTES},
+        None if residual is None else np.asarray(residual),
+    )
+    place = next(iter(looks.values()), {})
+    shape = dataset["displacement"].shape[-2:]
+    frame = frame_for(shape, setup, **{key: place.get(key) for key in _PLACE})
+    layers = result_layers(result, frame, name, cells="cells" in looks)
+    return [_as_it_was(layer, looks) for layer in layers]
+
+
+def _as_it_was(layer: FullLayerData, looks: dict[str, dict[str, Any]]) -> FullLayerData:
+    data, keywords, kind = layer
+    if not looks:
+        return layer
+    known = looks.get(role_of(keywords) or "", {"visible": False})
+    return data, {**keywords, **known}, kind
+
+
+def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray.Dataset:
+    """Make the dataset of a result that keeps how its layers look.
+
+    Parameters
+    ----------
+    layers : sequence of (data, keywords, layer type)
+        Layers of one result.
+    result : Result
+        The result behind them.
+
+    Returns
+    -------
+    xarray.Dataset
+        All of the result; caustics as they were painted last.
+    """
+    import xarray as xr
+
+    from napari_shadowinv.io.dataset import FORMAT, dataset_from_inversion
+
+    content = result.content
+    looks = {role_of(layer[1]): _look(layer) for layer in layers}
+    kept = {_LOOKS: json.dumps(looks)}
+    if isinstance(content, xr.Dataset):
+        return content.assign_attrs({"format": FORMAT, **kept})
+    dataset = dataset_from_inversion(
+        _with_painted_caustics(content, layers),
+        result.setup,
+        attributes={**result.attributes, **kept},
+    )
+    if result.flux_residual is None:
+        return dataset
+    labels = {"units": "1", "long_name": "Relative flux error of each site's cell"}
+    return dataset.assign({_FLUX_RESIDUAL: ("site", result.flux_residual, labels)})
+
+
+def _with_painted_caustics(inversion: Inversion, layers: Sequence[FullLayerData]) -> Inversion:
+    for data, keywords, _ in layers:
+        if role_of(keywords) == "caustic":
+            return replace(inversion, caustic=np.asarray(data) > 0)
+    return inversion
+
+
+def _look(layer: FullLayerData) -> dict[str, Any]:
+    _, keywords, kind = layer
+    names = (*_KEPT_BY_ALL, *_KEPT.get(kind, ()))
+    return {name: _plain(keywords[name]) for name in names if keywords.get(name) is not None}
+
+
+def _plain(value: Any) -> Any:
+    """Make a keyword fit for JSON."""
+    if isinstance(value, dict):
+        return _plain_colormap(value)
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    return value if isinstance(value, (bool, int, float)) else str(value)
+
+
+def _plain_colormap(colormap: dict[str, Any]) -> Any:
+    """Keep a colour map that napari knows by its name, any other by its colours."""
+    from napari.utils.colormaps import AVAILABLE_COLORMAPS, ensure_colormap
+
+    name = colormap.get("name")
+    if name in AVAILABLE_COLORMAPS and np.array_equal(
+        ensure_colormap(name).colors, colormap["colors"]
+    ):
+        return name
+    kept = ("name", "colors", "controls")
+    return {key: _plain(colormap[key]) for key in kept if key in colormap}

@@ -1,0 +1,143 @@
+"""What can be told about each site, and the shape of its cell.
+
+- numbers by site: `site_features`, `flux_residual`
+- the cells as polygons inside the image: `power_cells`
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError
+
+if TYPE_CHECKING:
+    from napari_shadowinv.geometry.power_diagram import PowerDiagram
+    from napari_shadowinv.inversion import Inversion
+
+__all__ = ["MOST_CELLS", "flux_residual", "power_cells", "site_features", "site_spacing"]
+
+Array = NDArray[np.float64]
+
+MOST_CELLS = 5_000
+
+
+def site_features(inversion: Inversion, flux_residual: Array | None) -> dict[str, Array]:
+    """Gather what is known about each site.
+
+    Parameters
+    ----------
+    inversion : Inversion
+        The result.
+    flux_residual : ndarray, shape (n,), or None
+        See `flux_residual`; left out if None.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (n,)
+        ``weight`` in px², ``mass`` in the source's flux, ``displacement`` in px, and
+        ``flux residual``, relative.
+    """
+    features = {
+        "weight": inversion.weights,
+        "mass": inversion.site_mass,
+        "displacement": np.hypot(*inversion.site_displacement.T),
+    }
+    if flux_residual is not None:
+        features["flux residual"] = flux_residual
+    return features
+
+
+def site_spacing(inversion: Inversion) -> float:
+    """Return the mean distance of neighbouring sites in px."""
+    return float(np.sqrt(inversion.potential.size / len(inversion.sites)))
+
+
+def flux_residual(inversion: Inversion) -> Array:
+    """Compare the flux in each site's cell with what the source gives it.
+
+    Parameters
+    ----------
+    inversion : Inversion
+        The result.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        (T - S) / S: positive where the cell holds too much of the image. Its largest
+        absolute value is the report's residual.
+    """
+    return _diagram(inversion).masses / inversion.site_mass - 1
+
+
+def power_cells(inversion: Inversion) -> tuple[list[Array], NDArray[np.intp]]:
+    """Find the power cells that the solver ended with.
+
+    Parameters
+    ----------
+    inversion : Inversion
+        The result, with 5,000 sites at most.
+
+    Returns
+    -------
+    polygons : list of ndarray, shape (k, 2)
+        Corners (y, x) of each cell, cut off at the image's border.
+    sites : ndarray of int
+        The site of each polygon; an empty cell has none.
+
+    Raises
+    ------
+    InputError
+        If there are too many sites to draw.
+    """
+    count = len(inversion.sites)
+    if count > MOST_CELLS:
+        raise InputError(
+            f"the result has {count:,} sites: power cells can be shown for up to {MOST_CELLS:,}; "
+            "invert with fewer sites to see cells"
+        )
+    diagram = _diagram(inversion)
+    height, width = inversion.potential.shape
+    polygons = [_clipped(diagram.cell(site), height, width) for site in range(count)]
+    kept = np.flatnonzero([len(polygon) > 2 for polygon in polygons])
+    return [polygons[site] for site in kept], kept
+
+
+def _diagram(inversion: Inversion) -> PowerDiagram:
+    """Return the power diagram of the last step over the image that the solver saw."""
+    from napari_shadowinv.geometry.density import Density
+    from napari_shadowinv.geometry.power_diagram import PowerDiagram
+    from napari_shadowinv.geometry.triangulation import RegularTriangulation
+    from napari_shadowinv.preprocess import prepare
+
+    # The image of a result is clipped and scaled already; this raises it to the floor.
+    mask = None if inversion.mask.all() else inversion.mask
+    prepared = prepare(inversion.image, inversion.source, inversion.options, mask)
+    density = Density.from_image(prepared.floored_image)
+    triangulation = RegularTriangulation(inversion.sites, inversion.weights, region=density.region)
+    return PowerDiagram(triangulation, density, threads=inversion.options.threads)
+
+
+def _clipped(corners: Array, height: int, width: int) -> Array:
+    """Cut a convex polygon off at the image's border, one side after the other."""
+    for axis, sign, limit in (
+        (0, -1, 0.5),
+        (0, 1, height - 0.5),
+        (1, -1, 0.5),
+        (1, 1, width - 0.5),
+    ):
+        if not len(corners):
+            break
+        inside = limit - sign * corners[:, axis]
+        kept = []
+        for k in range(len(corners)):
+            before, after = inside[k - 1], inside[k]
+            if (before >= 0) != (after >= 0):
+                share = before / (before - after)
+                kept.append(corners[k - 1] + share * (corners[k] - corners[k - 1]))
+            if after >= 0:
+                kept.append(corners[k])
+        corners = np.array(kept).reshape(-1, 2)
+    return corners

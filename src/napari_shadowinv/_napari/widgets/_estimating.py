@@ -1,0 +1,102 @@
+"""Estimates of the source, again and again: the last one kept, and quick ones for a preview.
+
+- estimate, unless it is known already: `SourceCache`
+- estimate from larger pixels: `quick_source`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv._napari.widgets._recipes import Estimate
+
+__all__ = ["SourceCache", "quick_source", "same_array"]
+
+Image = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass
+class SourceCache:
+    """The last estimate, for the next run with the same image."""
+
+    _key: tuple[Estimate, bool] | None = None
+    _arrays: tuple[Image, Mask | None] | None = field(default=None, repr=False)
+    _source: Image | None = field(default=None, repr=False)
+
+    def source(
+        self, estimate: Estimate, image: Image, mask: Mask | None, most_pixels: int | None
+    ) -> Image:
+        """Return the source of an image.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            How to guess it.
+        image : ndarray, shape (H, W)
+            The shot.
+        mask : ndarray of bool, shape (H, W), or None
+            True where a pixel is usable.
+        most_pixels : int or None
+            Merge pixels until there are no more than these, to be quick.
+
+        Returns
+        -------
+        ndarray, shape (H, W)
+        """
+        key = (estimate, most_pixels is not None)
+        if self._source is not None and self._arrays is not None and key == self._key:
+            last_image, last_mask = self._arrays
+            if same_array(image, last_image) and same_array(mask, last_mask):
+                return self._source
+        if most_pixels is None:
+            source = estimate.source(image, mask)
+        else:
+            source = quick_source(estimate, image, mask, most_pixels)
+        self._key, self._arrays, self._source = key, (image, mask), source
+        return source
+
+
+def quick_source(estimate: Estimate, image: Image, mask: Mask | None, most_pixels: int) -> Image:
+    """Estimate the source from an image whose pixels are merged, and spread it again.
+
+    Parameters
+    ----------
+    estimate, image, mask, most_pixels
+        See `SourceCache.source`.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+        Linear between the middles of the merged pixels; the flux is that of the image.
+    """
+    factor = int(np.ceil(np.sqrt(image.size / most_pixels)))
+    if factor == 1 or min(image.shape) < 8 * factor:
+        return estimate.source(image, mask)
+    from scipy.ndimage import map_coordinates
+    from skimage.transform import downscale_local_mean
+
+    # It comes without types.
+    merged: Callable[..., Image] = downscale_local_mean
+    usable = np.ones(image.shape, bool) if mask is None else mask
+    share = merged(usable.astype(float), (factor, factor))
+    sums = merged(np.where(usable, image, 0.0), (factor, factor))
+    known = share > 0
+    coarse = np.where(known, sums / np.where(known, share, 1.0), 0.0)
+    beam = estimate.coarser(factor).source(coarse, None if known.all() else known)
+    middle = (factor - 1) / 2
+    places = np.meshgrid(*((np.arange(n) - middle) / factor for n in image.shape), indexing="ij")
+    fine = map_coordinates(beam, places, order=1, mode="nearest")
+    return np.asarray(fine * (image[usable].sum() / fine[usable].sum()))
+
+
+def same_array(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
+    """Whether two arrays hold the same, or both are none."""
+    if one is None or other is None:
+        return one is other
+    return one is other or np.array_equal(one, other)

@@ -1,0 +1,287 @@
+"""Editors for one field of a pydantic model each.
+
+- the right editor for a field: `editor_for`
+- what all of them have: `Editor`
+"""
+
+from __future__ import annotations
+
+import types
+from typing import Any, Literal, Union, get_args, get_origin
+
+from pydantic.fields import FieldInfo
+from qtpy.QtCore import QEvent, QObject, QSignalBlocker, Qt, Signal
+from qtpy.QtWidgets import QCheckBox, QComboBox, QHBoxLayout, QLineEdit, QSizePolicy, QWidget
+from superqt import QLabeledDoubleSlider, QLabeledSlider, QLargeIntSpinBox
+
+from napari_shadowinv._napari.widgets._quantities import parsed, shown, unit_of_title
+from napari_shadowinv.errors import InputError
+
+__all__ = ["Editor", "SteadyComboBox", "editor_for"]
+
+_LARGEST_INTEGER = 2**63 - 1
+_NOT_GIVEN = "not given"
+
+
+class _WheelGuard(QObject):
+    """Keeps the mouse wheel, meant to scroll the form, from changing what it passes over."""
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
+        if event.type() == QEvent.Type.Wheel and not watched.hasFocus():
+            event.ignore()
+            return True
+        return False
+
+
+def _steady(widget: QWidget) -> None:
+    widget.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+    widget.installEventFilter(_WheelGuard(widget))
+
+
+class SteadyComboBox(QComboBox):
+    """A combo box that is as narrow as it has to be, and does not follow the wheel."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
+        self.setMinimumContentsLength(8)
+        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        _steady(self)
+
+
+class Editor(QWidget):
+    """A widget that holds the value of one field; None if it holds none.
+
+    Signals
+    -------
+    changed
+        The user, or the program, changed the value.
+    """
+
+    changed = Signal()
+    # Whether the value is shown with its unit, so that the label need not tell it.
+    shows_unit = False
+
+    def __init__(self, inner: QWidget) -> None:
+        super().__init__()
+        self.inner = inner
+        row = QHBoxLayout(self)
+        row.setContentsMargins(0, 0, 0, 0)
+        row.addWidget(inner)
+
+    @property
+    def checked(self) -> bool:
+        """Whether the field is given; false only for an optional one whose box is empty."""
+        return True
+
+    def value(self) -> Any:
+        raise NotImplementedError
+
+    def set_value(self, value: Any) -> None:
+        raise NotImplementedError
+
+
+class _Flag(Editor):
+    def __init__(self) -> None:
+        super().__init__(QCheckBox())
+        self.inner.toggled.connect(self.changed)
+
+    def value(self) -> bool:
+        return bool(self.inner.isChecked())
+
+    def set_value(self, value: Any) -> None:
+        self.inner.setChecked(bool(value))
+
+
+class _Choice(Editor):
+    def __init__(self, choices: tuple[Any, ...]) -> None:
+        super().__init__(SteadyComboBox())
+        for choice in choices:
+            self.inner.addItem(str(choice), choice)
+        self.inner.currentIndexChanged.connect(self.changed)
+
+    def value(self) -> Any:
+        return self.inner.currentData()
+
+    def set_value(self, value: Any) -> None:
+        index = self.inner.findData(value)
+        if index >= 0:
+            self.inner.setCurrentIndex(index)
+
+
+class _Integer(Editor):
+    def __init__(self, least: int | None, most: int | None) -> None:
+        super().__init__(QLargeIntSpinBox())
+        self.inner.setMinimum(-_LARGEST_INTEGER if least is None else least)
+        self.inner.setMaximum(_LARGEST_INTEGER if most is None else most)
+        # Each key of a long number is no change of its own.
+        self.inner.setKeyboardTracking(False)
+        self.inner.setMinimumWidth(80)
+        self.inner.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        _steady(self.inner)
+        self.inner.valueChanged.connect(lambda _: self.changed.emit())
+
+    def value(self) -> int:
+        return int(self.inner.value())
+
+    def set_value(self, value: Any) -> None:
+        self.inner.setValue(int(value))
+
+
+class _Slider(Editor):
+    """For a number with both bounds, that one tries out by eye."""
+
+    def __init__(self, least: float, most: float, whole: bool) -> None:
+        slider = QLabeledSlider if whole else QLabeledDoubleSlider
+        super().__init__(slider(Qt.Orientation.Horizontal))
+        self._whole = whole
+        if not whole:
+            self.inner.setDecimals(2)
+        self.inner.setRange(least, most)
+        _steady(self.inner)
+        self.inner.valueChanged.connect(lambda _: self.changed.emit())
+
+    def value(self) -> float:
+        value = self.inner.value()
+        return int(value) if self._whole else float(value)
+
+    def set_value(self, value: Any) -> None:
+        self.inner.setValue(int(value) if self._whole else float(value))
+
+
+class _Quantity(Editor):
+    """A number over many orders of magnitude, with its unit, as text."""
+
+    shows_unit = True
+
+    def __init__(self, unit: str) -> None:
+        super().__init__(QLineEdit())
+        self._unit = unit
+        self._value: float | None = None
+        self.inner.setPlaceholderText(f"in {unit}" if unit else "a number")
+        self.inner.setMinimumWidth(80)
+        self.inner.editingFinished.connect(self._take)
+
+    def value(self) -> float | str | None:
+        """The number; the text itself where it is none, for the model to refuse."""
+        return self.inner.text() if self._value is None and self.inner.text() else self._value
+
+    def set_value(self, value: Any) -> None:
+        self._value = None if value is None else float(value)
+        self._show()
+        self.changed.emit()
+
+    def _take(self) -> None:
+        text = self.inner.text().strip()
+        if self._value is not None and text == shown(self._value, self._unit):
+            return
+        try:
+            self._value = parsed(text, self._unit) if text else None
+        except InputError as error:
+            self._value = None
+            self.inner.setToolTip(str(error))
+        else:
+            self._show()
+        self.changed.emit()
+
+    def _show(self) -> None:
+        self.inner.setToolTip("")
+        self.inner.setText("" if self._value is None else shown(self._value, self._unit))
+        self.inner.setCursorPosition(0)
+
+
+class _Optional(Editor):
+    """Another editor behind a check box; None while it is not checked."""
+
+    def __init__(self, editor: Editor) -> None:
+        super().__init__(QCheckBox(_NOT_GIVEN))
+        self.editor = editor
+        self.shows_unit = editor.shows_unit
+        self.layout().addWidget(editor, 1)
+        editor.setVisible(False)
+        self.inner.toggled.connect(self._on_toggle)
+        editor.changed.connect(self.changed)
+
+    @property
+    def checked(self) -> bool:
+        return bool(self.inner.isChecked())
+
+    def value(self) -> Any:
+        return self.editor.value() if self.checked else None
+
+    def set_value(self, value: Any) -> None:
+        with QSignalBlocker(self):
+            if value is not None:
+                self.editor.set_value(value)
+            self.inner.setChecked(value is not None)
+        self.changed.emit()
+
+    def _on_toggle(self, given: bool) -> None:
+        self.inner.setText("" if given else _NOT_GIVEN)
+        self.editor.setVisible(given)
+        self.changed.emit()
+
+
+def editor_for(field: FieldInfo, first: Any = None) -> Editor:
+    """Make the editor that suits a field's type and bounds.
+
+    Parameters
+    ----------
+    field : pydantic.fields.FieldInfo
+        A number, a choice or a yes/no, each of them optional or not. A number whose
+        ``json_schema_extra`` holds ``"slider": [least, most]`` gets a slider.
+    first : object, optional
+        What an optional field starts with when it is first checked.
+
+    Returns
+    -------
+    Editor
+        With the field's default as its value.
+    """
+    kind, optional = _without_none(field.annotation)
+    editor = _plain_editor(kind, field)
+    if optional:
+        if first is not None:
+            editor.set_value(first)
+        editor = _Optional(editor)
+    if not field.is_required():
+        editor.set_value(field.get_default())
+    return editor
+
+
+def _plain_editor(kind: Any, field: FieldInfo) -> Editor:
+    if get_origin(kind) is Literal:
+        return _Choice(get_args(kind))
+    if kind is bool:
+        return _Flag()
+    extra = field.json_schema_extra
+    slider = extra.get("slider") if isinstance(extra, dict) else None
+    if isinstance(slider, (tuple, list)):
+        return _Slider(slider[0], slider[1], whole=kind is int)  # type: ignore[arg-type]
+    if kind is int:
+        return _Integer(*_integer_bounds(field))
+    if kind is float:
+        return _Quantity(unit_of_title(field.title or "")[1])
+    raise TypeError(f"no editor for a field of type {kind}")
+
+
+def _without_none(annotation: Any) -> tuple[Any, bool]:
+    if get_origin(annotation) in (Union, types.UnionType):
+        kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
+        if len(kinds) == 1:
+            return kinds[0], True
+    return annotation, False
+
+
+def _integer_bounds(field: FieldInfo) -> tuple[int | None, int | None]:
+    least = most = None
+    for bound in field.metadata:
+        if hasattr(bound, "ge"):
+            least = bound.ge
+        elif hasattr(bound, "gt"):
+            least = bound.gt + 1
+        elif hasattr(bound, "le"):
+            most = bound.le
+        elif hasattr(bound, "lt"):
+            most = bound.lt - 1
+    return least, most

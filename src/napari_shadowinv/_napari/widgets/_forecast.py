@@ -1,0 +1,119 @@
+"""The image that an object would make, as plain arrays: no napari, no Qt.
+
+- predict an image: `ForwardJob`, with a `Forecast` as the answer
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv._napari.widgets._jobs import plane_of
+from napari_shadowinv._napari.widgets._phantoms import PhantomRecipe
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+__all__ = ["Forecast", "ForwardJob"]
+
+Image = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """The image that an object would make.
+
+    Attributes
+    ----------
+    image : ndarray, shape (H, W)
+        Flux of each pixel, in the unit of the source.
+    displacement : ndarray, shape (2, H, W)
+        Displacement of the rays, px.
+    caustic_share : float
+        Share of the pixels whose rays cross or nearly do.
+    kept : float
+        Share of the flux that lands inside the image.
+    """
+
+    image: Image
+    displacement: Image
+    caustic_share: float
+    kept: float
+
+    @property
+    def warning(self) -> str:
+        """What to know before planning with it; empty if there is nothing."""
+        texts = []
+        if self.caustic_share > 0:
+            texts.append(
+                f"Caustics: rays cross, or nearly do, in {self.caustic_share:.2%} of the pixels. "
+                "From there on one image no longer tells the whole field."
+            )
+        if self.kept < 0.99:
+            texts.append(f"Only {self.kept:.1%} of the flux lands inside the image.")
+        return " ".join(texts)
+
+
+@dataclass(frozen=True, eq=False)
+class ForwardJob:
+    """An image to predict.
+
+    Attributes
+    ----------
+    field : array_like, shape (H, W), or PhantomRecipe
+        A potential, or an object to make one.
+    shape : tuple of int
+        Height and width of a phantom's image; a potential has its own.
+    to_px2 : float
+        Factor that brings the potential to px².
+    setup : ProtonSetup or OpticalSetup, optional
+        The experiment; a magnetic phantom needs it.
+    source : array_like, shape (H, W), optional
+        The undisturbed beam. Default: uniform.
+    caustic_jacobian : float
+        See `InversionOptions`.
+    """
+
+    field: ArrayLike | PhantomRecipe
+    shape: tuple[int, int] = (200, 200)
+    to_px2: float = 1.0
+    setup: ProtonSetup | OpticalSetup | None = None
+    source: ArrayLike | None = None
+    caustic_jacobian: float = InversionOptions.model_fields["caustic_jacobian"].default
+
+    def run(
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+    ) -> Forecast:
+        """Predict it.
+
+        Raises
+        ------
+        InputError
+            If the field or the source cannot be used.
+        InversionCancelled
+            If `should_stop` returned true.
+        """
+        from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
+
+        report = Reporter(on_progress, should_stop)
+        report("field", 0, None)
+        displacement = self._displacement()
+        source = None if self.source is None else plane_of(self.source, "the source")
+        report("image", 0, None)
+        image = synthetic_image(displacement, source)
+        report("image", 1, 1)
+        caustic = jacobian_determinant(displacement) < self.caustic_jacobian
+        flux = image.size if source is None else source.sum()
+        return Forecast(image, displacement, float(caustic.mean()), float(image.sum() / flux))
+
+    def _displacement(self) -> Image:
+        from napari_shadowinv.io.dataset import displacement_from_potential
+
+        if isinstance(self.field, PhantomRecipe):
+            return self.field.phantom(self.shape, self.setup).displacement
+        return displacement_from_potential(self.to_px2 * plane_of(self.field, "the potential"))

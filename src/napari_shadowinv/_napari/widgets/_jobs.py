@@ -1,0 +1,275 @@
+"""What a widget computes, as plain arrays: no napari, no Qt.
+
+- invert a shot: `ShotJob`
+- keep the sites while the source stays: `PlanCache`
+- estimate a source: `SourceJob`
+- an array as a plane of floats: `plane_of`
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv._napari.widgets._estimating import SourceCache, quick_source, same_array
+from napari_shadowinv._napari.widgets._recipes import Estimate, Filter
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
+
+if TYPE_CHECKING:
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.transport.sites import SitePlan
+
+__all__ = ["PREVIEW_SITES", "Crop", "PlanCache", "ShotJob", "SourceJob", "plane_of"]
+
+Image = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Crop = tuple[slice, slice]
+
+PREVIEW_SITES = 10_000
+
+
+@dataclass
+class PlanCache:
+    """The sites of the last run, for the next one with the same source.
+
+    Attributes
+    ----------
+    hits : int
+        How often the work was saved.
+    """
+
+    hits: int = 0
+    _key: tuple[Any, ...] = ()
+    _arrays: tuple[Image, Mask | None] | None = None
+    _plan: SitePlan | None = field(default=None, repr=False)
+
+    def plan(
+        self,
+        source: Image,
+        mask: Mask | None,
+        options: InversionOptions,
+        on_progress: OnProgress | None,
+        should_stop: ShouldStop | None,
+    ) -> SitePlan:
+        """Return the sites for a source, made anew only if anything about them changed."""
+        from napari_shadowinv.inversion import plan_sites
+
+        key = (
+            options.n_sites,
+            options.lloyd_iterations,
+            options.lloyd_tolerance,
+            options.seed,
+            None if mask is None else options.floor,
+        )
+        if self._plan is not None and key == self._key and self._same(source, mask):
+            self.hits += 1
+            return self._plan
+        self._plan = plan_sites(
+            source, options, mask=mask, on_progress=on_progress, should_stop=should_stop
+        )
+        self._key, self._arrays = key, (source, mask)
+        return self._plan
+
+    def _same(self, source: Image, mask: Mask | None) -> bool:
+        if self._arrays is None:
+            return False
+        last_source, last_mask = self._arrays
+        # A filter keeps the mean of a uniform source to rounding only.
+        return (
+            source.shape == last_source.shape
+            and np.allclose(source, last_source, rtol=1e-9, atol=0)
+            and same_array(mask, last_mask)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ShotJob:
+    """One shot to invert, with all that it takes.
+
+    Attributes
+    ----------
+    image : array_like, shape (H, W)
+        The whole image; also one that is read only when it is needed.
+    source : array_like, shape (H, W), or Path or Estimate
+        The undisturbed beam, a file of it, or how to guess it.
+    mask : ndarray of bool, shape (H, W), optional
+        True where a pixel is usable.
+    crop : tuple of slice, optional
+        The part to invert.
+    cleaning : Filter, optional
+        What is done to the image first.
+    options : InversionOptions
+        Choices of the inversion.
+    cache : PlanCache
+        Sites of earlier runs.
+    estimates : SourceCache
+        The source that the last run has guessed.
+    preview : bool
+        Whether to be quick rather than exact.
+    """
+
+    image: ArrayLike
+    source: ArrayLike | Path | Estimate
+    mask: Mask | None = None
+    crop: Crop | None = None
+    cleaning: Filter | None = None
+    options: InversionOptions = field(default_factory=InversionOptions)
+    cache: PlanCache = field(default_factory=PlanCache)
+    estimates: SourceCache = field(default_factory=SourceCache)
+    preview: bool = False
+
+    def for_preview(self) -> ShotJob:
+        """The same with few enough sites, and pixels of an estimate, to be quick."""
+        wanted = self.options.n_sites or PREVIEW_SITES
+        fewer = self.options.model_copy(update={"n_sites": min(wanted, PREVIEW_SITES)})
+        return replace(self, options=fewer, preview=True)
+
+    def run(
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+    ) -> Inversion:
+        """Invert the shot.
+
+        Raises
+        ------
+        InputError
+            If image, source, mask or crop cannot be used.
+        InversionCancelled
+            If `should_stop` returned true.
+        """
+        from napari_shadowinv.inversion import invert
+        from napari_shadowinv.preprocess import number_of_sites, prepare
+
+        report = Reporter(on_progress, should_stop)
+        seconds: dict[str, float] = {}
+        clock = time.perf_counter()
+        report("prepare", 0, None, "image and source")
+        image, mask = self._image_and_mask()
+        if self.cleaning is not None:
+            image = self.cleaning.filtered(image, mask)
+        # Before the sites are spread: a mistake is told at once.
+        report("prepare", 0, None)
+        prepare(image, None, self.options, mask)
+        source = self._source(image, mask)
+        report("prepare", 0, None)
+        seconds["source"], clock = time.perf_counter() - clock, time.perf_counter()
+        n_sites = number_of_sites((image.shape[0], image.shape[1]), self.options)
+        options = self.options.model_copy(update={"n_sites": n_sites})
+        plan = self.cache.plan(source, mask, options, on_progress, should_stop)
+        seconds["sites"] = time.perf_counter() - clock
+        inversion = invert(
+            image, plan=plan, options=self.options, on_progress=on_progress, should_stop=should_stop
+        )
+        spent = inversion.report.seconds
+        seconds |= {stage: spent[stage] + seconds.get(stage, 0.0) for stage in spent}
+        return replace(inversion, report=replace(inversion.report, seconds=seconds))
+
+    def _image_and_mask(self) -> tuple[Image, Mask | None]:
+        image = plane_of(self.image, "the image")
+        mask = self.mask
+        if mask is not None and mask.shape != image.shape:
+            raise InputError(f"mask has shape {mask.shape}, image {image.shape}: they must match")
+        if self.crop is None:
+            return image, mask
+        return _cropped(image, self.crop), None if mask is None else mask[self.crop]
+
+    def _source(self, image: Image, mask: Mask | None) -> Image:
+        from napari_shadowinv.preprocess import checked_source
+
+        if isinstance(self.source, Estimate):
+            # What an inversion would clip must not spoil the estimate.
+            clipped = np.maximum(np.where(mask, image, 0) if mask is not None else image, 0)
+            return self.estimates.source(
+                self.source, clipped, mask, PREVIEW_SITES if self.preview else None
+            )
+        given = self.source
+        if isinstance(given, Path):
+            from napari_shadowinv.io import read_radiograph
+
+            given = read_radiograph(given).image
+        source = plane_of(given, "the source")
+        whole = np.shape(self.image)
+        if source.shape != whole:
+            raise InputError(f"source has shape {source.shape}, image {whole}: they must match")
+        if self.crop is not None:
+            source = source[self.crop]
+        return checked_source(source, np.ones(image.shape, bool) if mask is None else mask)
+
+
+@dataclass(frozen=True, eq=False)
+class SourceJob:
+    """A source to estimate from a shot.
+
+    Attributes
+    ----------
+    image : array_like, shape (H, W)
+        The shot.
+    estimate : Estimate
+        How.
+    mask : ndarray of bool, shape (H, W), optional
+        True where a pixel is usable.
+    quick : bool
+        Whether to merge the pixels of a large image first.
+    """
+
+    image: ArrayLike
+    estimate: Estimate
+    mask: Mask | None = None
+    quick: bool = False
+
+    def run(
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+    ) -> Image:
+        """Estimate it.
+
+        Raises
+        ------
+        InputError
+            If image and mask cannot be used.
+        InversionCancelled
+            If `should_stop` returned true.
+        """
+        report = Reporter(on_progress, should_stop)
+        report("source", 0, None, type(self.estimate).title)
+        image = plane_of(self.image, "the image")
+        if self.quick:
+            source = quick_source(self.estimate, image, self.mask, PREVIEW_SITES)
+        else:
+            source = self.estimate.source(image, self.mask)
+        report("source", 1, 1)
+        return source
+
+
+def plane_of(values: ArrayLike, name: str) -> Image:
+    """Return one image as floats, or say why it is none.
+
+    Raises
+    ------
+    InputError
+        If it is a stack, has channels, or does not hold real numbers.
+    """
+    array = np.asarray(values)
+    if array.ndim != 2:
+        raise InputError(
+            f"{name} has shape {array.shape}, expected two dimensions (y, x): choose one shot or "
+            "one channel"
+        )
+    if array.dtype.kind not in "buif":
+        raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
+    return array.astype(np.float64)
+
+
+def _cropped(image: Image, crop: Crop) -> Image:
+    part = image[crop]
+    if min(part.shape) < 4:
+        raise InputError(
+            f"the crop leaves {part.shape[1]} × {part.shape[0]} pixels of the image, expected "
+            "at least 4 × 4: draw a larger rectangle on it"
+        )
+    return part

@@ -1,0 +1,136 @@
+"""Which layers a widget works on.
+
+- choose a layer: `LayerPicker`
+- hear of what is painted, drawn or replaced in the chosen layers: `LayerWatch`
+- listen to napari for as long as a Qt widget lives: `while_alive`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from qtpy.QtCore import QObject, QSignalBlocker, Signal
+
+from napari_shadowinv._napari.widgets._fields import SteadyComboBox
+
+__all__ = ["LayerPicker", "LayerWatch", "kind_of", "while_alive"]
+
+
+def while_alive(widget: QObject, emitter: Any, callback: Callable[..., Any]) -> None:
+    """Connect to an event of a layer or viewer for as long as a Qt object lives."""
+    emitter.connect(callback)
+    widget.destroyed.connect(lambda *_: emitter.disconnect(callback))
+
+
+def kind_of(layer: Any) -> str:
+    """Return a layer's type, such as ``"image"`` or ``"labels"``."""
+    # Not by type(): a widget may be handed a proxy, which tells its content's class only here.
+    return str(layer.__class__.__name__).lower()
+
+
+class LayerPicker(SteadyComboBox):
+    """A combo box of the viewer's layers of some kinds.
+
+    Parameters
+    ----------
+    viewer : napari.Viewer
+        Its layers are offered.
+    kinds : tuple of str
+        Layer types, such as ``"image"``.
+    none : str
+        What to show for no layer; without it the latest layer is chosen.
+
+    Signals
+    -------
+    picked
+        Another layer, or none, is chosen.
+    """
+
+    picked = Signal()
+
+    def __init__(self, viewer: Any, kinds: tuple[str, ...], none: str = "") -> None:
+        super().__init__()
+        self._viewer, self._kinds, self._none = viewer, kinds, none
+        self._offered: list[Any] = []
+        self._fill()
+        self.currentIndexChanged.connect(lambda _: self.picked.emit())
+        for emitter in (viewer.layers.events.inserted, viewer.layers.events.removed):
+            while_alive(self, emitter, self._fill)
+        for layer in viewer.layers:
+            self._watch_name(layer)
+        while_alive(self, viewer.layers.events.inserted, self._on_insertion)
+
+    @property
+    def layer(self) -> Any | None:
+        """The chosen layer."""
+        index = self.currentIndex() - bool(self._none)
+        return self._offered[index] if 0 <= index < len(self._offered) else None
+
+    @layer.setter
+    def layer(self, layer: Any | None) -> None:
+        if layer is None:
+            self.setCurrentIndex(0 if self._none else -1)
+        elif layer in self._offered:
+            self.setCurrentIndex(self._offered.index(layer) + bool(self._none))
+
+    def _on_insertion(self, event: Any) -> None:
+        self._watch_name(event.value)
+
+    def _watch_name(self, layer: Any) -> None:
+        while_alive(self, layer.events.name, self._fill)
+
+    def _fill(self, event: Any = None) -> None:
+        before = self.layer
+        offered = [layer for layer in self._viewer.layers if kind_of(layer) in self._kinds]
+        with QSignalBlocker(self):
+            self.clear()
+            self._offered = offered
+            if self._none:
+                self.addItem(self._none)
+            for layer in offered:
+                self.addItem(layer.name)
+            if before in offered:
+                self.layer = before
+            elif not self._none and offered:
+                self.layer = offered[-1]
+        if self.layer is not before:
+            self.picked.emit()
+
+
+class LayerWatch(QObject):
+    """Tells when the content of chosen layers changes.
+
+    Parameters
+    ----------
+    pickers : sequence of LayerPicker
+        Where the layers are chosen.
+
+    Signals
+    -------
+    edited
+        Something was painted, drawn or replaced in a chosen layer.
+    """
+
+    edited = Signal()
+
+    def __init__(self, pickers: Sequence[LayerPicker]) -> None:
+        super().__init__()
+        self._pickers = pickers
+        self._watched: list[Any] = []
+        for picker in pickers:
+            picker.picked.connect(self._watch)
+        self._watch()
+
+    def _watch(self) -> None:
+        for layer in [picker.layer for picker in self._pickers]:
+            if layer is None or any(layer is known for known in self._watched):
+                continue
+            self._watched.append(layer)
+            for name in ("data", "paint"):
+                if hasattr(layer.events, name):
+                    while_alive(self, getattr(layer.events, name), self._on_event)
+
+    def _on_event(self, event: Any) -> None:
+        if any(event.source is picker.layer for picker in self._pickers):
+            self.edited.emit()

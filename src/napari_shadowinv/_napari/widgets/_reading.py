@@ -1,0 +1,138 @@
+"""Arrays from layers: `image_of`, `mask_of`, `crop_of`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv._napari.widgets._picking import kind_of
+from napari_shadowinv.errors import InputError
+
+__all__ = ["crop_of", "image_of", "mask_of"]
+
+Mask = NDArray[np.bool_]
+
+
+def image_of(layer: Any | None, role: str = "image") -> Any:
+    """The 2-D array of an image layer, not read yet if it is lazy.
+
+    Parameters
+    ----------
+    layer : napari.layers.Image or None
+        The layer.
+    role : str
+        What it is for, for the message.
+
+    Returns
+    -------
+    array_like, shape (H, W)
+
+    Raises
+    ------
+    InputError
+        If there is no layer, or it is no single grey image.
+    """
+    if layer is None:
+        raise InputError(
+            f"there is no {role} to work on: open one (File → Open), drop it on the window, or "
+            "take a sample (File → Open Sample)"
+        )
+    data = layer.data[0] if getattr(layer, "multiscale", False) else layer.data
+    if getattr(layer, "rgb", False):
+        raise InputError(
+            f"'{layer.name}' is a colour image, expected a grey one: split it (right click on "
+            "the layer → Split RGB) and choose one channel"
+        )
+    if data.ndim != 2:
+        raise InputError(
+            f"'{layer.name}' has shape {tuple(data.shape)}, expected one image (y, x): "
+            "split the stack (right click on the layer → Split Stack) and choose one shot"
+        )
+    return data
+
+
+def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> Mask | None:
+    """Usable pixels of an image layer, from labels or shapes drawn on it.
+
+    Parameters
+    ----------
+    layer : napari.layers.Labels or napari.layers.Shapes or None
+        What was painted; None, or nothing painted, for no mask.
+    image : napari.layers.Image
+        The image that it belongs to.
+    painted_is_unusable : bool
+        Whether the paint marks what to leave out, or what to use.
+
+    Returns
+    -------
+    ndarray of bool, shape (H, W), or None
+
+    Raises
+    ------
+    InputError
+        If labels are not of the image's shape.
+    """
+    if layer is None:
+        return None
+    shape = tuple(image_of(image).shape)
+    if kind_of(layer) == "labels":
+        painted = np.asarray(layer.data) != 0
+        if painted.shape != shape:
+            raise InputError(
+                f"the mask '{layer.name}' has shape {painted.shape}, the image {shape}: they "
+                "must match; make new labels while the image is the only layer"
+            )
+    else:
+        painted = _drawn(layer, image, shape)
+    if not painted.any():
+        return None
+    return ~painted if painted_is_unusable else painted
+
+
+def crop_of(layer: Any | None, image: Any) -> tuple[slice, slice] | None:
+    """The pixels of an image whose centres are within a drawn rectangle.
+
+    Parameters
+    ----------
+    layer : napari.layers.Shapes or None
+        Of several shapes the selected one counts, else the last.
+    image : napari.layers.Image
+        The image that it is drawn on.
+
+    Returns
+    -------
+    tuple of slice, or None
+        Rows and columns; None if there is no shape.
+    """
+    if layer is None or not len(layer.data):
+        return None
+    chosen = max(layer.selected_data, default=len(layer.data) - 1)
+    corners = _in_pixels(layer, image)[chosen]
+    height, width = image_of(image).shape
+    least = np.ceil(corners.min(axis=0)).astype(int)
+    most = np.floor(corners.max(axis=0)).astype(int) + 1
+    rows, columns = (
+        slice(int(np.clip(a, 0, side)), int(np.clip(b, 0, side)))
+        for a, b, side in zip(least, most, (height, width), strict=True)
+    )
+    return rows, columns
+
+
+def _drawn(layer: Any, image: Any, shape: tuple[int, ...]) -> Mask:
+    if not len(layer.data):
+        return np.zeros(shape, bool)
+    from napari.layers import Shapes
+
+    on_pixels = Shapes(_in_pixels(layer, image), shape_type=list(layer.shape_type))
+    masks: Mask = np.asarray(on_pixels.to_masks(mask_shape=shape), dtype=np.bool_)
+    return np.asarray(masks.any(axis=0))
+
+
+def _in_pixels(layer: Any, image: Any) -> list[NDArray[np.float64]]:
+    """Corners of shapes in the pixels of an image that may be scaled differently."""
+    return [
+        np.array([image.world_to_data(layer.data_to_world(corner))[-2:] for corner in shape])
+        for shape in layer.data
+    ]

@@ -1,0 +1,179 @@
+"""Results as layers that stay where they are when the next result comes.
+
+- where a result lies: `result_frame`
+- place an image and what belongs to it by a setup: `place_together`
+- show a result in layers of its own: `ResultLayers`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from qtpy.QtCore import QObject, QTimer, Signal
+
+from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, place
+from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.widgets._picking import kind_of
+
+if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import FullLayerData
+
+__all__ = ["ResultLayers", "place_together", "result_frame"]
+
+
+def result_frame(image: Any, setup: Any | None, crop: tuple[slice, slice] | None) -> Frame:
+    """Frame of a result, so that it lies on its image once that is placed by the setup.
+
+    Parameters
+    ----------
+    image : napari.layers.Image
+        The shot.
+    setup : ProtonSetup or OpticalSetup or None
+        The experiment.
+    crop : tuple of slice, optional
+        The part that is inverted.
+
+    Returns
+    -------
+    Frame
+    """
+    frame = frame_of(image)
+    if setup is not None:
+        frame = frame_for(image.data.shape, setup, translate=frame.translate)
+    if crop is None:
+        return frame
+    y, x = (
+        origin + part.start * side
+        for origin, part, side in zip(frame.translate, crop, frame.scale, strict=True)
+    )
+    return replace(frame, translate=(y, x))
+
+
+def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> None:
+    """Give an image the pixel size of its setup, and what lies on it, too.
+
+    Parameters
+    ----------
+    viewer : napari.Viewer
+        Its camera follows where the image goes.
+    image : napari.layers.Image
+        The shot.
+    setup : ProtonSetup or OpticalSetup
+        The experiment.
+    companions : sequence of napari.layers.Layer
+        Source, mask and crop: those that lie as the image does go with it.
+    """
+    before = frame_of(image)
+    followers = [layer for layer in companions if frame_of(layer) == before]
+    place(image, setup)
+    if frame_of(image) == before:
+        return
+    for layer in followers:
+        layer.scale = (*layer.scale[:-2], *image.scale[-2:])
+        layer.units = (*layer.units[:-2], *image.units[-2:])
+    viewer.reset_view()
+
+
+class ResultLayers(QObject):
+    """Layers of a result that may be computed again and again.
+
+    Parameters
+    ----------
+    viewer : napari.Viewer
+        Where they are shown.
+    parent : QObject
+        The widget that shows them.
+
+    Signals
+    -------
+    complete
+        All layers of the last result are there.
+    """
+
+    complete = Signal()
+
+    def __init__(self, viewer: Any, parent: QObject) -> None:
+        super().__init__(parent)
+        self._viewer = viewer
+        self._layers: dict[str, Any] = {}
+        self._waiting: list[FullLayerData] = []
+        self._select, self._before = True, None
+        self._timer = QTimer(self)
+        self._timer.setInterval(0)
+        self._timer.timeout.connect(self._add_next)
+
+    @property
+    def layers(self) -> list[Any]:
+        """Those that are still in the viewer."""
+        return [layer for layer in self._layers.values() if layer in self._viewer.layers]
+
+    @property
+    def busy(self) -> bool:
+        """Whether layers wait to be added."""
+        return bool(self._timer.isActive())
+
+    def show(self, described: Sequence[FullLayerData], *, select: bool = True) -> None:
+        """Replace the data of the layers; add those that are not there.
+
+        Adding a layer takes napari some tenths of a second, so they are added one by one
+        while the window stays alive.
+
+        Parameters
+        ----------
+        described : sequence of (data, keywords, layer type)
+            The layers, the lowest first.
+        select : bool
+            Whether to select what is new; without it the user goes on painting where he was.
+        """
+        self._select = select
+        self._before = self._viewer.layers.selection.active
+        here = self.layers
+        self._waiting = []
+        for data, keywords, kind in described:
+            layer = self._layers.get(_role(keywords))
+            if layer is not None and layer in here and kind_of(layer) == kind:
+                _update(layer, data, keywords)
+            else:
+                self._waiting.append((data, keywords, kind))
+        if self._waiting:
+            self._timer.start()
+        else:
+            self.complete.emit()
+
+    def hide(self) -> None:
+        """Switch them off."""
+        for layer in self.layers:
+            layer.visible = False
+
+    def _add_next(self) -> None:
+        from napari_shadowinv._napari.layers import add_layers
+
+        if self._waiting:
+            described = self._waiting.pop(0)
+            (self._layers[_role(described[1])],) = add_layers(self._viewer, [described])
+        if not self._waiting:
+            self._timer.stop()
+            active = self._layers.get("field") if self._select else self._before
+            if active is not None and active in self._viewer.layers:
+                self._viewer.layers.selection.active = active
+            self.complete.emit()
+
+
+def _role(keywords: dict[str, Any]) -> str:
+    return str(role_of(keywords))
+
+
+def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
+    layer.data = data
+    layer.metadata = keywords["metadata"]
+    if layer.name != keywords["name"]:
+        layer.name = keywords["name"]
+    for name in ("scale", "translate"):
+        if tuple(getattr(layer, name)) != tuple(keywords[name]):
+            setattr(layer, name, keywords[name])
+    if tuple(str(unit) for unit in layer.units) != tuple(keywords["units"]):
+        layer.units = keywords["units"]
+    if "contrast_limits" in keywords:
+        layer.contrast_limits = keywords["contrast_limits"]

@@ -1,0 +1,159 @@
+"""Long work beside a responsive window.
+
+- run something, cancel it, hear how it ended: `Runner`, `Outcome`
+
+The thread talks to nobody: it leaves progress and outcome in a letter box that a timer of
+the window looks into. So no signal crosses threads, a closed window can be reached by
+nothing, and it is the same with every Qt binding.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from qtpy.QtCore import QObject, QTimer, Signal
+
+from napari_shadowinv._napari.widgets._messages import MISTAKES
+from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.progress import OnProgress, Progress, ShouldStop
+
+__all__ = ["Outcome", "Runner", "Work"]
+
+Work = Callable[[OnProgress, ShouldStop], Any]
+
+_LOOK_EVERY = 15  # ms
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How some work ended.
+
+    Attributes
+    ----------
+    value : object
+        What it returned.
+    error : Exception or None
+        What it raised.
+    cancelled : bool
+        Whether it was stopped on request.
+    tag : object
+        What `Runner.start` was given to remember.
+    """
+
+    value: Any = None
+    error: Exception | None = None
+    cancelled: bool = False
+    tag: Any = None
+
+    @property
+    def is_mistake(self) -> bool:
+        """Whether it ended by a mistake of the user's, not one of the program's."""
+        return isinstance(self.error, MISTAKES)
+
+
+@dataclass
+class _LetterBox:
+    """What a thread and the window tell each other."""
+
+    stop: threading.Event = field(default_factory=threading.Event)
+    progress: Progress | None = None
+    outcome: Outcome | None = None
+
+
+class Runner(QObject):
+    """Runs one piece of work at a time in a thread of its own.
+
+    Signals
+    -------
+    started
+        Work began.
+    progressed : Progress
+        The latest news of it.
+    ended : Outcome
+        It ended, one way or another.
+    """
+
+    started = Signal()
+    progressed = Signal(object)
+    ended = Signal(object)
+
+    def __init__(self, parent: QObject) -> None:
+        super().__init__(parent)
+        self._box: _LetterBox | None = None
+        self._pending: tuple[Work, Any] | None = None
+        self._timer = QTimer(self)
+        self._timer.setInterval(_LOOK_EVERY)
+        self._timer.timeout.connect(self._look)
+
+    @property
+    def running(self) -> bool:
+        """Whether work is being done."""
+        return self._box is not None
+
+    @property
+    def cancelling(self) -> bool:
+        """Whether the work has been asked to stop, and nothing waits to follow it."""
+        return self._box is not None and self._box.stop.is_set() and self._pending is None
+
+    def start(self, work: Work, tag: Any = None) -> None:
+        """Begin some work; what is running is asked to stop first.
+
+        Only the latest request waits: those between it and the running one are dropped.
+
+        Parameters
+        ----------
+        work : callable
+            Takes `on_progress` and `should_stop`, and runs in another thread.
+        tag : object
+            Comes back in the outcome.
+        """
+        if self._box is not None:
+            self._pending = (work, tag)
+            self._box.stop.set()
+            return
+        box = self._box = _LetterBox()
+        # A window that is closed takes its work with it.
+        self.destroyed.connect(lambda *_: box.stop.set())
+        threading.Thread(target=_run, args=(work, tag, box), name="shadowinv", daemon=False).start()
+        self._timer.start()
+        self.started.emit()
+
+    def cancel(self) -> None:
+        """Ask the work to stop, and forget what waits."""
+        self._pending = None
+        if self._box is not None:
+            self._box.stop.set()
+
+    def _look(self) -> None:
+        box = self._box
+        if box is None:
+            return
+        outcome, news = box.outcome, box.progress
+        if news is not None:
+            box.progress = None
+            if not box.stop.is_set():
+                self.progressed.emit(news)
+        if outcome is None:
+            return
+        self._timer.stop()
+        self._box = None
+        pending, self._pending = self._pending, None
+        self.ended.emit(outcome)
+        if pending is not None and self._box is None:
+            self.start(*pending)
+
+
+def _run(work: Work, tag: Any, box: _LetterBox) -> None:
+    def on_progress(progress: Progress) -> None:
+        box.progress = progress
+
+    try:
+        outcome = Outcome(work(on_progress, box.stop.is_set), tag=tag)
+    except InversionCancelled:
+        outcome = Outcome(cancelled=True, tag=tag)
+    except Exception as error:
+        outcome = Outcome(error=error, tag=tag)
+    box.outcome = outcome

@@ -1,0 +1,166 @@
+"""What napari saves with this plugin: layers of one result.
+
+- all of the result: `write_result`; its field for other codes: `write_pradformat`; its sites:
+  `write_sites`
+
+A part of a result's layers stands for all of it. Each file is written whole, beside the one
+that it replaces; napari's own dialog asks before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv.errors import FileFormatError, InputError
+
+if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import FullLayerData
+    from napari_shadowinv._napari.marks import Result
+
+__all__ = ["write_pradformat", "write_result", "write_sites"]
+
+
+def write_result(path: str, layers: Sequence[FullLayerData]) -> list[str]:
+    """Write all of a result, and how its layers look, as ``.shadowinv``.
+
+    Parameters
+    ----------
+    path : str
+        The file.
+    layers : sequence of (data, keywords, layer type)
+        Layers of one result; others are left out, and the user is told.
+
+    Returns
+    -------
+    list of str
+        The file.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no layer of a result, there are layers of several, or the file cannot be
+        written.
+    """
+    return _write(path, layers, (".shadowinv",))
+
+
+def write_pradformat(path: str, layers: Sequence[FullLayerData]) -> list[str]:
+    """Write a result's potential and deflection as a pradformat inversion.
+
+    Parameters
+    ----------
+    path, layers
+        See `write_result`.
+
+    Returns
+    -------
+    list of str
+        The file.
+
+    Raises
+    ------
+    FileFormatError
+        As `write_result`, and if the result is not that of a particle beam.
+    """
+    return _write(path, layers, (".h5", ".hdf5"))
+
+
+def write_sites(path: str, layers: Sequence[FullLayerData]) -> list[str]:
+    """Write the sites of a result, all of them, with weight, mass and displacement, as CSV.
+
+    Parameters
+    ----------
+    path, layers
+        See `write_result`.
+
+    Returns
+    -------
+    list of str
+        The file.
+
+    Raises
+    ------
+    FileFormatError
+        As `write_result`, and if the result has no sites.
+    """
+    return _write(path, layers, (".csv",))
+
+
+def _write(path: str, layers: Sequence[FullLayerData], suffixes: tuple[str, ...]) -> list[str]:
+    try:
+        return _write_result(path, layers, suffixes)
+    except InputError as error:
+        # napari takes any ValueError of a writer for "no writer", and swallows what it says.
+        raise FileFormatError(str(error)) from error
+
+
+def _write_result(
+    path: str, layers: Sequence[FullLayerData], suffixes: tuple[str, ...]
+) -> list[str]:
+    from napari_shadowinv._napari.saved import dataset_of_layers
+    from napari_shadowinv.io import write
+
+    own, result = _one_result(layers)
+    _warn_of_changes(own, result)
+    target = Path(path)
+    is_named = target.suffix.lower() in suffixes
+    if not is_named:
+        target = target.with_name(target.name + suffixes[0])
+    # napari's dialog asked about the name that was typed in, not about a longer one.
+    return [str(write(target, dataset_of_layers(own, result), overwrite=is_named))]
+
+
+def _one_result(layers: Sequence[FullLayerData]) -> tuple[list[FullLayerData], Result]:
+    from napari_shadowinv._napari.marks import result_of
+
+    results = {id(found): found for layer in layers if (found := result_of(layer[1])) is not None}
+    if len(results) > 1:
+        names = [_name(layer) for layer in layers if result_of(layer[1]) is not None]
+        raise InputError(
+            f"the layers show {len(results)} results ({_listed(names)}): select layers of one of "
+            "them and save the selected layers"
+        )
+    if not results:
+        raise InputError(
+            f"no layer shows a result ({_listed([_name(layer) for layer in layers])}): expected "
+            "at least one that an inversion made; save others as images"
+        )
+    (result,) = results.values()
+    return [layer for layer in layers if result_of(layer[1]) is result], result
+
+
+def _warn_of_changes(layers: Sequence[FullLayerData], result: Result) -> None:
+    """Say which layers no longer show what the file will hold."""
+    from napari_shadowinv._napari.frame import Frame
+    from napari_shadowinv._napari.layers import result_layers
+    from napari_shadowinv._napari.marks import role_of
+
+    images = [layer for layer in layers if layer[2] == "image"]
+    retrieved = {role_of(layer[1]): layer[0] for layer in result_layers(result, Frame())}
+    changed = [
+        _name(layer) for layer in images if not _same(layer[0], retrieved.get(role_of(layer[1])))
+    ]
+    if changed:
+        from napari.utils.notifications import show_warning
+
+        show_warning(
+            f"{_listed(changed)} changed since the inversion: the file keeps what was retrieved; "
+            "save the changed layers as images, too"
+        )
+
+
+def _same(shown: Any, retrieved: Any) -> bool:
+    return shown is retrieved or (retrieved is not None and np.array_equal(shown, retrieved))
+
+
+def _name(layer: FullLayerData) -> str:
+    return str(layer[1].get("name", "?"))
+
+
+def _listed(names: Sequence[str], most: int = 3) -> str:
+    shown = ", ".join(f"'{name}'" for name in names[:most])
+    return shown + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,97 @@
+"""Tests of the plugin need napari; those with a window also a display."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("napari")
+
+from napari.components import ViewerModel
+
+from napari_shadowinv import InversionOptions, invert
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import ellipse_pair
+
+
+@pytest.fixture
+def viewer() -> ViewerModel:
+    """A viewer without a window, with this plugin as it is installed."""
+    from npe2 import PluginManager
+
+    PluginManager.instance().discover()
+    return ViewerModel()
+
+
+@pytest.fixture(scope="session")
+def solved() -> Inversion:
+    """A small inversion that was really solved, of an object without symmetry."""
+    image = synthetic_image(ellipse_pair((40, 52)).displacement)
+    return invert(image, options=InversionOptions(n_sites=500))
+
+
+@pytest.fixture
+def told_of(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What napari's user is told, as texts."""
+    from napari.utils import notifications
+
+    texts: list[str] = []
+    monkeypatch.setattr(
+        notifications.notification_manager,
+        "dispatch",
+        lambda notification: texts.append(str(notification.message)),
+    )
+    return texts
+
+
+@pytest.fixture
+def in_loop(qtbot: Any) -> Any:
+    """Call a function from within the event loop, as a menu does, and return its answer."""
+    from qtpy.QtCore import QTimer
+
+    def call(function: Any, *args: Any) -> Any:
+        answers: list[Any] = []
+        errors: list[Exception] = []
+
+        def answer() -> None:
+            try:
+                answers.append(function(*args))
+            except Exception as error:
+                errors.append(error)
+
+        QTimer.singleShot(0, answer)
+        qtbot.waitUntil(lambda: bool(answers or errors), timeout=60_000)
+        if errors:
+            raise errors[0]
+        return answers[0]
+
+    return call
+
+
+def run_alone(code: str, tmp_path: Path) -> str:
+    """Run Python code in a process of its own and return what it printed."""
+    import subprocess
+
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def alone(tmp_path: Path) -> Any:
+    return lambda code: run_alone(code, tmp_path)
+
+
+@pytest.fixture
+def noisy() -> np.ndarray:
+    """An image of counts with one hot pixel and a slope."""
+    image = np.random.default_rng(3).normal(400, 4, (48, 60)) + np.linspace(0, 200, 60)
+    image[10, 20] = 5000
+    return image

@@ -1,0 +1,146 @@
+"""One-click commands of the layer menus."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.components import ViewerModel
+
+from napari_shadowinv import InputError, ProtonSetup, invert
+from napari_shadowinv._napari import commands
+from napari_shadowinv._napari.marks import role_of, setup_of
+from napari_shadowinv._napari.shots import shot_layer
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import ellipse_pair
+
+
+@pytest.fixture
+def shot() -> np.ndarray:
+    return synthetic_image(ellipse_pair((32, 40)).displacement)
+
+
+def add_shot(viewer: Any, image: Any, setup: ProtonSetup | None = None) -> Any:
+    data, keywords, _ = shot_layer(image, "shot", setup, (0.0, 2.0))
+    return viewer.add_image(data, **keywords)
+
+
+def test_invert_makes_the_layers_of_the_default_inversion(
+    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup
+) -> None:
+    layer = add_shot(viewer, shot, proton_setup)
+    layer.translate = (30.0, 60.0)
+    described = {role_of(keywords): (data, keywords)
+                 for data, keywords, _ in commands.invert_uniform(layer)}  # fmt: skip
+    field = proton_setup.path_integrated_b(invert(shot).displacement)
+    data, keywords = described["field"]
+    np.testing.assert_allclose(data, 1e6 * np.hypot(*field), rtol=1e-9)
+    assert keywords["name"] == "shot |∫B×dz| (µT·m)"
+    assert keywords["translate"] == (30.0, 60.0)
+    assert keywords["scale"] == (1.5, 1.5)
+
+
+def test_the_shot_that_is_shown_is_taken_of_a_stack(viewer: ViewerModel, shot: np.ndarray) -> None:
+    layer = add_shot(viewer, np.stack([np.full_like(shot, 5), shot]))
+    viewer.dims.set_point(0, 1)
+    ((data, keywords, _),) = commands.high_pass(layer, viewer)
+    ((alone, _, _),) = commands.high_pass(add_shot(viewer, shot))
+    np.testing.assert_array_equal(data, alone)
+    assert keywords["name"] == "shot 1 high-pass σ=4.8 px"
+
+
+def test_hot_pixels_are_replaced_and_counted(viewer: ViewerModel, noisy: np.ndarray) -> None:
+    ((data, keywords, _),) = commands.remove_hot_pixels(add_shot(viewer, noisy))
+    assert keywords["name"] == "shot without 1 hot or dead pixels"
+    assert data[10, 20] < 700
+    changed = data != noisy
+    assert changed.sum() == 1
+
+
+def test_high_pass_takes_the_slope_and_keeps_the_mean(
+    viewer: ViewerModel, noisy: np.ndarray
+) -> None:
+    ((data, _, _),) = commands.high_pass(add_shot(viewer, noisy))
+    assert data.mean() == pytest.approx(noisy.mean())
+    slope = data[:, -10:].mean() - data[:, :10].mean()
+    assert abs(slope) < 60  # 167 before
+
+
+def test_the_estimate_is_a_source_of_the_same_flux(
+    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup
+) -> None:
+    ((data, keywords, _),) = commands.estimate_source(add_shot(viewer, shot, proton_setup))
+    assert role_of(keywords) == "source"
+    assert setup_of(keywords) == proton_setup
+    assert data.sum() == pytest.approx(shot.sum())
+    assert data.std() < 0.5 * shot.std()
+
+
+@pytest.mark.parametrize(
+    "command", [commands.invert_uniform, commands.high_pass, commands.estimate_source]
+)
+def test_a_wrong_layer_is_one_sentence(viewer: ViewerModel, command: Any) -> None:
+    with pytest.raises(InputError, match="no layer is selected: select one image"):
+        command(None)
+    with pytest.raises(InputError, match="'Points' is of type Points: select a grey image"):
+        command(viewer.add_points(np.zeros((2, 2))))
+    with pytest.raises(InputError, match="'colours' is a colour image: select a grey image"):
+        command(viewer.add_image(np.zeros((5, 6, 3)), rgb=True, name="colours"))
+
+
+def registered(name: str) -> Any:
+    from napari._app_model import get_app_model
+
+    return lambda: get_app_model().commands.execute_command(f"napari-shadowinv.{name}").result()
+
+
+def test_from_the_menu_the_selected_layer_is_filtered_beside_the_window(
+    make_napari_viewer: Any, noisy: np.ndarray, in_loop: Any, qtbot: Any
+) -> None:
+    window = make_napari_viewer()
+    add_shot(window, noisy)
+    in_loop(registered("remove_hot_pixels"))
+    qtbot.waitUntil(lambda: len(window.layers) == 2, timeout=30_000)
+    assert window.layers[-1].data[10, 20] < 700
+
+
+def test_from_the_menu_an_inversion_brings_its_layers_and_the_scale_bar(
+    make_napari_viewer: Any, shot: np.ndarray, in_loop: Any, qtbot: Any, proton_setup: ProtonSetup
+) -> None:
+    window = make_napari_viewer()
+    add_shot(window, shot, proton_setup)
+    in_loop(registered("invert_uniform"))
+    qtbot.waitUntil(lambda: len(window.layers) == 11, timeout=120_000)
+    assert window.layers.selection.active.name == "shot |∫B×dz| (µT·m)"
+    assert window.canvas.overlays.scale_bar.visible
+
+
+def test_from_the_menu_a_mistake_is_one_notification(
+    make_napari_viewer: Any, in_loop: Any, qtbot: Any, told_of: list[str]
+) -> None:
+    window = make_napari_viewer()
+    in_loop(registered("invert_uniform"))
+    assert told_of == ["No layer is selected: select one image in the layer list"]
+    add_shot(window, np.full((20, 20), -1.0))
+    in_loop(registered("invert_uniform"))
+    qtbot.waitUntil(lambda: len(told_of) == 2, timeout=30_000)
+    assert told_of[1].startswith("Image has 400 negative pixels")
+    assert len(window.layers) == 1
+
+
+def test_the_cross_of_the_progress_bar_ends_an_inversion(
+    make_napari_viewer: Any, in_loop: Any, qtbot: Any, told_of: list[str]
+) -> None:
+    from napari.utils.progress import cancelable_progress, progress
+
+    window = make_napari_viewer()
+    image = synthetic_image(ellipse_pair((200, 200)).displacement)
+    add_shot(window, image)
+    in_loop(registered("invert_uniform"))
+    (bar,) = [bar for bar in progress._all_instances if isinstance(bar, cancelable_progress)]
+    assert bar.desc.startswith("Inverting shot")
+    bar.cancel()
+    qtbot.waitUntil(lambda: bar not in progress._all_instances, timeout=30_000)
+    assert len(window.layers) == 1
+    assert told_of == []

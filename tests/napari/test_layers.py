@@ -1,0 +1,277 @@
+"""Layers of a result: what they show, where they lie, and how fast they are there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.components import ViewerModel
+
+from napari_shadowinv import InputError, OpticalSetup, ProtonSetup, add_inversion
+from napari_shadowinv._napari.frame import frame_for, place
+from napari_shadowinv._napari.layers import inversion_layers, thinned_arrows
+from napari_shadowinv._napari.marks import result_of, role_of, setup_of, unit_of
+from napari_shadowinv._napari.sites import flux_residual, power_cells
+from napari_shadowinv.inversion import Inversion
+
+
+def by_role(layers: list[Any]) -> dict[str, Any]:
+    return {str(role_of(layer)): layer for layer in layers}
+
+
+def test_all_of_a_result_is_there_and_the_field_and_arrows_are_visible(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
+) -> None:
+    layers = by_role(add_inversion(viewer, solved, proton_setup, name="shot 7"))
+    assert list(layers) == [
+        "image", "reprojection", "residual", "potential", "field y", "field x", "field",
+        "caustic", "arrows", "sites",
+    ]  # fmt: skip
+    assert {role for role, layer in layers.items() if layer.visible} == {"field", "arrows"}
+    assert all(layer.name.startswith("shot 7 ") for layer in viewer.layers)
+    assert viewer.canvas.overlays.scale_bar.visible
+    assert viewer.layers.selection.active is layers["field"]
+
+
+def test_values_are_those_of_the_result_in_the_unit_that_the_layer_names(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
+) -> None:
+    layers = by_role(add_inversion(viewer, solved, proton_setup))
+    field = proton_setup.path_integrated_b(solved.displacement)
+    factor = {"mT·m": 1e3, "µT·m": 1e6, "T·m": 1.0}[unit_of(layers["field"])]
+    np.testing.assert_allclose(layers["field"].data, factor * np.hypot(*field))
+    np.testing.assert_allclose(layers["field y"].data, factor * field[0])
+    np.testing.assert_allclose(layers["field x"].data, factor * field[1])
+    metres = {"m": 1.0, "mm": 1e3, "µm": 1e6, "nm": 1e9}[unit_of(layers["potential"])]
+    np.testing.assert_allclose(
+        layers["potential"].data, metres * proton_setup.potential(solved.potential)
+    )
+    assert unit_of(layers["potential"]) in layers["potential"].name
+    percent = 100 * solved.residual / solved.source.mean()
+    np.testing.assert_allclose(layers["residual"].data, percent)
+    np.testing.assert_array_equal(layers["reprojection"].data, solved.reprojection)
+    np.testing.assert_array_equal(layers["caustic"].data > 0, solved.caustic)
+    np.testing.assert_array_equal(layers["sites"].data, solved.sites)
+
+
+def test_light_shows_the_deflection_angle(
+    viewer: ViewerModel, solved: Inversion, optical_setup: OpticalSetup
+) -> None:
+    field = by_role(add_inversion(viewer, solved, optical_setup))["field"]
+    factor = {"mrad": 1e3, "µrad": 1e6}[unit_of(field)]
+    angle = np.hypot(*optical_setup.deflection_angle(solved.displacement))
+    np.testing.assert_allclose(field.data, factor * angle)
+
+
+def test_signed_layers_have_symmetric_limits_and_a_white_middle(
+    viewer: ViewerModel, solved: Inversion
+) -> None:
+    layers = by_role(add_inversion(viewer, solved))
+    for role in ("residual", "field y", "field x"):
+        low, high = layers[role].contrast_limits
+        assert low == -high
+        middle = layers[role].colormap.map(np.array([0.5]))[0, :3]
+        assert middle.min() > 0.9
+    assert layers["field"].contrast_limits[0] == 0
+
+
+def test_pixels_are_lengths_at_the_object(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
+) -> None:
+    for layer in add_inversion(viewer, solved, proton_setup):
+        np.testing.assert_allclose(layer.scale, 1.5)
+        assert {str(unit) for unit in layer.units} == {"micrometer"}
+        assert layer.axis_labels == ("y", "x")
+        assert setup_of(layer) == proton_setup
+    # The centre of pixel (0, 0) is at the origin, for images as for sites.
+    height, width = solved.potential.shape
+    np.testing.assert_allclose(
+        viewer.layers[0].extent.world, [[0, 0], [1.5 * (height - 1), 1.5 * (width - 1)]]
+    )
+    assert {tuple(layer.translate) for layer in viewer.layers} == {(0.0, 0.0)}
+
+
+def test_without_a_setup_lengths_are_pixels(viewer: ViewerModel, solved: Inversion) -> None:
+    for layer in add_inversion(viewer, solved):
+        assert {str(unit) for unit in layer.units} == {"pixel"}
+        np.testing.assert_array_equal(layer.scale, 1)
+
+
+def test_large_objects_are_measured_in_millimetres(optical_setup: OpticalSetup) -> None:
+    assert frame_for((500, 500), optical_setup).units == ("um", "um")
+    large = frame_for((500, 1000), optical_setup)
+    assert large.units == ("mm", "mm")
+    np.testing.assert_allclose(large.scale, 12e-3)
+
+
+def test_a_binned_crop_lies_on_its_original(solved: Inversion, proton_setup: ProtonSetup) -> None:
+    layers = inversion_layers(
+        solved, proton_setup, scale=(3.0, 3.0), translate=(7.5, 9.0), units=("um", "um")
+    )
+    for _, keywords, _ in layers:
+        assert (keywords["scale"], keywords["translate"]) == ((3.0, 3.0), (7.5, 9.0))
+
+
+def test_place_gives_a_stack_the_pixels_of_a_setup(
+    viewer: ViewerModel, proton_setup: ProtonSetup
+) -> None:
+    layer = viewer.add_image(np.zeros((3, 20, 20)), contrast_limits=(0, 1))
+    place(layer, proton_setup)
+    np.testing.assert_allclose(layer.scale, [1, 1.5, 1.5])
+    assert [str(unit) for unit in layer.units] == ["pixel", "micrometer", "micrometer"]
+    assert layer.axis_labels[-2:] == ("y", "x")
+
+
+def test_arrows_are_true_displacements_on_a_grid_that_can_be_read(
+    viewer: ViewerModel, solved: Inversion
+) -> None:
+    arrows = by_role(add_inversion(viewer, solved))["arrows"]
+    starts, steps = arrows.data[:, 0].astype(int), arrows.data[:, 1]
+    np.testing.assert_array_equal(steps, solved.displacement[:, starts[:, 0], starts[:, 1]].T)
+    # Drawn, nearly all keep to their own place, and the longest reach to the next but one.
+    spacing = np.diff(np.unique(starts[:, 1])).min()
+    drawn = arrows.length * np.hypot(*steps.T) / spacing
+    assert np.percentile(drawn, 94) < 1
+    assert 0.9 < drawn.max() < 2
+
+
+@pytest.mark.parametrize("shape", [(64, 200), (700, 500), (20, 20)])
+def test_about_thirty_arrows_lie_along_the_longer_side(shape: tuple[int, int]) -> None:
+    data, spacing = thinned_arrows(np.ones((2, *shape)))
+    for axis in (0, 1):
+        places = np.unique(data[:, 0, axis])
+        np.testing.assert_array_equal(np.diff(places), spacing)
+        assert len(places) <= 30
+    assert len(np.unique(data[:, 0, int(np.argmax(shape))])) >= min(20, max(shape))
+
+
+def test_no_field_makes_no_arrow(viewer: ViewerModel, solved: Inversion) -> None:
+    still = replace(
+        solved,
+        displacement=np.zeros_like(solved.displacement),
+        potential=np.zeros_like(solved.potential),
+        residual=np.zeros_like(solved.residual),
+        site_displacement=np.zeros_like(solved.site_displacement),
+    )
+    layers = by_role(add_inversion(viewer, still))
+    assert len(layers["arrows"].data) == 0
+    assert layers["field"].contrast_limits == [0, 1]
+
+
+def test_features_of_the_sites_agree_with_the_report(
+    viewer: ViewerModel, solved: Inversion
+) -> None:
+    sites = by_role(add_inversion(viewer, solved))["sites"]
+    features = sites.features
+    assert list(features) == ["weight", "mass", "displacement", "flux residual"]
+    np.testing.assert_array_equal(features["weight"], solved.weights)
+    np.testing.assert_allclose(features["mass"].sum(), solved.source.sum())
+    np.testing.assert_allclose(features["displacement"], np.hypot(*solved.site_displacement.T))
+    worst = np.abs(features["flux residual"]).max()
+    np.testing.assert_allclose(worst, solved.report.residual, rtol=1e-6)
+
+
+def test_sites_are_coloured_by_displacement(viewer: ViewerModel, solved: Inversion) -> None:
+    sites = by_role(add_inversion(viewer, solved))["sites"]
+    order = np.argsort(sites.features["displacement"])
+    brightness = sites.face_color[order][:, :3].sum(axis=1)
+    assert brightness[-1] > brightness[0] + 1
+
+
+def test_power_cells_tile_the_image(viewer: ViewerModel, solved: Inversion) -> None:
+    polygons, kept = power_cells(solved)
+    assert len(kept) == len(solved.sites)
+    areas = []
+    for polygon in polygons:
+        y, x = polygon.T
+        areas.append(0.5 * abs(np.dot(y, np.roll(x, 1)) - np.dot(x, np.roll(y, 1))))
+    np.testing.assert_allclose(sum(areas), solved.potential.size, rtol=1e-9)
+    corners = np.concatenate(polygons)
+    height, width = solved.potential.shape
+    assert corners.min() >= -0.5 - 1e-9
+    assert (corners <= [height - 0.5 + 1e-9, width - 0.5 + 1e-9]).all()
+    cells = by_role(add_inversion(viewer, solved, cells=True))["cells"]
+    assert len(cells.data) == len(kept)
+
+
+def test_too_many_cells_are_refused_in_one_sentence(solved: Inversion) -> None:
+    many = replace(solved, sites=np.zeros((5001, 2)))
+    with pytest.raises(InputError, match="5,001 sites: power cells can be shown for up to 5,000"):
+        power_cells(many)
+
+
+def test_many_sites_are_thinned_and_the_name_says_so(
+    viewer: ViewerModel, solved: Inversion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("napari_shadowinv._napari.layers._MOST_SITES_SHOWN", 200)
+    sites = by_role(add_inversion(viewer, solved))["sites"]
+    np.testing.assert_array_equal(sites.data, solved.sites[::3])
+    assert sites.name == "sites (1 in 3)"
+    np.testing.assert_array_equal(sites.features["weight"], solved.weights[::3])
+
+
+def test_each_layer_knows_the_whole_result(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
+) -> None:
+    for layer in add_inversion(viewer, solved, proton_setup, attributes={"input_file": "a.tif"}):
+        result = result_of(layer)
+        assert result is not None
+        assert result.content is solved
+        assert result.attributes == {"input_file": "a.tif"}
+
+
+def test_an_uneven_source_has_its_layer(viewer: ViewerModel, solved: Inversion) -> None:
+    source = solved.source * np.linspace(0.5, 1.5, solved.source.shape[1])
+    uneven = replace(solved, source=source)
+    described = {role_of(keywords): data for data, keywords, _ in inversion_layers(uneven)}
+    assert described["source"] is source
+
+
+@pytest.fixture(scope="module")
+def large(make_inversion: Callable[..., Inversion]) -> Inversion:
+    """A result of a megapixel with 100,000 sites."""
+    inversion = make_inversion((1024, 1024))
+    count = 100_000
+    rng = np.random.default_rng(0)
+    return replace(
+        inversion,
+        sites=rng.uniform(-0.5, 1023.5, (count, 2)),
+        weights=np.zeros(count),
+        site_mass=np.full(count, inversion.source.sum() / count),
+        site_displacement=rng.normal(0, 1, (count, 2)),
+    )
+
+
+def quickest(action: Callable[[], Any], repeats: int = 5) -> float:
+    """Seconds of this thread's own work: other programs do not count."""
+    seconds = []
+    for _ in range(repeats):
+        start = time.thread_time()
+        action()
+        seconds.append(time.thread_time() - start)
+    return min(seconds)
+
+
+def test_a_megapixel_with_100_000_sites_is_there_within_a_second(
+    large: Inversion, record_property: Callable[[str, object], None]
+) -> None:
+    flux_residual(large)  # compiles its kernels
+    seconds = quickest(lambda: add_inversion(ViewerModel(), large))
+    record_property("seconds", seconds)
+    assert seconds < 1.0
+
+
+def test_sites_cost_a_window_less_than_a_second(
+    large: Inversion, make_napari_viewer: Any, record_property: Callable[[str, object], None]
+) -> None:
+    window = make_napari_viewer()
+    described = inversion_layers(large)
+    (data, keywords, _), field = described[-1], described[-4]
+    window.add_image(field[0], contrast_limits=(0, 1))
+    seconds = quickest(lambda: window.add_points(data, **{**keywords, "visible": True}))
+    record_property("seconds", seconds)
+    assert seconds < 1.0

@@ -1,0 +1,114 @@
+"""The manifest, and what is imported because of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import napari_shadowinv
+
+ROOT = Path(napari_shadowinv.__file__).parent
+
+
+def manifest() -> Any:
+    from npe2 import PluginManifest
+
+    return PluginManifest.from_file(ROOT / "napari.yaml")
+
+
+def test_it_is_valid_and_each_command_can_be_imported() -> None:
+    found = manifest()
+    found.validate_imports()
+    assert found.name == "napari-shadowinv"
+
+
+def test_its_menus_exist() -> None:
+    from napari._app_model.constants._menus import MenuId
+
+    menus = manifest().contributions.menus
+    assert set(menus) <= {str(menu) for menu in MenuId.contributables()}
+    assert {"napari/layers/measure", "napari/layers/filter"} <= set(menus)
+
+
+def test_every_command_is_used_and_every_use_is_a_command() -> None:
+    found = manifest().contributions
+    ids = {command.id for command in found.commands}
+    used = [
+        *(item.command for item in found.readers),
+        *(item.command for item in found.writers),
+        *(item.command for item in found.widgets or ()),
+        *(item.command for item in found.sample_data),
+        *(item.command for items in found.menus.values() for item in items),
+    ]
+    assert ids == set(used)
+
+
+def test_the_installed_plugin_is_this_manifest() -> None:
+    from importlib.metadata import entry_points
+
+    (entry,) = entry_points(group="napari.manifest", name="napari-shadowinv")
+    assert entry.value == "napari_shadowinv:napari.yaml"
+
+
+def test_reading_the_manifest_and_asking_the_reader_stays_light(alone: Any, tmp_path: Path) -> None:
+    for name in ("foreign.h5", "foreign.mat", "foreign.tif"):
+        (tmp_path / name).write_bytes(b"\x89HDF\r\n\x1a\n" + b"\0" * 90)
+    heavy = alone(
+        f"""
+import sys
+from npe2 import PluginManifest
+
+found = PluginManifest.from_file({str(ROOT / "napari.yaml")!r})
+from napari_shadowinv._napari.reader import get_reader
+assert get_reader("foreign.h5") is None
+assert get_reader("paper.pdf") is None
+get_reader("foreign.mat"), get_reader("foreign.tif"), get_reader(".")
+print([m for m in sys.modules if m in ("qtpy", "PyQt6", "PySide6", "numba", "napari", "dask")])
+"""
+    )
+    assert heavy.strip() == "[]"
+
+
+def test_the_package_works_where_napari_is_not_installed(alone: Any) -> None:
+    printed = alone(
+        """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("napari", "qtpy", "PyQt6", "PySide6", "superqt", "magicgui"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+import numpy as np
+import napari_shadowinv as nsi
+
+inversion = nsi.invert(np.ones((20, 20)))
+nsi.write("blank.shadowinv", inversion)
+print(nsi.read("blank.shadowinv").sizes["site"])
+
+from napari_shadowinv._napari.layers import inversion_layers
+from typer.testing import CliRunner
+from napari_shadowinv.cli import app
+
+answer = CliRunner().invoke(app, ["info", "blank.shadowinv"])
+assert answer.exit_code == 0, answer.output
+try:
+    nsi.add_inversion(object(), inversion)
+except ModuleNotFoundError as error:
+    print(error.name)
+"""
+    )
+    assert printed.split() == ["400", "napari"]
+
+
+def test_the_public_function_does_not_import_napari(alone: Any) -> None:
+    printed = alone(
+        """
+import sys
+import napari_shadowinv
+napari_shadowinv.add_inversion
+print([m for m in sys.modules if m in ("napari", "qtpy", "dask")])
+"""
+    )
+    assert printed.strip() == "[]"

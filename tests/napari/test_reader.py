@@ -1,0 +1,320 @@
+"""Files, folders and stores as layers."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from napari.components import ViewerModel
+from scipy.io import savemat
+
+from napari_shadowinv import FileFormatError, ProtonSetup, write
+from napari_shadowinv._napari.marks import mark_of, result_of, role_of, setup_of, source_of
+from napari_shadowinv._napari.reader import get_reader, read_paths
+from napari_shadowinv.inversion import Inversion
+
+PLUGIN = "napari-shadowinv"
+
+
+@pytest.fixture
+def shot() -> np.ndarray:
+    return np.random.default_rng(0).uniform(1, 9, (12, 17))
+
+
+def write_radiograph(path: Path, image: np.ndarray, **changes: Any) -> Path:
+    with h5py.File(path, "w") as file:
+        file["image"] = image
+        file.attrs.update(
+            {
+                "object_type": "radiograph",
+                "radiograph_type": "raster",
+                "pradformat_version": "0.2.0",
+                "pixel_width": 163.8e-6,
+                "source_object_dist": 1.3e-3,
+                "object_image_dist": 20e-3,
+                "spec_name": "p+",
+                "spec_energy": 14.7e6,
+                **changes,
+            }
+        )
+    return path
+
+
+def test_pradformat_opens_with_its_pixels_and_setup(
+    viewer: ViewerModel, shot: np.ndarray, tmp_path: Path
+) -> None:
+    (layer,) = viewer.open(write_radiograph(tmp_path / "d3he.h5", shot), plugin=PLUGIN)
+    setup = setup_of(layer)
+    assert isinstance(setup, ProtonSetup)
+    assert setup.energy == 14.7
+    np.testing.assert_allclose(layer.scale, 163.8 / (1 + 20 / 1.3))  # over the magnification
+    assert {str(unit) for unit in layer.units} == {"micrometer"}
+    assert (layer.name, layer.axis_labels) == ("d3he", ("y", "x"))
+    np.testing.assert_array_equal(layer.data, shot)
+    assert mark_of(layer)["file"]["sha256"]
+
+
+def test_pixels_stay_pixels_where_the_magnification_is_unknown(
+    viewer: ViewerModel, shot: np.ndarray, tmp_path: Path
+) -> None:
+    path = write_radiograph(tmp_path / "a.h5", shot)
+    with h5py.File(path, "a") as file:
+        del file.attrs["source_object_dist"]
+    (layer,) = viewer.open(path, plugin=PLUGIN)
+    assert setup_of(layer) is None
+    assert {str(unit) for unit in layer.units} == {"pixel"}
+    assert mark_of(layer)["file"]["geometry"]["detector_pixel_size"] == 163.8e-6
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".txt", ".dat", ".b16"])
+def test_formats_that_napari_does_not_know_need_no_choice(
+    viewer: ViewerModel, tmp_path: Path, suffix: str
+) -> None:
+    path, counts = tmp_path / f"shot{suffix}", np.arange(60).reshape(6, 10)
+    if suffix == ".mat":
+        savemat(path, {"image": counts.astype(np.float64)})
+    elif suffix == ".b16":
+        header = np.zeros(12, "<u4")
+        header[:4] = np.frombuffer(b"PCO-", "<u4")[0], 48 + counts.size * 2, 48, 10
+        header[4] = 6
+        path.write_bytes(header.tobytes() + counts.astype("<u2").tobytes())
+    else:
+        np.savetxt(path, counts)
+    (layer,) = viewer.open(path, plugin=None)  # raises where several plugins could
+    np.testing.assert_array_equal(layer.data, counts)
+    assert layer.source.reader_plugin == PLUGIN
+
+
+def test_text_with_a_header_brings_scale_and_source(viewer: ViewerModel, tmp_path: Path) -> None:
+    image, reference = np.full((4, 5), 7.0), np.full((4, 5), 8.0)
+    path = tmp_path / "praline.txt"
+    header = "s2r_cm 1.0\ns2d_cm 11.0\nEp_MeV 14.7\nbin_um 110.0\nflux2D (4, 5)"
+    np.savetxt(path, np.vstack([image, reference]), header=header)
+    source, layer = viewer.open(path, plugin=PLUGIN)
+    assert (role_of(source), role_of(layer)) == ("source", "image")
+    assert not source.visible
+    np.testing.assert_array_equal(source_of(layer), reference)
+    np.testing.assert_array_equal(source.data, reference)
+    np.testing.assert_allclose(layer.scale, 10.0)
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".hdf5"])
+def test_other_hdf5_is_left_to_others_at_once(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"other{suffix}"
+    with h5py.File(path, "w") as file:
+        file["data"] = np.zeros((5, 5))
+    assert get_reader(str(path)) is None
+    path.write_bytes(b"no HDF5 at all")
+    assert get_reader(str(path)) is None
+
+
+def test_what_is_no_shot_is_left_to_others(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.zarr").mkdir()
+    for name in ("empty", "notes.zarr", "film.mov", "paper.pdf"):
+        assert get_reader(str(tmp_path / name)) is None
+    assert get_reader([str(tmp_path / "a.mov")]) is None
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = tmp_path / "run 3"
+    folder.mkdir()
+    for shot in (1, 2, 10):
+        tifffile.imwrite(folder / f"shot{shot}.tif", np.full((6, 8), shot, np.float32))
+    (folder / "notes.txt").write_text("a fine day")
+    return folder
+
+
+def test_a_folder_is_a_lazy_stack_in_counting_order(viewer: ViewerModel, run: Path) -> None:
+    (layer,) = viewer.open(run, plugin=PLUGIN)
+    assert type(layer.data).__module__.startswith("dask")
+    assert layer.data.shape == (3, 6, 8)
+    assert layer.axis_labels == ("shot", "y", "x")
+    assert layer.name == "run 3"
+    np.testing.assert_array_equal(layer.data[:, 0, 0].compute(), [1, 2, 10])
+    names = [Path(path).name for path in mark_of(layer)["paths"]]
+    assert names == ["shot1.tif", "shot2.tif", "shot10.tif"]
+
+
+def test_only_the_first_shot_is_read(
+    viewer: ViewerModel, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import napari_shadowinv.io
+
+    read, seen = napari_shadowinv.io.read_radiograph, []
+
+    def watched(path: Path, **keywords: Any) -> Any:
+        seen.append(path.name)
+        return read(path, **keywords)
+
+    monkeypatch.setattr(napari_shadowinv.io, "read_radiograph", watched)
+    ((data, keywords, _),) = read_paths(str(run))
+    assert seen == ["shot1.tif"]
+    viewer.add_image(data, **keywords)  # shows the middle one
+    assert seen == ["shot1.tif", "shot2.tif"]
+    viewer.dims.set_point(0, 2)
+    assert seen == ["shot1.tif", "shot2.tif", "shot10.tif"]
+
+
+def test_lists_and_patterns_are_stacks_too(viewer: ViewerModel, run: Path) -> None:
+    files = sorted(str(path) for path in run.glob("*.tif"))
+    ((data, _, _),) = read_paths(files[:2])
+    assert data.shape == (2, 6, 8)
+    reader = get_reader(str(run / "shot1*.tif"))
+    assert reader is not None
+    ((data, _, _),) = reader(str(run / "shot1*.tif"))
+    np.testing.assert_array_equal(data[:, 0, 0].compute(), [1, 10])
+
+
+def test_a_stray_file_is_dark_and_gives_a_warning(run: Path) -> None:
+    tifffile.imwrite(run / "shot3.tif", np.ones((5, 5), np.float32))
+    whole = (run / "shot1.tif").read_bytes()
+    (run / "shot4.tif").write_bytes(whole[:-40])
+    ((data, _, _),) = read_paths(str(run))
+    with pytest.warns(UserWarning, match=r"left dark: .*shot3.tif has 5×5 pixels, the first.*6×8"):
+        assert not data[2].compute().any()
+    with pytest.warns(UserWarning, match=r"left dark: .*shot4.tif is cut short"):
+        assert not data[3].compute().any()
+    assert data[4].compute().all()
+
+
+def test_a_stray_first_file_does_not_end_the_show(run: Path) -> None:
+    (run / "shot0.tif").write_bytes(b"nonsense")
+    ((data, _, _),) = read_paths(str(run))
+    assert data.shape == (4, 6, 8)
+    assert data[1].compute().all()
+
+
+def test_no_shot_at_all_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").write_bytes(b"nonsense")
+    with pytest.raises(FileFormatError, match=r"none of 1 files can be read as a shot: .*a.tif"):
+        read_paths(str(tmp_path))
+
+
+def test_a_pradformat_inversion_shows_its_field(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
+) -> None:
+    write(tmp_path / "field.h5", solved, setup=proton_setup)
+    layers = {role_of(layer): layer for layer in viewer.open(tmp_path / "field.h5", plugin=PLUGIN)}
+    assert list(layers) == ["potential", "field y", "field x", "field", "arrows"]
+    field = proton_setup.path_integrated_b(solved.displacement)
+    np.testing.assert_allclose(layers["field"].data, 1e3 * np.hypot(*field), rtol=1e-9)
+    np.testing.assert_allclose(layers["field"].scale, 1.5)
+
+
+def test_a_result_of_the_command_line_opens_whole(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
+) -> None:
+    write(tmp_path / "shot9.shadowinv", solved, setup=proton_setup)
+    layers = viewer.open(tmp_path / "shot9.shadowinv", plugin=None)
+    assert all(layer.name.startswith("shot9 ") for layer in layers)
+    assert setup_of(layers[0]) == proton_setup
+    result = result_of(layers[0])
+    assert result is not None
+    assert result.content.options == solved.options
+    by_role = {role_of(layer): layer for layer in layers}
+    np.testing.assert_array_equal(by_role["reprojection"].data, solved.reprojection)
+
+
+BAD = {
+    "cut.shadowinv": (b"\x89HDF\r\n\x1a\n" + b"\0" * 40, "damaged or cut short"),
+    "empty.mat": (b"", "is empty"),
+    "cut.spe": (b"\x01" * 4200, "SPE"),
+    "words.txt": (b"# x\n1 2\n3 four\n", "words.txt"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_raise_one_sentence_in_a_script(
+    viewer: ViewerModel, tmp_path: Path, name: str
+) -> None:
+    content, words = BAD[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FileFormatError, match=words):
+        viewer.open(tmp_path / name, plugin=PLUGIN)
+    assert not viewer.layers
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_one_notification_in_a_window(
+    viewer: ViewerModel, tmp_path: Path, name: str, in_loop: Any, told_of: list[str]
+) -> None:
+    content, words = BAD[name]
+    (tmp_path / name).write_bytes(content)
+    assert in_loop(lambda: viewer.open(tmp_path / name, plugin=None)) == []
+    (text,) = told_of
+    assert words in text
+    assert "Traceback" not in text
+    assert "\n" not in text
+
+
+@pytest.fixture
+def store(solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path) -> Path:
+    """Three shots, the first still empty, as a run writes them."""
+    import xarray as xr
+
+    one = solved.to_dataset(proton_setup)
+    half = one.copy()
+    empty = one.copy(deep=True)
+    for name in ("potential", "displacement", "reprojection", "residual"):
+        half[name] = 0.5 * one[name]
+        empty[name] = np.nan * one[name]
+    run = xr.concat(
+        [part.drop_dims("site") for part in (empty, one, half)], "shot", data_vars="all"
+    )
+    run.attrs = one.attrs
+    path = tmp_path / "night.shadowinv.zarr"
+    run.chunk({"shot": 1}).to_zarr(path, consolidated=False)
+    return path
+
+
+def test_a_store_opens_as_lazy_layers(
+    viewer: ViewerModel, store: Path, solved: Inversion, proton_setup: ProtonSetup
+) -> None:
+    layers = {role_of(layer): layer for layer in viewer.open(store, plugin=PLUGIN)}
+    assert set(layers) == {
+        "image", "reprojection", "residual", "potential", "field y", "field x", "field", "caustic",
+    }  # fmt: skip
+    for layer in layers.values():
+        assert type(layer.data).__module__.startswith("dask")
+        assert layer.data.shape[0] == 3
+        assert layer.axis_labels == ("shot", "y", "x")
+        np.testing.assert_allclose(layer.scale, [1, 1.5, 1.5])
+        assert layer.name.startswith("night ")
+        assert setup_of(layer) == proton_setup
+    field = proton_setup.path_integrated_b(solved.displacement)
+    np.testing.assert_allclose(layers["field"].data[1].compute(), 1e3 * np.hypot(*field))
+    np.testing.assert_allclose(layers["field"].data[2].compute(), 500 * np.hypot(*field))
+    np.testing.assert_allclose(layers["field y"].data[1].compute(), 1e3 * field[0])
+    np.testing.assert_allclose(layers["field x"].data[1].compute(), 1e3 * field[1])
+    assert layers["field"].contrast_limits[1] == pytest.approx(1e3 * np.hypot(*field).max())
+    assert [name for name, layer in layers.items() if layer.visible] == ["field"]
+
+
+def test_shots_that_are_marked_as_pending_are_not_looked_at(store: Path, solved: Inversion) -> None:
+    import xarray as xr
+
+    with xr.open_zarr(store, consolidated=False) as run:
+        marks = xr.Dataset({"status": ("shot", np.array([0, 0, 1], np.int8))}, attrs=run.attrs)
+    marks.to_zarr(store, mode="a", consolidated=False)
+    described = {role_of(keywords): keywords for _, keywords, _ in read_paths(str(store))}
+    strongest = np.hypot(*solved.displacement).max()
+    setup = setup_of(described["field"])
+    assert isinstance(setup, ProtonSetup)
+    factor = np.hypot(*setup.path_integrated_b([1.0, 0.0])) * 1e6  # half is below 1 mT·m
+    assert described["field"]["contrast_limits"][1] == pytest.approx(0.5 * factor * strongest)
+
+
+def test_a_damaged_store_is_one_sentence(store: Path) -> None:
+    shutil.rmtree(store / "displacement")
+    (store / "zarr.json").unlink()
+    with pytest.raises(FileFormatError, match=r"no store of results or is damaged|without the"):
+        read_paths(str(store))
+    with pytest.raises(FileFormatError, match="does not exist"):
+        read_paths(str(store.with_name("gone.shadowinv.zarr")))

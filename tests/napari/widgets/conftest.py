@@ -1,0 +1,80 @@
+"""A real window with the plugin's widgets in it; nothing is read from or left to the user."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from napari_shadowinv._napari.widgets._jobs import ShotJob
+from napari_shadowinv._napari.widgets._recipes import UniformEstimate
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+
+
+@pytest.fixture(autouse=True)
+def settings_folder(tmp_path: Path) -> Path:
+    """Keep the widgets' state out of the user's settings."""
+    from qtpy.QtCore import QSettings
+
+    folder = tmp_path / "settings"
+    QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(folder))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shot() -> np.ndarray[Any, Any]:
+    """An off-centre blob in an even beam, in counts."""
+    blob = gaussian_blob((48, 60), 20.0, 8.0, (20.0, 33.0))
+    return 300 * synthetic_image(blob.displacement)
+
+
+@pytest.fixture(scope="session")
+def _compiled(shot: np.ndarray[Any, Any]) -> None:
+    """Compile what an inversion needs, so that no test waits for it."""
+    job = ShotJob(shot, UniformEstimate(), options=InversionOptions(n_sites=700))
+    job.run()
+
+
+@pytest.fixture
+def window(make_napari_viewer: Any, qtbot: Any, _compiled: None) -> Iterator[Any]:
+    """A viewer in a window that can be seen; at the end no thread of ours runs on."""
+    viewer = make_napari_viewer(show=True)
+    viewer.window._qt_window.resize(1280, 800)
+    yield viewer
+    qtbot.waitUntil(lambda: not running_threads(), timeout=20_000)
+
+
+@pytest.fixture
+def open_widget(window: Any) -> Callable[[str], Any]:
+    """Open a widget as the menu does."""
+
+    def opened(name: str) -> Any:
+        _, widget = window.window.add_plugin_dock_widget("napari-shadowinv", name)
+        return widget
+
+    return opened
+
+
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What the user is told, one text for each notification."""
+    from napari.utils import notifications
+
+    texts: list[str] = []
+    monkeypatch.setattr(
+        notifications.notification_manager,
+        "dispatch",
+        lambda notification: texts.append(str(notification.message)),
+    )
+    return texts
+
+
+def running_threads() -> list[Any]:
+    import threading
+
+    return [thread for thread in threading.enumerate() if thread.name == "shadowinv"]

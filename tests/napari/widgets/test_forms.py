@@ -1,0 +1,181 @@
+"""Forms made from the models, and the files that they read and write."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from qtpy.QtWidgets import QFileDialog
+
+from napari_shadowinv import InputError, InversionOptions, OpticalSetup, ProtonSetup
+from napari_shadowinv._napari.widgets._forms import ModelForm, ModelPicker, kinds_of
+from napari_shadowinv._napari.widgets._recipes import ESTIMATES
+from napari_shadowinv._napari.widgets._setups import SetupPicker
+from napari_shadowinv._napari.widgets._state import StateKeeper
+from napari_shadowinv._napari.widgets._toml import dump_toml, load_toml
+from napari_shadowinv.cli._inputs import options_from, setup_from
+
+CHANGED = {
+    "n_sites": 1234,
+    "floor": 2.5e-4,
+    "tolerance": 1e-5,
+    "lloyd_iterations": 0,
+    "readout": "centroid",
+    "negative": "clip",
+    "seed": 2**40,
+    "threads": 1,
+}
+
+
+def the_form(qtbot: Any, model: Any) -> ModelForm:
+    form = ModelForm(model)
+    qtbot.addWidget(form)
+    return form
+
+
+def test_a_new_form_holds_the_defaults(qtbot: Any) -> None:
+    assert the_form(qtbot, InversionOptions).model() == InversionOptions()
+
+
+def test_every_field_can_be_set_and_is_described(qtbot: Any) -> None:
+    form = the_form(qtbot, InversionOptions)
+    form.set_values(CHANGED)
+    assert form.model() == InversionOptions(**CHANGED)
+    assert set(form.editors) == set(InversionOptions.model_fields)
+    for name, field in InversionOptions.model_fields.items():
+        assert str(field.description) in form.editors[name].toolTip()
+    form.set_values({})
+    assert form.model() == InversionOptions()
+
+
+def test_a_number_is_kept_within_its_bounds(qtbot: Any) -> None:
+    form = the_form(qtbot, InversionOptions)
+    form.editors["lloyd_iterations"].set_value(5000)
+    assert form.values()["lloyd_iterations"] == 1000
+    form.editors["tolerance"].set_value(3.0)
+    with pytest.raises(InputError, match="less than 1"):
+        form.model()
+
+
+def test_text_that_is_no_number_is_refused_with_what_was_typed(qtbot: Any) -> None:
+    form = the_form(qtbot, InversionOptions)
+    editor = form.editors["floor"].inner
+    editor.setText("little")
+    editor.editingFinished.emit()
+    with pytest.raises(InputError, match="little"):
+        form.model()
+    editor.setText("0.01")
+    editor.editingFinished.emit()
+    assert form.model() == InversionOptions(floor=0.01)
+
+
+def test_only_one_pixel_size_is_given(qtbot: Any, proton_setup: ProtonSetup) -> None:
+    form = the_form(qtbot, ProtonSetup)
+    form.set_values(proton_setup.model_dump())
+    assert form.model() == proton_setup
+    detector = form.editors["detector_pixel_size"]
+    detector.inner.setChecked(True)
+    detector.editor.set_value(145e-6)
+    assert not form.editors["pixel_size"].checked
+    assert form.values()["detector_pixel_size"] == 145e-6
+    assert "pixel_size" not in form.values()
+
+
+def test_an_empty_setup_says_what_is_missing(qtbot: Any) -> None:
+    picker = SetupPicker()
+    qtbot.addWidget(picker)
+    assert picker.setup() is None
+    picker.picker.set_kind("proton")
+    with pytest.raises(InputError, match="energy"):
+        picker.setup()
+
+
+@pytest.mark.parametrize("name", ["proton_setup", "optical_setup"])
+def test_the_command_line_reads_a_saved_setup(
+    name: str, request: pytest.FixtureRequest, qtbot: Any, tmp_path: Path
+) -> None:
+    setup = request.getfixturevalue(name)
+    picker = SetupPicker()
+    qtbot.addWidget(picker)
+    picker.show_setup(setup.model_dump())
+    path = dump_toml(picker._to_save(), tmp_path / "setup")
+    assert path.suffix == ".toml"
+    assert setup_from(path) == setup
+    picker.picker.set_kind("none")
+    picker._take(load_toml(path), str(path))
+    assert picker.setup() == setup
+    if isinstance(setup, OpticalSetup):
+        assert math.isinf(picker.setup().source_object_distance)
+
+
+def test_the_command_line_reads_saved_options(qtbot: Any, tmp_path: Path) -> None:
+    form = the_form(qtbot, InversionOptions)
+    form.set_values(CHANGED)
+    path = dump_toml(form.values(), tmp_path / "options.toml")
+    assert options_from(path, {}, False) == InversionOptions(**CHANGED)
+
+
+def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> None:
+    dump_toml({"seed": 1}, tmp_path / "options.toml")
+    with pytest.raises(OSError, match="exists"):
+        dump_toml({"seed": 2}, tmp_path / "options")
+    dump_toml({"seed": 3}, tmp_path / "options.toml")
+    assert load_toml(tmp_path / "options.toml") == {"seed": 3}
+
+
+def test_the_buttons_save_and_load(
+    qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: list[str],
+    proton_setup: ProtonSetup,
+) -> None:  # fmt: skip
+    picker = SetupPicker()
+    qtbot.addWidget(picker)
+    path = str(tmp_path / "setup.toml")
+    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (path, ""))
+    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (path, ""))
+    picker.files.save_button.click()
+    assert len(told) == 1
+    assert "no setup to save" in told[0]
+    picker.show_setup(proton_setup.model_dump())
+    picker.files.save_button.click()
+    picker.picker.set_kind("none")
+    picker.files.load_button.click()
+    assert picker.setup() == proton_setup
+    Path(path).write_text("kind = 'proton'\nenergie = 3")
+    picker.files.load_button.click()
+    assert len(told) == 2
+    assert "energie" in told[1]
+    assert picker.setup() == proton_setup
+
+
+def test_a_picker_remembers_what_each_kind_holds(qtbot: Any) -> None:
+    picker, other = (ModelPicker("Method", kinds_of(ESTIMATES)) for _ in range(2))
+    for one in (picker, other):
+        qtbot.addWidget(one)
+    picker.set_kind("polynomial")
+    assert picker.form is not None
+    picker.form.editors["degree"].set_value(7)
+    picker.set_kind("low_pass")
+    other.restore(picker.state())
+    assert other.kind == "low_pass"
+    other.set_kind("polynomial")
+    assert other.model() == ESTIMATES["polynomial"](degree=7)  # type: ignore[call-arg]
+
+
+def test_what_was_kept_is_loaded_and_damage_is_forgiven(qtbot: Any, settings_folder: Path) -> None:
+    from qtpy.QtWidgets import QWidget
+
+    widget = QWidget()
+    qtbot.addWidget(widget)
+    keeper = StateKeeper(widget, "test", lambda: {"a": [1, math.inf], "b": "µm"})
+    assert keeper.load() == {}
+    keeper.write()
+    assert keeper.load() == {"a": [1, math.inf], "b": "µm"}
+    StateKeeper(widget, "damaged", lambda: {}).write()
+    (file,) = settings_folder.rglob("*.ini")
+    file.write_text(file.read_text().replace("damaged={}", "damaged={]"))
+    assert StateKeeper(widget, "damaged", lambda: {}).load() == {}
+    form = the_form(qtbot, InversionOptions)
+    form.set_values({"seed": "many", "unknown": 3, "floor": None, "readout": "none"})
+    assert form.model() == InversionOptions()

@@ -1,0 +1,280 @@
+"""What the widgets compute and hold, without a window."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.layers import Image, Labels, Shapes
+
+from napari_shadowinv import InputError, InversionCancelled, InversionOptions, filters, sources
+from napari_shadowinv._napari.widgets import _recipes as recipes
+from napari_shadowinv._napari.widgets._estimating import quick_source
+from napari_shadowinv._napari.widgets._forecast import ForwardJob
+from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
+from napari_shadowinv._napari.widgets._phantoms import BlobRecipe, ToroidRecipe
+from napari_shadowinv._napari.widgets._quantities import parsed, shown
+from napari_shadowinv._napari.widgets._reading import crop_of, image_of, mask_of
+from napari_shadowinv._napari.widgets._sampling import Profile, along, sampled, table_text
+
+FEW = InversionOptions(n_sites=500)
+Array = np.ndarray[Any, Any]
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("1.3 mm", "m", 1.3e-3),
+        ("810nm", "m", 8.1e-7),
+        ("145 µm", "m", 145e-6),
+        ("0.28", "m", 0.28),
+        ("inf", "m", math.inf),
+        ("3 keV", "MeV", 3e-3),
+        ("1e-3", "", 1e-3),
+    ],
+)
+def test_a_quantity_is_read_exactly_and_shown_so_that_it_reads_back(
+    text: str, unit: str, value: float
+) -> None:
+    assert parsed(text, unit) == value
+    assert parsed(shown(value, unit), unit) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"), [("1.3 kg", "m"), ("abc", "m"), ("2 m", ""), ("1 mm mm", "m"), ("", "m")]
+)
+def test_what_is_no_quantity_is_refused(text: str, unit: str) -> None:
+    with pytest.raises(InputError):
+        parsed(text, unit)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "function"),
+    [
+        (recipes.PolynomialEstimate, sources.polynomial_source),
+        (recipes.TotalVariationEstimate, sources.total_variation_source),
+        (recipes.InterpolatedEstimate, sources.interpolated_source),
+        (recipes.BackgroundFilter, filters.remove_background),
+        (recipes.HotPixelFilter, filters.remove_hot_pixels),
+    ],
+)
+def test_defaults_of_a_form_are_those_of_the_function(recipe: Any, function: Any) -> None:
+    parameters = inspect.signature(function).parameters
+    for name, field in recipe.model_fields.items():
+        if parameters[name].default is not inspect.Parameter.empty:
+            assert field.default == parameters[name].default, name
+
+
+def test_a_crop_gives_the_field_of_the_cropped_image(shot: Array) -> None:
+    rows, columns = slice(4, 44), slice(10, 58)
+    uniform = recipes.UniformEstimate()
+    cropped = ShotJob(shot, uniform, crop=(rows, columns), options=FEW).run()
+    alone = ShotJob(shot[rows, columns], uniform, options=FEW).run()
+    np.testing.assert_array_equal(cropped.displacement, alone.displacement)
+
+
+def test_what_the_mask_hides_does_not_matter(shot: Array) -> None:
+    usable = np.ones(shot.shape, bool)
+    usable[30:36, 5:12] = False
+    spoiled = shot.copy()
+    spoiled[~usable] = np.nan
+    jobs = [
+        ShotJob(
+            image, recipes.LowPassEstimate(), usable, None, recipes.LowPassFilter(), options=FEW
+        )
+        for image in (spoiled, np.where(usable, shot, 1e4))
+    ]
+    first, second = (job.run() for job in jobs)
+    np.testing.assert_allclose(first.potential, second.potential, atol=1e-9)
+
+
+def test_sites_are_kept_while_the_source_stays(shot: Array) -> None:
+    cache = PlanCache()
+    source = np.full(shot.shape, 7.0)
+
+    def run(image: Array, source: Any, **options: Any) -> None:
+        chosen = FEW.model_copy(update=options)
+        ShotJob(image, source, options=chosen, cache=cache).run()
+
+    run(shot, source)
+    run(shot, source)
+    run(filters.low_pass(shot, 1.0), source, tolerance=1e-2)
+    assert cache.hits == 2
+    run(shot, source + np.linspace(0, 1, shot.shape[1]))
+    run(shot, source, seed=1)
+    assert cache.hits == 2
+
+
+def test_a_uniform_source_is_the_same_after_a_filter(shot: Array) -> None:
+    cache = PlanCache()
+    for width in (1.0, 1.5, 2.0):
+        cleaning = recipes.LowPassFilter(width=width)
+        ShotJob(shot, recipes.UniformEstimate(), cleaning=cleaning, options=FEW, cache=cache).run()
+    assert cache.hits == 2
+
+
+def test_seconds_of_all_stages_are_told(shot: Array) -> None:
+    report = ShotJob(shot, recipes.LowPassEstimate(), options=FEW).run().report
+    assert set(report.seconds) == {"source", "prepare", "sites", "transport", "read-out"}
+    assert report.seconds["sites"] > 0
+    assert not report.warnings
+
+
+def test_a_preview_has_few_sites(shot: Array) -> None:
+    job = ShotJob(shot, recipes.UniformEstimate())
+    assert job.for_preview().options.n_sites == PREVIEW_SITES
+    assert (
+        ShotJob(shot, recipes.UniformEstimate(), options=FEW).for_preview().options.n_sites == 500
+    )
+
+
+@pytest.mark.parametrize(
+    "estimate", [recipes.LowPassEstimate(width=40), recipes.PolynomialEstimate()]
+)
+def test_a_quick_estimate_is_close_to_the_exact_one(estimate: recipes.Estimate) -> None:
+    y, x = np.mgrid[:90, :121]
+    beam = 100 * np.exp(-((y - 40) ** 2 + (x - 70) ** 2) / 9000)
+    usable = np.ones(beam.shape, bool)
+    usable[10:20, 30:50] = False
+    quick = quick_source(estimate, np.where(usable, beam, 1e9), usable, 3000)
+    exact = estimate.source(beam, usable)
+    assert quick[usable].sum() == pytest.approx(beam[usable].sum(), rel=1e-9)
+    assert abs(quick - exact)[usable].max() < 0.03 * exact.max()
+
+
+def test_a_quick_total_variation_removes_the_object_and_keeps_the_edge() -> None:
+    y, x = np.mgrid[:90, :120]
+    beam = np.where(x < 60, 100.0, 60.0)
+    shot = beam + 30 * (np.hypot(y - 45, x - 30) < 5)
+    estimate = recipes.TotalVariationEstimate(weight=1.0)
+    quick, exact = quick_source(estimate, shot, None, 3000), estimate.source(shot, None)
+    away = abs(x - 59.5) > 6
+    assert abs(quick - exact)[away].max() < 3
+    assert abs(quick - beam)[away].max() < 5
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"image": np.zeros((20, 20))}, "no positive pixel"),
+        ({"image": np.full((20, 20), np.nan)}, "NaN"),
+        ({"image": np.ones((1, 1))}, "at least 4 × 4"),
+        ({"image": np.ones((3, 20, 20))}, "expected two dimensions"),
+        ({"source": np.ones((20, 21))}, "must match"),
+        ({"source": Path("no such file.tif")}, "no such file"),
+        ({"mask": np.ones((20, 21), bool)}, "must match"),
+        ({"crop": (slice(3, 4), slice(0, 20))}, "larger rectangle"),
+        ({"source": recipes.InterpolatedEstimate()}, "choose a mask"),
+    ],
+)
+def test_a_mistake_gets_a_sentence(change: dict[str, Any], words: str) -> None:
+    good = {"image": np.ones((20, 20)), "source": recipes.UniformEstimate()}
+    with pytest.raises((InputError, OSError), match=words):
+        ShotJob(**{**good, **change}).run()
+
+
+def test_a_job_ends_when_it_is_asked_to(shot: Array) -> None:
+    stop = threading.Event()
+    stages: list[str] = []
+
+    def hear(progress: Any) -> None:
+        stages.append(progress.stage)
+        if progress.stage == "transport":
+            stop.set()
+
+    with pytest.raises(InversionCancelled):
+        ShotJob(shot, recipes.UniformEstimate(), options=FEW).run(hear, stop.is_set)
+    assert "read-out" not in stages
+
+
+def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:
+    weak = ForwardJob(BlobRecipe(amplitude=5, sigma=8), shape=(40, 50)).run()
+    strong = ForwardJob(BlobRecipe(amplitude=-200, sigma=8), shape=(40, 50)).run()
+    assert weak.warning == ""
+    assert "Caustics" in strong.warning
+    assert strong.caustic_share > 0
+
+
+def test_a_potential_and_its_object_make_the_same_image() -> None:
+    blob = BlobRecipe(amplitude=20, sigma=8)
+    phantom = blob.phantom((40, 50), None)
+    by_object = ForwardJob(blob, shape=(40, 50)).run()
+    by_potential = ForwardJob(1e9 * phantom.potential, to_px2=1e-9).run()
+    assert abs(by_object.image - by_potential.image).max() < 0.02
+
+
+def test_a_magnetic_object_asks_for_particles() -> None:
+    with pytest.raises(InputError, match="choose the setup"):
+        ForwardJob(ToroidRecipe()).run()
+
+
+def test_a_plane_is_sampled_exactly_at_its_place_in_the_world() -> None:
+    y, x = np.mgrid[:30, :40]
+    plane = 2.0 * y + 0.5 * x
+    points, distance = along([[5.0, 10.0], [35.0, 50.0]], 0.5)
+    values = sampled(plane, points, lambda at: (at - np.array([3.0, 4.0])) / 2.0)
+    expected = (points[:, 0] - 3) + 0.25 * (points[:, 1] - 4)
+    inside = ((points[:, 1] - 4) / 2 >= 0) & ((points[:, 1] - 4) / 2 <= 39)
+    np.testing.assert_allclose(values[inside], expected[inside], atol=1e-12)
+    assert distance[-1] == pytest.approx(50)
+    assert np.isnan(sampled(plane, np.array([[-1.0, 0.0]]), lambda at: at)).all()
+
+
+def test_a_table_names_each_unit_once() -> None:
+    profiles = [
+        Profile("a potential (nm)", "nm", np.array([1.0, 2.0])),
+        Profile("re-projection", "flux/px²", np.array([np.nan, 4.0])),
+    ]
+    text = table_text(np.array([0.0, 1.5]), "µm", profiles)
+    assert text.splitlines() == [
+        "distance (µm),a potential (nm),re-projection (flux/px²)",
+        "0,1,nan",
+        "1.5,2,4",
+    ]
+
+
+def test_painted_pixels_are_unusable_or_the_only_usable_ones() -> None:
+    image, labels = Image(np.ones((10, 12))), Labels(np.zeros((10, 12), int))
+    assert mask_of(labels, image, True) is None
+    labels.data[2, 3] = 5
+    usable = mask_of(labels, image, True)
+    assert usable is not None
+    assert usable.sum() == 119
+    assert not usable[2, 3]
+    chosen = mask_of(labels, image, False)
+    assert chosen is not None
+    assert chosen.sum() == 1
+
+
+def test_a_drawn_crop_follows_the_scale_of_its_image() -> None:
+    image = Image(np.ones((20, 30)), scale=(2.0, 2.0), translate=(10.0, 0.0))
+    drawn = Shapes([np.array([[14, 8], [14, 40], [30, 40], [30, 8]])], shape_type="rectangle")
+    assert crop_of(drawn, image) == (slice(2, 11), slice(4, 21))
+    beyond = Shapes([np.array([[-90, -90], [-90, 90], [90, 90], [90, -90]])])
+    assert crop_of(beyond, image) == (slice(0, 20), slice(0, 30))
+    assert crop_of(Shapes(ndim=2), image) is None
+
+
+def test_a_drawn_mask_covers_the_pixels_under_it() -> None:
+    image = Image(np.ones((20, 30)), scale=(2.0, 2.0))
+    drawn = Shapes([np.array([[8, 8], [8, 20], [16, 20], [16, 8]])], shape_type="rectangle")
+    usable = mask_of(drawn, image, True)
+    assert usable is not None
+    assert not usable[5:8, 5:10].any()
+    assert usable[:3].all()
+
+
+def test_layers_that_are_no_single_image_are_refused() -> None:
+    with pytest.raises(InputError, match="File → Open"):
+        image_of(None)
+    with pytest.raises(InputError, match="colour"):
+        image_of(Image(np.ones((8, 8, 3)), rgb=True))
+    with pytest.raises(InputError, match="Split Stack"):
+        image_of(Image(np.ones((4, 8, 8))))
+    with pytest.raises(InputError, match="they must match"):
+        mask_of(Labels(np.zeros((8, 9), int)), Image(np.ones((8, 8))), True)
