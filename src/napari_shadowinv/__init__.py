@@ -3,6 +3,7 @@
 - invert an image: `invert`, with `InversionOptions`; the answer is an `Inversion`
 - share sites between shots with one source: `plan_sites`
 - what a deflection means in SI units: `ProtonSetup`, `OpticalSetup`
+- many shots, with dask: `invert_stack`, `run_stack`, `stack_statistics`
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
 - read and write files: `read`, `write`
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.poisson import poisson_invert
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
     from napari_shadowinv.progress import Progress
+    from napari_shadowinv.stack import invert_stack, run_stack, stack_statistics
 
 __all__ = [
     "FileFormatError",
@@ -37,9 +39,12 @@ __all__ = [
     "Radiograph",
     "Report",
     "invert",
+    "invert_stack",
     "plan_sites",
     "poisson_invert",
     "read",
+    "run_stack",
+    "stack_statistics",
     "synthetic_image",
     "write",
 ]
@@ -56,9 +61,12 @@ _HOME = {
     "Radiograph": "io",
     "Report": "inversion",
     "invert": "inversion",
+    "invert_stack": "stack",
     "plan_sites": "inversion",
     "poisson_invert": "physics.poisson",
     "read": "io",
+    "run_stack": "stack",
+    "stack_statistics": "stack",
     "synthetic_image": "physics.forward",
     "write": "io",
 }

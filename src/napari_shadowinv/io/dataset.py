@@ -2,6 +2,7 @@
 
 - label everything, with units: `dataset_from_inversion`
 - the same for a field of other origin: `dataset_from_field`
+- the names, dimensions and units alone: `variable_labels`
 - the way back: `inversion_from_dataset`, `setup_from_dataset`
 - one file for all of it (NetCDF4, ``.shadowinv``): `write_result`, `read_result`
 - say which files it was made from: `provenance`
@@ -38,6 +39,7 @@ __all__ = [
     "provenance",
     "read_result",
     "setup_from_dataset",
+    "variable_labels",
     "write_result",
 ]
 
@@ -150,6 +152,37 @@ def dataset_from_field(
         attrs["setup"] = setup.model_dump_json()
     height, width = displacement.shape[1:]
     return xr.Dataset(variables, coords=_coordinates(height, width, setup), attrs=attrs)
+
+
+def variable_labels(
+    setup: ProtonSetup | OpticalSetup | None = None,
+) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+    """Name every variable of a result, with its dimensions and labels.
+
+    Parameters
+    ----------
+    setup : ProtonSetup or OpticalSetup, optional
+        Adds the fields in SI units.
+
+    Returns
+    -------
+    dict of str to (tuple of str, dict of str to str)
+        Dimensions, and ``units`` and ``long_name``.
+
+    Examples
+    --------
+    >>> variable_labels()["potential"]
+    (('y', 'x'), {'units': 'px²', 'long_name': 'Normalised deflection potential'})
+    """
+    labels = {
+        name: (dims if isinstance(dims, tuple) else (dims,), _labels(units, long_name))
+        for name, (dims, units, long_name) in _VARIABLES.items()
+    }
+    if setup is not None:
+        nothing = np.zeros((2, 4, 4))
+        fields = _fields(nothing, nothing[0], setup)
+        labels |= {name: (dims, dict(attrs)) for name, (dims, _, attrs) in fields.items()}
+    return labels
 
 
 def displacement_from_potential(potential: ArrayLike) -> NDArray[np.float64]:
