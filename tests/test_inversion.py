@@ -229,6 +229,33 @@ def test_a_plan_gives_the_same_answer_as_its_source(image):
     np.testing.assert_array_equal(with_plan.potential, again.potential)
 
 
+def test_the_shot_before_is_a_start_that_saves_steps_and_changes_nothing(phantom, image):
+    options = InversionOptions(tolerance=1e-8)
+    plan = plan_sites(np.ones(SHAPE), options)
+    before = invert(image, plan=plan, options=options)
+    noise = 0.02 * np.random.default_rng(3).normal(size=SHAPE)
+    shot = np.maximum(synthetic_image(1.03 * phantom.displacement) + noise, 0)
+    cold = invert(shot, plan=plan, options=options)
+    warm = invert(shot, plan=plan, options=options, start=before)
+    assert warm.report.converged
+    assert [sites for sites, _, _ in warm.report.levels] == [plan.levels[-1].sites.shape[0]]
+    assert warm.report.iterations <= cold.report.iterations - 3
+    np.testing.assert_allclose(warm.potential, cold.potential, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(warm.displacement, cold.displacement, rtol=0, atol=1e-5)
+    assert peak(warm.displacement - before.displacement) > 0.1
+
+
+def test_a_start_does_not_need_the_very_plan_but_its_sites(image):
+    source = 1 + np.random.default_rng(1).random(SHAPE)
+    before = invert(image * source, source=source)
+    again = invert(image * source, source=3 * source, start=before)
+    assert again.report.iterations == 0
+    other = InversionOptions(seed=1)
+    for others in ({"options": other}, {"options": InversionOptions(n_sites=900)}):
+        with pytest.raises(InputError, match="start has 4,800 sites that are not the"):
+            invert(image * source, source=source, start=before, **others)
+
+
 def test_threads_do_not_change_a_bit(image):
     one, many = (
         invert(image, options=InversionOptions(n_sites=20000, threads=threads))

@@ -69,6 +69,51 @@ def test_descent_finds_the_weights_that_newton_finds(solver, stages):
     np.testing.assert_allclose(by_descent.weights, by_newton.weights, atol=1e-4)
 
 
+@pytest.mark.parametrize(("solver", "steps"), [("newton", 0), ("lbfgs", 1)])
+def test_a_solution_as_start_is_the_answer(plan, solver, steps):
+    """Descent always makes a step before it asks how good it is."""
+    options = InversionOptions(tolerance=1e-2, solver=solver, max_iterations=3000)
+    cold = solve(plan.levels, bright_spot(), InversionOptions(tolerance=1e-2))
+    (warm,) = solve(plan.levels, bright_spot(), options, start=cold[-1].weights)
+    assert warm.converged
+    assert warm.iterations == steps
+    np.testing.assert_allclose(warm.weights, cold[-1].weights, rtol=0, atol=0.05 * steps + 1e-9)
+
+
+def test_a_start_that_leads_nowhere_has_no_influence(plan):
+    rng = np.random.default_rng(0)
+    nonsense = 1e4 * rng.normal(size=len(plan.levels[-1].sites))
+    folding = bright_spot() ** 3
+    image = folding / folding.mean() + 1e-3
+    image /= image.mean()
+    cold = solve(plan.levels, image, InversionOptions())
+    warm = solve(plan.levels, image, InversionOptions(), start=nonsense)
+    assert cold[-1].converged
+    assert len(warm) == len(cold) > 1
+    np.testing.assert_array_equal(warm[-1].weights, cold[-1].weights)
+
+
+def test_a_start_that_does_not_converge_is_no_worse_than_none(plan):
+    options = InversionOptions(tolerance=1e-12, max_iterations=1)
+    start = np.zeros(len(plan.levels[-1].sites))
+    cold = solve(plan.levels, bright_spot(), options)[-1]
+    warm = solve(plan.levels, bright_spot(), options, start=start)[-1]
+    assert not warm.converged
+    assert warm.residual == cold.residual
+
+
+def test_a_request_to_stop_ends_a_warm_start(plan):
+    start = np.zeros(len(plan.levels[-1].sites))
+    with pytest.raises(InversionCancelled, match="transport"):
+        solve(
+            plan.levels,
+            bright_spot(),
+            InversionOptions(),
+            Reporter(None, lambda: True),
+            start=start,
+        )
+
+
 def test_a_matrix_that_does_not_fit_is_refused():
     sites = np.random.default_rng(0).random((300_000, 2)) * 100 - 0.5
     objective = TransportObjective(

@@ -38,6 +38,7 @@ def newton(
     *,
     tolerance: float,
     max_iterations: int,
+    shortest_step: float = _SHORTEST_STEP,
     report: Reporter | None = None,
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
@@ -52,6 +53,8 @@ def newton(
         Largest relative flux error allowed in any cell.
     max_iterations : int
         Most steps.
+    shortest_step : float
+        It gives up where it would have to go less than this share of Newton's step.
     report : Reporter, optional
         Told of each step.
 
@@ -80,7 +83,9 @@ def newton(
             reason = f"Newton's system cannot be solved: {error}"
             break
         del laplacian
-        damped = _damped_step(objective, weights, step, gap, keep * mass.mean(), alive)
+        damped = _damped_step(
+            objective, weights, step, gap, keep * mass.mean(), shortest_step, alive
+        )
         if damped is None:
             reason = "no step along Newton's direction lowers the error without emptying a cell"
             break
@@ -99,12 +104,13 @@ def _damped_step(
     step: Array,
     gap: Array,
     least: float,
+    shortest: float,
     alive: Callable[[], None],
 ) -> tuple[Array, PowerDiagram] | None:
     """Halve the step until all cells keep some flux and the error falls."""
     error = np.linalg.norm(gap)
     share = 1.0
-    while share > _SHORTEST_STEP:
+    while share > shortest:
         diagram = None  # one at a time: they are large
         alive()
         trial = weights + share * step
@@ -117,7 +123,9 @@ def _damped_step(
     return None
 
 
-def with_full_cells(objective: TransportObjective, weights: Array) -> Array:
+def with_full_cells(
+    objective: TransportObjective, weights: Array, *, unchanged_first: bool = False
+) -> Array:
     """Find weights near the given ones for which every cell holds some flux.
 
     Hidden sites are lowered to where they just show; then a little of the zero weights,
@@ -129,13 +137,15 @@ def with_full_cells(objective: TransportObjective, weights: Array) -> Array:
         The problem.
     weights : ndarray, shape (n,)
         Any weights, px².
+    unchanged_first : bool
+        Whether nothing is mixed in where the cells are full without.
 
     Returns
     -------
     ndarray, shape (n,)
     """
     shown = objective.triangulation.lower_hidden(weights)
-    for share in _SHARES_OF_START:
+    for share in (1.0,) * unchanged_first + _SHARES_OF_START:
         diagram = objective.diagram_if_full(share * shown)
         if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
             return share * shown

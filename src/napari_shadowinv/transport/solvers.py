@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 
 _COARSE_TOLERANCE = 3e-2
 _BLURS = (4.0, 2.0, 1.0, 0.5)
+_WARM_STEPS = 10
+_SHORTEST_WARM_STEP = 0.1  # where steps must be shorter, starting afresh is faster
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,8 +67,12 @@ def solve(
     image: Array,
     options: InversionOptions,
     report: Reporter | None = None,
+    *,
+    start: Array | None = None,
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
+
+    With a `start` it solves on the finest level alone, if that converges.
 
     Parameters
     ----------
@@ -78,6 +84,9 @@ def solve(
         Solver, stages, tolerance, most iterations, threads.
     report : Reporter, optional
         Told of each step.
+    start : ndarray, shape (n,), optional
+        Weights of the finest level that solve a similar image, px². Where they lead nowhere
+        they have no influence on the answer.
 
     Returns
     -------
@@ -92,6 +101,10 @@ def solve(
     if options.stages == "single":
         levels = levels[-1:]
     density = Density.from_image(image)
+    if start is not None:
+        nearby = _solve_from(start, levels[-1], density, options, report)
+        if nearby is not None:
+            return [nearby]
     solutions: list[LevelSolution] = []
     for number, level in enumerate(levels):
         if number > 0:
@@ -106,6 +119,29 @@ def solve(
         solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
     return solutions
+
+
+def _solve_from(
+    start: Array,
+    level: Level,
+    image: Density,
+    options: InversionOptions,
+    report: Reporter | None,
+) -> LevelSolution | None:
+    """Solve one level from given weights, or return None where that gets nowhere soon."""
+    objective = _objective(level, image, options)
+    if options.solver == "newton":
+        solution = newton(
+            objective,
+            with_full_cells(objective, start, unchanged_first=True),
+            tolerance=options.tolerance,
+            max_iterations=min(_WARM_STEPS, options.max_iterations),
+            shortest_step=_SHORTEST_WARM_STEP,
+            report=report,
+        )
+    else:
+        solution = _solve_level(objective, start, options, options.tolerance, report)
+    return LevelSolution.of_level(level, objective, solution) if solution.converged else None
 
 
 def _objective(level: Level, image: Density, options: InversionOptions) -> TransportObjective:
