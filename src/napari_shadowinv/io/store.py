@@ -361,7 +361,7 @@ class StackStore:
             raise FileFormatError(f"{path} is no stack of shots: expected name{STORE_SUFFIX}")
         try:
             self._arrays = dict(zarr.open_group(path, mode="r").arrays())
-            self.names = tuple(map(str, np.asarray(self._arrays["name"][...])))
+            self.names = tuple(map(str, np.asarray(self._arrays["name"][...]).tolist()))
             self.statuses()
         except Exception as error:
             raise FileFormatError(
@@ -385,8 +385,8 @@ class StackStore:
 
     def reports(self) -> Sequence[dict[str, Any]]:
         """Return how each shot went."""
-        texts = np.asarray(self._arrays["report"][...])
-        return [json.loads(text) if text else {} for text in texts.astype(str)]
+        texts = np.asarray(self._arrays["report"][...]).tolist()
+        return [json.loads(text) if text else {} for text in texts]
 
     def summarise(self) -> None:
         """Gather numbers of each shot from their reports, for those who open the store.

@@ -7,6 +7,7 @@ import json
 import queue
 import time
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -187,8 +188,11 @@ def run_stack(
             try:
                 with engine_for(scheduler, workers) as engine:
                     run.on(engine)
-            finally:
-                store.summarise()
+            except BaseException:
+                with suppress(OSError):
+                    store.summarise()
+                raise
+            store.summarise()
         else:
             run.tell("nothing to do")
     return read_stack(path)
@@ -212,7 +216,7 @@ def _store_for(
         stack.sizes,
         _variables(stack, dtype),
         coordinates,
-        {**attributes_of(stack), **identity},
+        {**attributes_of(stack), **{name: value for name, value in identity.items() if value}},
         overwrite=overwrite,
     )
 

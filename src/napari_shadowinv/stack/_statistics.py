@@ -84,11 +84,11 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
 
 def _peak(field: xarray.DataArray) -> xarray.DataArray:
     planes = field.astype(np.float64)
+    squared = planes**2
     if "component" in field.dims:
-        magnitude = np.sqrt((planes**2).sum("component", skipna=False))
-    else:
-        magnitude = abs(planes)
-    return magnitude.max(("y", "x"), skipna=False)
+        squared = squared.sum("component", skipna=False)
+    largest: xarray.DataArray = squared.max(("y", "x"), skipna=False)
+    return largest**0.5
 
 
 def _labelled(values: xarray.DataArray, field: xarray.DataArray, what: str) -> xarray.DataArray:

@@ -252,7 +252,8 @@ def _threads_on(host: str, _age: int) -> int:
     from distributed import get_client
     from distributed.comm.addressing import get_address_host
 
-    workers = get_client().nthreads()
+    client: Any = get_client()
+    workers = client.nthreads()
     return sum(count for address, count in workers.items() if get_address_host(address) == host)
 
 
