@@ -2,7 +2,7 @@
 
 - label everything, with units: `dataset_from_inversion`
 - the same for a field of other origin: `dataset_from_field`
-- the names, dimensions and units alone: `variable_labels`
+- the names, dimensions and units alone: `variable_labels`; one field: `field_in_si`
 - the way back: `inversion_from_dataset`, `setup_from_dataset`
 - one file for all of it (NetCDF4, ``.shadowinv``): `write_result`, `read_result`
 - say which files it was made from: `provenance`
@@ -35,6 +35,7 @@ __all__ = [
     "dataset_from_field",
     "dataset_from_inversion",
     "displacement_from_potential",
+    "field_in_si",
     "inversion_from_dataset",
     "provenance",
     "read_result",
@@ -183,6 +184,31 @@ def variable_labels(
         fields = _fields(nothing, nothing[0], setup)
         labels |= {name: (dims, dict(attrs)) for name, (dims, _, attrs) in fields.items()}
     return labels
+
+
+def field_in_si(
+    name: str, values: NDArray[Any], setup: ProtonSetup | OpticalSetup
+) -> NDArray[np.float64]:
+    """Return a field in SI units by its name in a dataset.
+
+    Parameters
+    ----------
+    name : str
+        One of those that `variable_labels` adds for a setup.
+    values : ndarray, shape (2, H, W) or (H, W)
+        The displacement (px) for vectors, the normalised potential (px²) for planes.
+    setup : ProtonSetup or OpticalSetup
+        The geometry.
+
+    Returns
+    -------
+    ndarray, of the shape of `values`
+    """
+    nothing = np.zeros((2, 4, 4))
+    is_vector = values.ndim == 3
+    fields = _fields(values, nothing[0], setup) if is_vector else _fields(nothing, values, setup)
+    field: NDArray[np.float64] = fields[name][1]
+    return field
 
 
 def displacement_from_potential(potential: ArrayLike) -> NDArray[np.float64]:

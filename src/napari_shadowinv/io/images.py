@@ -164,7 +164,9 @@ def tiff_pages(path: Path) -> int:
         ) from error
 
 
-def read_tiff_page(path: Path, number: int) -> NDArray[Any]:
+def read_tiff_page(
+    path: Path, number: int, *, channel: str | int | None = None
+) -> NDArray[np.float64]:
     """Read one page of a TIFF that holds many.
 
     Parameters
@@ -173,11 +175,13 @@ def read_tiff_page(path: Path, number: int) -> NDArray[Any]:
         The file.
     number : int
         Which page, from 0.
+    channel : {"red", "green", "blue", "mean"} or int, optional
+        What to take of a colour image.
 
     Returns
     -------
     ndarray, shape (H, W)
-        Its pixels in the file's own dtype; equal colour channels become one.
+        Its pixels.
 
     Raises
     ------
@@ -197,7 +201,7 @@ def read_tiff_page(path: Path, number: int) -> NDArray[Any]:
             "complete picture; copy or export it again"
         ) from error
     _check(path, "tiff", array)
-    return to_grey(array, None, f"page {number} of {path}")
+    return to_grey(array, channel, f"page {number} of {path}")
 
 
 def _decode(path: Path, page: Any) -> NDArray[Any]:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.dataset import setup_from_dataset, variable_labels
+from napari_shadowinv.io.dataset import field_in_si, setup_from_dataset, variable_labels
 
 if TYPE_CHECKING:
     import xarray
@@ -435,14 +435,31 @@ def read_stack(path: str | Path) -> xarray.Dataset:
         dataset: xr.Dataset = xr.open_zarr(
             path, decode_times=False, mask_and_scale=False, chunks={}
         )
-        # As they were written; the folder's own order is arbitrary.
-        order = [
-            name
-            for name in (*variable_labels(setup_from_dataset(dataset)), *_OWN_ORDER)
-            if name in dataset
-        ]
-        return dataset[order].assign(status=dataset["status"].copy(data=store.statuses()))
+        setup = setup_from_dataset(dataset)
+        complete = _with_fields(dataset, setup)
+        # The folder's own order is arbitrary.
+        order = [*variable_labels(setup), *_OWN_ORDER]
+        shown = complete[[name for name in order if name in complete]]
+        return shown.assign(status=shown["status"].copy(data=store.statuses()))
     except Exception as error:
         raise FileFormatError(
             f"{path} is a stack of shots but is damaged ({error}): run it again with overwriting"
         ) from error
+
+
+def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
+    """Add the fields in SI units that follow from what is stored, lazily."""
+    if setup is None:
+        return dataset
+    found = {}
+    for name, (dims, labels) in variable_labels(setup).items():
+        origin = "displacement" if "component" in dims else "potential"
+        if name in dataset or name in variable_labels() or origin not in dataset:
+            continue
+        blocks = dataset[origin].data.map_blocks(_field_of_block, name, setup, dtype=np.float64)
+        found[name] = (("shot", *dims), blocks, labels)
+    return dataset.assign(found)
+
+
+def _field_of_block(block: NDArray[Any], name: str, setup: Any) -> NDArray[np.float64]:
+    return np.stack([field_in_si(name, values, setup) for values in block])

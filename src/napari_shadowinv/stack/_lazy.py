@@ -16,7 +16,7 @@ from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
 from napari_shadowinv.io.store import FORMAT, SUMMARY
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocess import checked_mask, checked_source, number_of_sites
-from napari_shadowinv.stack._shots import Reader, Shot, Shots, find_shots, find_source
+from napari_shadowinv.stack._shots import Reader, Shot, Shots, find_shots, find_source, read_shot
 from napari_shadowinv.stack._work import Beam, arrays_of, invert_shot, shared_plan, threads_here
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def describe_stack(
     options: InversionOptions | None,
     setup: ProtonSetup | OpticalSetup | None,
     variables: Collection[str] | None,
-    reader: Reader | None,
+    reader: Reader,
     warm_start: int,
 ) -> Stack:
     """Check everything that can be checked before a shot is read.
@@ -156,7 +156,7 @@ def invert_stack(
     options: InversionOptions | None = None,
     setup: ProtonSetup | OpticalSetup | None = None,
     variables: Collection[str] | None = None,
-    reader: Reader | None = None,
+    reader: Reader = read_shot,
     warm_start: int = 1,
 ) -> xarray.Dataset:
     """Describe the inversion of many shots; dask does the work where and when it is asked for.
@@ -179,7 +179,8 @@ def invert_stack(
     variables : collection of str, optional
         Make only these of a result's variables. Default: all.
     reader : callable, optional
-        Makes an image of a path. Default: `napari_shadowinv.io.read_radiograph`.
+        Makes an image of a path; one with a keyword ``page`` reads TIFFs with many pages, too.
+        `functools.partial(read_shot, factor=2)` sums blocks of 2 × 2 pixels.
     warm_start : int, optional
         The solver starts from the answer to the shot before, in runs of so many shots: for
         series in which shots are alike. The answers are the same within the tolerance. Shots of

@@ -41,7 +41,7 @@ from napari_shadowinv.stack._lazy import (
     dtype_of,
     values_of_beam,
 )
-from napari_shadowinv.stack._shots import Reader, Shot, checksum, described_reader
+from napari_shadowinv.stack._shots import Reader, Shot, checksum, described_reader, read_shot
 from napari_shadowinv.stack._work import Beam, arrays_of, invert_shot, threads_here
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def run_stack(
     setup: ProtonSetup | OpticalSetup | None = None,
     variables: Collection[str] = STORED,
     dtype: str = "float32",
-    reader: Reader | None = None,
+    reader: Reader = read_shot,
     warm_start: int = 1,
     scheduler: Any = None,
     workers: int | None = None,

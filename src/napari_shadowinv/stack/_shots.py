@@ -1,7 +1,7 @@
 """Where shots come from: files, pages, arrays; each is read when it is needed.
 
 - any input as references to single shots: `find_shots`
-- the images of one shot: `Shot.load`
+- the image of one shot: `Shot.load`; of one file, chosen and binned: `read_shot`
 - sources and masks in the same ways: `find_source`
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import glob
 import hashlib
+import inspect
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -26,9 +27,18 @@ from napari_shadowinv.errors import FileFormatError, InputError
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["ArrayShot", "BlockShot", "Reader", "Shot", "Shots", "find_shots", "find_source"]
+__all__ = [
+    "ArrayShot",
+    "BlockShot",
+    "Reader",
+    "Shot",
+    "Shots",
+    "find_shots",
+    "find_source",
+    "read_shot",
+]
 
-Reader = Callable[[Path], ArrayLike]
+Reader = Callable[..., ArrayLike]
 
 _MAGIC = re.compile(r"[*?\[]")
 _LOOKED_AT = 3  # files that are asked for the shape of all
@@ -46,6 +56,44 @@ class Shot(Protocol):
         ...
 
 
+def read_shot(
+    path: Path, *, page: int | None = None, channel: str | int | None = None, factor: int = 1
+) -> NDArray[np.float64]:
+    """Read the image of a shot; this is the reader where none is given.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    page : int, optional
+        Of a TIFF with many pages.
+    channel : {"red", "green", "blue", "mean"} or int, optional
+        What to take of a colour image.
+    factor : int, optional
+        Sum blocks of so many pixels squared.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+
+    Raises
+    ------
+    FileFormatError, InputError
+        See `napari_shadowinv.io.read_radiograph`.
+    """
+    from napari_shadowinv.io.images import read_tiff_page
+    from napari_shadowinv.io.radiograph import Radiograph
+    from napari_shadowinv.io.reading import read_radiograph
+
+    if page is None:
+        return read_radiograph(path, channel=channel).binned(factor).image
+    return Radiograph(read_tiff_page(path, page, channel=channel)).binned(factor).image
+
+
+def _knows_pages(reader: Reader) -> bool:
+    return "page" in inspect.signature(reader).parameters
+
+
 @dataclass(frozen=True)
 class FileShot:
     """A file that holds one image.
@@ -55,11 +103,11 @@ class FileShot:
     path : Path
         Absolute, so that a worker elsewhere finds it.
     reader : callable, optional
-        Makes an image of the path. Default: `napari_shadowinv.read_radiograph`.
+        Makes an image of the path.
     """
 
     path: Path
-    reader: Reader | None = None
+    reader: Reader = read_shot
 
     def __dask_tokenize__(self) -> tuple[Any, ...]:
         # A file that changed is another input, and what dask has of it another result.
@@ -76,10 +124,8 @@ class FileShot:
     def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
         """Read the file, with its checksum."""
         from napari_shadowinv.io.files import sha256
-        from napari_shadowinv.io.reading import read_radiograph
 
-        reader = self.reader or (lambda path: read_radiograph(path).image)
-        image = np.asarray(reader(self.path))
+        image = np.asarray(self.reader(self.path))
         return image, {**_stamp(self.path), "sha256": sha256(self.path)}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
@@ -100,16 +146,15 @@ def _stamp(path: Path) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class PageShot:
-    """A page of a TIFF that holds many."""
+    """A page of a TIFF that holds many; its reader takes the keyword ``page``."""
 
     path: Path
     page: int
+    reader: Reader = read_shot
 
     def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
         """Read the page, with its checksum."""
-        from napari_shadowinv.io.images import read_tiff_page
-
-        image = read_tiff_page(self.path, self.page)
+        image = np.asarray(self.reader(self.path, page=self.page))
         return image, {"sha256": checksum(image)}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
@@ -194,7 +239,7 @@ class Shots:
 
 
 def find_shots(
-    shots: Any, *, reader: Reader | None = None, shape: tuple[int, int] | None = None
+    shots: Any, *, reader: Reader = read_shot, shape: tuple[int, int] | None = None
 ) -> Shots:
     """Turn whatever holds shots into references to them.
 
@@ -240,7 +285,7 @@ def find_shots(
     return _from_array(shots)
 
 
-def _from_path(text: str, reader: Reader | None, shape: tuple[int, int] | None) -> Shots:
+def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shots:
     path = Path(text)
     if path.is_dir():
         raise InputError(f"{text} is a folder: say which files, such as '{text}/*.tif'")
@@ -249,11 +294,11 @@ def _from_path(text: str, reader: Reader | None, shape: tuple[int, int] | None) 
         if not found:
             raise InputError(f"no file matches {text}: expected shots; check folder and pattern")
         return _from_files(found, reader, shape)
-    pages = 1 if reader is not None else _page_count(path)
+    pages = _page_count(path) if _knows_pages(reader) else 1
     if pages == 1:
         return _from_files([path], reader, shape)
     return _of_files(
-        [PageShot(path.absolute(), page) for page in range(pages)],
+        [PageShot(path.absolute(), page, reader) for page in range(pages)],
         tuple(f"{path.name}[{page}]" for page in range(pages)),
         shape,
     )
@@ -272,9 +317,7 @@ def _page_count(path: Path) -> int:
     return tiff_pages(path) if kind_of(path) == "tiff" else 1
 
 
-def _from_files(
-    paths: Sequence[Path], reader: Reader | None, shape: tuple[int, int] | None
-) -> Shots:
+def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | None) -> Shots:
     if not paths:
         raise InputError("shots are an empty list: expected one path at least")
     names = tuple(path.name for path in paths)
@@ -362,7 +405,7 @@ class _Blocks(Sequence[Shot]):
 
 
 def find_source(
-    source: Any, count: int, *, reader: Reader | None = None
+    source: Any, count: int, *, reader: Reader = read_shot
 ) -> NDArray[Any] | Shots | None:
     """Turn whatever holds the undisturbed beam into one image, or into one for each shot.
 
@@ -388,7 +431,7 @@ def find_source(
     if source is None:
         return None
     single = isinstance(source, (str, Path)) and not _MAGIC.search(str(source))
-    if single and _page_count(Path(source)) == 1:
+    if single and not (_knows_pages(reader) and _page_count(Path(source)) > 1):
         return FileShot(Path(source).absolute(), reader).load()[0]
     if getattr(source, "ndim", None) == 2:
         return np.asarray(source)
@@ -402,10 +445,8 @@ def find_source(
     return sources
 
 
-def described_reader(reader: Reader | None) -> str:
+def described_reader(reader: Reader) -> str:
     """Name a reader, so that a store is not continued with another."""
-    if reader is None:
-        return "default"
     if isinstance(reader, functools.partial):
         named = ", ".join(f"{name}={value!r}" for name, value in sorted(reader.keywords.items()))
         return f"{described_reader(reader.func)}({named})"
