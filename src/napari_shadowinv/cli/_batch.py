@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -54,7 +53,7 @@ class _Ledger:
     def rate_text(self) -> str:
         seconds = time.monotonic() - self.start
         if not self.ended:
-            return "no shot yet"
+            return "no shot ended"
         rate = self.ended / seconds
         return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
 
@@ -83,7 +82,6 @@ def run_batch(
     from napari_shadowinv.stack import STORED, read_shot, run_stack
 
     _check(out, resume or redo_failed, overwrite)
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     ledger = _Ledger()
     geometry = None if setup is None else binned_setup(setup_from(setup), factor)
     reader = functools.partial(read_shot, channel=channel, factor=factor)
@@ -184,7 +182,8 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
                 last=last,
             )
             if outcome is not None and outcome.reason and not quiet:
-                console.print(Text(f"failed: {progress.name}: {outcome.reason}", style="red"))
+                line = Text(f"failed: {progress.name}: {outcome.reason}", style="red")
+                console.print(line, soft_wrap=True)
 
         yield show
 
@@ -215,9 +214,10 @@ def _tell_how_to_resume(out: Path, ledger: _Ledger) -> None:
 def _summary(out: Path, ledger: _Ledger) -> Table:
     done, failed, pending = _counts(out)
     seconds = time.monotonic() - ledger.start
+    this_run = f"{ledger.ended} shots in {seconds:.1f} s, {ledger.rate_text}"
     rows = [
         ("shots", _counts_text(done, failed, pending)),
-        ("this run", f"{ledger.ended} shots in {seconds:.1f} s, {ledger.rate_text}"),
+        ("this run", this_run if ledger.ended else "nothing was to be done"),
         *_trouble_rows(out),
         ("written", str(out)),
     ]
@@ -298,7 +298,7 @@ def store_rows(path: Path, *, trouble: bool = True) -> Rows:
         ("created", str(attributes["created"])),
         ("shots", _counts_text(done, failed, pending)),
         ("image", str(attributes["image_size"])),
-        ("source", str(attributes["source_image"])),
+        ("source", str(attributes.get("source_file", attributes["source_image"]))),
         ("stored", str(attributes["stored"])),
         ("options", str(attributes["options"])),
     ]

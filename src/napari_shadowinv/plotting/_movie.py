@@ -101,7 +101,7 @@ class _Frame:
         from matplotlib import rc_context
 
         with rc_context(STYLE):
-            grid = choose_grid(shape, 1, title=True)
+            grid = choose_grid(shape, 1, title=False)
             self._figure, (panel,) = new_page(grid, image_scale(shape, setup), None)
             # Without values: the colour bar must not depend on the first shot.
             panel.show(np.full(shape, limits[0]), "", label, "viridis", limits)

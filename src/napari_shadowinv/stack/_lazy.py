@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,6 +54,8 @@ class Stack:
         The variables that are wanted.
     warm_start : int
         So many shots in a row start from the answer to the one before; 1 for none.
+    source_file : str
+        Where the source comes from, if it was named by a path.
     """
 
     shots: Shots
@@ -63,6 +66,7 @@ class Stack:
     setup: ProtonSetup | OpticalSetup | None
     variables: tuple[str, ...]
     warm_start: int = 1
+    source_file: str = ""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -145,7 +149,8 @@ def describe_stack(
                 )
             checked_source(single, usable)
         beam = Beam.of(found.shape, single, usable)
-    return Stack(found, beam, sources, usable, options, setup, wanted, warm_start)
+    source_file = Path(source).name if isinstance(source, (str, Path)) else ""
+    return Stack(found, beam, sources, usable, options, setup, wanted, warm_start, source_file)
 
 
 def invert_stack(
@@ -233,6 +238,8 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
 def attributes_of(stack: Stack) -> dict[str, str]:
     """Return the attributes of a stack's dataset."""
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.setup).attrs
+    if stack.source_file:
+        attributes["source_file"] = stack.source_file
     return {"format": FORMAT, **attributes, "options": stack.options.model_dump_json()}
 
 
