@@ -136,6 +136,7 @@ class _Cluster:
 
     def result(self, future: Any) -> Any:
         from distributed import CancelledError as Cancelled
+        from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
 
         try:
@@ -145,9 +146,8 @@ class _Cluster:
                 "the worker died each time it was tried: too little memory for such a shot, or "
                 "the machine went down"
             ) from error
-        except (Cancelled, CancelledError, TimeoutError) as error:
-            self.check()
-            raise EngineError(f"{self.name} dropped a task; run again to resume") from error
+        except (Cancelled, CancelledError, CommClosedError, TimeoutError) as error:
+            raise EngineError(f"lost {self.name}: start it and run again to resume") from error
 
     def check(self) -> None:
         if self._client.status != "running":
@@ -233,6 +233,7 @@ def _processes(count: int) -> Iterator[Engine]:
             dashboard_address="127.0.0.1:0",
             # Workers that die are told of by the shots that they were at.
             silence_logs=logging.CRITICAL,
+            preload=["napari_shadowinv.stack._preload"],
         ) as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
     ):

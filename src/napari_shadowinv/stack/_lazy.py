@@ -130,25 +130,26 @@ def describe_stack(
             raise InputError(
                 f"there is no variable {name!r}{hint}: expected some of {', '.join(known)}"
             )
-    shape = np.shape(mask) if mask is not None else np.shape(source)  # () if not an array
-    found = find_shots(shots, reader=reader, shape=shape if len(shape) == 2 else None)
+    sources = find_source(source, reader=reader)
+    # Where the source tells it, no shot needs to be read for its shape.
+    shape: tuple[int, ...] = () if mask is None else np.shape(mask)
+    if sources is not None:
+        shape = sources.shape
+    found = find_shots(
+        shots, reader=reader, shape=(shape[0], shape[1]) if len(shape) == 2 else None
+    )
+    if sources is not None and sources.shape != found.shape:
+        raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
     usable = None if mask is None else checked_mask(mask, found.shape)
-    beam, sources = None, None
-    single = find_source(source, len(found), reader=reader)
-    if isinstance(single, Shots):
-        if single.shape != found.shape:
-            raise InputError(
-                f"sources have shape {single.shape}, shots {found.shape}: they must match"
-            )
-        sources = single
-    else:
-        if single is not None:
-            if single.shape != found.shape:
-                raise InputError(
-                    f"source has shape {single.shape}, shots {found.shape}: they must match"
-                )
-            checked_source(single, usable)
-        beam = Beam.of(found.shape, single, usable)
+    beam = None
+    if not isinstance(sources, Shots):
+        if sources is not None:
+            checked_source(sources, usable)
+        beam, sources = Beam.of(found.shape, sources, usable), None
+    elif len(sources) != len(found):
+        raise InputError(
+            f"got {len(sources)} sources for {len(found)} shots: expected one, or one for each shot"
+        )
     source_file = Path(source).name if isinstance(source, (str, Path)) else ""
     return Stack(found, beam, sources, usable, options, setup, wanted, warm_start, source_file)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.dataset import variable_labels
 from napari_shadowinv.io.locking import locked
@@ -455,6 +455,7 @@ def _run_shots(
     stop: Any = None,
 ) -> list[ShotOutcome]:
     """Task: invert some shots one after the other and write each."""
+    options = _with_threads(settings)
     previous: Inversion | None = None
     outcomes = []
     for shot, (index, wanted, source) in zip(shots, labels, strict=True):
@@ -468,14 +469,19 @@ def _run_shots(
             previous = invert_shot(
                 image,
                 here,
-                _with_threads(settings),
+                options,
                 start=previous,
                 should_stop=None if stop is None else stop.is_set,
             )
-        except (InputError, FileFormatError, OSError, ValueError, ArithmeticError) as error:
-            failure = str(error) or type(error).__name__
+        except InversionCancelled:
+            raise
         except MemoryError:
             failure = "there is not enough memory for this shot on its worker"
+        except (InputError, OSError) as error:
+            failure = str(error) or type(error).__name__
+        except Exception as error:
+            # Whatever a reader or a solver stumbles over, the other shots shall go on.
+            failure = f"{type(error).__name__}: {error}"
         else:
             failure = ""
         if failure:

@@ -404,17 +404,13 @@ class _Blocks(Sequence[Shot]):
         return BlockShot(dask.optimize(self._array.blocks[index])[0])
 
 
-def find_source(
-    source: Any, count: int, *, reader: Reader = read_shot
-) -> NDArray[Any] | Shots | None:
-    """Turn whatever holds the undisturbed beam into one image, or into one for each shot.
+def find_source(source: Any, *, reader: Reader = read_shot) -> NDArray[Any] | Shots | None:
+    """Turn whatever holds the undisturbed beam into one image, or into many.
 
     Parameters
     ----------
     source : array, path, sequence of paths, glob or None
         See `napari_shadowinv.invert_stack`.
-    count : int
-        How many shots there are, if there is a source for each.
     reader : callable, optional
         Makes an image of a path.
 
@@ -425,8 +421,8 @@ def find_source(
 
     Raises
     ------
-    InputError
-        If there are neither one nor as many sources as shots.
+    InputError, FileFormatError
+        If it is nothing of this, or cannot be read.
     """
     if source is None:
         return None
@@ -436,13 +432,7 @@ def find_source(
     if getattr(source, "ndim", None) == 2:
         return np.asarray(source)
     sources = find_shots(source, reader=reader)
-    if len(sources) == 1:
-        return sources.items[0].load()[0]
-    if len(sources) != count:
-        raise InputError(
-            f"got {len(sources)} sources for {count} shots: expected one, or one for each shot"
-        )
-    return sources
+    return sources.items[0].load()[0] if len(sources) == 1 else sources
 
 
 def described_reader(reader: Reader) -> str:
