@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -124,6 +124,10 @@ class _Cluster:
         # A task and not scattered data: it is made again when the worker that had it dies.
         future = self._client.submit(_same, value, key=name)
         self._shared.append(future)
+        if self._slots():
+            # On all workers at once: dask gives tasks to those that have it first.
+            with suppress(OSError, TimeoutError):
+                self._client.replicate([future])
         return future
 
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
