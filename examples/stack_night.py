@@ -113,7 +113,7 @@ for axes, name, title in (
     (spread, "potential_si_std", "Standard deviation"),
 ):
     picture = axes.imshow(1e9 * statistics[name], extent=extent)
-    figure.colorbar(picture, ax=axes, label="Potential (nm)")
+    figure.colorbar(picture, ax=axes, label="Potential (nm)", shrink=0.75)
     axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
 peaks.plot(statistics.shot, 1e6 * statistics.deflection_angle_peak, "o-")
 peaks.set(title="Strongest deflection", xlabel="Shot", ylabel="Angle (µrad)", ylim=(0, None))

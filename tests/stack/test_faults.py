@@ -19,10 +19,12 @@ import pytest
 from distributed import Client, LocalCluster
 from slow_reading import hang_once
 
-from napari_shadowinv import FileFormatError, InversionOptions, read, run_stack
+from napari_shadowinv import FileFormatError, InversionOptions, invert_stack, read, run_stack
+from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.io.locking import locked
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import _engines
+from napari_shadowinv.stack._work import threads_here
 
 OPTIONS = InversionOptions(n_sites=100)
 PATIENCE = 90.0
@@ -209,6 +211,46 @@ def test_a_dask_array_on_the_cluster_is_inverted_there(night, out, expected, clu
         shots = client.persist(da.from_array(night.images, chunks=(2, 24, 28)))
         run_stack(shots, out, source=night.source, options=OPTIONS)  # dask's current client
     assert values(out) == expected
+
+
+def count_plans() -> None:
+    """Make this process count the plans that it makes."""
+    from napari_shadowinv.stack import _work
+
+    original = _work.plan_sites
+
+    def plan_sites(source, options, **more):
+        plan_sites.made += 1
+        return original(source, options, **more)
+
+    plan_sites.made = 0
+    _work._entries.clear()
+    _work.plan_sites = plan_sites
+
+
+def plans_made() -> int:
+    from napari_shadowinv.stack import _work
+
+    return _work.plan_sites.made
+
+
+def test_a_lazy_stack_on_the_cluster_makes_its_sites_once_in_each_worker(make_night, cluster):
+    night = make_night(12)
+    stack = invert_stack(night.images, source=night.source, options=OPTIONS)
+    expected = stack.potential.compute(scheduler="synchronous")
+    with Client(cluster, set_as_default=False) as client:
+        client.run(count_plans)
+        found = client.compute(stack.potential).result(timeout=PATIENCE)
+        made = client.run(plans_made)
+    np.testing.assert_array_equal(found, expected)
+    assert 1 <= sum(made.values()) <= 2
+    assert max(made.values()) == 1
+
+
+def test_a_shot_on_a_worker_gets_its_share_of_the_cores(cluster):
+    with Client(cluster, set_as_default=False) as client:
+        shares = client.gather([client.submit(threads_here, pure=False) for _ in range(4)])
+    assert shares == [max(1, available_threads(None) // 2)] * 4
 
 
 class Dask:

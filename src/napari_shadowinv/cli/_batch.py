@@ -39,6 +39,8 @@ class _Ledger:
     not_converged: list[str] = field(default_factory=list)
 
     def note(self, progress: RunProgress) -> None:
+        if self.now is None:
+            self.start = time.monotonic()  # the workers are there
         self.now = progress
         outcome = progress.outcome
         if outcome is None:

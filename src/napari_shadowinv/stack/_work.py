@@ -16,7 +16,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -162,10 +162,12 @@ def invert_shot(
     """
     if np.shape(image) != beam.shape:
         raise InputError(f"image has shape {np.shape(image)}, expected {beam.shape} as the others")
+    began = time.perf_counter()
     plan = shared_plan(beam, options, on_progress=on_progress, should_stop=should_stop)
+    on_sites = time.perf_counter() - began
     if beam.source is None:
         image = _relative(image, beam.mask)
-    return invert(
+    inversion = invert(
         image,
         options=options,
         plan=plan,
@@ -173,6 +175,8 @@ def invert_shot(
         on_progress=on_progress,
         should_stop=should_stop,
     )
+    seconds = {**inversion.report.seconds, "sites": on_sites}
+    return replace(inversion, report=replace(inversion.report, seconds=seconds))
 
 
 def _relative(image: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[Any]:
