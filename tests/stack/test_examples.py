@@ -11,7 +11,7 @@ import pytest
 from napari_shadowinv import read
 from napari_shadowinv.io.store import DONE, FAILED
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples" / "notebooks"
 
 
 def test_the_night_is_inverted_but_for_the_shot_that_was_lost(tmp_path, monkeypatch, capsys):

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +59,15 @@ class _Ledger:
             return "no shot ended"
         rate = self.ended / seconds
         return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
+
+    @property
+    def left_text(self) -> str:
+        """Time that the pending shots will take, at the rate so far."""
+        if self.now is None or not self.ended:
+            return ""
+        pending = self.now.total - self.now.done - self.now.failed
+        seconds = round(pending * (time.monotonic() - self.start) / self.ended)
+        return f"{timedelta(seconds=seconds)} left" if pending else "closing"
 
 
 def run_batch(
@@ -150,7 +160,6 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
         Progress,
         SpinnerColumn,
         TextColumn,
-        TimeRemainingColumn,
     )
     from rich.text import Text
 
@@ -161,14 +170,13 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"),
-        TextColumn("[dim]left"),
-        TimeRemainingColumn(elapsed_when_finished=True),
+        TextColumn("{task.fields[left]}"),
         TextColumn("[red]{task.fields[failed]}"),
         TextColumn("[dim]{task.fields[last]}"),
     )
     hidden = quiet or not console.is_terminal
-    with Progress(*columns, console=console, disable=hidden, speed_estimate_period=600) as bars:
-        task = bars.add_task("starting", total=None, rate="", failed="", last="")
+    with Progress(*columns, console=console, disable=hidden) as bars:
+        task = bars.add_task("starting", total=None, rate="", left="", failed="", last="")
 
         def show(progress: RunProgress) -> None:
             ledger.note(progress)
@@ -180,6 +188,7 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
                 total=progress.total,
                 completed=progress.done + progress.failed,
                 rate=ledger.rate_text,
+                left=ledger.left_text,
                 failed=f"{progress.failed} failed" if progress.failed else "",
                 last=last,
             )

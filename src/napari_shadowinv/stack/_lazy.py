@@ -122,7 +122,7 @@ def describe_stack(
     options = options or InversionOptions()
     if warm_start < 1:
         raise InputError(f"warm_start is {warm_start}: expected a number of shots, 1 for no start")
-    known = variable_labels(setup)
+    known = _variables_of(options, setup)
     wanted = tuple(known) if variables is None else tuple(variables)
     for name in wanted:
         if name not in known:
@@ -152,6 +152,18 @@ def describe_stack(
         )
     source_file = Path(source).name if isinstance(source, (str, Path)) else ""
     return Stack(found, beam, sources, usable, options, setup, wanted, warm_start, source_file)
+
+
+def _variables_of(
+    options: InversionOptions, setup: ProtonSetup | OpticalSetup | None
+) -> dict[str, tuple[str, ...]]:
+    """Dimensions of the variables that a stack can have."""
+    labels = variable_labels(setup)
+    # Where sites cover a margin too, how many there are depends on the source.
+    is_free = getattr(options, "boundary", "closed") == "free"
+    return {
+        name: dims for name, (dims, _) in labels.items() if not (is_free and "site" in dims)
+    }
 
 
 def invert_stack(
