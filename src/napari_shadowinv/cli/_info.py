@@ -30,14 +30,12 @@ def described(path: Path) -> Table:
 
 
 def _rows(path: Path) -> Rows:
-    from napari_shadowinv.io import Radiograph, read
+    from napari_shadowinv.cli._batch import store_rows
+    from napari_shadowinv.io import Radiograph, is_stack, read
     from napari_shadowinv.io.arrays import read_npy
     from napari_shadowinv.io.files import kind_of
-    from napari_shadowinv.io.store import is_stack
 
     if is_stack(path):
-        from napari_shadowinv.cli._batch import store_rows
-
         return store_rows(path)
     kind = kind_of(path)
     if kind == "npy":

@@ -161,9 +161,7 @@ def _variables_of(
     labels = variable_labels(setup)
     # Where sites cover a margin too, how many there are depends on the source.
     is_free = getattr(options, "boundary", "closed") == "free"
-    return {
-        name: dims for name, (dims, _) in labels.items() if not (is_free and "site" in dims)
-    }
+    return {name: dims for name, (dims, _) in labels.items() if not (is_free and "site" in dims)}
 
 
 def invert_stack(
