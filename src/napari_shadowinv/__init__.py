@@ -4,6 +4,7 @@
 - share sites between shots with one source: `plan_sites`
 - how far the image's noise moves its field: `uncertainty`
 - what a deflection means in SI units: `ProtonSetup`, `OpticalSetup`
+- many shots, with dask: `invert_stack`, `run_stack`, `stack_statistics`
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
 - predict the image of the same object in another experiment: `project`, `project_potential`
 - read and write files: `read`, `write`
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.projection import project, project_potential
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
     from napari_shadowinv.progress import Progress
+    from napari_shadowinv.stack import invert_stack, run_stack, stack_statistics
 
 __all__ = [
     "FileFormatError",
@@ -45,11 +47,14 @@ __all__ = [
     "Uncertainty",
     "add_inversion",
     "invert",
+    "invert_stack",
     "plan_sites",
     "poisson_invert",
     "project",
     "project_potential",
     "read",
+    "run_stack",
+    "stack_statistics",
     "synthetic_image",
     "uncertainty",
     "write",
@@ -69,11 +74,14 @@ _HOME = {
     "Uncertainty": "error_bars",
     "add_inversion": "_napari.layers",
     "invert": "inversion",
+    "invert_stack": "stack",
     "plan_sites": "inversion",
     "poisson_invert": "physics.poisson",
     "project": "physics.projection",
     "project_potential": "physics.projection",
     "read": "io",
+    "run_stack": "stack",
+    "stack_statistics": "stack",
     "synthetic_image": "physics.forward",
     "uncertainty": "error_bars",
     "write": "io",

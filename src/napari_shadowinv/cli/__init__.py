@@ -1,4 +1,4 @@
-"""The command `shadowinv`: invert, predict, look at files, try it out.
+"""The command `shadowinv`: invert one shot or many, predict, look at files, try it out.
 
 Every heavy import waits until a command needs it, so that ``--help`` and the refusal of a
 mistake answer at once.
@@ -501,3 +501,193 @@ def demo(
     written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
     say(demo_table(inversion, setup, fields, written))
     alarm_unless_converged(inversion.report, written[0])
+
+
+_BATCH_EPILOG = """
+[bold]Examples[/bold]
+shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr
+shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr --resume
+shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
+
+[bold]Exit codes[/bold]
+0 all done; 1 some shot failed, the others are written; 2 a mistake in what was given;
+3 all done, but some did not converge; 130 cancelled, --resume goes on.
+"""
+
+StoreFolder = Annotated[
+    Path, typer.Argument(help="name.shadowinv.zarr, from shadowinv batch.", show_default=False)
+]
+ChosenShots = Annotated[
+    str | None,
+    typer.Option("--shots", help="Which, from 0: 3, 3:20, ::10 or 1,4,9. Default: all done."),
+]
+
+
+@app.command(epilog=_BATCH_EPILOG)
+@guarded
+def batch(
+    shots: Annotated[
+        list[str],
+        typer.Argument(
+            help="A glob in quotes, files, or one TIFF with a page for each shot.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The store to write: name.shadowinv.zarr.")],
+    source: Annotated[
+        str | None,
+        typer.Option(
+            "--source",
+            help="Undisturbed beam: one image, or a glob with one for each shot. Default: uniform.",
+        ),
+    ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option("--mask", help="Picture of the images' size, 0 where a pixel is unusable."),
+    ] = None,
+    setup: SetupFile = None,
+    options: Annotated[
+        Path | None, typer.Option("--options", help="TOML file with inversion options.")
+    ] = None,
+    n_sites: Annotated[
+        int | None, typer.Option(help="Number of sites. Default: as many as pixels.")
+    ] = None,
+    bin_: Annotated[
+        int, typer.Option("--bin", help="Sum blocks of so many pixels squared first.")
+    ] = 1,
+    channel: Channel = None,
+    clip_negative: Annotated[
+        bool, typer.Option("--clip-negative", help="Set negative pixels to zero and count them.")
+    ] = False,
+    variables: Annotated[
+        str | None,
+        typer.Option(help="What to store, with commas. Default: potential,displacement,caustic."),
+    ] = None,
+    warm_start: Annotated[
+        int, typer.Option(help="Start from the shot before, in runs of so many shots.")
+    ] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Address of a dask scheduler (tcp://host:8786), threads, or processes (default)."
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Shots at once on this machine. Default: one for each core.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where an earlier run stopped.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Throw away an earlier run.")
+    ] = False,
+    redo_failed: Annotated[
+        bool, typer.Option("--redo-failed", help="As --resume, and try failed shots again.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+) -> None:
+    """Invert many shots into one store that survives a crash."""
+    from napari_shadowinv.cli._batch import run_batch
+
+    run_batch(
+        shots,
+        out,
+        source=source,
+        mask=mask,
+        setup=setup,
+        options=options_from(options, {"n_sites": n_sites}, clip_negative),
+        factor=bin_,
+        channel=channel,
+        variables=variables,
+        warm_start=warm_start,
+        scheduler=scheduler,
+        workers=workers,
+        resume=resume,
+        overwrite=overwrite,
+        redo_failed=redo_failed,
+        quiet=quiet,
+    )
+
+
+@app.command()
+@guarded
+def status(
+    store: StoreFolder,
+    every: Annotated[bool, typer.Option("--all", help="A line for each shot.")] = False,
+) -> None:
+    """Tell which shots of a store are done, failed and why, or pending."""
+    from napari_shadowinv.cli._batch import status_tables
+
+    for table in status_tables(store, every):
+        say(table)
+
+
+@app.command()
+@guarded
+def export(
+    store: StoreFolder,
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            help=(
+                "tiff (float32, a file for each shot and component), pradformat (a file for each "
+                "shot), or csv (a table with a row for each shot)."
+            ),
+        ),
+    ],
+    shots: ChosenShots = None,
+    variables: Annotated[
+        str, typer.Option(help="Of TIFF: which images, with commas.")
+    ] = "potential",
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder, or file for csv. Default: the store's name, here."),
+    ] = None,
+    overwrite: Overwrite = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+) -> None:
+    """Write shots of a store in another format."""
+    from napari_shadowinv.cli._export import export_shots
+    from napari_shadowinv.io.store import STORE_SUFFIX
+
+    stem = store.name.removesuffix(STORE_SUFFIX)
+    target = Path(f"{stem}.csv" if form == "csv" else stem) if out is None else out
+    names = [name.strip() for name in variables.split(",")]
+    written = export_shots(store, target, form, shots, names, overwrite)
+    if not quiet:
+        say(f"Wrote {target}: {len(written)} {'file' if len(written) == 1 else 'files'}")
+
+
+@app.command()
+@guarded
+def movie(
+    store: StoreFolder,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The film: .mp4 or .gif.")],
+    variable: Annotated[
+        str | None,
+        typer.Option(help="What to show; of vectors the magnitude. Default: the potential."),
+    ] = None,
+    shots: ChosenShots = None,
+    rate: Annotated[float, typer.Option(help="Shots a second.")] = 10.0,
+    limits: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Ends of the colour scale. Default: those of all shots."),
+    ] = None,
+    overwrite: Overwrite = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+) -> None:
+    """Make a film of a store, all shots on one colour scale."""
+    from napari_shadowinv.cli._export import write_movie
+
+    frames = write_movie(
+        store,
+        out,
+        variable=variable,
+        shots=shots,
+        rate=rate,
+        limits=limits,
+        overwrite=overwrite,
+    )
+    if not quiet:
+        say(f"Wrote {out}: {frames} shots, {frames / rate:.1f} s")

@@ -30,12 +30,15 @@ def described(path: Path, variable: str | None = None) -> Table:
 
 
 def _rows(path: Path, variable: str | None) -> Rows:
-    from napari_shadowinv.io import Radiograph, read
+    from napari_shadowinv.cli._batch import store_rows
+    from napari_shadowinv.io import Radiograph, is_stack, read
     from napari_shadowinv.io.arrays import read_npy
     from napari_shadowinv.io.files import kind_of
     from napari_shadowinv.io.hdf5 import read_hdf5
     from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5
 
+    if is_stack(path):
+        return store_rows(path)
     kind = kind_of(path)
     is_mat = is_mat73(path) if kind == "hdf5" else kind == "mat" and not is_other_hdf5(path)
     if is_mat:

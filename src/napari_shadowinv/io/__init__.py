@@ -5,6 +5,7 @@
 - write a result or an image: `write`; check the path beforehand: `check_output`
 - an inversion as a labelled dataset and back: `dataset_from_inversion`,
   `inversion_from_dataset`, `setup_from_dataset`
+- results of many shots in one store: `read_stack`; tell it from other folders: `is_stack`
 - write a file of your own, whole or not at all: `replacing`
 """
 
@@ -17,6 +18,7 @@ from napari_shadowinv.io.dataset import (
 from napari_shadowinv.io.files import check_output, replacing
 from napari_shadowinv.io.radiograph import Radiograph, binned_setup
 from napari_shadowinv.io.reading import read, read_dataset, read_radiograph, read_toml
+from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.io.writing import write
 
 __all__ = [
@@ -25,10 +27,12 @@ __all__ = [
     "check_output",
     "dataset_from_inversion",
     "inversion_from_dataset",
+    "is_stack",
     "provenance",
     "read",
     "read_dataset",
     "read_radiograph",
+    "read_stack",
     "read_toml",
     "replacing",
     "setup_from_dataset",

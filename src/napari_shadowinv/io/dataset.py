@@ -6,6 +6,7 @@
 - the way back: `inversion_from_dataset`, `setup_from_dataset`
 - one file for all of it (NetCDF4, ``.shadowinv``): `write_result`, `read_result`
 - say which files it was made from: `provenance`
+- the names, dimensions and units alone: `variable_labels`; one field: `field_in_si`
 """
 
 from __future__ import annotations
@@ -37,10 +38,12 @@ __all__ = [
     "dataset_from_inversion",
     "dataset_from_uncertainty",
     "displacement_from_potential",
+    "field_in_si",
     "inversion_from_dataset",
     "provenance",
     "read_result",
     "setup_from_dataset",
+    "variable_labels",
     "write_result",
 ]
 
@@ -302,6 +305,62 @@ def _coordinates(
             metres = index * setup.object_pixel_size
             coords[f"{name}_si"] = (name, metres, _labels("m", f"{name} in the object plane"))
     return coords
+
+
+def variable_labels(
+    setup: ProtonSetup | OpticalSetup | None = None,
+) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+    """Name every variable of a result, with its dimensions and labels.
+
+    Parameters
+    ----------
+    setup : ProtonSetup or OpticalSetup, optional
+        Adds the fields in SI units.
+
+    Returns
+    -------
+    dict of str to (tuple of str, dict of str to str)
+        Dimensions, and ``units`` and ``long_name``.
+
+    Examples
+    --------
+    >>> variable_labels()["potential"]
+    (('y', 'x'), {'units': 'px²', 'long_name': 'Normalised deflection potential'})
+    """
+    labels = {
+        name: (dims if isinstance(dims, tuple) else (dims,), _labels(units, long_name))
+        for name, (dims, units, long_name) in _VARIABLES.items()
+    }
+    if setup is not None:
+        nothing = np.zeros((2, 4, 4))
+        fields = _fields(nothing, nothing[0], setup)
+        labels |= {name: (dims, dict(attrs)) for name, (dims, _, attrs) in fields.items()}
+    return labels
+
+
+def field_in_si(
+    name: str, values: NDArray[Any], setup: ProtonSetup | OpticalSetup
+) -> NDArray[np.float64]:
+    """Return a field in SI units by its name in a dataset.
+
+    Parameters
+    ----------
+    name : str
+        One of those that `variable_labels` adds for a setup.
+    values : ndarray, shape (2, H, W) or (H, W)
+        The displacement (px) for vectors, the normalised potential (px²) for planes.
+    setup : ProtonSetup or OpticalSetup
+        The geometry.
+
+    Returns
+    -------
+    ndarray, of the shape of `values`
+    """
+    nothing = np.zeros((2, 4, 4))
+    is_vector = values.ndim == 3
+    fields = _fields(values, nothing[0], setup) if is_vector else _fields(nothing, values, setup)
+    field: NDArray[np.float64] = fields[name][1]
+    return field
 
 
 def provenance(shot: Radiograph | None, source: Radiograph | None = None) -> dict[str, str]:

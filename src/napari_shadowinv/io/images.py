@@ -1,6 +1,7 @@
 """Pictures: TIFF with 8, 16 or 32 bits, PNG, BMP and JPEG.
 
 - read one of these, or a plane of another family of formats: `read_picture`
+- a page of a TIFF that holds many: `tiff_pages`, `read_tiff_page`
 - write a plane: `write_tiff`, `write_png`
 """
 
@@ -19,9 +20,10 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.camera import read_b16, read_spe
 from napari_shadowinv.io.matlab import read_mat
 from napari_shadowinv.io.promises import DEFLATE_RATIO, check_promise
+from napari_shadowinv.io.radiograph import to_grey
 from napari_shadowinv.io.text import read_text
 
-__all__ = ["read_picture", "write_png", "write_tiff"]
+__all__ = ["read_picture", "read_tiff_page", "tiff_pages", "write_png", "write_tiff"]
 
 
 def read_picture(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
@@ -114,17 +116,92 @@ def _read_tiff(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
                 f"{path} has {len(tiff.pages)} pages: expected one radiograph per file; "
                 "save the page that you want on its own"
             )
-        page = tiff.pages[0].aspage()
-        _check_complete(path, page)
-        array = _decode(path, page)
-        if page.photometric == tifffile.PHOTOMETRIC.PALETTE and page.colormap is not None:
-            array = _apply_palette(array, page.colormap)
-        if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and array.dtype.kind == "u":
-            # The format says that 0 is the brightest value here.
-            array = (2**page.bitspersample - 1 - array).astype(array.dtype)
-        if array.ndim == 3 and page.axes in ("SYX", "CYX"):
-            array = np.moveaxis(array, 0, -1)
-        return array, {"bits": int(page.bitspersample)}
+        return _read_page(path, tiff.pages[0].aspage())
+
+
+def _read_page(path: Path, page: Any) -> tuple[NDArray[Any], dict[str, Any]]:
+    import tifffile
+
+    _check_complete(path, page)
+    array = _decode(path, page)
+    if page.photometric == tifffile.PHOTOMETRIC.PALETTE and page.colormap is not None:
+        array = _apply_palette(array, page.colormap)
+    if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and array.dtype.kind == "u":
+        # The format says that 0 is the brightest value here.
+        array = (2**page.bitspersample - 1 - array).astype(array.dtype)
+    if array.ndim == 3 and page.axes in ("SYX", "CYX"):
+        array = np.moveaxis(array, 0, -1)
+    return array, {"bits": int(page.bitspersample)}
+
+
+def tiff_pages(path: Path) -> int:
+    """Return how many pages a TIFF has.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    int
+        1 for an ordinary picture.
+
+    Raises
+    ------
+    FileFormatError
+        If the chain of pages is damaged.
+    """
+    import tifffile
+
+    try:
+        with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
+            return len(tiff.pages)
+    except Exception as error:
+        raise FileFormatError(
+            f"{path} begins as TIFF but is damaged or cut short ({_one_line(error)}): expected "
+            "complete pages; copy or export it again"
+        ) from error
+
+
+def read_tiff_page(
+    path: Path, number: int, *, channel: str | int | None = None
+) -> NDArray[np.float64]:
+    """Read one page of a TIFF that holds many.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    number : int
+        Which page, from 0.
+    channel : {"red", "green", "blue", "mean"} or int, optional
+        What to take of a colour image.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+        Its pixels.
+
+    Raises
+    ------
+    FileFormatError, InputError
+        If the page is damaged, or has colours.
+    """
+    import tifffile
+
+    try:
+        with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
+            array, _ = _read_page(path, tiff.pages[number].aspage())
+    except (FileFormatError, MemoryError):
+        raise
+    except Exception as error:
+        raise FileFormatError(
+            f"page {number} of {path} is damaged or cut short ({_one_line(error)}): expected a "
+            "complete picture; copy or export it again"
+        ) from error
+    _check(path, "tiff", array)
+    return to_grey(array, channel, f"page {number} of {path}")
 
 
 def _decode(path: Path, page: Any) -> NDArray[Any]:
@@ -134,7 +211,7 @@ def _decode(path: Path, page: Any) -> NDArray[Any]:
         if "imagecodecs" not in str(error):
             raise
     # Pillow brings some codecs, LZW among them, but not for every pixel type.
-    array = _read_with_pillow(path)
+    array = _read_with_pillow(path, page.index)
     same = array.dtype == page.dtype.newbyteorder("=") and array.shape == page.shape
     if not same or page.photometric.name not in ("MINISBLACK", "RGB"):
         raise FileFormatError(
@@ -182,15 +259,15 @@ def _read_eight_bits(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
     return _read_with_pillow(path), {"bits": 8}
 
 
-def _read_with_pillow(path: Path) -> NDArray[Any]:
+def _read_with_pillow(path: Path, index: int = 0) -> NDArray[Any]:
     import imageio.v3 as iio
 
     # A file object, because imageio would believe the name.
     with path.open("rb") as file, iio.imopen(file, "r", plugin="pillow") as picture:
-        height, width = picture.properties(index=0).shape[:2]
+        height, width = picture.properties(index=index).shape[:2]
         # A pixel has one bit at least.
         check_promise(path, "picture", height * width // 8, DEFLATE_RATIO * path.stat().st_size)
-        return np.asarray(picture.read(index=0))
+        return np.asarray(picture.read(index=index))
 
 
 def write_tiff(path: Path, plane: NDArray[Any], pixel_size: float | None = None) -> None:

@@ -23,6 +23,7 @@ from napari_shadowinv.io.images import read_picture
 from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5, read_mat
 from napari_shadowinv.io.pradformat import is_result, read_pradformat
 from napari_shadowinv.io.radiograph import Radiograph, to_grey
+from napari_shadowinv.io.store import is_stack, read_stack
 
 if TYPE_CHECKING:
     import xarray
@@ -44,7 +45,8 @@ def read(
     path : str or Path
         TIFF (8, 16 or 32 bits, one page), PNG, BMP, JPEG, NPY, MATLAB (version 5 to 7.3),
         PCO ``.b16``, Princeton ``.spe`` (one frame), numbers as text (``.txt``, ``.csv``,
-        ``.dat``), a pradformat radiograph or inversion, or a ``.shadowinv`` result.
+        ``.dat``), a pradformat radiograph or inversion, a ``.shadowinv`` result, or a
+        ``.shadowinv.zarr`` store of many shots, which is read lazily.
     channel : {"red", "green", "blue", "mean"} or int, optional
         What to take of a colour image. An image whose channels are all equal is grey
         and needs no choice.
@@ -66,6 +68,8 @@ def read(
         same for the variables of a MATLAB or HDF5 file.
     """
     path = Path(path)
+    if is_stack(path):
+        return read_stack(path)
     kind = _family(path)
     if kind == "mat":
         return _radiograph(path, kind, *read_mat(path, variable))
@@ -191,7 +195,7 @@ def read_dataset(path: str | Path) -> xarray.Dataset:
     Parameters
     ----------
     path : str or Path
-        A ``.shadowinv`` file or a pradformat inversion.
+        A ``.shadowinv`` file, a pradformat inversion, or a ``.shadowinv.zarr`` store.
 
     Returns
     -------
@@ -204,7 +208,7 @@ def read_dataset(path: str | Path) -> xarray.Dataset:
         As `read`, and if the file holds an image.
     """
     path = Path(path)
-    content = read(path) if kind_of(path) == "hdf5" else None
+    content = read(path) if is_stack(path) or kind_of(path) == "hdf5" else None
     if content is None or isinstance(content, Radiograph):
         raise FileFormatError(
             f"{path} is an image: expected the result of an inversion, .shadowinv or pradformat"

@@ -2,6 +2,7 @@
 
 - all of one shot on a page: `report_figure`
 - fields side by side on one scale: `comparison_figure`
+- frames of a film of many shots: `stack_frames`
 - write a figure, whole or not at all: `save_figure`
 - the field that an experimenter asks for, in a handy unit: `shown_fields`; the potential:
   `shown_potential`
@@ -11,6 +12,7 @@ disturb the figures of a notebook.
 """
 
 from napari_shadowinv.plotting._figures import comparison_figure, report_figure, save_figure
+from napari_shadowinv.plotting._movie import stack_frames
 from napari_shadowinv.plotting._units import ShownField, shown_fields, shown_potential
 
 __all__ = [
@@ -20,4 +22,5 @@ __all__ = [
     "save_figure",
     "shown_fields",
     "shown_potential",
+    "stack_frames",
 ]

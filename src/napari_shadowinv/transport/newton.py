@@ -118,7 +118,9 @@ def _damped_step(
     return None
 
 
-def with_full_cells(objective: TransportObjective, weights: Array) -> Array:
+def with_full_cells(
+    objective: TransportObjective, weights: Array, *, unchanged_first: bool = False
+) -> Array:
     """Find weights near the given ones for which every cell holds some flux.
 
     Hidden sites are lowered to where they just show; then a little of the zero weights,
@@ -130,13 +132,15 @@ def with_full_cells(objective: TransportObjective, weights: Array) -> Array:
         The problem.
     weights : ndarray, shape (n,)
         Any weights, px².
+    unchanged_first : bool
+        Whether nothing is mixed in where the cells are full without.
 
     Returns
     -------
     ndarray, shape (n,)
     """
     shown = objective.triangulation.lower_hidden(weights)
-    for share in _SHARES_OF_START:
+    for share in (1.0,) * unchanged_first + _SHARES_OF_START:
         diagram = objective.diagram_if_full(share * shown)
         if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
             return share * shown

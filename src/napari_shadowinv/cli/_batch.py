@@ -1,0 +1,319 @@
+"""`shadowinv batch` and `shadowinv status`: a run seen live, and what became of each shot."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interruptible
+from napari_shadowinv.cli._inputs import setup_from
+from napari_shadowinv.cli._tables import Rows, say, two_columns
+from napari_shadowinv.errors import InputError, InversionCancelled
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from napari_shadowinv.options import InversionOptions
+    from napari_shadowinv.stack import RunProgress
+
+EXIT_FAILED_SHOTS = 1
+
+_NAMED = 10  # failures that a table names
+
+
+@dataclass
+class _Ledger:
+    """What a run told of itself."""
+
+    start: float = field(default_factory=time.monotonic)
+    now: RunProgress | None = None
+    ended: int = 0
+    failures: dict[str, str] = field(default_factory=dict)
+    not_converged: list[str] = field(default_factory=list)
+
+    def note(self, progress: RunProgress) -> None:
+        if self.now is None:
+            self.start = time.monotonic()  # the workers are there
+        self.now = progress
+        outcome = progress.outcome
+        if outcome is None:
+            return
+        self.ended += 1
+        if outcome.reason:
+            self.failures[progress.name] = outcome.reason
+        elif not outcome.converged:
+            self.not_converged.append(progress.name)
+
+    @property
+    def rate_text(self) -> str:
+        seconds = time.monotonic() - self.start
+        if not self.ended:
+            return "no shot ended"
+        rate = self.ended / seconds
+        return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
+
+    @property
+    def left_text(self) -> str:
+        """Time that the pending shots will take, at the rate so far."""
+        if self.now is None or not self.ended:
+            return ""
+        pending = self.now.total - self.now.done - self.now.failed
+        seconds = round(pending * (time.monotonic() - self.start) / self.ended)
+        return f"{timedelta(seconds=seconds)} left" if pending else "closing"
+
+
+def run_batch(
+    shots: list[str],
+    out: Path,
+    *,
+    source: str | None,
+    mask: Path | None,
+    setup: Path | None,
+    options: InversionOptions,
+    factor: int,
+    channel: str | None,
+    variables: str | None,
+    warm_start: int,
+    scheduler: str | None,
+    workers: int | None,
+    resume: bool,
+    overwrite: bool,
+    redo_failed: bool,
+    quiet: bool,
+) -> None:
+    """Invert all shots into a store, tell of it, and end with what became of them."""
+    from napari_shadowinv.io import binned_setup
+    from napari_shadowinv.stack import STORED, read_shot, run_stack
+
+    _check(out, resume or redo_failed, overwrite)
+    ledger = _Ledger()
+    geometry = None if setup is None else binned_setup(setup_from(setup), factor)
+    reader = functools.partial(read_shot, channel=channel, factor=factor)
+    try:
+        with interruptible() as should_stop, _display(ledger, quiet) as show:
+            run_stack(
+                shots[0] if len(shots) == 1 else shots,
+                out,
+                source=source,
+                mask=None if mask is None else _mask(mask, factor),
+                options=options,
+                setup=geometry,
+                variables=STORED if variables is None else _names(variables),
+                reader=reader,
+                warm_start=warm_start,
+                scheduler=scheduler or "processes",
+                workers=workers,
+                overwrite=overwrite,
+                redo_failed=redo_failed,
+                on_progress=show,
+                should_stop=should_stop,
+            )
+    except (KeyboardInterrupt, InversionCancelled):
+        _tell_how_to_resume(out, ledger)
+        raise typer.Exit(EXIT_CANCELLED) from None
+    if not quiet:
+        say(_summary(out, ledger))
+    _end(out)
+
+
+def _check(out: Path, resume: bool, overwrite: bool) -> None:
+    from napari_shadowinv.io.store import check_store_path
+
+    if resume and overwrite:
+        raise InputError("got --resume and --overwrite, expected one of them")
+    if check_store_path(out).exists() and not (resume or overwrite):
+        counts = _counts_text(*_counts(out))
+        raise InputError(
+            f"{out} exists ({counts}): go on with --resume, begin anew with --overwrite, or choose "
+            "another name"
+        )
+
+
+def _mask(path: Path, factor: int) -> Any:
+    import numpy as np
+
+    from napari_shadowinv.io import Radiograph, read_radiograph
+
+    usable = read_radiograph(path, channel="mean").image != 0
+    return Radiograph(np.ones(usable.shape), mask=usable).binned(factor).mask
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+@contextmanager
+def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], None]]:
+    """A bar with rate and time left, and above it each shot that failed."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        SpinnerColumn,
+        TextColumn,
+    )
+    from rich.text import Text
+
+    console = Console(stderr=True)
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TextColumn("{task.fields[left]}"),
+        TextColumn("[red]{task.fields[failed]}"),
+        TextColumn("[dim]{task.fields[last]}"),
+    )
+    hidden = quiet or not console.is_terminal
+    with Progress(*columns, console=console, disable=hidden) as bars:
+        task = bars.add_task("starting", total=None, rate="", left="", failed="", last="")
+
+        def show(progress: RunProgress) -> None:
+            ledger.note(progress)
+            outcome = progress.outcome
+            last = "" if outcome is None else f"{progress.name}, {outcome.seconds:.1f} s"
+            bars.update(
+                task,
+                description=progress.engine,
+                total=progress.total,
+                completed=progress.done + progress.failed,
+                rate=ledger.rate_text,
+                left=ledger.left_text,
+                failed=f"{progress.failed} failed" if progress.failed else "",
+                last=last,
+            )
+            if outcome is not None and outcome.reason and not quiet:
+                line = Text(f"failed: {progress.name}: {outcome.reason}", style="red")
+                console.print(line, soft_wrap=True)
+
+        yield show
+
+
+def _counts(out: Path) -> tuple[int, int, int]:
+    """Shots that are done, failed, pending."""
+    import numpy as np
+
+    from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
+
+    statuses = StackStore(out).statuses()
+    done, failed, pending = (int(np.sum(statuses == s)) for s in (DONE, FAILED, PENDING))
+    return done, failed, pending
+
+
+def _counts_text(done: int, failed: int, pending: int) -> str:
+    return f"{done} done, {failed} failed, {pending} pending"
+
+
+def _tell_how_to_resume(out: Path, ledger: _Ledger) -> None:
+    from rich.console import Console
+
+    state = _counts_text(*_counts(out)) if out.exists() else "nothing written"
+    text = f"Cancelled: {state}. Give the same command with --resume to go on."
+    Console(stderr=True).print(text, style="bold red", soft_wrap=True, highlight=False)
+
+
+def _summary(out: Path, ledger: _Ledger) -> Table:
+    done, failed, pending = _counts(out)
+    seconds = time.monotonic() - ledger.start
+    this_run = f"{ledger.ended} shots in {seconds:.1f} s, {ledger.rate_text}"
+    rows = [
+        ("shots", _counts_text(done, failed, pending)),
+        ("this run", this_run if ledger.ended else "nothing was to be done"),
+        *_trouble_rows(out),
+        ("written", str(out)),
+    ]
+    return two_columns("Batch", rows)
+
+
+def _trouble_rows(out: Path) -> Rows:
+    """Shots that failed, and those that are not to be trusted."""
+    import numpy as np
+
+    from napari_shadowinv.io.store import DONE, FAILED, StackStore
+
+    store = StackStore(out)
+    statuses = store.statuses()
+    failed = [int(index) for index in np.flatnonzero(statuses == FAILED)]
+    rows = [("failed", f"{store.names[i]}: {store.report(i)['reason']}") for i in failed[:_NAMED]]
+    if len(failed) > _NAMED:
+        rows.append(("failed", f"and {len(failed) - _NAMED} more: shadowinv status {out} --all"))
+    rough = [
+        store.names[index]
+        for index, report in enumerate(store.reports())
+        if statuses[index] == DONE and not report["converged"]
+    ]
+    if rough:
+        named = ", ".join(rough[:_NAMED]) + (", …" if len(rough) > _NAMED else "")
+        rows.append(("warning", f"{len(rough)} shots did not converge: {named}"))
+    return rows
+
+
+def _end(out: Path) -> None:
+    from napari_shadowinv.io.store import DONE, StackStore
+
+    store = StackStore(out)
+    statuses = store.statuses()
+    if (statuses != DONE).any():
+        raise typer.Exit(EXIT_FAILED_SHOTS)
+    if not all(report["converged"] for report in store.reports()):
+        raise typer.Exit(EXIT_NOT_CONVERGED)
+
+
+def status_tables(path: Path, every: bool) -> list[Table]:
+    """Tell what a store is, and what became of each shot."""
+    from rich import box
+    from rich.table import Table
+
+    from napari_shadowinv.io.store import STATUS_NAMES, StackStore
+
+    tables = [two_columns(str(path), store_rows(path, trouble=not every))]
+    if not every:
+        return tables
+    store = StackStore(path)
+    shots = Table(box=box.SIMPLE)
+    for heading in ("shot", "name", "status", "seconds", "iterations", "how it went"):
+        shots.add_column(heading, overflow="fold")
+    for index, (status, report) in enumerate(zip(store.statuses(), store.reports(), strict=True)):
+        shots.add_row(
+            str(index),
+            store.names[index],
+            STATUS_NAMES[status],
+            f"{report['seconds']:.1f}" if "seconds" in report else "",
+            str(report.get("iterations", "")),
+            report.get("reason") or "; ".join(report.get("warnings", ())),
+            style="red" if STATUS_NAMES[status] == "failed" else "",
+        )
+    return [*tables, shots]
+
+
+def store_rows(path: Path, *, trouble: bool = True) -> Rows:
+    """Tell what a store is."""
+    from napari_shadowinv.io.store import StackStore
+
+    store = StackStore(path)
+    done, failed, pending = _counts(path)
+    attributes = store.attributes
+    seconds = [report["seconds"] for report in store.reports() if "stages" in report]
+    rows = [
+        ("kind", f"stack of {len(store.names)} shots, shadowinv {attributes['package_version']}"),
+        ("created", str(attributes["created"])),
+        ("shots", _counts_text(done, failed, pending)),
+        ("image", str(attributes["image_size"])),
+        ("source", str(attributes.get("source_file", attributes["source_image"]))),
+        ("stored", str(attributes["stored"])),
+        ("options", str(attributes["options"])),
+    ]
+    if seconds:
+        mean = sum(seconds) / len(seconds)
+        rows.append(("time per shot", f"{mean:.2f} s on one worker, on average"))
+    return rows + (_trouble_rows(path) if trouble else [])

@@ -1,0 +1,233 @@
+"""`shadowinv export` and `shadowinv movie`: shots of a store to files and to a film."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from napari_shadowinv.errors import FileFormatError, InputError
+
+if TYPE_CHECKING:
+    import xarray
+
+FORMATS = ("tiff", "pradformat", "csv")
+
+_TABLE = ("shot", "name", "status", "converged", "flux_residual", "iterations", "reason")
+
+
+def opened(path: Path, shots: str | None) -> xarray.Dataset:
+    """Open a store and choose shots from it; only those that are done."""
+    import numpy as np
+
+    from napari_shadowinv.io.store import DONE, read_stack
+
+    dataset = read_stack(path).assign_coords(index=("shot", np.arange(_count(path))))
+    chosen = dataset if shots is None else dataset.isel(shot=parsed_shots(shots, _count(path)))
+    done = chosen.isel(shot=np.flatnonzero(chosen["status"].values == DONE))
+    if not done.sizes["shot"]:
+        raise InputError(f"{path} has no shot that is done among those: see shadowinv status")
+    return done
+
+
+def _count(path: Path) -> int:
+    from napari_shadowinv.io.store import StackStore
+
+    return len(StackStore(path).names)
+
+
+def parsed_shots(text: str, count: int) -> list[int]:
+    """Turn 3, 3:20, :10, ::5 or several of these with commas into numbers of shots."""
+    chosen: list[int] = []
+    for part in text.split(","):
+        try:
+            numbers = [int(piece) if piece.strip() else None for piece in part.split(":")]
+            if len(numbers) == 1 and numbers[0] is not None:
+                chosen.append(range(count)[numbers[0]])
+            elif 2 <= len(numbers) <= 3:
+                chosen.extend(range(count)[slice(*numbers)])
+            else:
+                raise ValueError(part)
+        except (ValueError, IndexError):
+            raise InputError(
+                f"shots are {text!r}: expected numbers from 0 to {count - 1} such as 3, 3:20, or "
+                "3,5,10:20"
+            ) from None
+    return chosen
+
+
+def export_shots(
+    store: Path,
+    out: Path,
+    form: str,
+    shots: str | None,
+    variables: list[str],
+    overwrite: bool,
+) -> list[Path]:
+    """Write shots of a store in another format.
+
+    Returns
+    -------
+    list of Path
+        The files.
+    """
+    if form not in FORMATS:
+        raise InputError(f"format is {form!r}: expected one of {', '.join(FORMATS)}")
+    if form == "csv":
+        return [_write_table(store, out, shots, overwrite)]
+    dataset = opened(store, shots)
+    jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
+    from napari_shadowinv.cli._outputs import make_folder
+    from napari_shadowinv.io import check_output
+
+    make_folder(out)
+    for name, _ in jobs:
+        check_output(out / name, overwrite)
+    return [_write(out / name, shot, overwrite) for name, shot in jobs]
+
+
+def _stem(shot: xarray.Dataset) -> str:
+    name = Path(str(shot["name"].values)).name
+    stem = name if "[" in name or name.isdecimal() else Path(name).stem
+    safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in stem)
+    return f"{int(shot['index']):04d}_{safe}"
+
+
+def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[tuple[str, Any]]:
+    for variable in variables:
+        dims = dataset[variable].dims if variable in dataset else ()
+        if dims[:1] != ("shot",) or dims[-2:] != ("y", "x"):
+            images = [name for name in dataset.data_vars if dataset[name].dims[-2:] == ("y", "x")]
+            raise InputError(
+                f"the store has no images {variable!r}: expected some of "
+                f"{', '.join(map(str, images))}"
+            )
+    for index in range(dataset.sizes["shot"]):
+        shot = dataset.isel(shot=index)
+        for variable in variables:
+            for component in ("y", "x") if "component" in shot[variable].dims else ("",):
+                plane = shot[variable]
+                if component:
+                    plane = plane.sel(component=component)
+                suffix = f"{variable}_{component}" if component else variable
+                yield f"{_stem(shot)}_{suffix}.tif", plane
+
+
+def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
+    from napari_shadowinv.io import setup_from_dataset
+    from napari_shadowinv.io.pradformat import check_pradformat_setup
+
+    check_pradformat_setup(setup_from_dataset(dataset))
+    for index in range(dataset.sizes["shot"]):
+        shot = dataset.isel(shot=index)
+        yield f"{_stem(shot)}.h5", shot.assign_attrs(input_file=str(shot["name"].values))
+
+
+def _write(path: Path, content: Any, overwrite: bool) -> Path:
+    import numpy as np
+
+    from napari_shadowinv.io import setup_from_dataset, write
+
+    if path.suffix == ".h5":
+        return write(path, content.load(), overwrite=overwrite)
+    setup = setup_from_dataset(content.to_dataset(name="plane").assign_attrs(content.attrs))
+    return write(path, np.asarray(content.values, dtype=float), setup=setup, overwrite=overwrite)
+
+
+def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:
+    """One row for each shot, done or not, with the largest magnitude of each field."""
+    import numpy as np
+
+    from napari_shadowinv.io import replacing
+    from napari_shadowinv.io.store import STATUS_NAMES, StackStore, read_stack
+    from napari_shadowinv.stack import stack_statistics
+
+    content = StackStore(store)
+    dataset = read_stack(store)
+    peaks = stack_statistics(dataset)
+    names = [str(name) for name in peaks.data_vars if str(name).endswith("_peak")]
+    columns = {name: np.asarray(peaks[name].values) for name in names}
+    headings = [f"{name} ({peaks[name].attrs['units']})" for name in names]
+    count = len(content.names)
+    chosen = range(count) if shots is None else parsed_shots(shots, count)
+    statuses, reports = content.statuses(), content.reports()
+    with (
+        replacing(out, overwrite) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as f,
+    ):
+        rows = csv.writer(f)
+        rows.writerow([*_TABLE, *headings])
+        for index in chosen:
+            report = reports[index]
+            rows.writerow(
+                [
+                    index,
+                    content.names[index],
+                    STATUS_NAMES[statuses[index]],
+                    report.get("converged", ""),
+                    report.get("residual", ""),
+                    report.get("iterations", ""),
+                    report.get("reason", ""),
+                    *(f"{columns[name][index]:.9g}" for name in names),
+                ]
+            )
+    return out
+
+
+def write_movie(
+    store: Path,
+    out: Path,
+    *,
+    variable: str | None,
+    shots: str | None,
+    rate: float,
+    limits: tuple[float, float] | None,
+    overwrite: bool,
+) -> int:
+    """Write a film of a store, a frame for each shot, all on one colour scale.
+
+    Returns
+    -------
+    int
+        Number of frames.
+    """
+    from napari_shadowinv.io import check_output, replacing
+    from napari_shadowinv.plotting import stack_frames
+
+    check_output(out, overwrite, suffixes=(".mp4", ".gif"))
+    if out.suffix.lower() == ".mp4":
+        _require_ffmpeg(out)
+    if not 0 < rate <= 120:
+        raise InputError(f"rate is {rate:g}: expected more than 0 and at most 120 frames a second")
+    dataset = opened(store, shots)
+    frames = stack_frames(dataset, variable, limits=limits)
+    with replacing(out, overwrite) as temporary:
+        return _write_frames(temporary, frames, rate)
+
+
+def _require_ffmpeg(out: Path) -> None:
+    from importlib.util import find_spec
+
+    if find_spec("imageio_ffmpeg") is None:
+        raise FileFormatError(
+            f"{out} needs the package imageio-ffmpeg: install it with pip install "
+            "'napari-shadowinv[movie]', or write a .gif"
+        )
+
+
+def _write_frames(path: Path, frames: Iterator[Any], rate: float) -> int:
+    import imageio.v2 as iio
+
+    options: dict[str, Any] = (
+        {"fps": rate, "codec": "libx264", "quality": 8, "macro_block_size": 2}
+        if path.suffix.lower() == ".mp4"
+        else {"duration": 1000 / rate, "loop": 0}
+    )
+    count = 0
+    film: Any = iio.get_writer(path, **options)
+    with film:
+        for frame in frames:
+            film.append_data(frame)
+            count += 1
+    return count

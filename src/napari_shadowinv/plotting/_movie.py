@@ -1,0 +1,122 @@
+"""Frames of a film: one variable of a stack, shot after shot, on one colour scale."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.dataset import setup_from_dataset
+from napari_shadowinv.plotting._panels import STYLE, choose_grid, new_page
+from napari_shadowinv.plotting._units import _prefix, image_scale
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["stack_frames"]
+
+_DOTS_PER_INCH = 120
+_OUTLIERS = 0.02  # share of the shots whose extremes may lie beyond the colour scale
+_UNITS_WITH_PREFIX = {"m", "rad", "T m", "V"}
+
+
+def stack_frames(
+    stack: xarray.Dataset,
+    variable: str | None = None,
+    *,
+    limits: tuple[float, float] | None = None,
+) -> Iterator[NDArray[np.uint8]]:
+    """Draw one variable of every shot, all on one colour scale.
+
+    Parameters
+    ----------
+    stack : xarray.Dataset
+        From `napari_shadowinv.invert_stack` or a store.
+    variable : str, optional
+        An image for each shot; of vectors the magnitude is shown. Default: the potential.
+    limits : tuple of float, optional
+        Ends of the colour scale, in the variable's own units. Default: the smallest and
+        largest value of all shots, but for a few shots that stick out.
+
+    Yields
+    ------
+    ndarray of uint8, shape (rows, columns, 3)
+        A frame for each shot, with even numbers of rows and columns.
+
+    Raises
+    ------
+    InputError
+        If there is no such variable.
+    """
+    setup = setup_from_dataset(stack)
+    if variable is None:
+        variable = "potential" if setup is None else "potential_si"
+    if variable not in stack or stack[variable].dims[-2:] != ("y", "x"):
+        images = [str(name) for name in stack.data_vars if stack[name].dims[-2:] == ("y", "x")]
+        raise InputError(
+            f"the stack has no images {variable!r}: expected one of {', '.join(images)}"
+        )
+    field = stack[variable]
+    low, high = _limits(field) if limits is None else limits
+    if not high > low:
+        raise InputError(f"limits are {low:g} and {high:g}: the second must be larger")
+    unit = str(field.attrs.get("units", ""))
+    factor, prefix = _prefix(max(abs(low), abs(high))) if unit in _UNITS_WITH_PREFIX else (1.0, "")
+    label = f"{field.attrs.get('long_name', variable)} ({prefix}{unit})"
+    draw = _Frame((field.sizes["y"], field.sizes["x"]), setup, label, (factor * low, factor * high))
+    return (
+        draw(factor * _plane(field, index), str(stack["name"].values[index]))
+        for index in range(field.sizes["shot"])
+    )
+
+
+def _plane(field: xarray.DataArray, index: int) -> NDArray[np.float64]:
+    values = np.asarray(field.isel(shot=index).values, dtype=np.float64)
+    return values if values.ndim == 2 else np.sqrt((values**2).sum(axis=0))
+
+
+def _limits(field: xarray.DataArray) -> tuple[float, float]:
+    extremes = np.array(
+        [
+            (plane.min(), plane.max())
+            for plane in (_plane(field, index) for index in range(field.sizes["shot"]))
+        ]
+    )
+    low = float(np.quantile(extremes[:, 0], _OUTLIERS, method="lower"))
+    high = float(np.quantile(extremes[:, 1], 1 - _OUTLIERS, method="higher"))
+    if "component" in field.dims:
+        low = 0.0
+    return low, high if high > low else low + 1.0
+
+
+class _Frame:
+    """A figure that is drawn again and again with other values."""
+
+    def __init__(
+        self, shape: tuple[int, int], setup: Any, label: str, limits: tuple[float, float]
+    ) -> None:
+        from matplotlib import rc_context
+
+        with rc_context(STYLE):
+            grid = choose_grid(shape, 1, title=False)
+            self._figure, (panel,) = new_page(grid, image_scale(shape, setup), None)
+            # Without values: the colour bar must not depend on the first shot.
+            panel.show(np.full(shape, limits[0]), "", label, "viridis", limits)
+        self._axes = panel.axes
+        self._picture = panel.axes.images[0]
+
+    def __call__(self, plane: NDArray[np.float64], name: str) -> NDArray[np.uint8]:
+        from matplotlib import rc_context
+
+        self._picture.set_data(plane)
+        with rc_context(STYLE):
+            self._axes.set_title(name)
+            self._figure.set_dpi(_DOTS_PER_INCH)
+            canvas: Any = self._figure.canvas
+            canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+        rows, columns = (length - length % 2 for length in pixels.shape[:2])
+        return np.ascontiguousarray(pixels[:rows, :columns])

@@ -1,0 +1,22 @@
+"""Many shots: lazily with dask, or into one store that survives a crash.
+
+- describe the inversion of many shots and let dask do it: `invert_stack`
+- write them shot by shot to ``name.shadowinv.zarr``, and go on after a crash: `run_stack`
+- read a shot's file with a colour channel chosen, or binned: `read_shot`
+- mean, spread and peaks across shots: `stack_statistics`
+"""
+
+from napari_shadowinv.stack._lazy import invert_stack
+from napari_shadowinv.stack._run import STORED, RunProgress, ShotOutcome, run_stack
+from napari_shadowinv.stack._shots import read_shot
+from napari_shadowinv.stack._statistics import stack_statistics
+
+__all__ = [
+    "STORED",
+    "RunProgress",
+    "ShotOutcome",
+    "invert_stack",
+    "read_shot",
+    "run_stack",
+    "stack_statistics",
+]

@@ -1,0 +1,265 @@
+"""Where shots are inverted: in this process, in others, on a cluster.
+
+- an engine for what the user names: `engine_for`
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from typing import Any, Protocol
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry._threads import available_threads
+from napari_shadowinv.stack._shots import BlockShot, Shot
+
+__all__ = ["Engine", "EngineError", "WorkerDied", "engine_for"]
+
+_CONNECT_SECONDS = 10.0
+_ASKED_AGAIN_AFTER = 2.0  # seconds: clusters grow and shrink
+_AHEAD = 2  # tasks for each slot: one that runs, one that waits for it to end
+_AHEAD_OF_FILES = 64  # references to files are small; a cluster that grows wants to see work
+
+
+class EngineError(OSError):
+    """The cluster is gone: the run must end, and can be resumed."""
+
+
+class WorkerDied(Exception):  # noqa: N818 - it is what happened to a shot
+    """A shot was tried several times and each time the worker died."""
+
+
+class Engine(Protocol):
+    """Runs tasks somewhere, several at once."""
+
+    name: str
+    workers: int | None
+    stop: threading.Event | None
+
+    def window(self, *, files: bool) -> int:
+        """Return how many tasks to hand over at once."""
+        ...
+
+    def share(self, value: Any, name: str) -> Any:
+        """Bring a value to where the tasks are, and return what stands for it."""
+        ...
+
+    def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
+        """Start ``task(shots, *args)``; the future has `add_done_callback` and `cancel`."""
+        ...
+
+    def result(self, future: Any) -> Any:
+        """Return what a task returned.
+
+        Raises
+        ------
+        WorkerDied, EngineError
+            If the shot cannot be done here, or the engine is gone.
+        """
+        ...
+
+    def check(self) -> None:
+        """Raise `EngineError` if the engine is gone."""
+        ...
+
+
+class _Threads:
+    """Threads of this process, or the calling thread's own pool of one."""
+
+    def __init__(self, pool: ThreadPoolExecutor, workers: int) -> None:
+        self.name = f"{workers} thread{'s' if workers > 1 else ''}"
+        self.workers: int | None = workers
+        self.stop: threading.Event | None = threading.Event()
+        self._pool = pool
+
+    def window(self, *, files: bool) -> int:
+        return _AHEAD * (self.workers or 1)
+
+    def share(self, value: Any, name: str) -> Any:
+        return value
+
+    def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
+        return self._pool.submit(task, shots, *args)
+
+    def result(self, future: Any) -> Any:
+        return future.result()
+
+    def check(self) -> None:
+        return None
+
+
+class _Cluster:
+    """Workers of `dask.distributed`."""
+
+    def __init__(self, client: Any, name: str, workers: int | None = None) -> None:
+        self.name = name
+        self.workers = workers  # of this machine, if it is known that all of them are
+        self.stop: threading.Event | None = None
+        self._client = client
+        self._shared: list[Any] = []
+        self._asked = -_ASKED_AGAIN_AFTER
+        self._known = 0
+
+    def window(self, *, files: bool) -> int:
+        return max(_AHEAD * self._slots(), _AHEAD_OF_FILES if files else _AHEAD)
+
+    def _slots(self) -> int:
+        if self.workers is not None:
+            return self.workers
+        if time.monotonic() > self._asked + _ASKED_AGAIN_AFTER:
+            self._asked = time.monotonic()
+            try:
+                self._known = sum(self._client.nthreads().values())
+            except (OSError, ValueError, TimeoutError):
+                self.check()
+        return self._known
+
+    def share(self, value: Any, name: str) -> Any:
+        # A task and not scattered data: it is made again when the worker that had it dies.
+        future = self._client.submit(_same, value, key=name)
+        self._shared.append(future)
+        if self._slots():
+            # On all workers at once: dask gives tasks to those that have it first.
+            with suppress(OSError, TimeoutError):
+                self._client.replicate([future])
+        return future
+
+    def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
+        # A dask array may live on the cluster already, so its blocks are the cluster's tasks.
+        handed = [self._block(shot) if isinstance(shot, BlockShot) else shot for shot in shots]
+        return self._client.submit(task, handed, *args, pure=False)
+
+    def _block(self, shot: BlockShot) -> Any:
+        return self._client.compute(shot.block.to_delayed().ravel()[0])
+
+    def result(self, future: Any) -> Any:
+        from distributed import CancelledError as Cancelled
+        from distributed.comm.core import CommClosedError
+        from distributed.scheduler import KilledWorker
+
+        try:
+            return future.result(timeout=_CONNECT_SECONDS)
+        except KilledWorker as error:
+            raise WorkerDied(
+                "the worker died each time it was tried: too little memory for such a shot, or "
+                "the machine went down"
+            ) from error
+        except (Cancelled, CancelledError, CommClosedError, TimeoutError) as error:
+            raise EngineError(f"lost {self.name}: start it and run again to resume") from error
+
+    def check(self) -> None:
+        if self._client.status != "running":
+            raise EngineError(f"lost {self.name}: start it and run again to resume")
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+@contextmanager
+def engine_for(scheduler: Any = None, workers: int | None = None) -> Iterator[Engine]:
+    """Make or find an engine; what was made here is taken down at the end.
+
+    Parameters
+    ----------
+    scheduler : str, distributed.Client, cluster or None
+        ``"threads"``, ``"synchronous"``, ``"processes"``, the address of a scheduler, a client
+        or a cluster. Default: the current client of dask, else threads.
+    workers : int, optional
+        Shots that are inverted at once on this machine. Default: as many as cores.
+
+    Yields
+    ------
+    Engine
+
+    Raises
+    ------
+    InputError
+        If there is no such engine.
+    EngineError
+        If the scheduler does not answer.
+    """
+    if workers is not None and workers < 1:
+        raise InputError(f"workers is {workers}: expected 1 or more")
+    if scheduler is None:
+        scheduler = _current_client() or "threads"
+    count = workers or available_threads(None)
+    if scheduler in ("threads", "synchronous"):
+        yield from _threads(1 if scheduler == "synchronous" else count)
+    elif scheduler == "processes":
+        yield from _processes(count)
+    elif isinstance(scheduler, str) and "://" not in scheduler:
+        raise InputError(
+            f"scheduler is {scheduler!r}: expected 'threads', 'processes', 'synchronous', an "
+            "address such as tcp://host:8786, a Client or a cluster"
+        )
+    else:
+        yield from _given(scheduler)
+
+
+def _current_client() -> Any:
+    if "distributed" not in sys.modules:
+        return None
+    distributed: Any = sys.modules["distributed"]
+    try:
+        return distributed.default_client()
+    except ValueError:
+        return None
+
+
+def _threads(count: int) -> Iterator[Engine]:
+    pool = ThreadPoolExecutor(count, thread_name_prefix="shot")
+    engine = _Threads(pool, count)
+    try:
+        yield engine
+    except BaseException:
+        # Shots that run stop at their next step.
+        if engine.stop is not None:
+            engine.stop.set()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _processes(count: int) -> Iterator[Engine]:
+    distributed: Any = import_module("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            # Workers that die are told of by the shots that they were at.
+            silence_logs=logging.CRITICAL,
+            preload=["napari_shadowinv.stack._preload"],
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        name = f"{count} process{'es' if count > 1 else ''}"
+        yield _Cluster(client, name, count)
+
+
+def _given(scheduler: Any) -> Iterator[Engine]:
+    distributed: Any = import_module("distributed")
+    if isinstance(scheduler, distributed.Client):
+        yield _Cluster(scheduler, f"the scheduler at {_address(scheduler)}")
+        return
+    try:
+        client = distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+    except (OSError, TypeError, ValueError) as error:
+        raise EngineError(
+            f"no scheduler answers at {scheduler} ({type(error).__name__}): start it with "
+            "'dask scheduler', and check the address"
+        ) from None
+    with client:
+        yield _Cluster(client, f"the scheduler at {_address(client)}")
+
+
+def _address(client: Any) -> str:
+    return str(getattr(client.scheduler, "address", "?")) if client.scheduler else "?"

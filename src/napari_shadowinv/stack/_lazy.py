@@ -1,0 +1,406 @@
+"""A stack as a lazy dataset: one dask task inverts one shot, when it is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
+from napari_shadowinv.io.store import FORMAT, SUMMARY
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocess import checked_mask, checked_source, number_of_sites
+from napari_shadowinv.stack._shots import Reader, Shot, Shots, find_shots, find_source, read_shot
+from napari_shadowinv.stack._work import Beam, arrays_of, invert_shot, shared_plan, threads_here
+
+if TYPE_CHECKING:
+    import xarray
+
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+__all__ = ["Stack", "describe_stack", "invert_stack"]
+
+# One number for each shot, beside the arrays of an inversion.
+_NUMBERS = ("converged", "flux_residual", "iterations")
+_OF_PLAN = ("sites", "site_mass")
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Everything about a stack that is known before any shot is inverted.
+
+    Attributes
+    ----------
+    shots : Shots
+        The shots.
+    beam : Beam or None
+        Source and mask of all shots; None if each has a source of its own.
+    sources : Shots or None
+        Source of each shot, if each has its own.
+    mask : ndarray of bool, shape (H, W), or None
+        The pixels that can be used.
+    options : InversionOptions
+        Choices.
+    setup : ProtonSetup or OpticalSetup or None
+        For fields in SI units.
+    variables : tuple of str
+        The variables that are wanted.
+    warm_start : int
+        So many shots in a row start from the answer to the one before; 1 for none.
+    source_file : str
+        Where the source comes from, if it was named by a path.
+    """
+
+    shots: Shots
+    beam: Beam | None
+    sources: Shots | None
+    mask: NDArray[np.bool_] | None
+    options: InversionOptions
+    setup: ProtonSetup | OpticalSetup | None
+    variables: tuple[str, ...]
+    warm_start: int = 1
+    source_file: str = ""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (H, W) of each shot."""
+        return self.shots.shape
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Length of each dimension."""
+        height, width = self.shape
+        sites = number_of_sites(self.shape, self.options)
+        return {"shot": len(self.shots), "y": height, "x": width, "component": 2, "site": sites}
+
+    def is_shared(self, name: str) -> bool:
+        """Whether all shots have one such variable together."""
+        return (
+            self.beam is not None
+            and name in (*_OF_PLAN, "source", "mask")
+            and not (name == "source" and self.beam.source is None)
+        )
+
+    def source_of(self, index: int) -> Shot | None:
+        """Reference to the source of one shot; None if all share one."""
+        return None if self.sources is None else self.sources.items[index]
+
+
+def describe_stack(
+    shots: Any,
+    source: Any,
+    mask: ArrayLike | None,
+    options: InversionOptions | None,
+    setup: ProtonSetup | OpticalSetup | None,
+    variables: Collection[str] | None,
+    reader: Reader,
+    warm_start: int,
+) -> Stack:
+    """Check everything that can be checked before a shot is read.
+
+    Parameters
+    ----------
+    shots, source, mask, options, setup, variables, reader, warm_start
+        See `invert_stack`.
+
+    Returns
+    -------
+    Stack
+
+    Raises
+    ------
+    InputError
+        If something does not fit.
+    """
+    options = options or InversionOptions()
+    if warm_start < 1:
+        raise InputError(f"warm_start is {warm_start}: expected a number of shots, 1 for no start")
+    known = _variables_of(options, setup)
+    wanted = tuple(known) if variables is None else tuple(variables)
+    for name in wanted:
+        if name not in known:
+            hint = " (it needs a setup)" if setup is None else ""
+            raise InputError(
+                f"there is no variable {name!r}{hint}: expected some of {', '.join(known)}"
+            )
+    sources = find_source(source, reader=reader)
+    # Where the source tells it, no shot needs to be read for its shape.
+    shape: tuple[int, ...] = () if mask is None else np.shape(mask)
+    if sources is not None:
+        shape = sources.shape
+    found = find_shots(
+        shots, reader=reader, shape=(shape[0], shape[1]) if len(shape) == 2 else None
+    )
+    if sources is not None and sources.shape != found.shape:
+        raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
+    usable = None if mask is None else checked_mask(mask, found.shape)
+    beam = None
+    if not isinstance(sources, Shots):
+        if sources is not None:
+            checked_source(sources, usable)
+        beam, sources = Beam.of(found.shape, sources, usable), None
+    elif len(sources) != len(found):
+        raise InputError(
+            f"got {len(sources)} sources for {len(found)} shots: expected one, or one for each shot"
+        )
+    source_file = Path(source).name if isinstance(source, (str, Path)) else ""
+    return Stack(found, beam, sources, usable, options, setup, wanted, warm_start, source_file)
+
+
+def _variables_of(
+    options: InversionOptions, setup: ProtonSetup | OpticalSetup | None
+) -> dict[str, tuple[str, ...]]:
+    """Dimensions of the variables that a stack can have."""
+    labels = variable_labels(setup)
+    # Where sites cover a margin too, how many there are depends on the source.
+    is_free = getattr(options, "boundary", "closed") == "free"
+    return {name: dims for name, (dims, _) in labels.items() if not (is_free and "site" in dims)}
+
+
+def invert_stack(
+    shots: Any,
+    *,
+    source: Any = None,
+    mask: ArrayLike | None = None,
+    options: InversionOptions | None = None,
+    setup: ProtonSetup | OpticalSetup | None = None,
+    variables: Collection[str] | None = None,
+    reader: Reader = read_shot,
+    warm_start: int = 1,
+) -> xarray.Dataset:
+    """Describe the inversion of many shots; dask does the work where and when it is asked for.
+
+    Parameters
+    ----------
+    shots : array (shot, y, x), xarray.DataArray or Dataset, str, Path or sequence of paths
+        A dask or numpy array; an xarray object with one such variable; paths of one image each;
+        a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; or a TIFF with a
+        page for each shot. Files are read by the tasks that invert them.
+    source : array (y, x), path, or as `shots`, optional
+        The undisturbed beam, one for all shots or one for each. Default: uniform, and then
+        intensities in the result are relative to each shot's mean.
+    mask : array_like of bool, shape (H, W), optional
+        The pixels that can be used, the same in all shots; see `napari_shadowinv.invert`.
+    options : InversionOptions, optional
+        Choices. If `threads` is None, all shots that are inverted at once share the cores.
+    setup : ProtonSetup or OpticalSetup, optional
+        Adds fields in SI units.
+    variables : collection of str, optional
+        Make only these of a result's variables. Default: all.
+    reader : callable, optional
+        Makes an image of a path; one with a keyword ``page`` reads TIFFs with many pages, too.
+        `functools.partial(read_shot, factor=2)` sums blocks of 2 × 2 pixels.
+    warm_start : int, optional
+        The solver starts from the answer to the shot before, in runs of so many shots: for
+        series in which shots are alike. The answers are the same within the tolerance. Shots of
+        one run are inverted one after the other. Default: each shot on its own.
+
+    Returns
+    -------
+    xarray.Dataset
+        The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
+        chunk, and ``converged``, ``flux_residual`` and ``iterations``. Sites have no
+        dimension ``shot`` where all shots share a source. Nothing is computed yet.
+
+    Raises
+    ------
+    InputError
+        If there are no shots, or source, mask and shots do not fit together. A shot that cannot
+        be inverted raises it when it is computed; `run_stack` goes on without it.
+    FileFormatError
+        If the source, or all of the first shots, cannot be read.
+
+    Notes
+    -----
+    The values do not depend on scheduler, chunks, order or number of workers. Sites are made
+    once in each process. To write many shots, `run_stack` is safer: it can be resumed.
+
+    Examples
+    --------
+    >>> shots = np.ones((3, 20, 20))
+    >>> stack = invert_stack(shots, options=InversionOptions(n_sites=50))
+    >>> dict(stack.potential.sizes)
+    {'shot': 3, 'y': 20, 'x': 20}
+    >>> float(abs(stack.displacement.isel(shot=1)).max())
+    0.0
+    """
+    stack = describe_stack(shots, source, mask, options, setup, variables, reader, warm_start)
+    return _Graph(stack).dataset()
+
+
+def coordinates_of(stack: Stack) -> dict[str, Any]:
+    """Return the coordinates of a stack's dataset."""
+    plane = dataset_from_field(np.zeros((2, *stack.shape)), None, stack.setup)
+    shots = stack.shots
+    numbers = np.arange(len(shots)) if shots.coordinate is None else shots.coordinate
+    coords: dict[str, Any] = {str(name): value for name, value in plane.coords.items()}
+    coords["shot"] = ("shot", numbers, {"long_name": "Shot"})
+    coords["name"] = ("shot", np.array(shots.names, dtype=str), {"long_name": "Name of the shot"})
+    return coords
+
+
+def attributes_of(stack: Stack) -> dict[str, str]:
+    """Return the attributes of a stack's dataset."""
+    attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.setup).attrs
+    if stack.source_file:
+        attributes["source_file"] = stack.source_file
+    return {"format": FORMAT, **attributes, "options": stack.options.model_dump_json()}
+
+
+def _invert(
+    label: str,
+    shot: Any,
+    beam: Beam | Shot,
+    mask: NDArray[np.bool_] | None,
+    settings: tuple[InversionOptions, Any, tuple[str, ...]],
+    previous: dict[str, Any] | None = None,
+    keep: bool = False,
+) -> dict[str, Any]:
+    """Task of one shot: its variables by name."""
+    options, setup, names = settings
+    if options.threads is None:
+        options = options.model_copy(update={"threads": threads_here()})
+    try:
+        image = shot[0] if isinstance(shot, np.ndarray) else shot.load()[0]
+        if not isinstance(beam, Beam):
+            beam = Beam.of(image.shape, beam.load()[0], mask)
+        start = None if previous is None else previous["inversion"]
+        inversion = invert_shot(image, beam, options, start=start)
+    except InputError as error:
+        raise InputError(f"{label}: {error}") from error
+    return {
+        **arrays_of(inversion, dict.fromkeys(names), setup),
+        **_numbers_of(inversion),
+        **({"inversion": inversion} if keep else {}),
+    }
+
+
+def _numbers_of(inversion: Inversion) -> dict[str, Any]:
+    report = inversion.report
+    return {
+        "converged": np.bool_(report.converged),
+        "flux_residual": np.float64(report.residual),
+        "iterations": np.int64(report.iterations),
+    }
+
+
+def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
+    """Return the variables that all shots share, by name; a task, too."""
+    if options.threads is None:
+        options = options.model_copy(update={"threads": threads_here()})
+    level = shared_plan(beam, options).levels[-1]
+    mask = np.ones(beam.shape, bool) if beam.mask is None else beam.mask
+    source = None if beam.source is None else checked_source(beam.source, beam.mask)
+    return {"sites": level.sites, "site_mass": level.mass, "mask": mask, "source": source}
+
+
+def _pick(record: dict[str, Any], name: str, with_shot: bool) -> NDArray[Any]:
+    value = np.asarray(record[name])
+    return value[np.newaxis] if with_shot else value
+
+
+class _Graph:
+    """The tasks of a stack: one for each shot, one that takes each variable out of it."""
+
+    def __init__(self, stack: Stack) -> None:
+        from dask.base import tokenize
+        from dask.delayed import delayed
+        from dask.highlevelgraph import HighLevelGraph
+
+        self._stack = stack
+        token = tokenize(
+            stack.shots.items if stack.shots.array is None else stack.shots.array.name,
+            None if stack.sources is None else stack.sources.items,
+            None if stack.beam is None else stack.beam.key,
+            stack.mask,
+            stack.options.model_dump_json(),
+            None if stack.setup is None else stack.setup.model_dump_json(),
+            stack.variables,
+            stack.warm_start,
+        )
+        self._token = token
+        self._inverted = f"invert-shot-{token}"
+        dependencies: list[Any] = [] if stack.shots.array is None else [stack.shots.array]
+        self._beam: Any = None
+        if stack.beam is not None:
+            # One node, so that a worker gets the source once and not with each shot.
+            self._beam = delayed(stack.beam, name=f"beam-{stack.beam.key}", traverse=False)
+            dependencies.append(self._beam)
+        settings = delayed(
+            (stack.options, stack.setup, stack.variables), name=f"settings-{token}", traverse=False
+        )
+        mask = delayed(stack.mask, name=f"mask-{token}", traverse=False)
+        tasks: dict[Any, Any] = {
+            (self._inverted, index): self._task(index, mask.key, settings.key)
+            for index in range(len(stack.shots))
+        }
+        self._shots = HighLevelGraph.from_collections(
+            self._inverted, tasks, dependencies=[*dependencies, settings, mask]
+        )
+
+    def _task(self, index: int, mask: Any, settings: Any) -> tuple[Any, ...]:
+        stack = self._stack
+        array = stack.shots.array
+        shot = stack.shots.items[index] if array is None else (array.name, index, 0, 0)
+        beam = stack.source_of(index) if self._beam is None else self._beam.key
+        run = stack.warm_start
+        previous = (self._inverted, index - 1) if index % run else None
+        keep = run > 1 and (index + 1) % run != 0
+        return (_invert, stack.shots.label(index), shot, beam, mask, settings, previous, keep)
+
+    def dataset(self) -> xarray.Dataset:
+        """Return the lazy dataset."""
+        import xarray as xr
+
+        stack = self._stack
+        variables: dict[str, Any] = {}
+        for name, (dims, labels) in variable_labels(stack.setup).items():
+            if name not in stack.variables:
+                continue
+            if stack.is_shared(name):
+                variables[name] = (dims, self._shared(name, dims), labels)
+            else:
+                variables[name] = (("shot", *dims), self._of_each(name, dims), labels)
+        for name in _NUMBERS:
+            dtype, labels = SUMMARY[name]
+            variables[name] = (("shot",), self._of_each(name, (), dtype), labels)
+        return xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes_of(stack))
+
+    def _of_each(self, name: str, dims: tuple[str, ...], dtype: Any = None) -> Any:
+        from dask.highlevelgraph import HighLevelGraph
+
+        sizes = self._stack.sizes
+        layer = f"{name}-{self._token}"
+        zeros = (0,) * len(dims)
+        tasks: dict[Any, Any] = {
+            (layer, index, *zeros): (_pick, (self._inverted, index), name, True)
+            for index in range(sizes["shot"])
+        }
+        graph = HighLevelGraph(
+            {**self._shots.layers, layer: tasks},
+            {**self._shots.dependencies, layer: {self._inverted}},
+        )
+        chunks = ((1,) * sizes["shot"], *((sizes[dim],) for dim in dims))
+        da: Any = import_module("dask.array")
+        return da.Array(graph, layer, chunks, dtype=dtype or dtype_of(name))
+
+    def _shared(self, name: str, dims: tuple[str, ...]) -> Any:
+        from dask.delayed import delayed
+
+        beam = delayed(values_of_beam, pure=True)(self._beam, self._stack.options)
+        value = delayed(_pick, pure=True)(beam, name, False)
+        shape = tuple(self._stack.sizes[dim] for dim in dims)
+        da: Any = import_module("dask.array")
+        return da.from_delayed(value, shape, dtype=dtype_of(name))
+
+
+def dtype_of(name: str) -> Any:
+    """Type of a variable as an inversion has it."""
+    return np.dtype(bool) if name in ("caustic", "mask") else np.dtype(np.float64)

@@ -1,0 +1,443 @@
+"""Where shots come from: files, pages, arrays; each is read when it is needed.
+
+- any input as references to single shots: `find_shots`
+- the image of one shot: `Shot.load`; of one file, chosen and binned: `read_shot`
+- sources and masks in the same ways: `find_source`
+"""
+
+from __future__ import annotations
+
+import functools
+import glob
+import hashlib
+import inspect
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv.errors import FileFormatError, InputError
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = [
+    "ArrayShot",
+    "BlockShot",
+    "Reader",
+    "Shot",
+    "Shots",
+    "find_shots",
+    "find_source",
+    "read_shot",
+]
+
+Reader = Callable[..., ArrayLike]
+
+_MAGIC = re.compile(r"[*?\[]")
+_LOOKED_AT = 3  # files that are asked for the shape of all
+
+
+class Shot(Protocol):
+    """One image that is read when it is asked for; it can be sent to a worker."""
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Return the image, and what tells it from others: a checksum at least."""
+        ...
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Whether it is still the image of which `load` said this."""
+        ...
+
+
+def read_shot(
+    path: Path, *, page: int | None = None, channel: str | int | None = None, factor: int = 1
+) -> NDArray[np.float64]:
+    """Read the image of a shot; this is the reader where none is given.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    page : int, optional
+        Of a TIFF with many pages.
+    channel : {"red", "green", "blue", "mean"} or int, optional
+        What to take of a colour image.
+    factor : int, optional
+        Sum blocks of so many pixels squared.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+
+    Raises
+    ------
+    FileFormatError, InputError
+        See `napari_shadowinv.io.read_radiograph`.
+    """
+    from napari_shadowinv.io.images import read_tiff_page
+    from napari_shadowinv.io.radiograph import Radiograph
+    from napari_shadowinv.io.reading import read_radiograph
+
+    if page is None:
+        return read_radiograph(path, channel=channel).binned(factor).image
+    return Radiograph(read_tiff_page(path, page, channel=channel)).binned(factor).image
+
+
+def _knows_pages(reader: Reader) -> bool:
+    return "page" in inspect.signature(reader).parameters
+
+
+@dataclass(frozen=True)
+class FileShot:
+    """A file that holds one image.
+
+    Attributes
+    ----------
+    path : Path
+        Absolute, so that a worker elsewhere finds it.
+    reader : callable, optional
+        Makes an image of the path.
+    """
+
+    path: Path
+    reader: Reader = read_shot
+
+    def __dask_tokenize__(self) -> tuple[Any, ...]:
+        # A file that changed is another input, and what dask has of it another result.
+        from dask.base import normalize_token
+
+        stamp = _stamp(self.path) if self.path.exists() else {}
+        return (
+            str(self.path),
+            normalize_token(self.reader),
+            stamp.get("size"),
+            stamp.get("mtime_ns"),
+        )
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Read the file, with its checksum."""
+        from napari_shadowinv.io.files import sha256
+
+        image = np.asarray(self.reader(self.path))
+        return image, {**_stamp(self.path), "sha256": sha256(self.path)}
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Compare size and time, and only where these differ the checksum."""
+        from napari_shadowinv.io.files import sha256
+
+        if not self.path.exists():
+            return True  # put away after it was inverted
+        if _stamp(self.path).items() <= origin.items():
+            return True
+        return bool(sha256(self.path) == origin.get("sha256"))
+
+
+def _stamp(path: Path) -> dict[str, int]:
+    status = path.stat()
+    return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
+
+
+@dataclass(frozen=True)
+class PageShot:
+    """A page of a TIFF that holds many; its reader takes the keyword ``page``."""
+
+    path: Path
+    page: int
+    reader: Reader = read_shot
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Read the page, with its checksum."""
+        image = np.asarray(self.reader(self.path, page=self.page))
+        return image, {"sha256": checksum(image)}
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Read the page again and compare."""
+        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayShot:
+    """An image in memory."""
+
+    image: NDArray[Any] = field(repr=False)
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Return the array, with its checksum."""
+        return self.image, {"sha256": checksum(self.image)}
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Compare the checksum."""
+        return bool(checksum(self.image) == origin.get("sha256"))
+
+
+@dataclass(frozen=True, eq=False)
+class BlockShot:
+    """An image of a dask array, computed when it is needed.
+
+    Attributes
+    ----------
+    block : dask.array.Array
+        Shape (1, H, W), one chunk.
+    """
+
+    block: Any = field(repr=False)
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Compute the image by dask's current scheduler."""
+        return ArrayShot(np.asarray(self.block.compute())[0]).load()
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Compute the image and compare."""
+        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
+
+
+def checksum(array: NDArray[Any]) -> str:
+    """Return the SHA-256 of an array's values, shape and type, in hexadecimal."""
+    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
+    digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """The shots of a stack, in order.
+
+    Attributes
+    ----------
+    items : sequence of Shot
+        One reference for each.
+    names : tuple of str
+        What each is called in messages and tables.
+    shape : tuple of int
+        Shape (H, W) that they should have.
+    coordinate : array or None
+        The values of the coordinate ``shot`` of an xarray object.
+    array : dask.array.Array or None
+        The same images as one array, chunks of one shot, where they came as an array.
+    """
+
+    items: Sequence[Shot]
+    names: tuple[str, ...]
+    shape: tuple[int, int]
+    coordinate: Any = None
+    array: Any = None
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def label(self, index: int) -> str:
+        """Name and number of a shot, for messages."""
+        name = self.names[index]
+        return f"shot {index}" if name == str(index) else f"shot {index} ({name})"
+
+
+def find_shots(
+    shots: Any, *, reader: Reader = read_shot, shape: tuple[int, int] | None = None
+) -> Shots:
+    """Turn whatever holds shots into references to them.
+
+    Parameters
+    ----------
+    shots : array, xarray object, path, glob or sequence of paths
+        See `napari_shadowinv.invert_stack`.
+    reader : callable, optional
+        Makes an image of a path.
+    shape : tuple of int, optional
+        Shape (H, W) that shots should have. Default: that of the array, or of most of the
+        first few files that can be read.
+
+    Returns
+    -------
+    Shots
+
+    Raises
+    ------
+    InputError
+        If there is no shot in it, or it is nothing that could hold shots.
+    FileFormatError
+        If none of the first files can be read.
+    """
+    if isinstance(shots, (str, Path)):
+        return _from_path(str(shots), reader, shape)
+    if hasattr(shots, "dims") and hasattr(shots, "coords"):
+        return _from_xarray(shots)
+    if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
+        return _from_files([Path(item) for item in shots], reader, shape)
+    if isinstance(shots, Sequence) and all(np.ndim(item) == 2 for item in shots):
+        shapes = {np.shape(item) for item in shots}
+        if len(shapes) > 1:
+            raise InputError(
+                f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected one for all"
+            )
+        shots = np.stack([np.asarray(item) for item in shots])
+    if not hasattr(shots, "ndim"):
+        raise InputError(
+            f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "
+            "object, paths, a glob such as 'shots/*.tif', or a TIFF with many pages"
+        )
+    return _from_array(shots)
+
+
+def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shots:
+    path = Path(text)
+    if path.is_dir():
+        raise InputError(f"{text} is a folder: say which files, such as '{text}/*.tif'")
+    if _MAGIC.search(text) and not path.exists():
+        found = sorted(map(Path, glob.glob(text, recursive=True)), key=_natural)
+        if not found:
+            raise InputError(f"no file matches {text}: expected shots; check folder and pattern")
+        return _from_files(found, reader, shape)
+    pages = _page_count(path) if _knows_pages(reader) else 1
+    if pages == 1:
+        return _from_files([path], reader, shape)
+    return _of_files(
+        [PageShot(path.absolute(), page, reader) for page in range(pages)],
+        tuple(f"{path.name}[{page}]" for page in range(pages)),
+        shape,
+    )
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sort shot_2 before shot_10."""
+    parts = re.split(r"(\d+)", str(path))
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def _page_count(path: Path) -> int:
+    from napari_shadowinv.io.files import kind_of
+    from napari_shadowinv.io.images import tiff_pages
+
+    return tiff_pages(path) if kind_of(path) == "tiff" else 1
+
+
+def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | None) -> Shots:
+    if not paths:
+        raise InputError("shots are an empty list: expected one path at least")
+    names = tuple(path.name for path in paths)
+    if len(set(names)) < len(names):
+        names = tuple(str(path) for path in paths)
+    if len(set(names)) < len(names):
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise InputError(f"shots name {twice} twice: expected each file once")
+    return _of_files([FileShot(path.absolute(), reader) for path in paths], names, shape)
+
+
+def _of_files(
+    items: Sequence[Shot], names: tuple[str, ...], shape: tuple[int, int] | None
+) -> Shots:
+    return Shots(items, names, shape or _usual_shape(items))
+
+
+def _usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
+    """Shape of most of the first few shots that can be read; bad ones fail later, by name."""
+    shapes: Counter[tuple[int, ...]] = Counter()
+    first_error: Exception | None = None
+    for shot in items:
+        try:
+            shapes[np.shape(shot.load()[0])] += 1
+        except (OSError, ValueError) as error:
+            first_error = first_error or error
+        if shapes.total() == _LOOKED_AT:
+            break
+    if not shapes:
+        raise FileFormatError(f"none of {len(items)} shots can be read, the first: {first_error}")
+    usual = shapes.most_common(1)[0][0]
+    if len(usual) != 2:
+        raise InputError(f"shots have shape {usual}, expected (y, x): choose one channel or plane")
+    return usual[0], usual[1]
+
+
+def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
+    if hasattr(shots, "data_vars"):
+        planes = [name for name, variable in shots.data_vars.items() if variable.ndim == 3]
+        chosen = ["image"] if "image" in planes else planes
+        if len(chosen) != 1:
+            raise InputError(
+                f"the dataset has {len(planes)} variables with three dimensions: expected one, "
+                "(shot, y, x), or one that is called 'image'; choose it"
+            )
+        shots = shots[chosen[0]]
+    if "shot" in shots.dims:
+        shots = shots.transpose("shot", ...)
+    coordinate = shots.coords.get(shots.dims[0])
+    return _from_array(shots.data, None if coordinate is None else coordinate.values)
+
+
+def _from_array(shots: Any, coordinate: Any = None) -> Shots:
+    da: Any = import_module("dask.array")
+    if shots.ndim != 3 or 0 in shots.shape:
+        raise InputError(
+            f"shots have shape {shots.shape}, expected (shot, y, x) with one shot at least"
+        )
+    count = shots.shape[0]
+    if not np.isfinite(shots.shape).all():
+        raise InputError(
+            f"shots have the unknown shape {shots.shape}: call compute_chunk_sizes() first"
+        )
+    lazy = isinstance(shots, da.Array)
+    array = shots if lazy else da.from_array(np.asarray(shots), chunks=(1, -1, -1))
+    array = array.rechunk((1, -1, -1))
+    items = _Blocks(array) if lazy else [ArrayShot(plane) for plane in np.asarray(shots)]
+    names = tuple(str(value) for value in (range(count) if coordinate is None else coordinate))
+    return Shots(items, names, (shots.shape[1], shots.shape[2]), coordinate, array)
+
+
+class _Blocks(Sequence[Shot]):
+    """The shots of a dask array; each is cut out when it is asked for."""
+
+    def __init__(self, array: Any) -> None:
+        self._array = array
+
+    def __len__(self) -> int:
+        return int(self._array.shape[0])
+
+    def __getitem__(self, index: Any) -> Any:
+        dask: Any = import_module("dask")
+        # Without the tasks of other shots, which would travel with it.
+        return BlockShot(dask.optimize(self._array.blocks[index])[0])
+
+
+def find_source(source: Any, *, reader: Reader = read_shot) -> NDArray[Any] | Shots | None:
+    """Turn whatever holds the undisturbed beam into one image, or into many.
+
+    Parameters
+    ----------
+    source : array, path, sequence of paths, glob or None
+        See `napari_shadowinv.invert_stack`.
+    reader : callable, optional
+        Makes an image of a path.
+
+    Returns
+    -------
+    ndarray of shape (H, W), or Shots, or None
+        One image for all shots, references to one for each, or none: a uniform beam.
+
+    Raises
+    ------
+    InputError, FileFormatError
+        If it is nothing of this, or cannot be read.
+    """
+    if source is None:
+        return None
+    single = isinstance(source, (str, Path)) and not _MAGIC.search(str(source))
+    if single and not (_knows_pages(reader) and _page_count(Path(source)) > 1):
+        return FileShot(Path(source).absolute(), reader).load()[0]
+    if getattr(source, "ndim", None) == 2:
+        return np.asarray(source)
+    sources = find_shots(source, reader=reader)
+    return sources.items[0].load()[0] if len(sources) == 1 else sources
+
+
+def described_reader(reader: Reader) -> str:
+    """Name a reader, so that a store is not continued with another."""
+    if isinstance(reader, functools.partial):
+        named = ", ".join(f"{name}={value!r}" for name, value in sorted(reader.keywords.items()))
+        return f"{described_reader(reader.func)}({named})"
+    return f"{reader.__module__}.{getattr(reader, '__qualname__', type(reader).__qualname__)}"

@@ -1,0 +1,96 @@
+"""What all shots of a stack have in common, and how they differ."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.store import DONE
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["stack_statistics"]
+
+_AVERAGED = (
+    "potential",
+    "displacement",
+    "potential_si",
+    "deflection_angle",
+    "path_integrated_b",
+    "path_integrated_e",
+    "line_integrated_log_index",
+    "line_integrated_density",
+)
+
+
+def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
+    """Describe mean, spread and peaks across the shots of a stack.
+
+    Parameters
+    ----------
+    stack : xarray.Dataset
+        From `invert_stack`, `run_stack` or `read`; its shots may be sliced. Shots that are not
+        done are left out of mean and spread.
+
+    Returns
+    -------
+    xarray.Dataset
+        Lazy. For each field ``name``: ``name_mean`` and ``name_std`` (y, x), the standard
+        deviation of one shot from the mean (divided by shots - 1; NaN for a single shot), and
+        ``name_peak`` (shot), the largest magnitude of each shot. For vectors the mean and
+        spread are those of each component.
+
+    Raises
+    ------
+    InputError
+        If the dataset has no shots, or no field.
+
+    Examples
+    --------
+    >>> from napari_shadowinv import InversionOptions, invert_stack
+    >>> stack = invert_stack(np.ones((3, 20, 20)), options=InversionOptions(n_sites=50))
+    >>> statistics = stack_statistics(stack)
+    >>> float(statistics.displacement_peak.max())
+    0.0
+    """
+    import xarray as xr
+
+    names = [name for name in _AVERAGED if name in stack and "shot" in stack[name].dims]
+    if not names:
+        raise InputError(
+            "the dataset has no field of many shots: expected one from invert_stack, run_stack "
+            "or a .shadowinv.zarr store"
+        )
+    found: dict[str, Any] = {}
+    for name in names:
+        field = stack[name]
+        done = field
+        if "status" in stack:
+            # By selection: NaN in their place would make every pixel of a mean a special case.
+            done = field.isel(shot=np.flatnonzero(stack["status"].values == DONE))
+        done = done.astype(np.float64)
+        found[f"{name}_mean"] = _labelled(done.mean("shot", skipna=False), field, "mean of shots")
+        spread = done.std("shot", ddof=1, skipna=False)
+        if done.sizes["shot"] < 2:
+            spread = spread * np.nan
+        found[f"{name}_std"] = _labelled(spread, field, "standard deviation of shots")
+        found[f"{name}_peak"] = _labelled(_peak(field), field, "largest magnitude")
+    attributes = {**stack.attrs, "shots": stack.sizes["shot"]}
+    return xr.Dataset(found, attrs=attributes)
+
+
+def _peak(field: xarray.DataArray) -> xarray.DataArray:
+    planes = field.astype(np.float64)
+    squared = planes**2
+    if "component" in field.dims:
+        squared = squared.sum("component", skipna=False)
+    largest: xarray.DataArray = squared.max(("y", "x"), skipna=False)
+    return largest**0.5
+
+
+def _labelled(values: xarray.DataArray, field: xarray.DataArray, what: str) -> xarray.DataArray:
+    name = str(field.attrs.get("long_name", field.name))
+    return values.assign_attrs(units=field.attrs.get("units", "1"), long_name=f"{name}, {what}")

@@ -1,0 +1,270 @@
+"""What a worker does with one shot; sites are made once in each process.
+
+- an undisturbed beam that can be sent around: `Beam`
+- sites that threads share: `shared_plan`
+- one shot to an inversion: `invert_shot`; to arrays for a dataset: `arrays_of`
+- how many threads a shot may use: `threads_here`
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import multiprocessing
+import sys
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry._threads import available_threads
+from napari_shadowinv.inversion import Inversion, invert, plan_sites
+from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.progress import OnProgress, ShouldStop
+from napari_shadowinv.stack._shots import checksum
+from napari_shadowinv.transport.sites import SitePlan
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+__all__ = ["Beam", "arrays_of", "invert_shot", "shared_plan", "threads_here"]
+
+_ASKED_AGAIN_AFTER = 10.0  # seconds: workers come and go, but asking takes milliseconds
+_PLANS_KEPT = 2  # a worker that changes between two sources makes each once
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """The undisturbed beam and the mask of one or more shots.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Shape (H, W).
+    source : ndarray, shape (H, W), or None
+        None for a uniform beam.
+    mask : ndarray of bool, shape (H, W), or None
+        The pixels that can be used.
+    key : str
+        Checksum of all of it.
+    """
+
+    shape: tuple[int, int]
+    source: NDArray[Any] | None = field(default=None, repr=False)
+    mask: NDArray[np.bool_] | None = field(default=None, repr=False)
+    key: str = ""
+
+    @classmethod
+    def of(
+        cls, shape: tuple[int, int], source: NDArray[Any] | None, mask: NDArray[np.bool_] | None
+    ) -> Beam:
+        """Make a beam with its checksum."""
+        parts = ["" if array is None else checksum(array) for array in (source, mask)]
+        text = f"{shape}{parts[0]}|{parts[1]}"
+        return cls(shape, source, mask, hashlib.sha256(text.encode()).hexdigest())
+
+
+class _Entry:
+    """A plan that is being made, or is there."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.plan: SitePlan | None = None
+
+
+_entries: OrderedDict[str, _Entry] = OrderedDict()
+_entries_lock = threading.Lock()
+
+
+def shared_plan(
+    beam: Beam,
+    options: InversionOptions,
+    *,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> SitePlan:
+    """Return the sites for a beam; the first in this process who asks makes them.
+
+    Parameters
+    ----------
+    beam : Beam
+        Source and mask.
+    options : InversionOptions
+        Choices; `threads` does not matter.
+    on_progress, should_stop
+        See `napari_shadowinv.invert`.
+
+    Returns
+    -------
+    SitePlan
+        The same object for the same beam and options; the last few are kept.
+    """
+    key = beam.key + options.model_dump_json(exclude={"threads"})
+    with _entries_lock:
+        entry = _entries.setdefault(key, _Entry())
+        _entries.move_to_end(key)
+        while len(_entries) > _PLANS_KEPT:
+            _entries.popitem(last=False)
+    with entry.lock:
+        if entry.plan is None:
+            entry.plan = plan_sites(
+                np.ones(beam.shape) if beam.source is None else beam.source,
+                options,
+                mask=beam.mask,
+                on_progress=on_progress,
+                should_stop=should_stop,
+            )
+            for level in entry.plan.levels:
+                # Made when first asked for, which two threads would do at once.
+                _ = level.mirrored
+        return entry.plan
+
+
+def invert_shot(
+    image: NDArray[Any],
+    beam: Beam,
+    options: InversionOptions,
+    *,
+    start: Inversion | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Inversion:
+    """Invert one shot with the sites that its process shares.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W)
+        The shot.
+    beam : Beam
+        Source and mask.
+    options : InversionOptions
+        Choices.
+    start : Inversion, optional
+        The solver starts from there.
+    on_progress, should_stop
+        See `napari_shadowinv.invert`.
+
+    Returns
+    -------
+    Inversion
+
+    Raises
+    ------
+    InputError
+        If the shot cannot be inverted.
+    """
+    if np.shape(image) != beam.shape:
+        raise InputError(f"image has shape {np.shape(image)}, expected {beam.shape} as the others")
+    began = time.perf_counter()
+    plan = shared_plan(beam, options, on_progress=on_progress, should_stop=should_stop)
+    on_sites = time.perf_counter() - began
+    if beam.source is None:
+        image = _relative(image, beam.mask)
+    inversion = invert(
+        image,
+        options=options,
+        plan=plan,
+        start=start,
+        on_progress=on_progress,
+        should_stop=should_stop,
+    )
+    seconds = {**inversion.report.seconds, "sites": on_sites}
+    return replace(inversion, report=replace(inversion.report, seconds=seconds))
+
+
+def _relative(image: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[Any]:
+    """Divide by the mean, because a uniform beam that all shots share is 1 everywhere."""
+    values = np.asarray(image, dtype=np.float64)
+    used = values if mask is None else values[mask]
+    # An image that cannot be inverted is left alone: the error shall tell of it as it was.
+    if not np.isfinite(used).all():
+        return values
+    mean = float(np.maximum(used, 0).mean())
+    return values / mean if mean > 0 else values
+
+
+def arrays_of(
+    inversion: Inversion, names: Mapping[str, Any], setup: ProtonSetup | OpticalSetup | None
+) -> dict[str, NDArray[Any]]:
+    """Return variables of an inversion by name, fields in SI units among them.
+
+    Parameters
+    ----------
+    inversion : Inversion
+        The result.
+    names : collection of str
+        Names as in `napari_shadowinv.io.dataset.variable_labels`.
+    setup : ProtonSetup or OpticalSetup or None
+        For fields in SI units.
+
+    Returns
+    -------
+    dict of str to ndarray
+    """
+    own = variable_labels()
+    arrays = {name: getattr(inversion, name) for name in names if name in own}
+    if len(arrays) < len(names):
+        fields = dataset_from_field(inversion.displacement, inversion.potential, setup)
+        arrays |= {name: fields[name].values for name in names if name not in own}
+    return arrays
+
+
+def threads_here(workers: int | None = None) -> int:
+    """Return how many threads one shot may use, so that all shots at once fill the machine.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Shots that are inverted at once on this machine. Default: found out. On a worker of
+        `dask.distributed` it is the number of threads of all workers on this machine; in a
+        pool of dask it is `num_workers` of dask's configuration, or a thread for each core.
+
+    Returns
+    -------
+    int
+        Cores divided by workers, 1 at least.
+    """
+    cores = available_threads(None)
+    if workers is None:
+        workers = _threads_of_cluster() or _threads_of_pool(cores)
+    return max(1, cores // workers)
+
+
+def _threads_of_cluster() -> int | None:
+    """Threads of all dask workers on this machine; None elsewhere than on a worker."""
+    if "distributed" not in sys.modules:
+        return None
+    from distributed import get_worker
+    from distributed.comm.addressing import get_address_host
+
+    try:
+        here = get_address_host(get_worker().address)
+    except ValueError:
+        return None
+    return _threads_on(here, int(time.monotonic() / _ASKED_AGAIN_AFTER))
+
+
+@functools.lru_cache(maxsize=1)
+def _threads_on(host: str, _age: int) -> int:
+    from distributed import get_client
+    from distributed.comm.addressing import get_address_host
+
+    client: Any = get_client()
+    workers = client.nthreads()
+    return sum(count for address, count in workers.items() if get_address_host(address) == host)
+
+
+def _threads_of_pool(cores: int) -> int:
+    alone = threading.current_thread() is threading.main_thread()
+    if alone and multiprocessing.parent_process() is None:
+        return 1
+    import dask
+
+    return int(dask.config.get("num_workers", None) or cores)

@@ -1,0 +1,77 @@
+"""A few small shots with their source, in memory and as files."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import InversionOptions, invert, plan_sites, synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+
+# Workers import readers from there; they get this process's path.
+sys.path.insert(0, str(Path(__file__).parent))
+
+SHAPE = (24, 28)
+OPTIONS = InversionOptions(n_sites=100)
+
+
+def make_shots(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Shots of a blob that grows and wanders, and their source."""
+    source = 100 + 10 * np.random.default_rng(0).random(SHAPE)
+    blobs = [
+        gaussian_blob(SHAPE, 2 + 3 * np.sin(0.7 * i) ** 2, 4.0, (10, 12 + i % 5))
+        for i in range(count)
+    ]
+    return np.stack([synthetic_image(blob.displacement, source) for blob in blobs]), source
+
+
+@dataclass(frozen=True)
+class Night:
+    """Shots with a source, in memory and as files."""
+
+    images: np.ndarray
+    source: np.ndarray
+    folder: Path
+
+    @property
+    def glob(self) -> str:
+        return str(self.folder / "shot_*.npy")
+
+    def path(self, index: int) -> Path:
+        return self.folder / f"shot_{index}.npy"
+
+    @property
+    def reads(self) -> list[str]:
+        log = self.folder / "reads.txt"
+        return log.read_text().split() if log.exists() else []
+
+
+@pytest.fixture(scope="session")
+def compiled() -> None:
+    """Compile what an inversion needs, once and not in each worker."""
+    images, source = make_shots(1)
+    plan = plan_sites(source, OPTIONS)
+    first = invert(images[0], plan=plan, options=OPTIONS)
+    invert(images[0], plan=plan, options=OPTIONS, start=first)
+
+
+@pytest.fixture
+def make_night(tmp_path, compiled):
+    def make(count: int) -> Night:
+        images, source = make_shots(count)
+        folder = tmp_path / "shots"
+        folder.mkdir()
+        for index, image in enumerate(images):
+            np.save(folder / f"shot_{index}.npy", image)
+        return Night(images, source, folder)
+
+    return make
+
+
+@pytest.fixture
+def night(make_night) -> Night:
+    return make_night(6)

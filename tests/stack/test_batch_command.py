@@ -1,0 +1,282 @@
+"""`shadowinv batch`, `status`, `export` and `movie`."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner, Result
+
+from napari_shadowinv import InversionOptions, invert, read
+from napari_shadowinv.cli import app
+from napari_shadowinv.io.store import DONE, PENDING, StackStore
+
+HERE = Path(__file__).parent
+SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
+OPTICAL = """
+kind = "optical"
+wavelength = 532e-9
+object_image_distance = 0.3
+pixel_size = 2e-5
+"""
+PROTON = """
+kind = "proton"
+energy = 14.7
+source_object_distance = 0.01
+object_image_distance = 0.3
+pixel_size = 1e-5
+"""
+
+
+def shadowinv(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def flat(text: str) -> str:
+    return " ".join(text.split())
+
+
+@pytest.fixture
+def folder(night, tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    np.save("reference.npy", night.source)
+    Path("setup.toml").write_text(OPTICAL)
+    return tmp_path
+
+
+def batch(*more: object) -> Result:
+    return shadowinv(
+        "batch", "shots/shot_*.npy", "--source", "reference.npy", "--out", "n.shadowinv.zarr",
+        "--n-sites", 100, "--scheduler", "threads", *more,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def store(folder) -> Path:
+    assert batch("--setup", "setup.toml").exit_code == 0
+    return folder / "n.shadowinv.zarr"
+
+
+def test_a_batch_is_written_and_told_of(night, folder):
+    result = batch("--setup", "setup.toml")
+    assert result.exit_code == 0
+    assert "6 done, 0 failed, 0 pending" in flat(result.output)
+    dataset = read("n.shadowinv.zarr")
+    alone = invert(night.images[2], source=night.source, options=InversionOptions(n_sites=100))
+    np.testing.assert_allclose(dataset.potential[2], alone.potential, rtol=1e-6, atol=1e-6)
+    assert dataset.attrs["source_file"] == "reference.npy"
+    assert "line_integrated_density" in dataset
+
+
+def test_shots_that_fail_are_named_and_the_exit_code_is_one(night, folder):
+    night.path(1).write_bytes(b"")
+    np.save(night.path(4), 0 * night.images[4])
+    result = batch()
+    assert result.exit_code == 1
+    text = flat(result.output)
+    assert "4 done, 2 failed, 0 pending" in text
+    assert "shot_1.npy" in text
+    assert "is empty" in text
+    assert "shot_4.npy: image has no positive pixel" in text
+    status = flat(shadowinv("status", "n.shadowinv.zarr").output)
+    assert "4 done, 2 failed, 0 pending" in status
+    assert "shot_4.npy: image has no positive pixel" in status
+    every = shadowinv("status", "n.shadowinv.zarr", "--all").output
+    for index in range(6):
+        assert f"shot_{index}.npy" in every
+    for index in (1, 4):
+        np.save(night.path(index), night.images[index])
+    assert batch("--redo-failed").exit_code == 0
+
+
+def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
+    before = store.stat().st_mtime_ns
+    refused = batch("--setup", "setup.toml")
+    assert refused.exit_code == 2
+    assert "exists (6 done, 0 failed, 0 pending): go on with --resume" in flat(refused.output)
+    assert batch("--resume", "--overwrite").exit_code == 2
+    assert store.stat().st_mtime_ns == before
+    resumed = batch("--setup", "setup.toml", "--resume")
+    assert resumed.exit_code == 0
+    assert "nothing was to be done" in flat(resumed.output)
+    other = batch("--resume")
+    assert other.exit_code == 2
+    assert "was begun with another setup" in flat(other.output)
+    assert batch("--overwrite").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["batch", "no/*.tif", "--out", "a.shadowinv.zarr"], "no file matches no/*.tif"),
+        (["batch", "shots/*.npy", "--out", "a.zarr"], "ends with .shadowinv.zarr"),
+        (["batch", "shots/*.npy", "--out", "a.shadowinv.zarr", "--source", "x.tif"], "not exist"),
+        (["status", "shots"], "is no stack of shots"),
+        (["export", "shots", "--format", "csv"], "is no stack of shots"),
+    ],
+)
+def test_mistakes_are_told_in_one_sentence_and_nothing_is_written(folder, arguments, words):
+    before = sorted(folder.rglob("*"))
+    result = shadowinv(*arguments)
+    assert result.exit_code == 2
+    assert words in flat(result.output)
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_a_tiff_with_pages_a_mask_and_bins(night, folder):
+    tifffile.imwrite("film.tif", night.images.astype(np.float32), photometric="minisblack")
+    mask = np.ones(night.source.shape, np.uint8)
+    mask[:2, :2] = 0
+    iio.imwrite("mask.png", mask)
+    result = shadowinv(
+        "batch", "film.tif", "--source", "reference.npy", "--mask", "mask.png", "--bin", 2,
+        "--setup", "setup.toml", "--out", "f.shadowinv.zarr", "--scheduler", "threads",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    dataset = read("f.shadowinv.zarr")
+    assert dict(dataset.sizes) == {"shot": 6, "y": 12, "x": 14, "component": 2}
+    assert float(dataset.x_si[1]) == pytest.approx(4e-5)
+
+    def binned(image: np.ndarray) -> np.ndarray:
+        return image.reshape(12, 2, 14, 2).sum(axis=(1, 3))
+
+    usable = np.ones((12, 14), bool)
+    usable[0, 0] = False
+    shot = binned(night.images[3].astype(np.float32).astype(float))
+    alone = invert(shot, source=binned(night.source), mask=usable)
+    np.testing.assert_allclose(dataset.potential[3], alone.potential, rtol=1e-6, atol=1e-6)
+
+
+def test_shots_are_exported_as_tiff(store):
+    result = shadowinv(
+        "export", store, "--format", "tiff", "--shots", "1:3,5", "--variables",
+        "potential,displacement", "--out", "tiffs",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    dataset = read(store)
+    names = sorted(path.name for path in Path("tiffs").iterdir())
+    assert len(names) == 3 * 3
+    plane = tifffile.imread("tiffs/0005_shot_5_displacement_x.tif")
+    np.testing.assert_array_equal(plane, dataset.displacement.sel(component="x")[5])
+    again = shadowinv("export", store, "--format", "tiff", "--shots", "1", "--out", "tiffs")
+    assert again.exit_code == 2
+    assert "exists" in again.output
+
+
+def test_shots_are_exported_as_pradformat_if_the_setup_is_a_particle_beams(store):
+    refused = shadowinv("export", store, "--format", "pradformat")
+    assert refused.exit_code == 2
+    assert not Path("n").exists()
+    Path("setup.toml").write_text(PROTON)
+    assert batch("--setup", "setup.toml", "--overwrite").exit_code == 0
+    assert shadowinv("export", store, "--format", "pradformat", "--shots", "4").exit_code == 0
+    (path,) = Path("n").iterdir()
+    with h5py.File(path) as file:
+        assert file.keys()
+    exported = read(path)
+    np.testing.assert_allclose(exported.displacement, read(store).displacement[4], atol=1e-6)
+
+
+def test_a_table_of_all_shots_is_exported_as_csv(night, folder):
+    np.save(night.path(2), 0 * night.images[2])
+    assert batch().exit_code == 1
+    assert shadowinv("export", "n.shadowinv.zarr", "--format", "csv").exit_code == 0
+    with Path("n.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["name"] for row in rows] == [f"shot_{i}.npy" for i in range(6)]
+    assert rows[2]["status"] == "failed"
+    assert "no positive pixel" in rows[2]["reason"]
+    largest = np.hypot(*read("n.shadowinv.zarr").displacement.values[3]).max()
+    assert float(rows[3]["displacement_peak (px)"]) == pytest.approx(largest, rel=1e-6)
+
+
+@pytest.mark.parametrize("text", ["6", "a", "1:2:3:4", ""])
+def test_shots_that_do_not_exist_are_refused(store, text):
+    result = shadowinv("export", store, "--format", "tiff", "--shots", text)
+    assert result.exit_code == 2
+    assert "expected numbers from 0 to 5" in flat(result.output)
+
+
+@pytest.mark.parametrize("name", ["plume.gif", "plume.mp4"])
+def test_a_film_has_a_frame_for_each_shot(store, name):
+    if name.endswith("mp4"):
+        pytest.importorskip("imageio_ffmpeg")
+    result = shadowinv("movie", store, "-o", name, "--shots", "1:5")
+    assert result.exit_code == 0, result.output
+    frames = iio.imread(name)
+    assert len(frames) == 4
+    assert all(length % 2 == 0 for length in frames.shape[1:3])
+    assert not np.array_equal(frames[0], frames[2])
+    assert shadowinv("movie", store, "-o", name).exit_code == 2  # it exists
+
+
+def test_the_colour_scale_of_a_film_is_fixed(store):
+    from napari_shadowinv.plotting import stack_frames
+
+    dataset = read(store)
+    brightest = int(np.argmax([float(dataset.potential[i].max()) for i in range(6)]))
+    alone = next(stack_frames(dataset.isel(shot=[0]), "potential", limits=(0, 1)))
+    together = list(stack_frames(dataset, "potential", limits=(0, 1)))
+    np.testing.assert_array_equal(together[0], alone)
+    scaled = list(stack_frames(dataset, "potential"))
+    # The same value has the same colour in all shots: the colour bar's pixels never change.
+    bar = slice(int(0.82 * alone.shape[1]), None)
+    for frame in scaled:
+        np.testing.assert_array_equal(frame[60:, bar], scaled[brightest][60:, bar])
+
+
+def test_without_its_package_mp4_is_refused_in_one_sentence(store, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    result = shadowinv("movie", store, "-o", "plume.mp4")
+    assert result.exit_code == 2
+    assert "plume.mp4 needs the package imageio-ffmpeg" in flat(result.output)
+    assert not Path("plume.mp4").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
+def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    night = make_night(60)
+    np.save("reference.npy", night.source)
+    command = [
+        "batch", "shots/shot_*.npy", "--source", "reference.npy", "--out", "n.shadowinv.zarr",
+        "--n-sites", "100",
+    ]  # fmt: skip
+    out = tmp_path / "n.shadowinv.zarr"
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from napari_shadowinv.cli import app; app()", *command,
+         "--workers", "1"],
+        env={**os.environ, "PYTHONPATH": str(SOURCES)},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        end = time.monotonic() + 90
+        while not list(out.glob("status/c/*")):
+            assert process.poll() is None
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        # As a terminal does: to the command and to its workers.
+        os.killpg(process.pid, signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "Give the same command with --resume to go on" in flat(told)
+    assert "Traceback" not in told
+    statuses = StackStore(out).statuses()
+    assert set(statuses) == {DONE, PENDING}
+    resumed = shadowinv(*command, "--resume", "--scheduler", "threads", "--quiet")
+    assert resumed.exit_code == 0
+    assert (StackStore(out).statuses() == DONE).all()

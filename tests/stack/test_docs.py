@@ -1,0 +1,61 @@
+"""What the page about many shots shows must work as it stands there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from napari_shadowinv import invert
+from napari_shadowinv.cli import app
+
+PAGE = (Path(__file__).parents[2] / "docs" / "batch.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^    (shadowinv [^#\n]*)", PAGE, re.MULTILINE)
+
+
+@pytest.fixture
+def folder(night, tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for index, image in enumerate(night.images):
+        tifffile.imwrite(f"shots/shot_{index}.tif", image.astype("float32"))
+    tifffile.imwrite("reference.tif", night.source.astype("float32"))
+    return tmp_path
+
+
+def test_the_python_blocks_make_what_they_promise(folder, night):
+    names: dict[str, object] = {}
+    blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    for block in blocks:
+        if "cluster" not in block:
+            exec(compile(block, "batch.md", "exec"), names)
+    alone = invert(tifffile.imread("shots/shot_3.tif"), source=tifffile.imread("reference.tif"))
+    assert float(names["one"].max()) == pytest.approx(alone.potential.max())  # type: ignore[attr-defined]
+    assert list(names["later"].status) == [1] * 6  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if "batch" not in c])
+def test_the_commands_work_as_shown(folder, command):
+    pytest.importorskip("imageio_ffmpeg")
+    batch = ["batch", "shots/*.tif", "--source", "reference.tif", "--out", "night.shadowinv.zarr"]
+    assert batch == COMMANDS[0].replace("'", "").split()[1:]
+    runner = CliRunner()
+    fast = ["--scheduler", "threads", "--n-sites", "100"]
+    if "pradformat" in command:
+        Path("setup.toml").write_text(
+            'kind = "proton"\nenergy = 14.7\nsource_object_distance = 0.01\n'
+            "object_image_distance = 0.3\npixel_size = 1e-5\n"
+        )
+        fast += ["--setup", "setup.toml"]
+    assert runner.invoke(app, [*batch, *fast]).exit_code == 0
+    # The night of the page has more shots than this one.
+    result = runner.invoke(app, command.replace("3:20", "3:6").split()[1:])
+    assert result.exit_code == 0, result.output
+
+
+def test_every_link_of_the_page_leads_somewhere():
+    for target in re.findall(r"\]\(([^)#]+)\)", PAGE):
+        if not target.startswith("http"):
+            assert (Path(__file__).parents[2] / "docs" / target).exists(), target

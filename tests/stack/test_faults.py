@@ -1,0 +1,418 @@
+"""What can go wrong in a night: real schedulers, real worker processes, real signals."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from distributed import Client, LocalCluster
+from slow_reading import hang_once
+
+from napari_shadowinv import FileFormatError, InversionOptions, invert_stack, read, run_stack
+from napari_shadowinv.geometry._threads import available_threads
+from napari_shadowinv.io.locking import locked
+from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
+from napari_shadowinv.stack import _engines
+from napari_shadowinv.stack._work import threads_here
+
+OPTIONS = InversionOptions(n_sites=100)
+PATIENCE = 90.0
+HERE = Path(__file__).parent
+SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
+
+
+def wait_for(condition, what: str):
+    end = time.monotonic() + PATIENCE
+    while not (found := condition()):
+        assert time.monotonic() < end, f"waited {PATIENCE} s for {what}"
+        time.sleep(0.02)
+    return found
+
+
+@pytest.fixture(scope="module")
+def cluster(compiled):
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+    ) as made:
+        yield made
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "night.shadowinv.zarr"
+
+
+@pytest.fixture
+def expected(night, tmp_path) -> dict[str, bytes]:
+    """What is written where nothing goes wrong."""
+    store = tmp_path / "expected.shadowinv.zarr"
+    run_stack(night.glob, store, source=night.source, options=OPTIONS)
+    return values(store)
+
+
+def values(store: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(store)): path.read_bytes()
+        for name in ("potential", "displacement", "caustic", "status")
+        for path in sorted((store / name).rglob("*"))
+        if path.is_file()
+    }
+
+
+class InThread(threading.Thread):
+    """A run that the test watches from outside."""
+
+    def __init__(self, *args, **kwargs) -> None:
+        super().__init__(daemon=True)
+        self._work = lambda: run_stack(*args, **kwargs)
+        self.error: BaseException | None = None
+
+    def run(self) -> None:
+        try:
+            self._work()
+        except BaseException as error:
+            self.error = error
+
+    def ended(self) -> BaseException | None:
+        self.join(PATIENCE)
+        assert not self.is_alive()
+        return self.error
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(SOURCES), str(HERE)])}
+
+
+def test_a_worker_killed_in_the_middle_of_a_shot(night, out, expected, cluster):
+    (night.folder / "hang.txt").write_text("shot_2")
+    run = InThread(
+        night.glob,
+        out,
+        source=night.source,
+        options=OPTIONS,
+        reader=hang_once,
+        scheduler=cluster.scheduler_address,
+    )
+    run.start()
+    victim = int(wait_for(lambda: read_text(night.folder / "hanging"), "a shot to begin"))
+    assert victim != os.getpid()
+    os.kill(victim, signal.SIGKILL)
+    assert run.ended() is None
+    assert values(out) == expected
+    assert (read(out).status == DONE).all()
+    # Another worker did it again, and nothing else was done twice.
+    assert Counter(night.reads)["shot_2"] == 1
+
+
+def read_text(path: Path) -> str:
+    return path.read_text() if path.exists() else ""
+
+
+DRIVER = """
+    import sys
+    import numpy as np
+    from napari_shadowinv import InversionOptions, run_stack
+    from slow_reading import hang_once
+
+    folder, out, address = sys.argv[1:]
+    run_stack(
+        f"{folder}/shot_*.npy",
+        out,
+        source=np.load(f"{folder}/source.npy"),
+        options=InversionOptions(n_sites=100),
+        reader=hang_once,
+        scheduler=address,
+    )
+"""
+
+
+def test_the_client_killed_and_resumed_while_a_second_one_is_refused(night, out, expected, cluster):
+    np.save(night.folder / "source.npy", night.source)
+    (night.folder / "hang.txt").write_text("shot_3")
+    arguments = {
+        "source": night.source,
+        "options": OPTIONS,
+        "reader": hang_once,
+        "scheduler": cluster.scheduler_address,
+    }
+    client = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            textwrap.dedent(DRIVER),
+            str(night.folder),
+            str(out),
+            cluster.scheduler_address,
+        ],
+        env=environment(),
+    )
+    try:
+        wait_for(lambda: read_text(night.folder / "hanging"), "a shot to begin")
+        wait_for(lambda: (StackStore(out).statuses() == DONE).sum() == 5, "the other shots")
+        with pytest.raises(FileFormatError, match=f"being written by process {client.pid} on"):
+            run_stack(night.glob, out, **arguments)
+    finally:
+        client.kill()
+        client.wait()
+    assert list(np.flatnonzero(read(out).status == PENDING)) == [3]
+    reads = Counter(night.reads)
+    # The lock of the dead is none; the worker that is still at the shot may go on.
+    run = InThread(night.glob, out, **arguments)
+    run.start()
+    (night.folder / "release").touch()
+    assert run.ended() is None
+    assert values(out) == expected
+    again = Counter(night.reads) - reads
+    assert not {"shot_4", "shot_5"} & set(again)
+
+
+def test_ten_of_a_hundred_files_corrupt(make_night, out, cluster):
+    night = make_night(100)
+    spoilt = list(range(4, 100, 10))
+    for index in spoilt:
+        path = night.path(index)
+        content = path.read_bytes()
+        if index % 20 == 4:
+            path.write_bytes(content[: len(content) // 2])
+        else:
+            np.save(path, np.zeros((3, 3)) if index % 3 else 0 * night.images[index])
+    written = run_stack(
+        night.glob,
+        out,
+        source=night.source,
+        options=OPTIONS,
+        scheduler=cluster.scheduler_address,
+    )
+    assert list(np.flatnonzero(written.status == FAILED)) == spoilt
+    assert (written.status == DONE).sum() == 90
+    done = written.isel(shot=written.status.values == DONE)
+    assert np.isfinite(done.potential.values).all()
+    store = StackStore(out)
+    for index in spoilt:
+        reason = store.report(index)["reason"]
+        assert any(word in reason for word in ("cut short", "(3, 3)", "no positive pixel"))
+
+
+def test_a_dask_array_on_the_cluster_is_inverted_there(night, out, expected, cluster):
+    import dask.array as da
+
+    with Client(cluster) as client:
+        shots = client.persist(da.from_array(night.images, chunks=(2, 24, 28)))
+        run_stack(shots, out, source=night.source, options=OPTIONS)  # dask's current client
+    assert values(out) == expected
+
+
+def count_plans() -> None:
+    """Make this process count the plans that it makes."""
+    from napari_shadowinv.stack import _work
+
+    original = _work.plan_sites
+
+    def plan_sites(source, options, **more):
+        plan_sites.made += 1
+        return original(source, options, **more)
+
+    plan_sites.made = 0
+    _work._entries.clear()
+    _work.plan_sites = plan_sites
+
+
+def plans_made() -> int:
+    from napari_shadowinv.stack import _work
+
+    return _work.plan_sites.made
+
+
+def test_a_lazy_stack_on_the_cluster_makes_its_sites_once_in_each_worker(make_night, cluster):
+    night = make_night(12)
+    stack = invert_stack(night.images, source=night.source, options=OPTIONS)
+    expected = stack.potential.compute(scheduler="synchronous")
+    with Client(cluster, set_as_default=False) as client:
+        client.run(count_plans)
+        found = client.compute(stack.potential).result(timeout=PATIENCE)
+        made = client.run(plans_made)
+    np.testing.assert_array_equal(found, expected)
+    assert 1 <= sum(made.values()) <= 2
+    assert max(made.values()) == 1
+
+
+def test_a_shot_on_a_worker_gets_its_share_of_the_cores(cluster):
+    with Client(cluster, set_as_default=False) as client:
+        shares = client.gather([client.submit(threads_here, pure=False) for _ in range(4)])
+    assert shares == [max(1, available_threads(None) // 2)] * 4
+
+
+class Dask:
+    """A scheduler and a worker, each a process of its own."""
+
+    def __init__(self) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.address = f"tcp://127.0.0.1:{self.port}"
+        self.processes: list[subprocess.Popen] = []
+
+    def start(self) -> None:
+        ours = ["--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0"]
+        scheduler = ["distributed.cli.dask_scheduler", *ours, "--port", str(self.port)]
+        worker = ["distributed.cli.dask_worker", self.address, *ours, "--nthreads", "1"]
+        self.processes = [
+            subprocess.Popen(
+                [sys.executable, "-m", *command],
+                env=environment(),
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            for command in (scheduler, [*worker, "--no-nanny"])
+        ]
+
+    def kill(self) -> None:
+        for process in self.processes:
+            process.kill()
+            process.wait()
+
+
+def test_the_scheduler_restarted_and_the_run_resumed(night, out, expected):
+    (night.folder / "hang.txt").write_text("shot_3")
+    arguments = {
+        "source": night.source,
+        "options": OPTIONS,
+        "reader": hang_once,
+    }
+    dask = Dask()
+    try:
+        dask.start()
+        run = InThread(night.glob, out, **arguments, scheduler=dask.address)
+        run.start()
+        wait_for(lambda: read_text(night.folder / "hanging"), "a shot to begin")
+        dask.kill()
+        error = run.ended()
+        assert isinstance(error, OSError)
+        assert "run again to resume" in str(error)
+        before = read(out)
+        assert (before.status == PENDING).any()
+        assert not (before.status == FAILED).any()
+        dask.start()
+        written = run_stack(night.glob, out, **arguments, scheduler=dask.address)
+    finally:
+        dask.kill()
+    assert (written.status == DONE).all()
+    assert values(out) == expected
+
+
+def test_no_scheduler_answers(night, out, monkeypatch):
+    monkeypatch.setattr(_engines, "_CONNECT_SECONDS", 1.0)
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
+        with pytest.raises(OSError, match=f"no scheduler answers at {address}"):
+            run_stack(night.images, out, options=OPTIONS, scheduler=address)
+    assert (read(out).status == PENDING).all()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def size(option: str) -> bool:
+        command = ["mount", "-t", "tmpfs", "-o", option, "tmpfs", str(folder)]
+        return subprocess.run(command, capture_output=True).returncode == 0
+
+    if os.name != "posix" or not shutil.which("mount") or not size("size=400k"):
+        pytest.skip("no file system can be mounted here")
+    try:
+        yield folder, lambda: size("remount,size=16m")
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def test_the_disk_full_while_writing(make_night, small_disk):
+    night = make_night(40)
+    folder, enlarge = small_disk
+    out = folder / "night.shadowinv.zarr"
+    arguments = {"source": night.source, "options": OPTIONS}
+    with pytest.raises(OSError, match=r"No space left on device\): make room"):
+        run_stack(night.glob, out, **arguments)
+    before = read(out)
+    done = before.status.values == DONE
+    assert 0 < done.sum() < 40
+    assert not (before.status == FAILED).any()
+    assert np.isfinite(before.potential.values[done]).all()
+    kept = {name: text for name, text in values(out).items() if done[shot_of(name)]}
+    assert enlarge()
+    after = run_stack(night.glob, out, **arguments)
+    assert (after.status == DONE).all()
+    assert np.isfinite(after.potential.values).all()
+    assert kept.items() <= values(out).items()
+
+
+def shot_of(name: str) -> int:
+    parts = Path(name).parts
+    return int(parts[2]) if parts[1] == "c" else 0
+
+
+class TestLocks:
+    def test_the_lock_of_a_process_that_was_killed_is_none(self, tmp_path):
+        path = tmp_path / "store"
+        code = f"""
+            import time
+            from pathlib import Path
+            from napari_shadowinv.io.locking import locked
+            with locked(Path({str(path)!r})):
+                print("locked", flush=True)
+                time.sleep(60)
+        """
+        holder = subprocess.Popen(
+            [sys.executable, "-c", textwrap.dedent(code)],
+            env=environment(),
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "locked\n"
+        refused = f"being written by process {holder.pid} on {socket.gethostname()}"
+        with pytest.raises(FileFormatError, match=refused), locked(path):
+            pass
+        holder.kill()
+        holder.wait()
+        with locked(path):
+            pass
+        assert list(tmp_path.iterdir()) == []
+
+    def test_another_host_holds_its_lock_while_it_gives_signs_of_life(self, tmp_path):
+        lock = tmp_path / ".store.lock"
+        lock.write_text('{"host": "elsewhere", "pid": 7}')
+        path = tmp_path / "store"
+        with pytest.raises(FileFormatError, match="process 7 on elsewhere"), locked(path):
+            pass
+        past = time.time() - 1000
+        os.utime(lock, (past, past))
+        with locked(path):
+            pass
+
+    def test_signs_of_life_are_given(self, tmp_path):
+        with locked(tmp_path / "store") as live:
+            past = time.time() - 1000
+            os.utime(tmp_path / ".store.lock", (past, past))
+            live()
+            assert time.time() - (tmp_path / ".store.lock").stat().st_mtime < 100
+
+    def test_one_process_cannot_take_it_twice(self, tmp_path):
+        with locked(tmp_path / "store"):
+            refused = pytest.raises(FileFormatError, match=f"process {os.getpid()}")
+            with refused, locked(tmp_path / "store"):
+                pass
+        with locked(tmp_path / "store"):
+            pass

@@ -1,0 +1,303 @@
+"""`invert_stack`: lazy, the same whatever the way, sites made once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+
+import dask
+import dask.array as da
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+
+from napari_shadowinv import FileFormatError, InputError, InversionOptions, invert, invert_stack
+from napari_shadowinv.physics.setup import OpticalSetup
+from napari_shadowinv.stack import _work
+
+OPTIONS = InversionOptions(n_sites=100)
+
+
+@pytest.fixture(autouse=True)
+def no_plans(monkeypatch):
+    monkeypatch.setattr(_work, "_entries", type(_work._entries)())
+
+
+@pytest.fixture
+def plans_made(monkeypatch):
+    made = []
+
+    def plan_sites(source, options, **more):
+        made.append(source)
+        return original(source, options, **more)
+
+    original = _work.plan_sites
+    monkeypatch.setattr(_work, "plan_sites", plan_sites)
+    return made
+
+
+def test_each_shot_has_the_variables_of_its_own_inversion(night, optical_setup):
+    stack = invert_stack(night.images, source=night.source, options=OPTIONS, setup=optical_setup)
+    computed = stack.compute()
+    for index, image in enumerate(night.images):
+        inversion = invert(image, source=night.source, options=OPTIONS)
+        alone = inversion.to_dataset(optical_setup)
+        assert set(alone.data_vars) <= set(stack.data_vars)
+        for name in alone.data_vars:
+            values = computed[name]
+            values = values.isel(shot=index) if "shot" in values.dims else values
+            assert values.dims == alone[name].dims
+            assert values.attrs == alone[name].attrs
+            np.testing.assert_array_equal(values.values, alone[name].values, err_msg=str(name))
+        assert computed.flux_residual[index] == inversion.report.residual
+        assert computed.iterations[index] == inversion.report.iterations
+        assert bool(computed.converged[index]) is inversion.report.converged
+
+
+def test_without_a_source_the_field_is_that_of_a_uniform_beam(night):
+    stack = invert_stack(night.images, options=OPTIONS)
+    alone = invert(night.images[2], options=OPTIONS)
+    shot = stack.isel(shot=2).compute()
+    np.testing.assert_allclose(shot.potential, alone.potential, atol=1e-9)
+    np.testing.assert_allclose(shot.displacement, alone.displacement, atol=1e-9)
+    np.testing.assert_allclose(shot.image, night.images[2] / night.images[2].mean(), rtol=1e-12)
+
+
+def test_masked_pixels_do_not_count(night):
+    mask = np.ones(night.source.shape, bool)
+    mask[3:6, 4:9] = False
+    spoilt = np.where(mask, night.images, np.nan)
+    stack = invert_stack(spoilt, source=night.source, mask=mask, options=OPTIONS)
+    alone = invert(night.images[1], source=night.source, mask=mask, options=OPTIONS)
+    np.testing.assert_array_equal(stack.potential[1], alone.potential)
+    np.testing.assert_array_equal(stack["mask"], mask)
+    uniform = invert_stack(spoilt, mask=mask, options=OPTIONS)
+    alone = invert(night.images[1], mask=mask, options=OPTIONS)
+    np.testing.assert_allclose(uniform.potential[1], alone.potential, atol=1e-9)
+
+
+def test_nothing_is_read_before_it_is_needed_and_only_what_is_needed(night):
+    from slow_reading import log_and_read
+
+    stack = invert_stack(night.glob, source=night.source, options=OPTIONS, reader=log_and_read)
+    assert night.reads == []
+    stack.potential.isel(shot=slice(3, 5)).compute()
+    assert sorted(night.reads) == ["shot_3", "shot_4"]
+
+
+def test_all_variables_of_a_shot_come_from_one_inversion(night):
+    from slow_reading import log_and_read
+
+    stack = invert_stack(night.glob, source=night.source, options=OPTIONS, reader=log_and_read)
+    dask.compute(stack.potential, stack.displacement, stack.weights, stack.converged)
+    assert sorted(night.reads) == [f"shot_{i}" for i in range(6)]
+
+
+@pytest.mark.parametrize("scheduler", ["synchronous", "threads"])
+def test_sites_are_made_once_for_shots_with_one_source(night, plans_made, scheduler):
+    stack = invert_stack(night.images, source=night.source, options=OPTIONS)
+    stack[["potential", "sites"]].compute(scheduler=scheduler, num_workers=4)
+    assert len(plans_made) == 1
+
+
+def test_threads_that_ask_at_once_get_the_same_plan(night, plans_made):
+    beam = _work.Beam.of(night.source.shape, night.source, None)
+    plans: list[object] = []
+    start = threading.Barrier(4)
+
+    def ask() -> None:
+        start.wait()
+        plans.append(_work.shared_plan(beam, OPTIONS.model_copy(update={"threads": 1})))
+
+    threads = [threading.Thread(target=ask) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(plans_made) == 1
+    assert all(plan is plans[0] for plan in plans)
+    assert all("mirrored" in vars(level) for level in plans[0].levels)  # type: ignore[attr-defined]
+
+
+def test_plans_are_told_apart_by_source_mask_and_options_not_by_threads(night, plans_made):
+    mask = np.ones(night.source.shape, bool)
+    mask[0, 0] = False
+    beams = [
+        _work.Beam.of(night.source.shape, night.source, None),
+        _work.Beam.of(night.source.shape, night.source + 1, None),
+        _work.Beam.of(night.source.shape, night.source, mask),
+    ]
+    for beam in beams:
+        for _ in range(2):
+            _work.shared_plan(beam, OPTIONS)
+    _work.shared_plan(beams[2], OPTIONS.model_copy(update={"threads": 2}))
+    assert len(plans_made) == 3
+    _work.shared_plan(beams[2], OPTIONS.model_copy(update={"seed": 1}))
+    assert len(plans_made) == 4
+
+
+def test_the_result_does_not_depend_on_scheduler_chunks_or_order(night):
+    def potential(shots: object) -> xr.DataArray:
+        return invert_stack(shots, source=night.source, options=OPTIONS).potential
+
+    expected = potential(night.images).compute(scheduler="synchronous").values
+    chunked = da.from_array(night.images, chunks=(4, 10, 28))
+    np.testing.assert_array_equal(potential(chunked).compute(scheduler="threads"), expected)
+    backwards = potential(night.images[::-1]).compute(num_workers=3)
+    np.testing.assert_array_equal(backwards[::-1], expected)
+    rechunked = potential(night.images).chunk(shot=3)
+    np.testing.assert_array_equal(rechunked, expected)
+
+
+def test_the_graph_holds_the_source_once(night):
+    stack = invert_stack(night.images, source=night.source, options=OPTIONS)
+    graph = dict(stack.potential.data.__dask_graph__())
+    beams = [key for key in graph if str(key).startswith("beam-")]
+    assert len(beams) == 1
+    inverted = [key for key in graph if str(key).startswith("('invert-shot-")]
+    assert len(inverted) == len(night.images)
+
+
+def test_a_source_for_each_shot(night, plans_made):
+    sources = np.stack([night.source * (1 + 0.1 * (i // 3) * np.eye(24, 28)) for i in range(6)])
+    stack = invert_stack(night.images, source=sources, options=OPTIONS)
+    assert stack.sites.dims == ("shot", "site", "component")
+    shots = stack[["potential", "sites", "source"]].compute(scheduler="synchronous")
+    assert len(plans_made) == 2  # equal sources share their sites
+    for index in (1, 4):
+        alone = invert(night.images[index], source=sources[index], options=OPTIONS)
+        np.testing.assert_array_equal(shots.potential[index], alone.potential)
+        np.testing.assert_array_equal(shots.sites[index], alone.sites)
+    with pytest.raises(InputError, match="got 2 sources for 6 shots"):
+        invert_stack(night.images, source=sources[:2], options=OPTIONS)
+
+
+def test_a_warm_start_gives_the_same_answer_within_the_tolerance_with_fewer_steps(night):
+    alike = np.stack([night.images[1] * (1 + 0.001 * i * np.eye(24, 28)) for i in range(6)])
+    options = InversionOptions(n_sites=600, tolerance=1e-4)
+    cold = invert_stack(alike, source=night.source, options=options)
+    warm = invert_stack(alike, source=night.source, options=options, warm_start=3)
+    cold, warm = (s[["potential", "iterations"]].compute() for s in (cold, warm))
+    np.testing.assert_allclose(warm.potential, cold.potential, atol=2e-3)
+    assert (warm.iterations[[0, 3]] == cold.iterations[[0, 3]]).all()
+    assert warm.iterations[[1, 2, 4, 5]].sum() < cold.iterations[[1, 2, 4, 5]].sum()
+    # Where a slice begins does not change it.
+    part = invert_stack(alike, source=night.source, options=options, warm_start=3)
+    np.testing.assert_array_equal(part.potential.isel(shot=5), warm.potential.isel(shot=5))
+
+
+class TestInputs:
+    def potential(self, shots, **more) -> np.ndarray:
+        return invert_stack(shots, options=OPTIONS, **more).potential.compute().values
+
+    @pytest.fixture
+    def expected(self, night) -> np.ndarray:
+        return self.potential(night.images, source=night.source)
+
+    def test_files(self, night, expected, tmp_path):
+        reference = tmp_path / "reference.npy"
+        np.save(reference, night.source)
+        paths = [night.path(i) for i in range(6)]
+        np.testing.assert_array_equal(self.potential(paths, source=reference), expected)
+        np.testing.assert_array_equal(self.potential(night.glob, source=reference), expected)
+
+    def test_a_glob_is_sorted_by_number(self, make_night):
+        night = make_night(12)
+        stack = invert_stack(night.glob, options=OPTIONS)
+        assert list(stack.name.values) == [f"shot_{i}.npy" for i in range(12)]
+
+    def test_pages_of_a_tiff(self, night, expected, tmp_path):
+        film = tmp_path / "film.tif"
+        tifffile.imwrite(film, night.images, photometric="minisblack")
+        stack = invert_stack(film, source=night.source, options=OPTIONS)
+        assert stack.name.values[4] == "film.tif[4]"
+        np.testing.assert_array_equal(stack.potential, expected)
+
+    def test_xarray_keeps_its_coordinate(self, night, expected):
+        shots = xr.DataArray(
+            np.moveaxis(night.images, 0, -1),
+            dims=("y", "x", "shot"),
+            coords={"shot": [3, 1, 4, 9, 5, 2]},
+        )
+        for given in (shots, shots.to_dataset(name="image").assign(other=shots)):
+            stack = invert_stack(given, source=night.source, options=OPTIONS)
+            np.testing.assert_array_equal(stack.potential.sel(shot=4), expected[2])
+
+    def test_a_list_of_images(self, night, expected):
+        np.testing.assert_array_equal(
+            self.potential(list(night.images), source=night.source), expected
+        )
+
+    @pytest.mark.parametrize(
+        ("shots", "words"),
+        [
+            ("nothing/*.tif", "no file matches nothing/"),
+            ([], "empty list"),
+            (np.ones((5, 6)), r"shape \(5, 6\), expected \(shot, y, x\)"),
+            (7, "are a int: expected an array"),
+            ([np.ones((5, 6)), np.ones((6, 5))], "expected one for all"),
+        ],
+    )
+    def test_what_holds_no_shots_is_refused(self, shots, words):
+        with pytest.raises(InputError, match=words):
+            invert_stack(shots)
+
+    def test_a_folder_is_refused(self, night):
+        with pytest.raises(InputError, match="is a folder: say which files"):
+            invert_stack(night.folder)
+
+    def test_files_of_which_none_can_be_read_are_refused(self, tmp_path):
+        (tmp_path / "a.tif").write_bytes(b"")
+        with pytest.raises(FileFormatError, match="none of 1 shots can be read"):
+            invert_stack(str(tmp_path / "*.tif"))
+
+    def test_what_does_not_fit_together_is_refused(self, night):
+        with pytest.raises(InputError, match=r"source has shape \(5, 6\), shots \(24, 28\)"):
+            invert_stack(night.images, source=np.ones((5, 6)))
+        with pytest.raises(InputError, match="mask has shape"):
+            invert_stack(night.images, mask=np.ones((5, 6), bool))
+        with pytest.raises(InputError, match="no variable 'potental'"):
+            invert_stack(night.images, variables=["potental"])
+        with pytest.raises(InputError, match="needs a setup"):
+            invert_stack(night.images, variables=["potential_si"])
+
+
+def test_a_bad_shot_is_named_when_it_is_computed(night):
+    night.images[3] = 0
+    stack = invert_stack(night.images, source=night.source, options=OPTIONS)
+    stack.potential.isel(shot=2).compute()
+    with pytest.raises(InputError, match="shot 3: image has no positive pixel"):
+        stack.potential.compute()
+
+
+def test_only_what_is_asked_for_is_made(night):
+    setup = OpticalSetup(wavelength=5e-7, object_image_distance=0.3, pixel_size=1e-5)
+    stack = invert_stack(night.images, setup=setup, variables=["potential_si"], options=OPTIONS)
+    assert set(stack.data_vars) == {"potential_si", "converged", "flux_residual", "iterations"}
+    alone = invert(night.images[0], options=OPTIONS)
+    np.testing.assert_allclose(stack.potential_si[0], setup.potential(alone.potential), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("workers", "cores", "threads"), [(1, 8, 8), (2, 8, 4), (3, 8, 2), (8, 8, 1), (16, 8, 1)]
+)
+def test_all_shots_at_once_never_have_more_threads_than_cores(monkeypatch, workers, cores, threads):
+    monkeypatch.setattr(_work, "available_threads", lambda _: cores)
+    assert _work.threads_here(workers) == threads
+    seen = []
+    with dask.config.set(num_workers=workers):
+        ask = threading.Thread(target=lambda: seen.append(_work.threads_here()))
+        ask.start()
+        ask.join()
+    assert seen == [threads]
+
+
+def test_importing_the_package_imports_no_dask():
+    code = (
+        "import sys, napari_shadowinv, napari_shadowinv.cli\n"
+        "print({'dask', 'zarr', 'distributed', 'xarray'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

@@ -1,0 +1,312 @@
+"""`run_stack`: what the store holds, going on, refusing what does not belong together."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from slow_reading import log_and_read
+
+from napari_shadowinv import (
+    FileFormatError,
+    InputError,
+    InversionCancelled,
+    InversionOptions,
+    invert_stack,
+    read,
+    run_stack,
+)
+from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
+
+OPTIONS = InversionOptions(n_sites=100)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "night.shadowinv.zarr"
+
+
+def content(store: Path, *names: str) -> dict[str, bytes]:
+    """Files with the values of shots."""
+    return {
+        str(path.relative_to(store)): path.read_bytes()
+        for name in names or ("potential", "displacement", "caustic", "status")
+        for path in sorted((store / name).rglob("*"))
+        if path.is_file()
+    }
+
+
+def stop_after(count: int):
+    """Return a callback and a question that end a run after so many shots."""
+    ended = []
+
+    def note(progress):
+        if progress.outcome is not None:
+            ended.append(progress.outcome.index)
+
+    return note, lambda: len(ended) >= count
+
+
+def test_the_store_holds_what_the_lazy_stack_computes(night, out, optical_setup):
+    written = run_stack(
+        night.images, out, source=night.source, options=OPTIONS, setup=optical_setup
+    )
+    lazy = invert_stack(night.images, source=night.source, options=OPTIONS, setup=optical_setup)
+    assert (written.status == DONE).all()
+    assert written.potential.dtype == np.float32
+    assert written.potential.chunks[0] == (1,) * 6
+    for name in ("potential", "displacement", "caustic"):
+        np.testing.assert_allclose(written[name], lazy[name], rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(written.iterations, lazy.iterations)
+    np.testing.assert_array_equal(written.flux_residual, lazy.flux_residual)
+    # Fields in SI units follow from what is stored, when they are asked for.
+    for name in ("deflection_angle", "line_integrated_density"):
+        assert written[name].attrs == lazy[name].attrs
+        largest = float(abs(lazy[name]).max())
+        np.testing.assert_allclose(written[name], lazy[name], atol=1e-6 * largest)
+
+
+def test_read_opens_it_and_so_does_plain_xarray(night, out, recwarn):
+    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    dataset = read(out)
+    assert isinstance(dataset, xr.Dataset)
+    assert dataset.potential.attrs["units"] == "px²"
+    assert json.loads(dataset.attrs["options"])["n_sites"] == 100
+    plain = xr.open_zarr(out)
+    assert list(plain.status.values) == [DONE] * 6
+    assert plain.status.attrs["flag_meanings"] == "pending done failed"
+    np.testing.assert_array_equal(plain.potential, dataset.potential)
+    assert not [w for w in recwarn if "zarr" in str(w.message).lower()]
+
+
+def test_what_is_stored_can_be_chosen_and_sites_are_stored_once(night, out):
+    names = ("weights", "sites", "source", "reprojection")
+    written = run_stack(
+        night.images,
+        out,
+        source=night.source,
+        options=OPTIONS,
+        variables=names,
+        dtype="float64",
+    )
+    lazy = invert_stack(night.images, source=night.source, options=OPTIONS)
+    assert written.sites.dims == ("site", "component")
+    assert written.source.dims == ("y", "x")
+    assert "potential" not in written
+    for name in names:
+        np.testing.assert_array_equal(written[name], lazy[name])
+
+
+def test_the_bytes_do_not_depend_on_threads_or_order(night, out, tmp_path):
+    other = tmp_path / "other.shadowinv.zarr"
+    run_stack(night.images, out, source=night.source, options=OPTIONS, scheduler="synchronous")
+    run_stack(night.images, other, source=night.source, options=OPTIONS, workers=3)
+    assert content(out) == content(other)
+
+
+def test_a_run_goes_on_where_it_stopped(night, out):
+    note, enough = stop_after(2)
+    arguments = {"source": night.source, "options": OPTIONS, "reader": log_and_read}
+    with pytest.raises(InversionCancelled, match="run again to resume"):
+        run_stack(
+            night.glob,
+            out,
+            **arguments,
+            scheduler="synchronous",
+            on_progress=note,
+            should_stop=enough,
+        )
+    before = read(out)
+    done = np.flatnonzero(before.status == DONE)
+    assert 2 <= len(done) < 6
+    pending = before.isel(shot=before.status.values == PENDING)
+    assert np.isnan(pending.potential.values).all()
+    first = content(out)
+    reads = len(night.reads)
+    told = []
+    after = run_stack(night.glob, out, **arguments, on_progress=told.append)
+    assert (after.status == DONE).all()
+    assert (told[0].done, told[0].total) == (len(done), 6)
+    # What was done is neither read nor written again.
+    assert not {f"shot_{i}" for i in done} & set(night.reads[reads:])
+    assert first.items() <= content(out).items()
+    lazy = invert_stack(night.images, source=night.source, options=OPTIONS)
+    np.testing.assert_allclose(after.potential, lazy.potential, rtol=1e-6, atol=1e-6)
+
+
+def test_a_finished_run_has_nothing_to_do(night, out):
+    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    told = []
+    run_stack(night.images, out, source=night.source, options=OPTIONS, on_progress=told.append)
+    assert [(p.engine, p.done, p.outcome) for p in told] == [("nothing to do", 6, None)]
+
+
+def spoil(night) -> dict[int, str]:
+    """Spoil some shots; return the words that must tell of each."""
+    night.path(0).write_bytes(b"")
+    night.path(1).write_bytes(night.path(1).read_bytes()[:999])
+    np.save(night.path(2), 0 * night.images[2])
+    np.save(night.path(3), np.ones((7, 9)))
+    np.save(night.path(4), np.where(night.images[4] > 101, np.nan, night.images[4]))
+    return {0: "is empty", 1: "cut short", 2: "no positive pixel", 3: "(7, 9)", 4: "NaN"}
+
+
+def test_bad_shots_fail_alone_with_their_reason_and_can_be_redone(make_night, out):
+    night = make_night(8)
+    words = spoil(night)
+    arguments = {"source": night.source, "options": OPTIONS}
+    written = run_stack(night.glob, out, **arguments)
+    assert list(np.flatnonzero(written.status == FAILED)) == [0, 1, 2, 3, 4]
+    assert list(np.flatnonzero(written.status == DONE)) == [5, 6, 7]
+    store = StackStore(out)
+    for index, word in words.items():
+        assert word in store.report(index)["reason"]
+    before = content(out, "potential")
+    for index in words:
+        np.save(night.path(index), night.images[index])
+    assert (run_stack(night.glob, out, **arguments).status == FAILED).sum() == 5
+    redone = run_stack(night.glob, out, **arguments, redo_failed=True)
+    assert (redone.status == DONE).all()
+    assert before.items() <= content(out, "potential").items()
+    assert "reason" not in StackStore(out).report(0)
+
+
+def test_each_shot_brings_its_own_source(night, out):
+    sources = [night.folder / f"source_{i}.npy" for i in range(6)]
+    for index, path in enumerate(sources):
+        np.save(path, night.source + 5 * index * np.eye(24, 28))
+    sources[2].write_bytes(b"")
+    written = run_stack(
+        night.glob, out, source=sources, options=OPTIONS, variables=("potential", "sites")
+    )
+    assert list(np.flatnonzero(written.status == FAILED)) == [2]
+    lazy = invert_stack(night.images[4:5], source=np.load(sources[4]), options=OPTIONS)
+    np.testing.assert_allclose(written.potential[4], lazy.potential[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(written.sites[4], lazy.sites)
+
+
+def test_a_warm_start_does_not_depend_on_where_a_run_stopped(night, out, tmp_path):
+    arguments = {
+        "source": night.source,
+        "options": OPTIONS,
+        "warm_start": 3,
+        "variables": ("weights",),
+        "scheduler": "synchronous",
+    }
+    other = tmp_path / "other.shadowinv.zarr"
+    run_stack(night.images, other, **arguments)
+    spoilt = night.images.copy()
+    run_stack(spoilt, out, **arguments)
+    # As if the run had been killed after the first shot of the second three.
+    for index in (4, 5):
+        (out / "status" / "c" / str(index)).unlink()
+        for path in (out / "weights" / "c" / str(index)).rglob("*"):
+            path.write_bytes(b"torn")
+    run_stack(spoilt, out, **arguments)
+    assert content(out, "weights") == content(other, "weights")
+
+
+class TestRefusals:
+    @pytest.fixture(autouse=True)
+    def begun(self, night, out):
+        self.run(night, out)
+        self.before = content(out)
+        yield
+        assert content(out) == self.before
+
+    @staticmethod
+    def run(night, out, **changes):
+        arguments = {"source": night.source, "options": OPTIONS, **changes}
+        return run_stack(arguments.pop("shots", night.glob), out, **arguments)
+
+    def test_other_options(self, night, out):
+        with pytest.raises(InputError, match=r"another options \(n_sites: 100 there, 50 now\)"):
+            self.run(night, out, options=InversionOptions(n_sites=50))
+
+    def test_threads_are_no_other_option(self, night, out):
+        self.run(night, out, options=OPTIONS.model_copy(update={"threads": 1}))
+
+    def test_another_source(self, night, out):
+        with pytest.raises(InputError, match="another source image"):
+            self.run(night, out, source=night.source + 1)
+
+    def test_another_mask(self, night, out):
+        mask = np.ones(night.source.shape, bool)
+        mask[0] = False
+        with pytest.raises(InputError, match="another mask image"):
+            self.run(night, out, mask=mask)
+
+    def test_another_setup(self, night, out, optical_setup):
+        with pytest.raises(InputError, match="another setup"):
+            self.run(night, out, setup=optical_setup)
+
+    def test_other_variables(self, night, out):
+        with pytest.raises(InputError, match="another stored"):
+            self.run(night, out, variables=("potential",))
+
+    def test_more_shots(self, night, out):
+        np.save(night.path(6), night.images[0])
+        with pytest.raises(InputError, match=r"other shots \(6 there, 7 now\)"):
+            self.run(night, out)
+
+    def test_a_shot_that_changed(self, night, out):
+        np.save(night.path(3), night.images[3] + 1)
+        with pytest.raises(InputError, match=r"shot 3 \(shot_3.npy\) has changed"):
+            self.run(night, out)
+
+    def test_a_shot_that_was_only_touched(self, night, out):
+        np.save(night.path(3), night.images[3])
+        self.run(night, out)
+
+    def test_a_name_with_another_ending(self, night, tmp_path):
+        with pytest.raises(FileFormatError, match=r"ends with \.shadowinv\.zarr"):
+            run_stack(night.images, tmp_path / "night.zarr")
+
+    def test_a_folder_of_another_kind_is_not_overwritten(self, night, tmp_path):
+        mine = tmp_path / "thesis.shadowinv.zarr"
+        mine.mkdir()
+        (mine / "chapter.txt").write_text("years of work")
+        with pytest.raises(FileFormatError, match="holds no stack of shots"):
+            run_stack(night.images, mine, overwrite=True)
+        assert (mine / "chapter.txt").read_text() == "years of work"
+
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            ({"scheduler": "quick"}, "scheduler is 'quick'"),
+            ({"workers": 0}, "workers is 0"),
+            ({"dtype": "int8"}, "dtype is 'int8'"),
+            ({"warm_start": 0}, "warm_start is 0"),
+        ],
+    )
+    def test_arguments_that_mean_nothing(self, night, tmp_path, changes, words):
+        with pytest.raises(InputError, match=words):
+            self.run(night, tmp_path / "new.shadowinv.zarr", **changes)
+
+
+def test_overwriting_begins_anew(night, out):
+    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    other = InversionOptions(n_sites=60)
+    written = run_stack(night.images[:2], out, source=night.source, options=other, overwrite=True)
+    assert written.sizes["shot"] == 2
+    assert [path.name for path in out.parent.glob(".*")] == []
+
+
+def test_a_writer_of_a_store_that_was_replaced_writes_nothing(night, out):
+    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    old = StackStore(out).writer
+    run_stack(night.images, out, source=night.source, options=OPTIONS, overwrite=True)
+    before = content(out)
+    with pytest.raises(OSError, match="is another store than at the start"):
+        old.write(0, {"potential": np.zeros(night.source.shape)}, {})
+    assert content(out) == before
+
+
+def test_a_damaged_store_is_told_in_one_sentence(night, out):
+    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    (out / "status" / "c" / "2").write_bytes(b"")
+    with pytest.raises(FileFormatError, match="stack of shots but is damaged"):
+        read(out)

@@ -1,0 +1,57 @@
+"""`stack_statistics`: means, spreads and peaks of shots that are done."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import (
+    InputError,
+    InversionOptions,
+    invert_stack,
+    run_stack,
+    stack_statistics,
+)
+
+OPTIONS = InversionOptions(n_sites=100)
+
+
+def test_they_are_those_of_numpy_and_lazy(night, optical_setup):
+    stack = invert_stack(night.images, source=night.source, options=OPTIONS, setup=optical_setup)
+    statistics = stack_statistics(stack)
+    assert all(variable.chunks for variable in statistics.data_vars.values())
+    computed = statistics.compute()
+    for name in ("potential", "displacement", "deflection_angle"):
+        values = stack[name].values
+        np.testing.assert_allclose(computed[f"{name}_mean"], values.mean(axis=0), rtol=1e-9)
+        np.testing.assert_allclose(
+            computed[f"{name}_std"], values.std(axis=0, ddof=1), rtol=1e-6, atol=1e-15
+        )
+        assert computed[f"{name}_mean"].attrs["units"] == stack[name].attrs["units"]
+    length = np.sqrt((stack.displacement.values**2).sum(axis=1)).max(axis=(1, 2))
+    np.testing.assert_allclose(computed.displacement_peak, length, rtol=1e-12)
+
+
+def test_shots_that_failed_do_not_count(night, tmp_path):
+    images = night.images.copy()
+    images[2] = 0
+    out = tmp_path / "night.shadowinv.zarr"
+    written = run_stack(images, out, source=night.source, options=OPTIONS, dtype="float64")
+    good = [0, 1, 3, 4, 5]
+    alone = invert_stack(night.images[good], source=night.source, options=OPTIONS)
+    found, expected = stack_statistics(written), stack_statistics(alone)
+    np.testing.assert_allclose(found.potential_mean, expected.potential_mean, rtol=1e-9)
+    np.testing.assert_allclose(found.potential_std, expected.potential_std, rtol=1e-9)
+    peaks = found.displacement_peak.values
+    assert np.isnan(peaks[2])
+    np.testing.assert_allclose(peaks[good], expected.displacement_peak, rtol=1e-12)
+
+
+def test_one_shot_has_no_spread(night):
+    stack = invert_stack(night.images[:1], source=night.source, options=OPTIONS)
+    assert np.isnan(stack_statistics(stack).potential_std).all()
+
+
+def test_a_dataset_without_shots_is_refused(inversion):
+    with pytest.raises(InputError, match="no field of many shots"):
+        stack_statistics(inversion.to_dataset())
