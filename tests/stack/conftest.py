@@ -59,17 +59,23 @@ def compiled() -> None:
     invert(images[0], plan=plan, options=OPTIONS, start=first)
 
 
+def written_night(count: int, folder: Path) -> Night:
+    images, source = make_shots(count)
+    folder.mkdir()
+    for index, image in enumerate(images):
+        np.save(folder / f"shot_{index}.npy", image)
+    return Night(images, source, folder)
+
+
 @pytest.fixture
 def make_night(tmp_path, compiled):
-    def make(count: int) -> Night:
-        images, source = make_shots(count)
-        folder = tmp_path / "shots"
-        folder.mkdir()
-        for index, image in enumerate(images):
-            np.save(folder / f"shot_{index}.npy", image)
-        return Night(images, source, folder)
+    return lambda count: written_night(count, tmp_path / "shots")
 
-    return make
+
+@pytest.fixture(scope="session")
+def any_night(tmp_path_factory, compiled) -> Night:
+    """One that no test may change."""
+    return written_night(6, tmp_path_factory.mktemp("any") / "shots")
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -61,9 +62,25 @@ def batch(*more: object) -> Result:
     )  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def finished(any_night, tmp_path_factory) -> Path:
+    """A finished run, as the command of `batch` makes it."""
+    place = tmp_path_factory.mktemp("finished")
+    np.save(place / "reference.npy", any_night.source)
+    (place / "setup.toml").write_text(OPTICAL)
+    result = shadowinv(
+        "batch", any_night.glob, "--source", place / "reference.npy", "--n-sites", 100,
+        "--setup", place / "setup.toml", "--scheduler", "threads",
+        "--out", place / "n.shadowinv.zarr",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    return place / "n.shadowinv.zarr"
+
+
 @pytest.fixture
-def store(folder) -> Path:
-    assert batch("--setup", "setup.toml").exit_code == 0
+def store(folder, finished) -> Path:
+    """A copy of it, beside the same shots."""
+    shutil.copytree(finished, folder / "n.shadowinv.zarr")
     return folder / "n.shadowinv.zarr"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -210,12 +211,21 @@ def test_a_warm_start_does_not_depend_on_where_a_run_stopped(night, out, tmp_pat
 
 
 class TestRefusals:
+    @pytest.fixture(scope="class")
+    def finished(self, any_night, tmp_path_factory):
+        return self.begin(any_night, tmp_path_factory.mktemp("finished") / "n.shadowinv.zarr")
+
     @pytest.fixture(autouse=True)
-    def begun(self, night, out):
-        self.run(night, out)
+    def begun(self, night, out, finished):
+        """A finished store of the very same files."""
+        shutil.copytree(finished, out)
         self.before = content(out)
         yield
         assert content(out) == self.before
+
+    def begin(self, night, out):
+        self.run(night, out)
+        return out
 
     @staticmethod
     def run(night, out, **changes):
