@@ -32,7 +32,8 @@ Image = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Crop = tuple[slice, slice]
 
-PREVIEW_SITES = 10_000
+PREVIEW_SITES = 5_000
+PREVIEW_PIXELS = 10_000
 
 
 @dataclass
@@ -186,7 +187,7 @@ class ShotJob:
             # What an inversion would clip must not spoil the estimate.
             clipped = np.maximum(np.where(mask, image, 0) if mask is not None else image, 0)
             return self.estimates.source(
-                self.source, clipped, mask, PREVIEW_SITES if self.preview else None
+                self.source, clipped, mask, PREVIEW_PIXELS if self.preview else None
             )
         given = self.source
         if isinstance(given, Path):
@@ -239,7 +240,7 @@ class SourceJob:
         report("source", 0, None, type(self.estimate).title)
         image = plane_of(self.image, "the image")
         if self.quick:
-            source = quick_source(self.estimate, image, self.mask, PREVIEW_SITES)
+            source = quick_source(self.estimate, image, self.mask, PREVIEW_PIXELS)
         else:
             source = self.estimate.source(image, self.mask)
         report("source", 1, 1)

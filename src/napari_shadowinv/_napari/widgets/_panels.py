@@ -95,6 +95,7 @@ class RunPanel(QWidget):
             column.addWidget(widget)
         self._activity = shown = _Activity()
         self._quiet = False
+        self._said = ("", False)
         self.runner.started.connect(self._on_start)
         self.runner.progressed.connect(self._on_progress)
         self.runner.ended.connect(self._on_end)
@@ -123,6 +124,10 @@ class RunPanel(QWidget):
 
     def say(self, text: str, problem: bool = False) -> None:
         """Show a line of text under the button."""
+        # To draw a window with a canvas in it takes time: only if there is something new.
+        if (text, problem) == self._said:
+            return
+        self._said = (text, problem)
         self.status.setText(text)
         self.status.setStyleSheet(PROBLEM_STYLE if problem else "")
         self.status.setVisible(bool(text))
@@ -147,8 +152,9 @@ class RunPanel(QWidget):
     def _on_end(self, outcome: Outcome) -> None:
         self._activity.close()
         self.bar.setVisible(False)
-        self.button.setText(self._run_text)
-        self.button.setEnabled(True)
+        if self.button.text() != self._run_text:
+            self.button.setText(self._run_text)
+            self.button.setEnabled(True)
         self.say("Cancelled." if outcome.cancelled and not self._quiet else "")
         if outcome.error is None:
             return

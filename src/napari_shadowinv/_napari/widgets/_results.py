@@ -20,6 +20,8 @@ from napari_shadowinv._napari.widgets._picking import kind_of
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
 
+_VISIBLE = 0.02
+
 __all__ = ["ResultLayers", "place_together", "result_frame"]
 
 
@@ -175,5 +177,14 @@ def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
             setattr(layer, name, keywords[name])
     if tuple(str(unit) for unit in layer.units) != tuple(keywords["units"]):
         layer.units = keywords["units"]
-    if "contrast_limits" in keywords:
-        layer.contrast_limits = keywords["contrast_limits"]
+    limits = keywords.get("contrast_limits")
+    if limits is not None and _differ(layer.contrast_limits, limits):
+        layer.contrast_limits = limits
+
+
+def _differ(shown: Sequence[float], limits: Sequence[float]) -> bool:
+    """Whether limits are so different that it can be seen: to set them takes as long as data."""
+    low, high = limits
+    return any(
+        abs(one - other) > _VISIBLE * (high - low) for one, other in zip(shown, limits, strict=True)
+    )

@@ -199,11 +199,12 @@ class InvertShot(LivePanel):
 
     def on_change(self) -> None:
         # A filter must not work unseen in a folded section.
-        self._cleaning_section.setText(f"Filter first: {self.cleaning.choice.currentText()}")
+        title = f"Filter first: {self.cleaning.choice.currentText()}"
+        if self._cleaning_section.text() != title:
+            self._cleaning_section.setText(title)
         super().on_change()
 
     def show_result(self, value: _Answer, request: _Request) -> None:
-        self.report.show_rows(report_rows(value.inversion))
         image = request.image
         if image not in self.viewer.layers and not request.preview:
             tell_warning(
@@ -214,7 +215,10 @@ class InvertShot(LivePanel):
             place_together(self.viewer, image, request.setup, request.companions)
         if request.preview:
             self.previewed.show(value.described, select=False)
+            if not value.inversion.report.converged:
+                self.panel.say(f"Preview {value.inversion.report.warnings[0]}", problem=True)
             return
+        self.report.show_rows(report_rows(value.inversion))
         self.previewed.hide()
         self.results = ResultLayers(self.viewer, self)
         self.results.show(value.described)
