@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
-from slow_reading import hang_once
+from slow_reading import die, hang_once
 
 from napari_shadowinv import FileFormatError, InversionOptions, invert_stack, read, run_stack
 from napari_shadowinv.geometry._threads import available_threads
@@ -253,6 +253,21 @@ def test_a_shot_on_a_worker_gets_its_share_of_the_cores(cluster):
     assert shares == [max(1, available_threads(None) // 2)] * 4
 
 
+def test_a_shot_whose_worker_always_dies_fails_with_this_reason(make_night, out, cluster):
+    night = make_night(1)
+    cluster.scheduler.allowed_failures = 0
+    written = run_stack(
+        night.glob,
+        out,
+        source=night.source,
+        options=OPTIONS,
+        reader=die,
+        scheduler=cluster.scheduler_address,
+    )
+    assert list(written.status) == [FAILED]
+    assert "the worker died each time" in StackStore(out).report(0)["reason"]
+
+
 class Dask:
     """A scheduler and a worker, each a process of its own."""
 
@@ -318,7 +333,7 @@ def test_no_scheduler_answers(night, out, monkeypatch):
         address = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
         with pytest.raises(OSError, match=f"no scheduler answers at {address}"):
             run_stack(night.images, out, options=OPTIONS, scheduler=address)
-    assert (read(out).status == PENDING).all()
+    assert not out.exists()
 
 
 @pytest.fixture

@@ -295,6 +295,7 @@ class TestRefusals:
     def test_arguments_that_mean_nothing(self, night, tmp_path, changes, words):
         with pytest.raises(InputError, match=words):
             self.run(night, tmp_path / "new.shadowinv.zarr", **changes)
+        assert not (tmp_path / "new.shadowinv.zarr").exists()
 
 
 def test_overwriting_begins_anew(night, out):

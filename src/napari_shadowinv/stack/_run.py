@@ -179,34 +179,28 @@ def run_stack(
     if dtype not in ("float32", "float64"):
         raise InputError(f"dtype is {dtype!r}: expected 'float32' or 'float64'")
     stack = describe_stack(shots, source, mask, options, setup, variables, reader, warm_start)
+    identity = _identity(stack, np.dtype(dtype), described_reader(reader))
+    again = (PENDING, FAILED) if redo_failed else (PENDING,)
     with locked(path) as live:
-        store = _store_for(path, stack, np.dtype(dtype), described_reader(reader), overwrite)
-        again = (PENDING, FAILED) if redo_failed else (PENDING,)
-        todo = [int(i) for i in np.flatnonzero(np.isin(store.statuses(), again))]
-        run = _Run(stack, store, todo, on_progress, should_stop, live)
-        if todo:
-            try:
-                with engine_for(scheduler, workers) as engine:
-                    run.on(engine)
-            except BaseException:
-                with suppress(OSError):
-                    store.summarise()
-                raise
-            store.summarise()
-        else:
-            run.tell("nothing to do")
+        store = None
+        if path.exists() and not overwrite:
+            store = StackStore(path)
+            _refuse_others(store, stack, identity)
+            if not np.isin(store.statuses(), again).any():
+                _Run(stack, store, (), on_progress, should_stop, live).tell("nothing to do")
+                return read_stack(path)
+        # Before a store is made: a scheduler that does not answer shall leave nothing behind.
+        with engine_for(scheduler, workers) as engine:
+            if store is None:
+                store = _new_store(path, stack, np.dtype(dtype), identity, overwrite)
+            _Run(stack, store, again, on_progress, should_stop, live).on(engine)
     return read_stack(path)
 
 
-def _store_for(
-    path: Path, stack: Stack, dtype: np.dtype[Any], reader: str, overwrite: bool
+def _new_store(
+    path: Path, stack: Stack, dtype: np.dtype[Any], identity: dict[str, str], overwrite: bool
 ) -> StackStore:
-    """Make the store, or open it if it is one of this stack."""
-    identity = _identity(stack, dtype, reader)
-    if path.exists() and not overwrite:
-        store = StackStore(path)
-        _refuse_others(store, stack, identity)
-        return store
+    """Make the store, all its shots pending."""
     coordinates = {
         name: Variable(*_dims_and_values(coordinate))
         for name, coordinate in coordinates_of(stack).items()
@@ -338,21 +332,21 @@ class _Run:
         self,
         stack: Stack,
         store: StackStore,
-        todo: list[int],
+        again: tuple[int, ...],
         on_progress: OnRunProgress | None,
         should_stop: ShouldStop | None,
         live: Callable[[], None],
     ) -> None:
         self._stack = stack
         self._store = store
-        self._todo = set(todo)
         self._on_progress = on_progress
         self._should_stop = should_stop
         self._live = live
         statuses = store.statuses()
+        self._todo = {int(index) for index in np.flatnonzero(np.isin(statuses, again))}
         self._counts = {
-            DONE: int((statuses == DONE).sum()),
-            FAILED: int(((statuses == FAILED) & ~np.isin(np.arange(len(statuses)), todo)).sum()),
+            status: 0 if status in again else int((statuses == status).sum())
+            for status in (DONE, FAILED)
         }
 
     def tell(self, engine: str, outcome: ShotOutcome | None = None) -> None:
@@ -366,7 +360,16 @@ class _Run:
             self._on_progress(RunProgress(len(shots), done, failed, engine, name, outcome))
 
     def on(self, engine: Engine) -> None:
-        """Invert all shots that are to be inverted."""
+        """Invert all shots that are to be inverted, and gather what their reports say."""
+        try:
+            self._work_on(engine)
+        except BaseException:
+            with suppress(OSError):
+                self._store.summarise()
+            raise
+        self._store.summarise()
+
+    def _work_on(self, engine: Engine) -> None:
         self.tell(engine.name)
         stack = self._stack
         variables = tuple(name for name in stack.variables if not stack.is_shared(name))
