@@ -229,7 +229,10 @@ def _threads(count: int) -> Iterator[Engine]:
 
 def _processes(count: int) -> Iterator[Engine]:
     distributed: Any = import_module("distributed")
+    dask: Any = import_module("dask")
     with (
+        # Its records grow by megabytes a minute, and nobody would look at them.
+        dask.config.set({"distributed.worker.profile.enabled": False}),
         distributed.LocalCluster(
             n_workers=count,
             threads_per_worker=1,
