@@ -26,7 +26,7 @@ __all__ = ["Outcome", "Runner", "Work"]
 
 Work = Callable[[OnProgress, ShouldStop], Any]
 
-_LOOK_EVERY = 15  # ms
+_LOOK_EVERY = 10  # ms
 _SHORT_TURN = 1e-3  # s
 
 
