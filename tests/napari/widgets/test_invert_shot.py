@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +75,17 @@ def computed(tool: Any) -> Any:
 
 
 def slowdown() -> float:
-    """How much longer than it should a piece of work takes on this machine just now."""
-    start, used = time.perf_counter(), time.thread_time()
-    while time.thread_time() - used < 0.05:
-        pass
-    return (time.perf_counter() - start) / (time.thread_time() - used)
+    """How much longer than alone two threads, as an inversion has, take on this machine now."""
+    block = bytes(2**20)  # large enough for hashing to release the interpreter
+
+    def busy(_: int) -> float:
+        start, used = time.perf_counter(), time.thread_time()
+        while time.thread_time() - used < 0.05:
+            hashlib.sha256(block).digest()
+        return (time.perf_counter() - start) / (time.thread_time() - used)
+
+    with ThreadPoolExecutor(2) as pool:
+        return max(pool.map(busy, range(2)))
 
 
 def settled(tool: Any) -> bool:

@@ -14,7 +14,7 @@ from napari_shadowinv._napari.widgets._runner import Outcome
 
 __all__ = ["LivePanel"]
 
-_SETTLE = 20  # ms; a few changes at once are one
+_SETTLE = 10  # ms; a few changes at once are one
 
 
 class LivePanel(ToolPanel):

@@ -25,6 +25,7 @@ from qtpy.QtWidgets import (
 from superqt import QCollapsible
 
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, wrapping_label
+from napari_shadowinv._napari.widgets._lifetime import when_destroyed
 from napari_shadowinv._napari.widgets._messages import tell_error
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv.progress import Progress
@@ -93,13 +94,13 @@ class RunPanel(QWidget):
         column.setContentsMargins(0, 0, 0, 0)
         for widget in (self.button, self.bar, self.status):
             column.addWidget(widget)
-        self._activity = shown = _Activity()
+        self._activity = _Activity()
         self._quiet = False
         self._said = ("", False)
         self.runner.started.connect(self._on_start)
         self.runner.progressed.connect(self._on_progress)
         self.runner.ended.connect(self._on_end)
-        self.destroyed.connect(lambda *_: shown.close())
+        when_destroyed(self, self._activity.close)
 
     def run(self, work: Work, tag: object = None, *, quiet: bool = False) -> None:
         """Begin some work.

@@ -2,25 +2,20 @@
 
 - choose a layer: `LayerPicker`
 - hear of what is painted, drawn or replaced in the chosen layers: `LayerWatch`
-- listen to napari for as long as a Qt widget lives: `while_alive`
+- a layer's type: `kind_of`
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from qtpy.QtCore import QObject, QSignalBlocker, Signal
 
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
+from napari_shadowinv._napari.widgets._lifetime import while_alive
 
-__all__ = ["LayerPicker", "LayerWatch", "kind_of", "while_alive"]
-
-
-def while_alive(widget: QObject, emitter: Any, callback: Callable[..., Any]) -> None:
-    """Connect to an event of a layer or viewer for as long as a Qt object lives."""
-    emitter.connect(callback)
-    widget.destroyed.connect(lambda *_: emitter.disconnect(callback))
+__all__ = ["LayerPicker", "LayerWatch", "kind_of"]
 
 
 def kind_of(layer: Any) -> str:

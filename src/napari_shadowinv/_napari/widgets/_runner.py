@@ -17,6 +17,7 @@ from typing import Any
 
 from qtpy.QtCore import QObject, QTimer, Signal
 
+from napari_shadowinv._napari.widgets._lifetime import when_destroyed
 from napari_shadowinv._napari.widgets._messages import MISTAKES
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.progress import OnProgress, Progress, ShouldStop
@@ -25,7 +26,7 @@ __all__ = ["Outcome", "Runner", "Work"]
 
 Work = Callable[[OnProgress, ShouldStop], Any]
 
-_LOOK_EVERY = 15  # ms
+_LOOK_EVERY = 10  # ms
 _SHORT_TURN = 1e-3  # s
 
 
@@ -65,6 +66,17 @@ class _LetterBox:
     outcome: Outcome | None = None
 
 
+@dataclass
+class _Stopper:
+    """Stops what runs, when its runner is gone and can no longer do so."""
+
+    box: _LetterBox | None = None
+
+    def stop(self) -> None:
+        if self.box is not None:
+            self.box.stop.set()
+
+
 class Runner(QObject):
     """Runs one piece of work at a time in a thread of its own.
 
@@ -86,6 +98,9 @@ class Runner(QObject):
         super().__init__(parent)
         self._box: _LetterBox | None = None
         self._pending: tuple[Work, Any] | None = None
+        self._stopper = _Stopper()
+        # A window that is closed takes its work with it.
+        when_destroyed(self, self._stopper.stop)
         self._timer = QTimer(self)
         self._timer.setInterval(_LOOK_EVERY)
         self._timer.timeout.connect(self._look)
@@ -117,8 +132,7 @@ class Runner(QObject):
             self._box.stop.set()
             return
         box = self._box = _LetterBox()
-        # A window that is closed takes its work with it.
-        self.destroyed.connect(lambda *_: box.stop.set())
+        self._stopper.box = box
         threading.Thread(target=_run, args=(work, tag, box), name="shadowinv", daemon=False).start()
         self._timer.start()
         self.started.emit()
@@ -141,7 +155,7 @@ class Runner(QObject):
         if outcome is None:
             return
         self._timer.stop()
-        self._box = None
+        self._box = self._stopper.box = None
         pending, self._pending = self._pending, None
         self.ended.emit(outcome)
         if pending is not None and self._box is None:

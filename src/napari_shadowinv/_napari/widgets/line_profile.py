@@ -22,8 +22,9 @@ from napari_shadowinv._napari.marks import role_of, unit_of
 from napari_shadowinv._napari.widgets._base import with_button
 from napari_shadowinv._napari.widgets._drawing import new_shapes
 from napari_shadowinv._napari.widgets._forms import labelled, wrapping_label
+from napari_shadowinv._napari.widgets._lifetime import while_alive
 from napari_shadowinv._napari.widgets._messages import reporting, tell_info
-from napari_shadowinv._napari.widgets._picking import LayerPicker, kind_of, while_alive
+from napari_shadowinv._napari.widgets._picking import LayerPicker, kind_of
 from napari_shadowinv._napari.widgets._plotting import ProfilePlot
 from napari_shadowinv._napari.widgets._sampling import Profile, along, sampled, table_text
 from napari_shadowinv.errors import InputError
