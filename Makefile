@@ -1,19 +1,26 @@
 # make demo   simulate and invert the paper's toroidal shot, write figures to demo/
 # make test   check style and types, then run the whole test suite
+# make gallery make the pictures of docs/gallery.md again
 # make format put the code into the project's format
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+ON_SCREEN := xvfb-run -a -s "-screen 0 2560x1440x24"
 
-.PHONY: demo test lint format clean
+.PHONY: demo test gallery lint format clean
 
 demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
 
+gallery: $(VENV)/installed
+	$(BIN)/python docs/make_gallery.py
+
 test: lint
 	@sh .ci/need-display
-	xvfb-run -a -s "-screen 0 2560x1440x24" $(BIN)/python -m pytest
+	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest
+	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest -q \
+		tests/napari/widgets/test_tools.py tests/napari/widgets/test_forms.py
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
