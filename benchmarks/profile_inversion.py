@@ -30,6 +30,8 @@ PARTS = {  # function, or file of functions, that belong to a part of the work
     "build": "triangulations from scratch",
     "repair": "repair of the triangulation",
     "raise_hidden": "repair of the triangulation",
+    "look_for_irregular": "repair of the triangulation",
+    "relocate": "repair of the triangulation",
     "hilbert_permutation": "triangulations from scratch",
     "_integrate_edges": "integrals along borders",
     "_power_centres": "integrals along borders",
