@@ -127,6 +127,8 @@ def test_a_stack_layer_becomes_a_store_and_layers(
     np.testing.assert_allclose(field.scale, image.scale)
     assert image.scale[-1] == pytest.approx(1.5)
     assert field.units == image.units
+    # The first shot is not the strongest: colours reach to the one that is.
+    assert field.contrast_limits[1] == pytest.approx(float(field.data.max().compute()))
     # Again: there is nothing to do.
     before = written(out)
     run(tool)
@@ -209,6 +211,7 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     assert StackStore(out).statuses().tolist() == [DONE, DONE, PENDING, PENDING]
     before = written(out)
     assert len(before) == 2
+    potential.contrast_limits = (-3.0, 4.0)
 
     held.set()
     run(tool)
@@ -217,6 +220,8 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     # The shot in view was pending, and is seen now.
     assert np.isfinite(field._slice.image.raw).all()
     assert layer_of(window, "field") is field
+    assert field.contrast_limits[1] == pytest.approx(float(field.data.max().compute()))
+    assert tuple(potential.contrast_limits) == (-3.0, 4.0)
     assert told == []
 
 
@@ -316,7 +321,7 @@ def test_the_source_is_guessed_for_each_shot(
     tool.source.picker.form.editors["width"].set_value(6.0)
     run(tool)
     source = LowPassEstimate(width=6.0).source(np.where(mask, stack[1], 0), mask)
-    expected = invert(stack[1], source, mask=mask, options=InversionOptions(**FEW))
+    expected = invert(stack[1], source=source, mask=mask, options=InversionOptions(**FEW))
     shown = np.asarray(layer_of(window, "potential").data[1])
     np.testing.assert_allclose(
         shown[mask], expected.potential[mask], atol=1e-4 * np.ptp(expected.potential)

@@ -35,6 +35,7 @@ def image_of(layer: Any | None, role: str = "image") -> Any:
         If there is no layer, or it is no single grey image.
     """
     data = _grey(layer, role)
+    assert layer is not None
     if data.ndim != 2:
         raise InputError(
             f"'{layer.name}' has shape {tuple(data.shape)}, expected one image (y, x): "

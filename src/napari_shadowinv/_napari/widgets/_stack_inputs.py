@@ -156,8 +156,8 @@ class EnginePicker(QWidget):
     def __init__(self) -> None:
         super().__init__()
         self.picker = ModelPicker(
-            "Computer",
-            {_HERE: ("this one", None), _SCHEDULER: ("a dask cluster", None)},
+            "Run on",
+            {_HERE: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
         )
         self.picker.choice.setToolTip(
             "<qt>The values do not depend on it. Workers of a cluster must see the folders of "
@@ -165,7 +165,8 @@ class EnginePicker(QWidget):
         )
         self.workers = QSpinBox()
         self.workers.setRange(0, 1024)
-        self.workers.setSpecialValueText("as many as cores")
+        self.workers.setSuffix(" shots")
+        self.workers.setSpecialValueText("as many shots as cores")
         self.workers.setToolTip("How many shots are inverted at the same time.")
         self.address = QLineEdit()
         self.address.setPlaceholderText("tcp://host:8786")
@@ -173,7 +174,7 @@ class EnginePicker(QWidget):
         self.address.setMinimumWidth(60)
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
-        self._workers_row = labelled("Workers", self.workers)
+        self._workers_row = labelled("At once", self.workers)
         self._address_row = labelled("Address", self.address)
         for widget in (self.picker, self._workers_row, self._address_row):
             column.addWidget(widget)

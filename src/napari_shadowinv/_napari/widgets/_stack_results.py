@@ -7,13 +7,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QHeaderView
 
+from napari_shadowinv._napari.marks import role_of
 from napari_shadowinv._napari.widgets._panels import ReportTable
+from napari_shadowinv._napari.widgets._picking import kind_of
 from napari_shadowinv._napari.widgets._results import result_frame
 from napari_shadowinv._napari.widgets._stacking import StackJob
 from napari_shadowinv.errors import InputError
@@ -51,14 +56,50 @@ class StackRequest:
     companions: tuple[Any, ...]
     place: dict[str, Any]
     described: list[FullLayerData] = field(default_factory=list)
+    _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _given: set[tuple[float, float]] = field(default_factory=set)
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
         """Invert the shots, and describe the layers once one is done, beside the window."""
-        return self.job.run(on_progress, should_stop, self._describe)
+        return self.job.run(on_progress, should_stop, self._look)
+
+    def follow(self, layers: Sequence[Any]) -> None:
+        """Let the colours of layers reach to the strongest shot so far.
+
+        Where the user has chosen other contrast limits, they stay.
+        """
+        for layer in filter(_is_image, layers):
+            wanted = self._limits.get(str(role_of(layer)))
+            if wanted is None or wanted == tuple(layer.contrast_limits):
+                continue
+            if tuple(layer.contrast_limits) in self._given:
+                self._given.add(wanted)
+                layer.contrast_limits = wanted
+
+    def go_on_from(self, earlier: StackRequest, layers: Sequence[Any]) -> None:
+        """Take over the colours of an earlier run into the same store."""
+        self._given |= earlier._given
+        now = {role_of(one): tuple(one.contrast_limits) for one in layers if _is_image(one)}
+        for _, keywords, kind in self.described:
+            role = str(role_of(keywords))
+            if kind == "image" and role in earlier._limits:
+                limits = _widened(self._limits[role], np.array(earlier._limits[role]))
+                self._limits[role] = limits
+                self._given.add(limits)
+                keywords["contrast_limits"] = now.get(role, limits)
+
+    def _look(self, index: int | None) -> None:
+        """Describe the layers once a shot is done, and look how strong each one is."""
+        if not self.described:
+            self._describe()
+        if index is None:
+            return
+        for data, keywords, kind in self.described:
+            if kind == "image":
+                role = str(role_of(keywords))
+                self._limits[role] = _widened(self._limits[role], np.asarray(data[index]))
 
     def _describe(self) -> None:
-        if self.described:
-            return
         from napari_shadowinv._napari.stores import store_layers
 
         try:
@@ -67,7 +108,26 @@ class StackRequest:
             return  # the next shot may do, and the run goes on without
         # What napari remembers of a pending shot would hide that it is done.
         more = {"cache": False, **self.place}
+        for _, keywords, kind in layers:
+            if kind == "image":
+                limits = keywords["contrast_limits"]
+                self._limits[str(role_of(keywords))] = limits
+                self._given.add(limits)
         self.described.extend((data, keywords | more, kind) for data, keywords, kind in layers)
+
+
+def _is_image(layer: Any) -> bool:
+    return kind_of(layer) == "image"
+
+
+def _widened(limits: tuple[float, float], plane: NDArray[Any]) -> tuple[float, float]:
+    """Limits that hold a plane, too; around zero if they were."""
+    finite = plane[np.isfinite(plane)]
+    low = min(limits[0], float(finite.min(initial=np.inf)))
+    high = max(limits[1], float(finite.max(initial=-np.inf)))
+    if limits[0] == -limits[1]:
+        return -max(-low, high), max(-low, high)
+    return low, high
 
 
 def place_on(layer: Any, setup: Any) -> dict[str, Any]:

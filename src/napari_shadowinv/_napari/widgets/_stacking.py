@@ -99,7 +99,7 @@ class StackJob:
         self,
         on_progress: OnProgress,
         should_stop: ShouldStop,
-        on_done: Callable[[], None] = lambda: None,
+        on_done: Callable[[int | None], None] = lambda _: None,
     ) -> RunBooks:
         """Invert all shots that are not done yet.
 
@@ -108,7 +108,8 @@ class StackJob:
         on_progress, should_stop
             See `napari_shadowinv.progress`.
         on_done : callable, optional
-            Called when there are finished shots, before this is told.
+            Called before it is told that there are finished shots, with the one that has just
+            ended well, if any.
 
         Raises
         ------
@@ -124,7 +125,8 @@ class StackJob:
                 self._recall()
             self.books.take(news)
             if news.done:
-                on_done()
+                ended = news.outcome
+                on_done(None if ended is None or ended.reason else ended.index)
             step = news.done + news.failed
             on_progress(Progress("shots", step, news.total, self.books.text))
 

@@ -55,6 +55,7 @@ class InvertStack(ToolPanel):
         self._shown: StackRequest | None = None
         self._running: StackRequest | None = None
         self._heard = 0
+        self._look_at = False
         self._soon = QTimer(self)
         self._soon.setSingleShot(True)
         self._soon.setInterval(_REFRESH_AFTER)
@@ -174,7 +175,7 @@ class InvertStack(ToolPanel):
         # A run may have a source for each shot.
         chosen = self.source.layers.layer
         if self.source.picker.kind == "layer" and chosen is not None and chosen.ndim == 3:
-            return stack_of(chosen)  # type: ignore[no-any-return]
+            return stack_of(chosen)
         return self.source.source(layer)  # type: ignore[return-value]
 
     def _mask(self) -> Any:
@@ -215,15 +216,28 @@ class InvertStack(ToolPanel):
         self._heard = books.ended
 
     def _show_layers(self, request: StackRequest) -> None:
-        again = self._shown is not None and self._shown.job.out == request.job.out
-        self._shown = request
+        earlier, self._shown = self._shown, request
+        again = earlier is not None and earlier.job.out == request.job.out
         if request.image is not None and request.job.setup is not None:
             place_together(self.viewer, request.image, request.job.setup, request.companions)
-        if not again:
+        if earlier is not None and again:
+            request.go_on_from(earlier, self.results.layers)
+        else:
             self.results = ResultLayers(self.viewer, self)
+            self.results.complete.connect(self._on_layers)
+        self._look_at = not again and request.image is None
         self.results.show(request.described, select=not again)
 
+    def _on_layers(self) -> None:
+        # Files lie where their setup puts them, which may be far from what is in view.
+        if self._look_at:
+            self._look_at = False
+            self.viewer.reset_view()
+        self._soon.start()
+
     def _refresh(self) -> None:
+        if self._shown is not None:
+            self._shown.follow(self.results.layers)
         for layer in self.results.layers:
             layer.refresh()
 
