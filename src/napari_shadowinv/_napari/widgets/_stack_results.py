@@ -78,7 +78,7 @@ class StackRequest:
 
     def go_on_from(self, earlier: StackRequest, layers: Sequence[Any]) -> None:
         """Take over the colours of an earlier run into the same store."""
-        self._given |= earlier._given
+        self._given.update(earlier._given)
         now = {role_of(one): tuple(one.contrast_limits) for one in layers if _is_image(one)}
         for _, keywords, kind in self.described:
             role = str(role_of(keywords))
