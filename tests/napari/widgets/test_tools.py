@@ -20,7 +20,7 @@ from napari_shadowinv.physics.phantoms import four_toroids, paper_setup
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
-NAMES = ("Invert shot", "Estimate source", "Forward model", "Line profile")
+NAMES = ("Invert shot", "Invert stack", "Estimate source", "Forward model", "Line profile")
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -86,11 +86,11 @@ class PathEdit(QWidget):
 
     changed = Signal()
 
-    def __init__(self, title: str) -> None:
+    def __init__(self, title: str, example: str = "path of a file") -> None:
         super().__init__()
         self._title = title
         self.edit = QLineEdit()
-        self.edit.setPlaceholderText("path of a file")
+        self.edit.setPlaceholderText(example)
         self.edit.setMinimumWidth(60)
         row = QHBoxLayout(self)
         row.setContentsMargins(0, 0, 0, 0)
@@ -102,8 +102,13 @@ class PathEdit(QWidget):
         """The path; empty if there is none."""
         return str(self.edit.text()).strip()
 
-    def _choose(self) -> None:
+    def ask(self) -> str:
+        """Let the user choose in a dialog; empty if he does not."""
         path, _ = QFileDialog.getOpenFileName(self, self._title)
+        return str(path)
+
+    def _choose(self) -> None:
+        path = self.ask()
         if path:
             self.edit.setText(path)
             self.changed.emit()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.widgets._reading import image_of
+from napari_shadowinv._napari.widgets._reading import image_of, stack_of
 
 __all__ = ["new_mask", "new_shapes"]
 
@@ -20,7 +20,7 @@ def new_mask(viewer: Any, image: Any) -> Any:
     viewer : napari.Viewer
         Where to add them.
     image : napari.layers.Image or None
-        The image to be masked.
+        The image, or the stack, to be masked.
 
     Returns
     -------
@@ -29,9 +29,9 @@ def new_mask(viewer: Any, image: Any) -> Any:
     Raises
     ------
     InputError
-        If there is no image, or it is a stack or in colour.
+        If there is no image, or it is in colour.
     """
-    shape = image_of(image).shape
+    shape = (image_of(image) if image is None or image.ndim != 3 else stack_of(image)).shape[-2:]
     labels = _added(viewer, image, "labels", np.zeros(shape, np.uint8), "mask")
     labels.mode = "paint"
     return labels

@@ -43,6 +43,7 @@ _STAGES = {
     "source": "Estimating the source",
     "field": "Making the field",
     "image": "Tracing the rays",
+    "shots": "Inverting",
 }
 
 

@@ -1,4 +1,4 @@
-"""Arrays from layers: `image_of`, `mask_of`, `crop_of`."""
+"""Arrays from layers: `image_of`, `stack_of`, `mask_of`, `crop_of`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from napari_shadowinv._napari.widgets._picking import kind_of
 from napari_shadowinv.errors import InputError
 
-__all__ = ["crop_of", "image_of", "mask_of"]
+__all__ = ["crop_of", "image_of", "mask_of", "stack_of"]
 
 Mask = NDArray[np.bool_]
 
@@ -34,23 +34,62 @@ def image_of(layer: Any | None, role: str = "image") -> Any:
     InputError
         If there is no layer, or it is no single grey image.
     """
-    if layer is None:
-        raise InputError(
-            f"there is no {role} to work on: open one (File → Open), drop it on the window, or "
-            "take a sample (File → Open Sample)"
-        )
-    data = layer.data[0] if getattr(layer, "multiscale", False) else layer.data
-    if getattr(layer, "rgb", False):
-        raise InputError(
-            f"'{layer.name}' is a colour image, expected a grey one: split it (right click on "
-            "the layer → Split RGB) and choose one channel"
-        )
+    data = _grey(layer, role)
+    assert layer is not None
     if data.ndim != 2:
         raise InputError(
             f"'{layer.name}' has shape {tuple(data.shape)}, expected one image (y, x): "
             "split the stack (right click on the layer → Split Stack) and choose one shot"
         )
     return data
+
+
+def stack_of(layer: Any | None) -> Any:
+    """The 3-D array (shot, y, x) of an image layer, not read yet if it is lazy.
+
+    Parameters
+    ----------
+    layer : napari.layers.Image or None
+        The layer.
+
+    Returns
+    -------
+    ndarray or dask.array.Array, shape (shots, H, W)
+
+    Raises
+    ------
+    InputError
+        If there is no layer, or it is no stack of grey images.
+    """
+    data = _grey(layer, "stack of shots")
+    assert layer is not None
+    if data.ndim != 3:
+        hint = "use 'Invert shot' for one image, or " if data.ndim == 2 else ""
+        raise InputError(
+            f"'{layer.name}' has shape {tuple(data.shape)}, expected a stack (shot, y, x): "
+            f"{hint}choose another layer, or files"
+        )
+    if isinstance(data, np.ndarray):
+        return data
+    from dask import array
+
+    # Whatever reads from a disk stays there until a shot is needed.
+    whole = array.asanyarray(data)  # type: ignore[no-untyped-call]
+    return whole
+
+
+def _grey(layer: Any | None, role: str) -> Any:
+    if layer is None:
+        raise InputError(
+            f"there is no {role} to work on: open one (File → Open), drop it on the window, or "
+            "take a sample (File → Open Sample)"
+        )
+    if getattr(layer, "rgb", False):
+        raise InputError(
+            f"'{layer.name}' is a colour image, expected a grey one: split it (right click on "
+            "the layer → Split RGB) and choose one channel"
+        )
+    return layer.data[0] if getattr(layer, "multiscale", False) else layer.data
 
 
 def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> Mask | None:

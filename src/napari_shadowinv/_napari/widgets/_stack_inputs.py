@@ -1,0 +1,221 @@
+"""What a run over many shots is given.
+
+- which shots: `ShotsPicker`
+- which store: `StoreEdit`
+- who computes: `EnginePicker`
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from qtpy.QtCore import Signal
+from qtpy.QtWidgets import QFileDialog, QLineEdit, QSpinBox, QVBoxLayout, QWidget
+
+from napari_shadowinv._napari.widgets._base import PathEdit
+from napari_shadowinv._napari.widgets._forms import ModelPicker, labelled
+from napari_shadowinv._napari.widgets._picking import LayerPicker
+from napari_shadowinv._napari.widgets._reading import stack_of
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.store import STORE_SUFFIX
+
+__all__ = ["EnginePicker", "ShotsPicker", "StoreEdit"]
+
+_LAYER, _FILES = "layer", "files"
+_HERE, _SCHEDULER = "threads", "scheduler"
+_BETWEEN = "; "
+
+
+class _FilesEdit(PathEdit):
+    """Files by a pattern, or one by one."""
+
+    def ask(self) -> str:
+        paths, _ = QFileDialog.getOpenFileNames(self, self._title)
+        return _BETWEEN.join(paths)
+
+
+class StoreEdit(PathEdit):
+    """The folder that shots are written to, new or begun."""
+
+    def __init__(self) -> None:
+        super().__init__("Store of the results", f"results{STORE_SUFFIX}")
+        self.edit.setToolTip(
+            f"<qt>A folder named …{STORE_SUFFIX}. If it is there, the run goes on where it "
+            "stopped.</qt>"
+        )
+
+    @property
+    def store(self) -> Path:
+        """Its path.
+
+        Raises
+        ------
+        InputError
+            If none is given.
+        """
+        if not self.path:
+            raise InputError(
+                f"no store for the results is given: choose a folder that ends with {STORE_SUFFIX}"
+            )
+        return Path(self.path).expanduser()
+
+    def ask(self) -> str:
+        # To go on with what is there is no danger: nothing is replaced without its box.
+        path, _ = QFileDialog.getSaveFileName(
+            self,
+            self._title,
+            self.path or f"results{STORE_SUFFIX}",
+            f"stores (*{STORE_SUFFIX})",
+            options=QFileDialog.Option.DontConfirmOverwrite,
+        )
+        if not path:
+            return ""
+        chosen = Path(path)
+        # A store is a folder, which a dialog steps into.
+        for folder in (chosen, *chosen.parents):
+            if folder.name.endswith(STORE_SUFFIX):
+                return str(folder)
+        return path + STORE_SUFFIX
+
+
+class ShotsPicker(QWidget):
+    """A stack layer, or files.
+
+    Signals
+    -------
+    changed
+        Other shots were chosen.
+    """
+
+    changed = Signal()
+
+    def __init__(self, viewer: Any) -> None:
+        super().__init__()
+        self.picker = ModelPicker(
+            "Shots", {_LAYER: ("a stack layer", None), _FILES: ("files", None)}
+        )
+        self.picker.choice.setToolTip("Where the shots are.")
+        self.layers = LayerPicker(viewer, ("image",))
+        self.layers.setToolTip("Image layer (shot, y, x); one on a disk is read shot by shot.")
+        self.files = _FilesEdit("Files of the shots", "shots/*.tif")
+        self.files.edit.setToolTip(
+            "<qt>A pattern such as shots/*.tif, files with ; between them, or a TIFF with many "
+            "pages.</qt>"
+        )
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        self._layer_row, self._files_row = labelled("", self.layers), labelled("", self.files)
+        for widget in (self.picker, self._layer_row, self._files_row):
+            column.addWidget(widget)
+        self.picker.changed.connect(self._on_change)
+        self.layers.picked.connect(self.changed)
+        self.files.changed.connect(self.changed)
+        self._on_change()
+
+    @property
+    def layer(self) -> Any | None:
+        """The chosen layer; None where files are chosen."""
+        return self.layers.layer if self.picker.kind == _LAYER else None
+
+    def shots(self) -> Any:
+        """The chosen shots, as `napari_shadowinv.stack.run_stack` takes them.
+
+        Raises
+        ------
+        InputError
+            If there are none, or the layer is no stack.
+        """
+        if self.picker.kind == _LAYER:
+            return stack_of(self.layers.layer)
+        parts = [part.strip() for part in self.files.path.split(_BETWEEN.strip())]
+        paths = [os.path.expanduser(part) for part in parts if part]
+        if not paths:
+            raise InputError("no files are given: type a pattern such as shots/*.tif, or choose")
+        return paths[0] if len(paths) == 1 else paths
+
+    def _on_change(self) -> None:
+        self._layer_row.setVisible(self.picker.kind == _LAYER)
+        self._files_row.setVisible(self.picker.kind == _FILES)
+        self.changed.emit()
+
+
+class EnginePicker(QWidget):
+    """The computer in front of the user, or a scheduler of dask.
+
+    Signals
+    -------
+    changed
+        Another was chosen.
+    """
+
+    changed = Signal()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.picker = ModelPicker(
+            "Run on",
+            {_HERE: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
+        )
+        self.picker.choice.setToolTip(
+            "<qt>The values do not depend on it. Workers of a cluster must see the folders of "
+            "shots and store under the same names.</qt>"
+        )
+        self.workers = QSpinBox()
+        self.workers.setRange(0, 1024)
+        self.workers.setSuffix(" at once")
+        self.workers.setSpecialValueText("as many as cores")
+        self.workers.setToolTip("How many shots are inverted at the same time.")
+        self.address = QLineEdit()
+        self.address.setPlaceholderText("tcp://host:8786")
+        self.address.setToolTip("What 'dask scheduler' prints when it starts.")
+        self.address.setMinimumWidth(60)
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        self._workers_row = labelled("Jobs", self.workers)
+        self._address_row = labelled("Address", self.address)
+        for widget in (self.picker, self._workers_row, self._address_row):
+            column.addWidget(widget)
+        self.picker.changed.connect(self._on_change)
+        self.workers.valueChanged.connect(lambda _: self.changed.emit())
+        self.address.editingFinished.connect(self.changed)
+        self._on_change()
+
+    def engine(self) -> tuple[str, int | None]:
+        """Scheduler and number of workers, as `napari_shadowinv.stack.run_stack` takes them.
+
+        Raises
+        ------
+        InputError
+            If no address of a scheduler is given.
+        """
+        if self.picker.kind == _HERE:
+            return "threads", self.workers.value() or None
+        address = self.address.text().strip()
+        if "://" not in address:
+            raise InputError(
+                f"the scheduler's address is '{address}': expected one such as tcp://host:8786, "
+                "which 'dask scheduler' prints"
+            )
+        return address, None
+
+    def state(self) -> dict[str, Any]:
+        """What is kept between sessions."""
+        return {
+            "kind": self.picker.kind,
+            "workers": self.workers.value(),
+            "address": self.address.text(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Show what `state` has returned."""
+        self.picker.set_kind(str(state.get("kind", _HERE)))
+        self.workers.setValue(int(state.get("workers", 0)))
+        self.address.setText(str(state.get("address", "")))
+
+    def _on_change(self) -> None:
+        self._workers_row.setVisible(self.picker.kind == _HERE)
+        self._address_row.setVisible(self.picker.kind == _SCHEDULER)
+        self.changed.emit()

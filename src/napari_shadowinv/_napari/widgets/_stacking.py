@@ -1,0 +1,207 @@
+"""A run over many shots, without napari and Qt.
+
+- what to do: `StackJob`
+- what has come of it so far, for the window to look at: `RunBooks`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv._napari.widgets._recipes import Estimate, UniformEstimate
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.progress import OnProgress, Progress, ShouldStop
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.stack import RunProgress
+
+__all__ = ["RunBooks", "StackJob"]
+
+Image = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass
+class RunBooks:
+    """What is known of a run. Its thread writes, the window reads.
+
+    Attributes
+    ----------
+    total, done, failed : int
+        Shots of the stack, with those of earlier runs.
+    ended : int
+        Shots that ended in this run.
+    failures : list of (str, str)
+        Names of failed shots, and why.
+    """
+
+    total: int = 0
+    done: int = 0
+    failed: int = 0
+    ended: int = 0
+    failures: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def text(self) -> str:
+        """One line of it."""
+        failed = f", {self.failed} failed" if self.failed else ""
+        return f"{self.done} of {self.total} done{failed}"
+
+    def take(self, news: RunProgress) -> None:
+        """Enter what became of a shot."""
+        if news.outcome is not None:
+            self.ended += 1
+            if news.outcome.reason:
+                self.failures.append((news.name, news.outcome.reason))
+        self.total, self.done, self.failed = news.total, news.done, news.failed
+
+
+@dataclass(frozen=True, eq=False)
+class StackJob:
+    """Many shots to invert into a store.
+
+    Attributes
+    ----------
+    shots : array of shape (shots, H, W), str or list of Path
+        The images, also lazy ones, or their files.
+    out : Path
+        The store.
+    source : array_like, Path or Estimate
+        The undisturbed beam, of all shots or of each, or how to guess it for each.
+    mask : ndarray of bool, shape (H, W), optional
+        True where a pixel is usable.
+    options, setup, scheduler, workers, overwrite, redo_failed
+        See `napari_shadowinv.stack.run_stack`.
+    books : RunBooks
+        What becomes of it.
+    """
+
+    shots: Any
+    out: Path
+    source: ArrayLike | Path | Estimate = field(default_factory=UniformEstimate)
+    mask: Mask | None = None
+    options: InversionOptions = field(default_factory=InversionOptions)
+    setup: ProtonSetup | OpticalSetup | None = None
+    scheduler: str = "threads"
+    workers: int | None = None
+    overwrite: bool = False
+    redo_failed: bool = False
+    books: RunBooks = field(default_factory=RunBooks)
+
+    def run(
+        self,
+        on_progress: OnProgress,
+        should_stop: ShouldStop,
+        on_done: Callable[[int | None], None] = lambda _: None,
+    ) -> RunBooks:
+        """Invert all shots that are not done yet.
+
+        Parameters
+        ----------
+        on_progress, should_stop
+            See `napari_shadowinv.progress`.
+        on_done : callable, optional
+            Called before it is told that there are finished shots, with the one that has just
+            ended well, if any.
+
+        Raises
+        ------
+        InputError, OSError
+            See `napari_shadowinv.stack.run_stack`.
+        InversionCancelled
+            If `should_stop` returned true.
+        """
+        from napari_shadowinv.stack import run_stack
+
+        def tell(news: RunProgress) -> None:
+            if news.outcome is None:
+                self._recall()
+            self.books.take(news)
+            if news.done:
+                ended = news.outcome
+                on_done(None if ended is None or ended.reason else ended.index)
+            step = news.done + news.failed
+            on_progress(Progress("shots", step, news.total, self.books.text))
+
+        on_progress(Progress("prepare", 0, None, "shots and source"))
+        run_stack(
+            self.shots,
+            self.out,
+            source=self._source(),
+            mask=self.mask,
+            options=self.options,
+            setup=self.setup,
+            scheduler=self.scheduler,
+            workers=self.workers,
+            overwrite=self.overwrite,
+            redo_failed=self.redo_failed,
+            on_progress=tell,
+            should_stop=should_stop,
+        )
+        return self.books
+
+    def _recall(self) -> None:
+        """Enter the failures of earlier runs that are not tried again."""
+        from napari_shadowinv.io.store import FAILED, StackStore
+
+        if self.redo_failed:
+            return
+        store = StackStore(self.out)
+        for index in np.flatnonzero(store.statuses() == FAILED):
+            reason = str(store.report(int(index)).get("reason", "unknown"))
+            self.books.failures.append((store.names[index], reason))
+
+    def _source(self) -> Any:
+        if isinstance(self.source, UniformEstimate):
+            return None
+        if isinstance(self.source, Estimate):
+            return _estimates(self.shots, self.source, self.mask)
+        return self.source
+
+
+def _estimates(shots: Any, estimate: Estimate, mask: Mask | None) -> Any:
+    """Source of each shot, guessed when the shot's turn comes; an xarray.DataArray."""
+    import xarray as xr
+
+    from napari_shadowinv._napari.lazy import lazy_stack
+    from napari_shadowinv.stack._shots import find_shots
+
+    found = find_shots(shots)
+    if found.array is None:
+        reading = _Estimating(estimate, mask)
+        sources = lazy_stack(reading.of_shot, found.items, found.shape)
+    else:
+        sources = found.array.map_blocks(
+            _Estimating(estimate, mask).of_block, dtype=np.float64, meta=np.empty((0, 0, 0))
+        )
+    # The store tells by these names whether it goes on with the same estimate.
+    values = ", ".join(f"{name} {value}" for name, value in estimate.model_dump().items())
+    how = f"{estimate.title} ({values})" if values else estimate.title
+    names = [f"{how} of {name}" for name in found.names]
+    return xr.DataArray(sources, dims=("shot", "y", "x"), coords={"shot": names})
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimating:
+    """Guesses sources on a worker, which has neither napari nor Qt."""
+
+    estimate: Estimate
+    mask: Mask | None
+
+    def of_block(self, block: NDArray[Any]) -> Image:
+        return np.stack([self._of_image(image) for image in block])
+
+    def of_shot(self, shot: Any) -> Image:
+        return self._of_image(np.asarray(shot.load()[0]))
+
+    def _of_image(self, image: NDArray[Any]) -> Image:
+        usable = image if self.mask is None else np.where(self.mask, image, 0)
+        # What an inversion would clip must not spoil the estimate.
+        return self.estimate.source(np.maximum(usable, 0).astype(np.float64), self.mask)

@@ -1,0 +1,281 @@
+"""The widget that turns a run of shots into a store of fields: `InvertStack`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from qtpy.QtCore import QTimer
+from qtpy.QtWidgets import QCheckBox, QLabel
+
+from napari_shadowinv._napari.widgets._base import ToolPanel, with_button
+from napari_shadowinv._napari.widgets._drawing import new_mask
+from napari_shadowinv._napari.widgets._forms import ModelForm, labelled
+from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES
+from napari_shadowinv._napari.widgets._messages import reporting
+from napari_shadowinv._napari.widgets._panels import RunPanel, section
+from napari_shadowinv._napari.widgets._picking import LayerPicker
+from napari_shadowinv._napari.widgets._reading import stack_of
+from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
+from napari_shadowinv._napari.widgets._runner import Outcome
+from napari_shadowinv._napari.widgets._setups import SetupPicker
+from napari_shadowinv._napari.widgets._sources import SourcePicker
+from napari_shadowinv._napari.widgets._stack_inputs import EnginePicker, ShotsPicker, StoreEdit
+from napari_shadowinv._napari.widgets._stack_results import FailureTable, StackRequest, place_on
+from napari_shadowinv._napari.widgets._stacking import StackJob
+from napari_shadowinv._napari.widgets._toml import TomlButtons
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.progress import Progress
+from napari_shadowinv.validation import validated
+
+if TYPE_CHECKING:
+    import napari
+
+__all__ = ["InvertStack"]
+
+_REFRESH_AFTER = 200  # ms; many small shots may end in a second
+
+
+class InvertStack(ToolPanel):
+    """Choose shots and a store, press Run; press it again to go on after an interruption.
+
+    Parameters
+    ----------
+    viewer : napari.viewer.Viewer
+        The viewer to work in.
+    """
+
+    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+        super().__init__(viewer, "invert-stack")
+        self.panel = RunPanel(
+            "Invert stack", "Run", "Invert every shot that is not done yet, into the store."
+        )
+        self.results = ResultLayers(viewer, self)
+        self._shown: StackRequest | None = None
+        self._running: StackRequest | None = None
+        self._heard = 0
+        self._look_at = False
+        self._soon = QTimer(self)
+        self._soon.setSingleShot(True)
+        self._soon.setInterval(_REFRESH_AFTER)
+        self._soon.timeout.connect(self._refresh)
+        self._build()
+        self._connect()
+        self.restore(self._keeper.load())
+        self._on_layer()
+        self._ready = True
+
+    def _build(self) -> None:
+        self.shots = ShotsPicker(self.viewer)
+        self.source = SourcePicker(self.viewer)
+        self.masks = LayerPicker(self.viewer, ("labels",), none="none")
+        self.masks.setToolTip("<qt>Labels that mark pixels of the detector, in all shots.</qt>")
+        self.painted_is_unusable = QCheckBox("painted = unusable")
+        self.painted_is_unusable.setChecked(True)
+        self.painted_is_unusable.setToolTip(
+            "<qt>Checked: what is painted is left out (writing, dead pixels). Unchecked: only "
+            "what is painted is used.</qt>"
+        )
+        self.setup = SetupPicker()
+        self.options = ModelForm(InversionOptions, first={"n_sites": PREVIEW_SITES})
+        self.option_files = TomlButtons("options", self._options_to_save, self._take_options)
+        self.store = StoreEdit()
+        self.overwrite = QCheckBox("overwrite what the store holds")
+        self.overwrite.setToolTip("<qt>Begin anew. Else the run goes on where it stopped.</qt>")
+        self.redo_failed = QCheckBox("redo failed shots")
+        self.redo_failed.setToolTip("<qt>Try shots again that failed in an earlier run.</qt>")
+        self.engine = EnginePicker()
+        self.failures_title = QLabel("Failed shots")
+        self.failures_title.setVisible(False)
+        self.failures = FailureTable()
+        paint = with_button(self.masks, "✎", "Paint a mask.", self._paint_mask)
+        for row in (
+            self.shots,
+            self.source,
+            labelled("Mask", paint),
+            labelled("", self.painted_is_unusable),
+            self.setup,
+            section("Options", self.options, self.option_files),
+            labelled("Store", self.store),
+            labelled("", self.overwrite),
+            labelled("", self.redo_failed),
+            self.engine,
+            self.panel,
+            self.failures_title,
+            self.failures,
+        ):
+            self.column.addWidget(row)
+
+    def _connect(self) -> None:
+        self.shots.changed.connect(self._on_layer)
+        for signal in (
+            self.source.changed,
+            self.setup.changed,
+            self.options.changed,
+            self.engine.changed,
+            self.painted_is_unusable.toggled,
+        ):
+            signal.connect(self.keep)
+        self.panel.button.clicked.connect(lambda: self._run_or_cancel())
+        self.panel.runner.progressed.connect(self._on_progress)
+        self.panel.runner.ended.connect(self._on_end)
+
+    # What is kept, and what is asked for
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "source": self.source.state(),
+            "setup": self.setup.picker.state(),
+            "options": self.options.values(),
+            "engine": self.engine.state(),
+            "painted_is_unusable": self.painted_is_unusable.isChecked(),
+        }
+
+    def restore(self, kept: Any) -> None:
+        """Show what `state` has returned."""
+        self.source.restore(kept.get("source", {}))
+        self.setup.picker.restore(kept.get("setup", {}))
+        self.options.set_values(kept.get("options", {}))
+        self.engine.restore(kept.get("engine", {}))
+        self.painted_is_unusable.setChecked(bool(kept.get("painted_is_unusable", True)))
+
+    def request(self) -> StackRequest:
+        """What the controls ask for.
+
+        Raises
+        ------
+        InputError
+            If something is missing or cannot be used.
+        """
+        layer = self.shots.layer
+        setup = self.setup.setup()
+        scheduler, workers = self.engine.engine()
+        job = StackJob(
+            shots=self.shots.shots(),
+            out=self.store.store,
+            source=self._source(layer),
+            mask=self._mask(),
+            options=self.options.model(),  # type: ignore[arg-type]
+            setup=setup,
+            scheduler=scheduler,
+            workers=workers,
+            overwrite=self.overwrite.isChecked(),
+            redo_failed=self.redo_failed.isChecked(),
+        )
+        companions = (self.masks.layer, self.source.layers.layer)
+        return StackRequest(
+            job,
+            layer,
+            tuple(one for one in companions if one is not None and one is not layer),
+            {} if layer is None else place_on(layer, setup),
+        )
+
+    def _source(self, layer: Any) -> ArrayLike:
+        # A run may have a source for each shot.
+        chosen = self.source.layers.layer
+        if self.source.picker.kind == "layer" and chosen is not None and chosen.ndim == 3:
+            return stack_of(chosen)
+        return self.source.source(layer)  # type: ignore[return-value]
+
+    def _mask(self) -> Any:
+        if self.masks.layer is None:
+            return None
+        painted = np.asarray(self.masks.layer.data) != 0
+        if not painted.any():
+            return None
+        return ~painted if self.painted_is_unusable.isChecked() else painted
+
+    # A run
+
+    @reporting
+    def _run_or_cancel(self) -> None:
+        if self.panel.runner.running:
+            self.panel.cancel()
+            return
+        self._running, self._heard = self.request(), 0
+        self._show_failures([])
+        self.panel.run(self._running.run, self._running)
+
+    def _on_progress(self, news: Progress) -> None:
+        if self._running is not None and news.stage == "shots":
+            self._show(self._running)
+
+    def _show(self, request: StackRequest) -> None:
+        """Show what is new."""
+        # Once it is done: to press Run again must not throw these shots away.
+        self.overwrite.setChecked(False)
+        self.redo_failed.setChecked(False)
+        books = request.job.books
+        if len(books.failures) != self.failures.count:
+            self._show_failures(list(books.failures))
+        if request.described and request is not self._shown:
+            self._show_layers(request)
+        elif books.ended > self._heard and not self._soon.isActive():
+            self._soon.start()
+        self._heard = books.ended
+
+    def _show_layers(self, request: StackRequest) -> None:
+        earlier, self._shown = self._shown, request
+        again = earlier is not None and earlier.job.out == request.job.out
+        if request.image is not None and request.job.setup is not None:
+            place_together(self.viewer, request.image, request.job.setup, request.companions)
+        if earlier is not None and again:
+            request.go_on_from(earlier, self.results.layers)
+        else:
+            self.results = ResultLayers(self.viewer, self)
+            self.results.complete.connect(self._on_layers)
+        self._look_at = not again and request.image is None
+        self.results.show(request.described, select=not again)
+
+    def _on_layers(self) -> None:
+        # Files lie where their setup puts them, which may be far from what is in view.
+        if self._look_at:
+            self._look_at = False
+            self.viewer.reset_view()
+        self._soon.start()
+
+    def _refresh(self) -> None:
+        if self._shown is not None:
+            self._shown.follow(self.results.layers)
+        for layer in self.results.layers:
+            layer.refresh()
+
+    def _show_failures(self, failures: list[tuple[str, str]]) -> None:
+        self.failures.show_failures(failures)
+        self.failures_title.setVisible(bool(failures))
+
+    @reporting
+    def _on_end(self, outcome: Outcome) -> None:
+        request: StackRequest = outcome.tag
+        books = request.job.books
+        self._running = None
+        if not books.total:
+            return
+        self._show(request)
+        if outcome.cancelled:
+            self.panel.say(f"Cancelled: {books.text}; Run goes on from there.")
+        else:
+            self.panel.say(f"{books.text}, in {request.job.out.name}")
+        self.panel.status.setToolTip(str(request.job.out.absolute()))
+
+    # Layers and files
+
+    def _on_layer(self) -> None:
+        layer = self.shots.layer
+        if layer is not None:
+            self.source.follow(layer)
+            self.setup.follow(layer)
+        self.keep()
+
+    @reporting
+    def _paint_mask(self) -> None:
+        self.masks.layer = new_mask(self.viewer, self.shots.layer)
+
+    def _options_to_save(self) -> dict[str, object]:
+        self.options.model()
+        return self.options.values()
+
+    def _take_options(self, loaded: dict[str, object], path: str) -> None:
+        validated(InversionOptions, loaded, path)
+        self.options.set_values(loaded)

@@ -1,0 +1,347 @@
+"""The widget that inverts a run of shots, in a real window."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import dask.array as da
+import numpy as np
+import pytest
+
+from napari_shadowinv import InversionOptions, ProtonSetup, invert
+from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.widgets._recipes import LowPassEstimate
+from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.stack import _engines, _run
+
+Array = np.ndarray[Any, Any]
+FEW = {"n_sites": 100}
+PATIENCE = 60_000  # ms
+SHAPE = (24, 28)
+
+
+@pytest.fixture(scope="module")
+def stack() -> Array:
+    """Four shots of a blob that grows and wanders."""
+    blobs = [gaussian_blob(SHAPE, 2.0 + i, 4.0, (10, 12 + i)) for i in range(4)]
+    return np.stack([100 * synthetic_image(blob.displacement) for blob in blobs])
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "run.shadowinv.zarr"
+
+
+@pytest.fixture
+def tool(window: Any, open_widget: Callable[[str], Any], stack: Array, out: Path) -> Any:
+    window.add_image(stack, name="shots")
+    return prepared(open_widget("Invert stack"), out)
+
+
+def prepared(widget: Any, out: Path) -> Any:
+    widget.options.set_values(FEW)
+    widget.store.edit.setText(str(out))
+    widget.engine.workers.setValue(1)
+    return widget
+
+
+@pytest.fixture
+def run(qtbot: Any) -> Callable[[Any], None]:
+    """Press Run and wait until all is there."""
+
+    def pressed(tool: Any) -> None:
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: at_rest(tool), timeout=PATIENCE)
+
+    return pressed
+
+
+def at_rest(tool: Any) -> bool:
+    return not (tool.panel.runner.running or tool.results.busy or tool._soon.isActive())
+
+
+@pytest.fixture
+def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Hold each run at its third shot, as a large image would, until it is stopped or let go."""
+    let_go = threading.Event()
+    original = _run.invert_shot
+    count = iter(range(1000))
+
+    def holding(*args: Any, should_stop: Any = None, **kwargs: Any) -> Any:
+        if next(count) >= 2:
+            while not let_go.is_set() and not should_stop():
+                time.sleep(0.01)
+        return original(*args, should_stop=should_stop, **kwargs)
+
+    monkeypatch.setattr(_run, "invert_shot", holding)
+    return let_go
+
+
+def layer_of(viewer: Any, role: str) -> Any:
+    (found,) = [one for one in viewer.layers if role_of(one) == role]
+    return found
+
+
+def written(out: Path) -> dict[str, int]:
+    """When each shot's potential was written."""
+    chunks = out / "potential" / "c"
+    return {path.name: (path / "0" / "0").stat().st_mtime_ns for path in sorted(chunks.iterdir())}
+
+
+def running() -> list[str]:
+    """Threads of ours, of the run and of its shots."""
+    names = [one.name for one in threading.enumerate()]
+    return [name for name in names if name.startswith(("shot", "shadowinv"))]
+
+
+def test_a_stack_layer_becomes_a_store_and_layers(
+    window: Any,
+    tool: Any,
+    run: Any,
+    stack: Array,
+    out: Path,
+    told: list[str],
+    proton_setup: ProtonSetup,
+) -> None:
+    tool.setup.show_setup(proton_setup.model_dump())
+    tool.engine.workers.setValue(2)
+    run(tool)
+    assert told == []
+    assert (StackStore(out).statuses() == DONE).all()
+    assert tool.panel.status.text() == "4 of 4 done, in run.shadowinv.zarr"
+    assert tool.panel.status.toolTip() == str(out)
+    assert not tool.failures.isVisible()
+    field, image = layer_of(window, "field"), window.layers["shots"]
+    expected = invert(stack[2], options=InversionOptions(**FEW))
+    strength = np.hypot(*proton_setup.path_integrated_b(expected.displacement))
+    shown = np.asarray(field.data[2])
+    np.testing.assert_allclose(shown / shown.max(), strength / strength.max(), atol=1e-5)
+    assert layer_of(window, "potential").data.shape == stack.shape
+    np.testing.assert_allclose(field.scale, image.scale)
+    assert image.scale[-1] == pytest.approx(1.5)
+    assert field.units == image.units
+    # The first shot is not the strongest: colours reach to the one that is.
+    assert field.contrast_limits[1] == pytest.approx(float(field.data.max().compute()))
+    # Again: there is nothing to do.
+    before = written(out)
+    run(tool)
+    assert written(out) == before
+    assert [role_of(one) for one in window.layers].count("field") == 1
+
+
+def test_a_lazy_layer_is_read_shot_by_shot(
+    window: Any, tool: Any, run: Any, stack: Array, out: Path
+) -> None:
+    at_once: list[int] = []
+
+    def read(block: Array) -> Array:
+        at_once.append(len(block))
+        return block
+
+    lazy = da.from_array(stack, chunks=(1, -1, -1)).map_blocks(read, meta=np.empty((0, 0, 0)))
+    tool.shots.layers.layer = window.add_image(lazy, name="lazy", contrast_limits=(0, 200))
+    run(tool)
+    assert set(at_once) == {1}
+    stored = StackStore(out)
+    assert (stored.statuses() == DONE).all()
+    expected = invert(stack[3], options=InversionOptions(**FEW))
+    shown = np.asarray(layer_of(window, "potential").data[3])
+    np.testing.assert_allclose(shown, expected.potential, atol=1e-5 * np.ptp(expected.potential))
+
+
+def test_a_corrupt_file_is_listed_and_the_others_are_done(
+    window: Any, tool: Any, run: Any, stack: Array, out: Path, tmp_path: Path, told: list[str]
+) -> None:
+    for index, image in enumerate(stack):
+        np.save(tmp_path / f"shot_{index}.npy", image)
+    whole = (tmp_path / "shot_1.npy").read_bytes()
+    (tmp_path / "shot_1.npy").write_bytes(whole[:200])
+    tool.shots.picker.set_kind("files")
+    tool.shots.files.edit.setText(str(tmp_path / "shot_*.npy"))
+    run(tool)
+    assert told == []
+    assert StackStore(out).statuses().tolist() == [DONE, FAILED, DONE, DONE]
+    (name, reason), *others = tool.failures.texts().items()
+    assert name == "shot_1.npy"
+    assert reason == StackStore(out).report(1)["reason"]
+    assert others == []
+    assert tool.failures.isVisible()
+    assert tool.panel.status.text() == "3 of 4 done, 1 failed, in run.shadowinv.zarr"
+    assert np.isnan(np.asarray(layer_of(window, "potential").data[1])).all()
+
+    # It stays so until it is to be tried again, which takes a box.
+    (tmp_path / "shot_1.npy").write_bytes(whole)
+    before = written(out)
+    run(tool)
+    assert list(tool.failures.texts()) == ["shot_1.npy"]
+    tool.redo_failed.setChecked(True)
+    run(tool)
+    assert not tool.failures.isVisible()
+    assert (StackStore(out).statuses() == DONE).all()
+    assert before.items() <= written(out).items()
+    assert not tool.redo_failed.isChecked()
+
+
+def test_cancelled_in_the_middle_it_goes_on_from_there(
+    window: Any, tool: Any, run: Any, out: Path, qtbot: Any, held: threading.Event, told: list[str]
+) -> None:
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: tool.panel.bar.value() == 2, timeout=PATIENCE)
+    assert tool.panel.bar.maximum() == 4
+    assert tool.panel.status.text() == "Inverting: 2 of 4 done"
+    # What is finished can be looked at while the run goes on.
+    qtbot.waitUntil(lambda: not tool.results.busy and bool(tool.results.layers), timeout=PATIENCE)
+    potential = layer_of(window, "potential")
+    assert np.isfinite(np.asarray(potential.data[1])).all()
+    assert np.isnan(np.asarray(potential.data[2])).all()
+    field = layer_of(window, "field")
+    window.dims.set_current_step(0, 3)
+    qtbot.waitUntil(lambda: np.isnan(field._slice.image.raw).all(), timeout=PATIENCE)
+    tool.panel.button.click()
+    assert tool.panel.button.text() == "Cancelling…"
+    qtbot.waitUntil(lambda: at_rest(tool), timeout=PATIENCE)
+    assert tool.panel.status.text() == "Cancelled: 2 of 4 done; Run goes on from there."
+    assert StackStore(out).statuses().tolist() == [DONE, DONE, PENDING, PENDING]
+    before = written(out)
+    assert len(before) == 2
+    potential.contrast_limits = (-3.0, 4.0)
+
+    held.set()
+    run(tool)
+    assert (StackStore(out).statuses() == DONE).all()
+    assert before.items() <= written(out).items()
+    # The shot in view was pending, and is seen now.
+    assert np.isfinite(field._slice.image.raw).all()
+    assert layer_of(window, "field") is field
+    assert field.contrast_limits[1] == pytest.approx(float(field.data.max().compute()))
+    assert tuple(potential.contrast_limits) == (-3.0, 4.0)
+    assert told == []
+
+
+def test_closing_the_window_ends_the_run(
+    make_napari_viewer: Any,
+    qtbot: Any,
+    stack: Array,
+    out: Path,
+    held: threading.Event,
+    told: list[str],
+) -> None:
+    viewer = make_napari_viewer(show=True)
+    viewer.add_image(stack, name="shots")
+    _, widget = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert stack")
+    prepared(widget, out).panel.button.click()
+    qtbot.waitUntil(lambda: widget.panel.bar.value() == 2, timeout=PATIENCE)
+    viewer.close()
+    qtbot.waitUntil(lambda: not running(), timeout=5000)
+    qtbot.wait(100)
+    assert told == []
+    assert StackStore(out).statuses().tolist() == [DONE, DONE, PENDING, PENDING]
+
+
+def test_a_mistake_is_told_once_and_nothing_is_lost(
+    window: Any,
+    tool: Any,
+    run: Any,
+    out: Path,
+    told: list[str],
+    qtbot: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def expect(words: str) -> None:
+        told.clear()
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: bool(told) and at_rest(tool), timeout=PATIENCE)
+        qtbot.wait(30)
+        assert len(told) == 1, told
+        assert words in told[0]
+        assert tool.panel.button.text() == "Run"
+        assert tool.panel.button.isEnabled()
+
+    run(tool)
+    before = written(out)
+    tool.options.set_values({**FEW, "seed": 7})
+    expect("begun with another options (seed: 0 there, 7 now)")
+    tool.options.set_values(FEW)
+    tool.source.picker.set_kind("low_pass")
+    expect("begun with another source")
+    tool.source.picker.set_kind("uniform")
+    assert written(out) == before
+
+    tool.store.edit.setText(str(tmp_path / "results"))
+    expect(".shadowinv.zarr")
+    tool.store.edit.setText("")
+    expect("o store for the results")
+    tool.store.edit.setText(str(tmp_path / "other.shadowinv.zarr"))
+    tool.engine.picker.set_kind("scheduler")
+    expect("address is ''")
+    monkeypatch.setattr(_engines, "_CONNECT_SECONDS", 0.3)
+    tool.engine.address.setText("tcp://127.0.0.1:9")
+    expect("o scheduler answers at tcp://127.0.0.1:9")
+    tool.engine.picker.set_kind("threads")
+    tool.shots.picker.set_kind("files")
+    expect("o files are given")
+    tool.shots.files.edit.setText(str(tmp_path / "*.tif"))
+    expect("o file matches")
+    tool.shots.picker.set_kind("layer")
+    tool.shots.layers.layer = window.add_image(np.ones(SHAPE), name="one")
+    expect("use 'Invert shot'")
+    tool.shots.layers.layer = window.add_image(np.ones((*SHAPE, 3)), rgb=True)
+    expect("colour image")
+    window.layers.clear()
+    expect("no stack of shots")
+    assert sorted(path.name for path in tmp_path.glob("*.zarr")) == [out.name]
+
+
+def test_overwriting_takes_a_box_that_counts_once(tool: Any, run: Any, out: Path) -> None:
+    run(tool)
+    before = written(out)
+    tool.options.set_values({**FEW, "seed": 7})
+    tool.overwrite.setChecked(True)
+    run(tool)
+    assert not before.items() & written(out).items()
+    assert not tool.overwrite.isChecked()
+
+
+def test_the_source_is_guessed_for_each_shot(
+    window: Any, tool: Any, run: Any, stack: Array, out: Path
+) -> None:
+    mask = np.ones(SHAPE, bool)
+    mask[:3, :4] = False
+    tool._paint_mask()
+    tool.masks.layer.data[:3, :4] = 1
+    tool.source.picker.set_kind("low_pass")
+    tool.source.picker.form.editors["width"].set_value(6.0)
+    run(tool)
+    source = LowPassEstimate(width=6.0).source(np.where(mask, stack[1], 0), mask)
+    expected = invert(stack[1], source=source, mask=mask, options=InversionOptions(**FEW))
+    shown = np.asarray(layer_of(window, "potential").data[1])
+    np.testing.assert_allclose(
+        shown[mask], expected.potential[mask], atol=1e-4 * np.ptp(expected.potential)
+    )
+
+
+def test_it_fits_and_remembers_what_is_harmless(
+    window: Any, tool: Any, qtbot: Any, out: Path
+) -> None:
+    tool.engine.workers.setValue(3)
+    tool.overwrite.setChecked(True)
+    tool._show_failures([("a_very_long_name_of_a_file_of_a_shot_0001.tif", "it is damaged " * 5)])
+    for size in ((1280, 800), (2560, 1440)):
+        window.window._qt_window.resize(*size)
+        qtbot.wait(50)
+        assert tool.area.horizontalScrollBar().maximum() == 0
+        assert tool.area.widget().minimumSizeHint().width() <= tool.area.viewport().width()
+    tool._keeper.write()
+    again = InvertStack(window)
+    qtbot.addWidget(again)
+    assert again.options.model() == InversionOptions(**FEW)
+    assert again.engine.engine() == ("threads", 3)
+    assert not again.overwrite.isChecked()
