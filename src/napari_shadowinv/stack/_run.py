@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -302,7 +303,7 @@ def _difference(found: str, value: str) -> str:
         names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
         return ", ".join(f"{name}: {before.get(name)} there, {now.get(name)} now" for name in names)
     except (ValueError, AttributeError):
-        return f"{found or 'none'} there, {value or 'none'} now"
+        return f"{shorten(found or 'none', 80)} there, {shorten(value or 'none', 80)} now"
 
 
 def _other_names(before: tuple[str, ...], stack: Stack) -> str:
