@@ -3,9 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram, power_diagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.sites import lloyd, plan_levels, sample_sites
 
 
@@ -77,3 +79,32 @@ def test_few_sites_on_a_small_bright_spot_still_hold_the_whole_image():
     triangulation = plan.levels[-1].triangulation
     masses = PowerDiagram(triangulation, Density.from_image(np.ones((200, 200)))).masses
     assert masses.sum() == pytest.approx(200 * 200, rel=1e-12)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_all_levels_stop_when_asked_to(threads):
+    """The coarse levels, which are made in another thread, must not be waited for."""
+    asked = []
+
+    def soon():
+        asked.append(True)
+        return len(asked) > 3
+
+    with pytest.raises(InversionCancelled):
+        plan_levels(
+            gaussian_beam(),
+            4000,
+            lloyd_iterations=1_000_000,
+            threads=threads,
+            report=Reporter(None, soon),
+        )
+
+
+def test_levels_do_not_depend_on_threads():
+    one, three = (
+        plan_levels(gaussian_beam(), 5000, lloyd_iterations=3, threads=threads)
+        for threads in (1, 3)
+    )
+    for a, b in zip(one.levels, three.levels, strict=True):
+        np.testing.assert_array_equal(a.sites, b.sites)
+        np.testing.assert_array_equal(a.mass, b.mass)

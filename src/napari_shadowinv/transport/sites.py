@@ -12,15 +12,17 @@ Paper, sections II.C and III: rejection, then weighted Lloyd relaxation.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
+from threading import Event
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import mirrored_across_border
@@ -38,6 +40,7 @@ Array = NDArray[np.float64]
 COARSEST = 600  # sites with which the solver can start from zero weights
 RATIO = 4  # sites of a level per site of the next coarser one
 
+_POLL = 0.05  # seconds between two looks at work in another thread
 _MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between sites
 
 
@@ -279,7 +282,7 @@ def plan_levels(
     lloyd_iterations, lloyd_tolerance, seed, threads
         See `lloyd` and `sample_sites`.
     report : Reporter, optional
-        Told of each step of the finest level.
+        Told of each step of the finest level, with one thread of all levels.
 
     Returns
     -------
@@ -291,7 +294,7 @@ def plan_levels(
     while counts[-1] > COARSEST:
         counts.append(max(4, counts[-1] // RATIO))
 
-    def level(count: int, tell: Callable[[int, int], None] | None = None) -> Level:
+    def level(count: int, tell: Callable[[int, int], None]) -> Level:
         triangulation = RegularTriangulation(
             sample_sites(source, count, seed), region=density.region
         )
@@ -317,9 +320,21 @@ def plan_levels(
             report("sites", step, lloyd_iterations, f"{count:,} sites, Lloyd relaxation")
 
     if available_threads(threads) == 1:
-        coarse = [level(count) for count in counts[:0:-1]]
-        return SitePlan(source, (*coarse, level(n_sites, tell)))
-    with ThreadPoolExecutor(1) as pool:  # beside the finest level, which takes three times as long
-        others = pool.submit(lambda: [level(count) for count in counts[:0:-1]])
-        finest = level(n_sites, tell)
+        return SitePlan(source, tuple(level(count, tell) for count in reversed(counts)))
+    abandoned = Event()
+
+    def give_up(step: int, count: int) -> None:
+        if abandoned.is_set():
+            raise InversionCancelled("the finest level was given up")
+
+    # beside the finest level, which takes three times as long; this thread alone reports
+    with ThreadPoolExecutor(1) as pool:
+        others = pool.submit(lambda: [level(count, give_up) for count in counts[:0:-1]])
+        try:
+            finest = level(n_sites, tell)
+            while not wait([others], timeout=_POLL).done:
+                tell(lloyd_iterations, n_sites)
+        except BaseException:
+            abandoned.set()
+            raise
         return SitePlan(source, (*others.result(), finest))
