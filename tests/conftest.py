@@ -48,6 +48,7 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         sites=sites,
         weights=np.linspace(-1, 1, 17),
         site_mass=np.full(17, source.sum() / 17),
+        site_flux=source.sum() / 17 * (1 + np.linspace(-1, 1, 17) / 3000),
         site_displacement=sites / 7,
         reprojection=reprojection,
         residual=image - reprojection,

@@ -125,6 +125,15 @@ def test_sites_carry_the_source_and_point_along_the_field(phantom, image):
     assert relative_error(inversion.site_displacement, true) < 0.12
 
 
+@pytest.mark.parametrize("boundary", ["closed", "free"])
+def test_cells_hold_the_flux_of_the_source_to_the_residual(image, boundary):
+    inversion = invert(image, options=InversionOptions(n_sites=3000, boundary=boundary))
+    error = np.abs(inversion.site_flux - inversion.site_mass) / inversion.site_mass
+    assert error.max() == pytest.approx(inversion.report.residual, rel=1e-6)
+    if boundary == "closed":
+        assert inversion.site_flux.sum() == pytest.approx(inversion.image.sum(), rel=1e-3)
+
+
 def test_both_read_outs_agree_on_a_smooth_object(phantom, image):
     options = InversionOptions(lloyd_iterations=30)
     dual = invert(image, options=options)

@@ -120,6 +120,9 @@ class Inversion:
         Weights of the power diagram, px².
     site_mass : ndarray, shape (n,)
         Flux of the source in each site's cell.
+    site_flux : ndarray, shape (n,)
+        Flux of the image in each site's power cell: that of the source but for the residual,
+        ``max(abs(site_flux / site_mass - 1))``.
     site_displacement : ndarray, shape (n, 2)
         Centroid of each site's cell in the image minus that in the source, px.
     reprojection : ndarray, shape (H, W)
@@ -143,6 +146,7 @@ class Inversion:
     sites: Array
     weights: Array
     site_mass: Array
+    site_flux: Array
     site_displacement: Array
     reprojection: Array
     residual: Array
@@ -360,6 +364,7 @@ def invert(
         sites=level.sites - plan.margin,
         weights=solutions[-1].weights,
         site_mass=level.mass,
+        site_flux=solutions[-1].flux,
         site_displacement=solutions[-1].displacement,
         reprojection=fields.reprojection,
         residual=np.where(prepared.mask, prepared.image - fields.reprojection, 0.0),

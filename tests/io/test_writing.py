@@ -35,6 +35,7 @@ def test_sites_as_a_table(tmp_path: Path, inversion: Inversion) -> None:
         inversion.sites,
         inversion.weights[:, None],
         inversion.site_mass[:, None],
+        inversion.site_flux[:, None],
         inversion.site_displacement,
     ]
     np.testing.assert_array_equal(table, np.hstack(expected))

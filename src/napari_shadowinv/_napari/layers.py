@@ -98,9 +98,7 @@ def inversion_layers(
     InputError
         If cells are asked for and there are too many.
     """
-    from napari_shadowinv._napari.sites import flux_residual
-
-    result = Result(inversion, setup, dict(attributes or {}), flux_residual(inversion))
+    result = Result(inversion, setup, dict(attributes or {}))
     frame = frame_for(
         inversion.potential.shape, setup, scale=scale, translate=translate, units=units
     )
@@ -403,10 +401,7 @@ def _sites(make: _Maker, inversion: Inversion) -> FullLayerData:
 
     every = -(-len(inversion.sites) // _MOST_SITES_SHOWN)
     shown = slice(None, None, every)
-    features = {
-        name: values[shown]
-        for name, values in site_features(inversion, make.result.flux_residual).items()
-    }
+    features = {name: values[shown] for name, values in site_features(inversion).items()}
     return make.layer(
         inversion.sites[shown],
         "points",
@@ -427,7 +422,7 @@ def _cells(make: _Maker, inversion: Inversion) -> FullLayerData:
     from napari_shadowinv._napari.sites import power_cells, site_features
 
     polygons, kept = power_cells(inversion)
-    features = site_features(inversion, make.result.flux_residual)
+    features = site_features(inversion)
     return make.layer(
         polygons,
         "shapes",

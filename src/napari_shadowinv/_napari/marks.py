@@ -50,14 +50,11 @@ class Result:
         The experiment.
     attributes : mapping of str to str
         Which files it was made from, as `napari_shadowinv.io.provenance` tells.
-    flux_residual : ndarray, shape (n,), or None
-        Relative flux error of each site's cell, where it is known.
     """
 
     content: Inversion | xarray.Dataset
     setup: ProtonSetup | OpticalSetup | None = None
     attributes: Mapping[str, str] = field(default_factory=dict)
-    flux_residual: NDArray[np.float64] | None = None
 
 
 def mark(

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = ["dataset_of_layers", "layers_of_dataset"]
 
 _LOOKS = "napari_layers"
-_FLUX_RESIDUAL = "site_flux_residual"
 
 # Attributes that the dataset of a result makes anew.
 _OWN_ATTRIBUTES = {
@@ -68,12 +67,10 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
 
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     setup = setup_from_dataset(dataset)
-    residual = dataset.get(_FLUX_RESIDUAL)
     result = Result(
         inversion_from_dataset(dataset) if "report" in dataset.attrs else dataset,
         setup,
         {key: value for key, value in dataset.attrs.items() if key not in _OWN_ATTRIBUTES},
-        None if residual is None else np.asarray(residual),
     )
     place = next(iter(looks.values()), {})
     shape = dataset["displacement"].shape[-2:]
@@ -114,15 +111,11 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray
     kept = {_LOOKS: json.dumps(looks)}
     if isinstance(content, xr.Dataset):
         return content.assign_attrs({"format": FORMAT, **kept})
-    dataset = dataset_from_inversion(
+    return dataset_from_inversion(
         _with_painted_caustics(content, layers),
         result.setup,
         attributes={**result.attributes, **kept},
     )
-    if result.flux_residual is None:
-        return dataset
-    labels = {"units": "1", "long_name": "Relative flux error of each site's cell"}
-    return dataset.assign({_FLUX_RESIDUAL: ("site", result.flux_residual, labels)})
 
 
 def _with_painted_caustics(inversion: Inversion, layers: Sequence[FullLayerData]) -> Inversion:

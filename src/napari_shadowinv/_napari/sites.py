@@ -1,6 +1,6 @@
 """What can be told about each site, and the shape of its cell.
 
-- numbers by site: `site_features`, `flux_residual`
+- numbers by site: `site_features`
 - the cells as polygons inside the image: `power_cells`
 """
 
@@ -17,59 +17,38 @@ if TYPE_CHECKING:
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.inversion import Inversion
 
-__all__ = ["MOST_CELLS", "flux_residual", "power_cells", "site_features", "site_spacing"]
+__all__ = ["MOST_CELLS", "power_cells", "site_features", "site_spacing"]
 
 Array = NDArray[np.float64]
 
 MOST_CELLS = 5_000
 
 
-def site_features(inversion: Inversion, flux_residual: Array | None) -> dict[str, Array]:
+def site_features(inversion: Inversion) -> dict[str, Array]:
     """Gather what is known about each site.
 
     Parameters
     ----------
     inversion : Inversion
         The result.
-    flux_residual : ndarray, shape (n,), or None
-        See `flux_residual`; left out if None.
 
     Returns
     -------
     dict of str to ndarray, shape (n,)
         ``weight`` in px², ``mass`` in the source's flux, ``displacement`` in px, and
-        ``flux residual``, relative.
+        ``flux residual``: what the cell holds too much of the image, as a share of the mass.
     """
-    features = {
+    return {
         "weight": inversion.weights,
         "mass": inversion.site_mass,
         "displacement": np.hypot(*inversion.site_displacement.T),
+        "flux residual": inversion.site_flux / inversion.site_mass - 1,
     }
-    if flux_residual is not None:
-        features["flux residual"] = flux_residual
-    return features
 
 
 def site_spacing(inversion: Inversion) -> float:
     """Return the mean distance of neighbouring sites in px."""
     return float(np.sqrt(inversion.potential.size / len(inversion.sites)))
-
-
-def flux_residual(inversion: Inversion) -> Array:
-    """Compare the flux in each site's cell with what the source gives it.
-
-    Parameters
-    ----------
-    inversion : Inversion
-        The result.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        (T - S) / S: positive where the cell holds too much of the image. Its largest
-        absolute value is the report's residual.
-    """
-    return _diagram(inversion).masses / inversion.site_mass - 1
 
 
 def power_cells(inversion: Inversion) -> tuple[list[Array], NDArray[np.intp]]:
@@ -98,26 +77,28 @@ def power_cells(inversion: Inversion) -> tuple[list[Array], NDArray[np.intp]]:
             f"the result has {count:,} sites: power cells can be shown for up to {MOST_CELLS:,}; "
             "invert with fewer sites to see cells"
         )
-    diagram = _diagram(inversion)
+    diagram, margin = _diagram(inversion)
     height, width = inversion.potential.shape
-    polygons = [_clipped(diagram.cell(site), height, width) for site in range(count)]
+    polygons = [_clipped(diagram.cell(site) - margin, height, width) for site in range(count)]
     kept = np.flatnonzero([len(polygon) > 2 for polygon in polygons])
     return [polygons[site] for site in kept], kept
 
 
-def _diagram(inversion: Inversion) -> PowerDiagram:
-    """Return the power diagram of the last step over the image that the solver saw."""
+def _diagram(inversion: Inversion) -> tuple[PowerDiagram, int]:
+    """Return the power diagram that the solver ended with, and the margin that it has in px."""
     from napari_shadowinv.geometry.density import Density
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.geometry.triangulation import RegularTriangulation
-    from napari_shadowinv.preprocess import prepare
+    from napari_shadowinv.preprocess import margin_around
 
-    # The image of a result is clipped and scaled already; this raises it to the floor.
-    mask = None if inversion.mask.all() else inversion.mask
-    prepared = prepare(inversion.image, inversion.source, inversion.options, mask)
-    density = Density.from_image(prepared.floored_image)
-    triangulation = RegularTriangulation(inversion.sites, inversion.weights, region=density.region)
-    return PowerDiagram(triangulation, density, threads=inversion.options.threads)
+    options, shape = inversion.options, inversion.potential.shape
+    margin = margin_around(shape, options) if options.boundary == "free" else 0
+    # The cells do not depend on what they hold.
+    anything = Density.from_image(np.ones([side + 2 * margin for side in shape]))
+    triangulation = RegularTriangulation(
+        inversion.sites + margin, inversion.weights, region=anything.region
+    )
+    return PowerDiagram(triangulation, anything, threads=options.threads), margin
 
 
 def _clipped(corners: Array, height: int, width: int) -> Array:

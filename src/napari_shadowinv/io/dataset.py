@@ -60,6 +60,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "sites": (_SITE_VECTORS, "px", "Positions of the sites"),
     "weights": (("site",), "px²", "Weights of the power diagram"),
     "site_mass": (("site",), "flux", "Flux of the source in each site's cell"),
+    "site_flux": (("site",), "flux", "Flux of the image in each site's power cell"),
     "site_displacement": (_SITE_VECTORS, "px", "Centroid of each site's cell minus the site"),
     "image": (_PLANE, "flux/px²", "Image, scaled to the flux of the source"),
     "source": (_PLANE, "flux/px²", "Undisturbed beam"),

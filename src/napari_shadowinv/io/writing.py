@@ -38,7 +38,7 @@ __all__ = ["IMAGE_SUFFIXES", "RESULT_SUFFIXES", "write"]
 RESULT_SUFFIXES = (".shadowinv", ".h5", ".hdf5", ".csv")
 IMAGE_SUFFIXES = (".tif", ".tiff", ".npy", ".png")
 
-_SITE_COLUMNS = "y_px,x_px,weight_px2,mass,displacement_y_px,displacement_x_px"
+_SITE_COLUMNS = "y_px,x_px,weight_px2,mass,flux,displacement_y_px,displacement_x_px"
 
 
 def write(
@@ -131,7 +131,7 @@ def _write_result(path: Path, dataset: xarray.Dataset) -> None:
 
 
 def _write_sites(path: Path, dataset: xarray.Dataset) -> None:
-    names = ("sites", "weights", "site_mass", "site_displacement")
+    names = ("sites", "weights", "site_mass", "site_flux", "site_displacement")
     _require(dataset, names)
     columns = np.column_stack([dataset[name].values for name in names])
     np.savetxt(path, columns, delimiter=",", header=_SITE_COLUMNS, comments="", fmt="%.17g")

@@ -45,6 +45,8 @@ class LevelSolution(Solution):
 
     Attributes
     ----------
+    flux : ndarray, shape (n,)
+        What each cell holds of the image.
     displacement : ndarray, shape (n, 2)
         Centroid of each cell in the image minus that of the same site's cell in the
         source, px. (The paper subtracts the site, which is the same after enough Lloyd
@@ -55,15 +57,20 @@ class LevelSolution(Solution):
     Paper, lines 21–23 of its algorithm.
     """
 
+    flux: Array
     displacement: Array
 
     @classmethod
     def of_level(
         cls, level: Level, objective: TransportObjective, solution: Solution
     ) -> LevelSolution:
-        """Add the displacement of the sites to a solution that `objective` has arrived at."""
+        """Add what the cells hold to a solution that `objective` has arrived at."""
         diagram = objective.diagram(solution.weights, with_moments=True)
-        return cls(**vars(solution), displacement=diagram.centroids - level.centroids)
+        return cls(
+            **vars(solution),
+            flux=diagram.masses,
+            displacement=diagram.centroids - level.centroids,
+        )
 
 
 def solve(
