@@ -414,12 +414,10 @@ def _read_fields(
     if plan.outside is None:
         reprojection = synthetic_image(displacement, prepared.source, threads=options.threads)
     else:
-        image_part = np.zeros_like(plan.outside.beam)
-        plan.within(image_part)[:] = prepared.source
-        margin_part = plan.outside.beam.copy()
-        plan.within(margin_part)[:] = 0
-        from_image = synthetic_image(displacement, image_part, threads=options.threads)
-        from_margin = synthetic_image(displacement, margin_part, threads=options.threads)
+        from_image, from_margin = (
+            synthetic_image(displacement, part, threads=options.threads)
+            for part in plan.outside.parts(prepared.source)
+        )
         reprojection = plan.within(from_image + from_margin)
         left, entered = crossings(from_image, from_margin, plan.outside)
     report("read-out", 2, 2)

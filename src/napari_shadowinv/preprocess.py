@@ -123,22 +123,26 @@ def prepare(
         beam = checked_source(source, usable)
     ratio = float(values.sum() / beam.sum())
     conserved = flux_scale is None and options.flux != "known"
-    scale = ratio if conserved else flux_scale or 1.0
-    values = values / scale
+    if flux_scale is None:
+        flux_scale = ratio if conserved else 1.0
+    values = values / flux_scale
     least = options.floor * values.sum() / usable.sum()
     floored = np.maximum(values, least)
     floored_source = masked_source(beam, usable, options)
+    if conserved:
+        # The floor has added to both, not alike.
+        floored *= floored_source.sum() / floored.sum()
     below = int((values[usable] < least).sum())
     return Prepared(
         image=values,
         source=beam,
-        floored_image=floored * (floored_source.sum() / floored.sum() if conserved else 1.0),
+        floored_image=floored,
         floored_source=floored_source,
         mask=usable,
         clipped_pixels=negative,
         floored_pixels=below,
-        flux_scale=scale,
-        warnings=_warnings(ratio if scale != 1.0 else 1.0, negative, below, int(usable.sum())),
+        flux_scale=flux_scale,
+        warnings=_warnings(ratio if conserved else 1.0, negative, below, int(usable.sum())),
     )
 
 

@@ -118,9 +118,7 @@ def _damped_step(
     return None
 
 
-def with_full_cells(
-    objective: TransportObjective, weights: Array, *, unchanged_first: bool = False
-) -> Array:
+def with_full_cells(objective: TransportObjective, weights: Array) -> Array:
     """Find weights near the given ones for which every cell holds some flux.
 
     Hidden sites are lowered to where they just show; then a little of the zero weights,
@@ -132,15 +130,13 @@ def with_full_cells(
         The problem.
     weights : ndarray, shape (n,)
         Any weights, px².
-    unchanged_first : bool
-        Whether nothing is mixed in where the cells are full without.
 
     Returns
     -------
     ndarray, shape (n,)
     """
     shown = objective.triangulation.lower_hidden(weights)
-    for share in (1.0,) * unchanged_first + _SHARES_OF_START:
+    for share in _SHARES_OF_START:
         diagram = objective.diagram_if_full(share * shown)
         if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
             return share * shown

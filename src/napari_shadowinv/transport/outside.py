@@ -10,12 +10,14 @@ potential runs on smoothly across the edge.
 
 - the beam beyond the edge: `Outside`
 - the transport with a free boundary: `OpenObjective`
-- what has left through each side, and what has entered: `crossings`
+- what crosses each side of the image: `crossings`
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +31,11 @@ from napari_shadowinv.transport.linear import solve_laplacian
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import Level
 
-__all__ = ["SIDES", "OpenObjective", "Outside", "crossings"]
+__all__ = ["OpenObjective", "Outside", "crossings"]
 
 Array = NDArray[np.float64]
 
-SIDES = ("top", "bottom", "left", "right")
+_SIDES = ("top", "bottom", "left", "right")
 
 
 @dataclass(frozen=True)
@@ -71,14 +73,45 @@ class Outside:
             return_indices=True,
         )
         beam = np.pad(source, margin)[rows, columns]
-        inside = cls(beam, margin)
-        inside.within(beam)[:] = source
-        return inside
+        outside = cls(beam, margin)
+        outside.within(beam)[:] = source
+        return outside
 
     def within(self, values: Array) -> Array:
         """Return the part of an array that belongs to the image; its last axes are y and x."""
         m = self.margin
         return values[..., m:-m, m:-m]
+
+    def parts(self, source: Array) -> tuple[Array, Array]:
+        """Return a source of the image, and the beam of the margin, each alone in the whole."""
+        image_part = np.zeros_like(self.beam)
+        self.within(image_part)[:] = source
+        return image_part, np.where(self.beyond, self.beam, 0)
+
+    @cached_property
+    def beyond(self) -> NDArray[np.bool_]:
+        """Where the margin is, shape (H + 2 m, W + 2 m)."""
+        margin = np.ones(self.beam.shape, bool)
+        self.within(margin)[:] = False
+        return margin
+
+    def edge_distance(self, points: NDArray[Any]) -> Array:
+        """How far inside each side of the image points lie, px.
+
+        Parameters
+        ----------
+        points : ndarray, shape (..., 2)
+            Positions (y, x), counted from the margin's corner.
+
+        Returns
+        -------
+        ndarray, shape (..., 4)
+            From top, bottom, left and right; negative beyond.
+        """
+        first = self.margin - 0.5
+        last = np.array(self.beam.shape) - 1 - first
+        both = np.stack([points - first, last - points], axis=-1)
+        return both.reshape(*points.shape[:-1], 4)
 
 
 class OpenObjective(TransportObjective):
@@ -109,15 +142,13 @@ class OpenObjective(TransportObjective):
     ) -> None:
         self._pixels = outside.beam.copy()
         outside.within(self._pixels)[:] = image
-        beyond = np.ones(outside.beam.shape, bool)
-        outside.within(beyond)[:] = False
         super().__init__(
             level.triangulation.copy(),
             level.mass,
             Density.from_image(self._pixels),
             threads=threads,
         )
-        self._beyond = np.nonzero(beyond)
+        self._beyond = np.nonzero(outside.beyond)
         self._beam = outside.beam[self._beyond]
         self._site = KDTree(level.sites).query(
             np.stack(self._beyond, axis=1), workers=available_threads(threads)
@@ -172,17 +203,14 @@ def crossings(
         For each of the sides top, bottom, left and right the flux, as a share of the source's
         flux in the image.
     """
-    height, width = outside.beam.shape
-    m = outside.margin
-    y, x = np.indices((height, width))
-    distances = np.stack([y - m + 0.5, height - m - 0.5 - y, x - m + 0.5, width - m - 0.5 - x])
-    nearest = distances.argmin(axis=0)
-    beyond = np.ones((height, width), bool)
-    outside.within(beyond)[:] = False
+    pixels = np.moveaxis(np.indices(outside.beam.shape), 0, -1)
+    nearest = outside.edge_distance(pixels).argmin(axis=-1)
     total = outside.within(outside.beam).sum()
 
     def by_side(flux: Array) -> dict[str, float]:
         shares = np.bincount(nearest.ravel(), flux.ravel(), minlength=4) / total
-        return dict(zip(SIDES, shares.tolist(), strict=True))
+        return dict(zip(_SIDES, shares.tolist(), strict=True))
 
-    return by_side(np.where(beyond, left_behind, 0)), by_side(np.where(beyond, 0, arrived))
+    return by_side(np.where(outside.beyond, left_behind, 0)), by_side(
+        np.where(outside.beyond, 0, arrived)
+    )

@@ -174,11 +174,7 @@ def fitted_flux(
 
 def _move_at_edge(level: Level, solution: LevelSolution, outside: Outside) -> float:
     """Return the mean square displacement of the sites along the image's edge."""
-    height, width = level.shape
-    y, x = level.sites.T - outside.margin
-    inwards = np.min([y, height - 2 * outside.margin - 1 - y], axis=0)
-    inwards = np.minimum(inwards, np.min([x, width - 2 * outside.margin - 1 - x], axis=0))
-    at_edge = np.abs(inwards + 0.5) < level.spacing
+    at_edge = np.abs(outside.edge_distance(level.sites).min(axis=-1)) < level.spacing
     return float((solution.displacement[at_edge] ** 2).sum(axis=1).mean())
 
 
