@@ -27,6 +27,7 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/npe2 validate --imports napari.yaml
 
 format: $(VENV)/installed-dev
 	$(BIN)/ruff check --fix .
