@@ -25,9 +25,9 @@ Mask = NDArray[np.bool_]
 class SourceCache:
     """The last estimate, for the next run with the same image."""
 
-    _key: tuple[Estimate, bool] | None = None
-    _arrays: tuple[Image, Mask | None] | None = field(default=None, repr=False)
-    _source: Image | None = field(default=None, repr=False)
+    _kept: tuple[tuple[Estimate, bool], Image, Mask | None, Image] | None = field(
+        default=None, repr=False
+    )
 
     def source(
         self, estimate: Estimate, image: Image, mask: Mask | None, most_pixels: int | None
@@ -50,15 +50,16 @@ class SourceCache:
         ndarray, shape (H, W)
         """
         key = (estimate, most_pixels is not None)
-        if self._source is not None and self._arrays is not None and key == self._key:
-            last_image, last_mask = self._arrays
-            if same_array(image, last_image) and same_array(mask, last_mask):
-                return self._source
+        if self._kept is not None:
+            last_key, last_image, last_mask, source = self._kept
+            same = same_array(image, last_image) and same_array(mask, last_mask)
+            if key == last_key and same:
+                return source
         if most_pixels is None:
             source = estimate.source(image, mask)
         else:
             source = quick_source(estimate, image, mask, most_pixels)
-        self._key, self._arrays, self._source = key, (image, mask), source
+        self._kept = key, image, mask, source
         return source
 
 

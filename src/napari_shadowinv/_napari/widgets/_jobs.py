@@ -47,9 +47,9 @@ class PlanCache:
     """
 
     hits: int = 0
-    _key: tuple[Any, ...] = ()
-    _arrays: tuple[Image, Mask | None] | None = None
-    _plan: SitePlan | None = field(default=None, repr=False)
+    _kept: tuple[tuple[Any, ...], Image, Mask | None, SitePlan] | None = field(
+        default=None, repr=False
+    )
 
     def plan(
         self,
@@ -69,25 +69,22 @@ class PlanCache:
             options.seed,
             None if mask is None else options.floor,
         )
-        if self._plan is not None and key == self._key and self._same(source, mask):
-            self.hits += 1
-            return self._plan
-        self._plan = plan_sites(
+        if self._kept is not None:
+            last_key, last_source, last_mask, plan = self._kept
+            if key == last_key and _alike(source, last_source) and same_array(mask, last_mask):
+                self.hits += 1
+                return plan
+        plan = plan_sites(
             source, options, mask=mask, on_progress=on_progress, should_stop=should_stop
         )
-        self._key, self._arrays = key, (source, mask)
-        return self._plan
+        # At once: a run that was cancelled may still be about to do the same.
+        self._kept = key, source, mask, plan
+        return plan
 
-    def _same(self, source: Image, mask: Mask | None) -> bool:
-        if self._arrays is None:
-            return False
-        last_source, last_mask = self._arrays
-        # A filter keeps the mean of a uniform source to rounding only.
-        return (
-            source.shape == last_source.shape
-            and np.allclose(source, last_source, rtol=1e-9, atol=0)
-            and same_array(mask, last_mask)
-        )
+
+def _alike(one: Image, other: Image) -> bool:
+    # A filter keeps the mean of a uniform source to rounding only.
+    return one.shape == other.shape and np.allclose(one, other, rtol=1e-9, atol=0)
 
 
 @dataclass(frozen=True, eq=False)

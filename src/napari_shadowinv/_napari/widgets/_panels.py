@@ -78,12 +78,14 @@ class RunPanel(QWidget):
         The name of the work, for the activity dock.
     run_text, run_tip : str
         What the button says, and its tooltip.
+    **keywords
+        More of `Runner`.
     """
 
-    def __init__(self, what: str, run_text: str, run_tip: str) -> None:
+    def __init__(self, what: str, run_text: str, run_tip: str, **keywords: float) -> None:
         super().__init__()
         self._what, self._run_text = what, run_text
-        self.runner = Runner(self)
+        self.runner = Runner(self, **keywords)
         self.button = QPushButton(run_text)
         self.button.setToolTip(run_tip)
         self.bar = QProgressBar()

@@ -9,8 +9,10 @@ nothing, and it is the same with every Qt binding.
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -28,6 +30,7 @@ Work = Callable[[OnProgress, ShouldStop], Any]
 
 _LOOK_EVERY = 10  # ms
 _SHORT_TURN = 1e-3  # s
+_PATIENCE = 0.5  # s
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class Outcome:
 class _LetterBox:
     """What a thread and the window tell each other."""
 
+    tag: Any = None
+    give_up_at: float = math.inf
     stop: threading.Event = field(default_factory=threading.Event)
     progress: Progress | None = None
     outcome: Outcome | None = None
@@ -80,6 +85,14 @@ class _Stopper:
 class Runner(QObject):
     """Runs one piece of work at a time in a thread of its own.
 
+    Parameters
+    ----------
+    parent : QObject
+        What it lives as long as.
+    patience : float
+        Seconds that cancelled work has to stop. After that it counts as cancelled, nobody
+        listens to it any more, and its thread ends where it next asks whether to stop.
+
     Signals
     -------
     started
@@ -94,8 +107,9 @@ class Runner(QObject):
     progressed = Signal(object)
     ended = Signal(object)
 
-    def __init__(self, parent: QObject) -> None:
+    def __init__(self, parent: QObject, patience: float = _PATIENCE) -> None:
         super().__init__(parent)
+        self._patience = patience
         self._box: _LetterBox | None = None
         self._pending: tuple[Work, Any] | None = None
         self._stopper = _Stopper()
@@ -131,17 +145,19 @@ class Runner(QObject):
             self._pending = (work, tag)
             self._box.stop.set()
             return
-        box = self._box = _LetterBox()
+        box = self._box = _LetterBox(tag)
         self._stopper.box = box
-        threading.Thread(target=_run, args=(work, tag, box), name="shadowinv", daemon=False).start()
+        threading.Thread(target=_run, args=(work, box), name="shadowinv", daemon=False).start()
         self._timer.start()
         self.started.emit()
 
     def cancel(self) -> None:
         """Ask the work to stop, and forget what waits."""
         self._pending = None
-        if self._box is not None:
-            self._box.stop.set()
+        box = self._box
+        if box is not None:
+            box.stop.set()
+            box.give_up_at = min(box.give_up_at, time.monotonic() + self._patience)
 
     def _look(self) -> None:
         box = self._box
@@ -153,7 +169,9 @@ class Runner(QObject):
             if not box.stop.is_set():
                 self.progressed.emit(news)
         if outcome is None:
-            return
+            if time.monotonic() < box.give_up_at:
+                return
+            outcome = Outcome(cancelled=True, tag=box.tag)
         self._timer.stop()
         self._box = self._stopper.box = None
         pending, self._pending = self._pending, None
@@ -191,15 +209,15 @@ class _Courtesy:
 _courtesy = _Courtesy()
 
 
-def _run(work: Work, tag: Any, box: _LetterBox) -> None:
+def _run(work: Work, box: _LetterBox) -> None:
     def on_progress(progress: Progress) -> None:
         box.progress = progress
 
     try:
         with _courtesy:
-            outcome = Outcome(work(on_progress, box.stop.is_set), tag=tag)
+            outcome = Outcome(work(on_progress, box.stop.is_set), tag=box.tag)
     except InversionCancelled:
-        outcome = Outcome(cancelled=True, tag=tag)
+        outcome = Outcome(cancelled=True, tag=box.tag)
     except Exception as error:
-        outcome = Outcome(error=error, tag=tag)
+        outcome = Outcome(error=error, tag=box.tag)
     box.outcome = outcome

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,7 +50,10 @@ class InvertStack(ToolPanel):
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__(viewer, "invert-stack")
         self.panel = RunPanel(
-            "Invert stack", "Run", "Invert every shot that is not done yet, into the store."
+            "Invert stack",
+            "Run",
+            "Invert every shot that is not done yet, into the store.",
+            patience=math.inf,  # until it has left the store
         )
         self.results = ResultLayers(viewer, self)
         self._shown: StackRequest | None = None
