@@ -57,13 +57,13 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     let_go = threading.Event()
     run = _runner._run
 
-    def waiting(work: Any, tag: Any, box: Any) -> None:
+    def waiting(work: Any, box: Any) -> None:
         def work_slowly(on_progress: Any, should_stop: Any) -> Any:
             while not let_go.is_set() and not should_stop():
                 time.sleep(0.01)
             return work(on_progress, should_stop)
 
-        run(work_slowly, tag, box)
+        run(work_slowly, box)
 
     monkeypatch.setattr(_runner, "_run", waiting)
     return let_go
