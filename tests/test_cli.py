@@ -21,7 +21,7 @@ from typer.testing import CliRunner, Result
 from napari_shadowinv import filters, sources
 from napari_shadowinv.cli import app
 from napari_shadowinv.cli._inputs import Experiment, experiment_from
-from napari_shadowinv.cli._preparing import Preparation
+from napari_shadowinv.cli._preparation import Preparation
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.io import inversion_from_dataset, read, setup_from_dataset

@@ -11,6 +11,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 if TYPE_CHECKING:
     from napari_shadowinv.cli._inputs import Experiment
     from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.physics.setup import Setup
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -45,6 +46,14 @@ def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
 
 def _is_same(first: Path, second: Path) -> bool:
     return first.resolve() == second.resolve()
+
+
+def check_setup(result: Path, setup: Setup | None) -> None:
+    """Refuse a setup that the result's format cannot keep."""
+    from napari_shadowinv.io.pradformat import check_pradformat_setup
+
+    if result.suffix.lower() in (".h5", ".hdf5"):
+        check_pradformat_setup(setup)
 
 
 def make_folder(path: Path) -> None:
