@@ -475,7 +475,9 @@ def write_result(path: Path, dataset: xarray.Dataset) -> None:
         packed = {"zlib": True, "shuffle": True, "complevel": 4} if variable.size > 64 else {}
         if numeric:
             encoding[str(name)] = {**packed, "_FillValue": None}
-    dataset.to_netcdf(path, engine="h5netcdf", encoding=encoding)
+    # A field that was read from a file of another format still says so.
+    marked = dataset.assign_attrs(format=FORMAT)
+    marked.to_netcdf(path, engine="h5netcdf", encoding=encoding)
 
 
 def read_result(path: Path) -> xarray.Dataset:

@@ -2,7 +2,7 @@
 
 - tell the kind of a file from its first bytes: `kind_of`
 - its fingerprint: `sha256`
-- refuse an output before hours of work: `check_output`
+- refuse an output before hours of work: `check_output`, `check_folder_of`
 - write all of a file or nothing: `replacing`
 """
 
@@ -20,6 +20,7 @@ from napari_shadowinv.errors import FileFormatError
 
 __all__ = [
     "READABLE",
+    "check_folder_of",
     "check_output",
     "kind_of",
     "replacing",
@@ -201,6 +202,23 @@ def check_output(
             f"{path} exists: choose another name or allow overwriting (overwrite=True, or "
             "--overwrite on the command line)"
         )
+    check_folder_of(path)
+    return path
+
+
+def check_folder_of(path: Path) -> None:
+    """Refuse a path that has no folder to lie in, or one that nothing can be written to.
+
+    Parameters
+    ----------
+    path : Path
+        The file or folder to be made later.
+
+    Raises
+    ------
+    FileFormatError
+        If its folder is missing or read-only.
+    """
     if not path.parent.is_dir():
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} does not exist; create it first"
@@ -209,7 +227,6 @@ def check_output(
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} is read-only; choose another"
         )
-    return path
 
 
 @contextmanager
