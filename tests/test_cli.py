@@ -23,8 +23,8 @@ from napari_shadowinv.cli import app
 from napari_shadowinv.cli._inputs import Experiment, experiment_from
 from napari_shadowinv.cli._preparation import Preparation
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import invert
-from napari_shadowinv.io import inversion_from_dataset, read, setup_from_dataset
+from napari_shadowinv.inversion import Inversion, invert
+from napari_shadowinv.io import inversion_from_dataset, read, setup_from_dataset, write
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -708,6 +708,18 @@ def test_info_of_a_result_tells_options_and_peak(folder: Path, shot: Path) -> No
     for words in ("32 × 24 px", "seed = 12", "14.7 MeV proton", "shot.npy", "converged"):
         assert words in text
     assert f"peak |d| {peak:.3g} px" in text
+
+
+def test_info_tells_a_field_of_another_program(folder: Path, inversion: Inversion) -> None:
+    setup = ProtonSetup(
+        energy=14.7, source_object_distance=0.01, object_image_distance=0.3, pixel_size=1e-5
+    )
+    write("field.h5", inversion, setup=setup)
+    write("kept.shadowinv", read("field.h5"))
+    for name, kind in (("field.h5", "pradformat inversion"), ("kept.shadowinv", "another program")):
+        text = " ".join(shadowinv("info", name).stdout.split())
+        assert kind in text
+        assert "14.7 MeV proton" in text
 
 
 def test_demo_finds_the_field_that_it_made(folder: Path) -> None:
