@@ -303,7 +303,8 @@ def test_files_that_are_no_image_are_refused(
     refused("invert", "notes.tif", names=("notes.tif", "text file"))
     (folder / "cut.npy").write_bytes(shot.read_bytes()[:-100])
     refused("invert", "cut.npy", names=("cut.npy", "cut short"))
-    refused("invert", folder, names="is a folder")
+    for place in (folder, "", "."):
+        refused("invert", place, names="is a folder")
     refused("info", "missing.tif", names="missing.tif")
     refused("forward", "missing.tif", names="missing.tif")
 
@@ -330,9 +331,12 @@ def test_impossible_images_and_sources_are_refused(
     refused("invert", shot, "--source", "small.npy", names=("(20, 20)", "(24, 32)"))
     refused("invert", shot, "--bin", 0, names="by 0")
     refused("invert", shot, "--bin", 20, names="by 20")
+    np.save("pixel.npy", np.ones((1, 1)))
+    refused("invert", "pixel.npy", names=("pixel.npy has 1×1 pixels", "two rows"))
 
 
 def test_impossible_numbers_of_sites_are_refused(shot: Path, refused: Callable[..., None]) -> None:
+    refused("invert", shot, "--margin", 4, names=("--margin", "needs --boundary free"))
     refused("invert", shot, "--n-sites", 3, names=("n_sites", "3", "at least 4"))
     refused("invert", shot, "--n-sites", 10**12, names=("1,000,000,000,000 sites", "GB"))
 
@@ -738,6 +742,8 @@ def test_demo_finds_the_field_that_it_made(folder: Path) -> None:
 
 def test_demo_refuses_nonsense(folder: Path, refused: Callable[..., None]) -> None:
     refused("demo", "--noise", -1, names="noise is -1")
+    refused("demo", "--dm", "nan", names=("dm is nan", "MG·µm"))
+    assert not (folder / "demo").exists()
     refused("demo", "--n-sites", 2, names="n_sites")
     (folder / "demo").write_text("a file")
     refused("demo", names=("demo", "cannot be made a folder"))
@@ -792,6 +798,32 @@ def test_ctrl_c_while_computing_leaves_nothing(folder: Path) -> None:
     code, errors = interrupted(folder, say_when, ["invert", "shot.npy", "--n-sites", "30000"])
     assert (code, errors.strip()) == (130, "Cancelled")
     assert content(folder) == before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
+def test_ctrl_c_that_a_library_makes_another_error_of(folder: Path, shot: Path) -> None:
+    half_imported = """
+        import time
+        from napari_shadowinv import io
+
+        class HalfMade:
+            def __del__(self):
+                raise AttributeError("half made")
+
+        kept = HalfMade()
+
+        def read_radiograph(*arguments, **options):
+            try:
+                print("now")
+                time.sleep(60)
+            except KeyboardInterrupt:
+                raise ImportError("a part of the library failed to import")
+
+        io.read_radiograph = read_radiograph
+    """
+    code, errors = interrupted(folder, half_imported, ["invert", "shot.npy"])
+    assert (code, errors.strip()) == (130, "Cancelled")
+    assert sorted(content(folder)) == ["shot.npy"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")

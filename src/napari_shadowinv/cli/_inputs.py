@@ -48,6 +48,12 @@ def options_from(
     return validated(InversionOptions, chosen, "options" if path is None else str(path))
 
 
+def check_margin(margin: int | None, options: InversionOptions) -> None:
+    """Refuse --margin where the boundary is closed: it would do nothing."""
+    if margin is not None and options.boundary != "free":
+        raise InputError("received --margin: it needs --boundary free")
+
+
 def experiment_from(
     image: Path,
     source: Path | None,

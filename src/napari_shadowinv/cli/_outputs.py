@@ -18,6 +18,8 @@ FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:
     """Choose the names of result and figure; the figure never takes the image's name."""
+    if not image.stem:
+        raise InputError(f"{image} is a folder: expected an image; give the name of a file")
     result = Path(f"{image.stem}.shadowinv") if out is None else out
     if report is not None:
         return result, report

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -46,6 +47,7 @@ from napari_shadowinv.cli._guard import alarm_unless_converged, guarded
 from napari_shadowinv.cli._info import described
 from napari_shadowinv.cli._inputs import (
     Experiment,
+    check_margin,
     experiment_from,
     field_from,
     options_from,
@@ -140,6 +142,7 @@ def invert(
     transport = given(n_sites=n_sites, threads=threads, seed=seed)
     edge = given(boundary=boundary, margin=margin, flux=flux)
     chosen = options_from(options, transport | edge, clip_negative, other_tables=(TABLE,))
+    check_margin(margin, chosen)
     filters = given(
         hot_pixels=hot_pixels,
         background_degree=background_degree,
@@ -307,6 +310,8 @@ def demo(
     """
     if not 0 <= noise < float("inf"):
         raise InputError(f"noise is {noise:g}: it must be 0 or more, as a share of the mean")
+    if not math.isfinite(dm):
+        raise InputError(f"dm is {dm:g}: it must be a finite number, in MG·µm")
     chosen = options_from(None, given(n_sites=n_sites), clip_negative=True)
     make_folder(out)
     from napari_shadowinv.io import Radiograph

@@ -356,6 +356,11 @@ class StackStore:
         import zarr
 
         self.path = path
+        if not path.exists():
+            raise FileFormatError(
+                f"{path} does not exist: expected a stack of shots, name{STORE_SUFFIX}; check the "
+                "path"
+            )
         self.attributes = _attributes(path)
         if self.attributes.get("format") != FORMAT:
             raise FileFormatError(f"{path} is no stack of shots: expected name{STORE_SUFFIX}")
