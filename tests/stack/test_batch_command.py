@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -297,3 +298,76 @@ def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch
     resumed = shadowinv(*command, "--resume", "--scheduler", "threads", "--quiet")
     assert resumed.exit_code == 0
     assert (StackStore(out).statuses() == DONE).all()
+
+
+def interrupted(preparation: str, pause: float, *arguments: str) -> tuple[int, str]:
+    """Run a batch in its own processes; Ctrl-C some time after it has said "now"."""
+    script = textwrap.dedent(preparation) + "\nfrom napari_shadowinv.cli import app\napp()\n"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, "batch", "shots/shot_*.npy", "--out", "n.shadowinv.zarr",
+         "--n-sites", "100", *arguments],
+        env={**os.environ, "PYTHONPATH": str(SOURCES), "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "now\n"
+        time.sleep(pause)
+        os.killpg(process.pid, signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    return process.returncode, told
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
+def test_ctrl_c_while_workers_start_is_told_in_one_sentence(night, folder):
+    starting = """
+        import distributed
+
+        class Cluster(distributed.LocalCluster):
+            def __init__(self, *args, **kwargs):
+                print("now")
+                super().__init__(*args, **kwargs)
+
+        distributed.LocalCluster = Cluster
+    """
+    before = sorted(folder.rglob("*"))
+    # When the workers are about to import what they need.
+    code, told = interrupted(starting, 0.6, "--workers", "1")
+    assert code == 130
+    assert told.splitlines() == [
+        "Cancelled: nothing written. Give the same command with --resume to go on."
+    ]
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
+def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
+    # As Zarr does, which would go on after the interrupt.
+    behind_our_back = """
+        import time
+        from concurrent.futures import ThreadPoolExecutor
+        from pathlib import Path
+        from napari_shadowinv.io import store
+
+        create = store._create_array
+        pool = ThreadPoolExecutor(1)
+
+        def create_slowly(group, name, *arguments):
+            create(group, name, *arguments)
+            if name == "status":
+                print("now")
+                time.sleep(0.3)
+                Path(group.store.root, "late").mkdir(parents=True)
+
+        store._create_array = lambda *arguments: pool.submit(create_slowly, *arguments).result()
+    """
+    before = sorted(folder.rglob("*"))
+    code, told = interrupted(behind_our_back, 0.1, "--scheduler", "threads")
+    assert code == 130
+    assert "Cancelled: nothing written" in told
+    assert sorted(folder.rglob("*")) == before

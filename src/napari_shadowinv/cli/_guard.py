@@ -41,8 +41,6 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
         except BaseException as error:
             if _is_cancelled(error):
                 code, text = EXIT_CANCELLED, "Cancelled"
-                # What was half made complains when Python clears up.
-                sys.unraisablehook = lambda _: None
             elif isinstance(error, OSError | MemoryError) or _is_mistake(error):
                 code, text = EXIT_MISTAKE, str(error) or "There is not enough memory for this"
             else:
@@ -104,6 +102,8 @@ def _noting_interrupts() -> Iterator[None]:
 
     def stop(number: int, frame: object) -> None:
         _ctrl_c.set()
+        # What is half made now complains when Python clears up.
+        sys.unraisablehook = lambda _: None
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, stop)

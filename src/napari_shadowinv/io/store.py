@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.interrupts import interrupts_put_off
 from napari_shadowinv.io.dataset import field_in_si, setup_from_dataset, variable_labels
 from napari_shadowinv.io.files import check_folder_of
 
@@ -181,7 +182,9 @@ def create_store(
     }
     new = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
     try:
-        _write_arrays(new, sizes, arrays, marks)
+        # Zarr writes in a thread of its own, which would go on behind our back.
+        with interrupts_put_off():
+            _write_arrays(new, sizes, arrays, marks)
         if path.exists():
             old = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
             os.replace(path, old)
