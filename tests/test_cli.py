@@ -749,6 +749,14 @@ def test_demo_refuses_nonsense(folder: Path, refused: Callable[..., None]) -> No
     refused("demo", names=("demo", "cannot be made a folder"))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names there are text")
+def test_a_name_that_is_no_text_is_kept_as_its_bytes(folder: Path, shot: Path) -> None:
+    os.rename(shot, b"sh\xf6t.npy")
+    result = shadowinv("invert", os.fsdecode(b"sh\xf6t.npy"), "--out", "a.shadowinv")
+    assert result.exit_code == 0, result.output
+    assert dataset("a.shadowinv").attrs["input_file"] == r"sh\xf6t.npy"
+
+
 def test_our_own_bug_is_not_blamed_on_the_user(shot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*arguments: object, **options: object) -> None:
         raise ValueError("shapes do not broadcast")

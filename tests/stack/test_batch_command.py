@@ -133,6 +133,20 @@ def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
     assert batch("--overwrite").exit_code == 0
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names there are text")
+def test_names_that_are_no_text_are_kept_as_their_bytes(night, folder):
+    os.rename(night.path(0), b"shots/shot_\xf6.npy")
+    Path(os.fsdecode(b"shots/shot_\xfc.npy")).write_bytes(b"no image")
+    assert batch().exit_code == 1
+    names = StackStore(Path("n.shadowinv.zarr")).names
+    assert {r"shot_\xf6.npy", r"shot_\xfc.npy"} <= set(names)
+    result = shadowinv("export", "n.shadowinv.zarr", "--format", "csv", "--out", "n.csv")
+    assert result.exit_code == 0, result.output
+    rows = list(csv.DictReader(Path("n.csv").read_text(encoding="utf-8").splitlines()))
+    (failed,) = [row for row in rows if row["status"] == "failed"]
+    assert failed["name"] == r"shot_\xfc.npy"
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -140,6 +154,7 @@ def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
         (["batch", "shots/*.npy", "--out", "a.zarr"], "ends with .shadowinv.zarr"),
         (["batch", "shots/*.npy", "--out", "a.shadowinv.zarr", "--source", "x.tif"], "not exist"),
         (["status", "shots"], "is no stack of shots"),
+        (["status", "none.shadowinv.zarr"], "none.shadowinv.zarr does not exist"),
         (["export", "shots", "--format", "csv"], "is no stack of shots"),
     ],
 )

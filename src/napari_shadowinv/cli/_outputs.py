@@ -73,10 +73,11 @@ def write_all(
 ) -> None:
     """Write result and figure; should drawing the figure fail, nothing is written."""
     from napari_shadowinv.io import write
+    from napari_shadowinv.io.files import text_of
     from napari_shadowinv.plotting import report_figure, save_figure
 
     shot, setup = experiment.shot, experiment.setup
-    title = "" if shot.path is None else shot.path.name
+    title = "" if shot.path is None else text_of(shot.path.name)
     figure = report_figure(inversion, setup, title=title)
     write(out, inversion, setup=setup, shot=shot, source=experiment.source, overwrite=overwrite)
     save_figure(report, figure, overwrite)

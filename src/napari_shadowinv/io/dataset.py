@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.radiograph import Radiograph
 
 if TYPE_CHECKING:
@@ -386,7 +387,7 @@ def provenance(shot: Radiograph | None, source: Radiograph | None = None) -> dic
         if radiograph is not None and radiograph.metadata.get("preparation"):
             found[f"{role}_preparation"] = json.dumps(radiograph.metadata["preparation"])
         if radiograph is not None and radiograph.path is not None:
-            found[f"{role}_file"] = radiograph.path.name
+            found[f"{role}_file"] = text_of(radiograph.path.name)
             if "sha256" in radiograph.metadata:
                 found[f"{role}_sha256"] = str(radiograph.metadata["sha256"])
     return found

@@ -1,7 +1,7 @@
 """What every file needs, whatever its format.
 
 - tell the kind of a file from its first bytes: `kind_of`
-- its fingerprint: `sha256`
+- its fingerprint: `sha256`; its name as text: `text_of`
 - refuse an output before hours of work: `check_output`, `check_folder_of`
 - write all of a file or nothing: `replacing`
 """
@@ -25,6 +25,7 @@ __all__ = [
     "kind_of",
     "replacing",
     "sha256",
+    "text_of",
 ]
 
 READABLE = (
@@ -161,6 +162,24 @@ def sha256(path: str | Path) -> str:
     """Return the SHA-256 checksum of a file, in hexadecimal."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def text_of(path: str | Path) -> str:
+    """Return a path as text that can be kept in a file.
+
+    Names that are no text in this system's encoding, as an old disk may hold them, show the
+    bytes that are not understood.
+
+    Parameters
+    ----------
+    path : str or Path
+        A path or a name.
+
+    Returns
+    -------
+    str
+    """
+    return os.fsencode(path).decode("utf-8", errors="backslashreplace")
 
 
 def check_output(
