@@ -9,28 +9,24 @@ left out where they are absent.
 from __future__ import annotations
 
 import argparse
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import _drawing as drawing
 import numpy as np
+from _drawing import BLUE, DARK, HERE, ORANGE, FloatArray, save
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image
 
 from napari_shadowinv import filters, invert, read, sources, synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
-HERE = Path(__file__).parent
 SHOT = "Image_20241017221829851.bmp"
 SHAPE = (160, 200)
 COUNTS = 2000.0
-WIDTH = 1500  # of a picture, in px
-BLUE, ORANGE, DARK = "#1f77d0", "#e8711a", "#333333"
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -108,41 +104,12 @@ def page(title: str, widths: list[float], rows: int = 1) -> tuple[Figure, list[A
     return figure, list(axes.ravel())
 
 
-def show(
-    axes: Axes,
-    image: FloatArray,
-    title: str,
-    label: str,
-    limits: tuple[float, float],
-    cmap: str = "gray",
-) -> None:
-    mapped = axes.imshow(image, cmap=cmap, vmin=limits[0], vmax=limits[1])
-    axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
-    axes.set_xlabel("x (px)")
-    axes.set_ylabel("y (px)")
-    bar = axes.figure.colorbar(mapped, cax=axes.inset_axes((1.03, 0, 0.045, 1)), extend="both")
-    bar.set_label(label)
+show = partial(drawing.show, extend="both")
 
 
 def tidy(axes: Axes, title: str, x_label: str, y_label: str) -> None:
-    axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_box_aspect(0.72)
+    drawing.tidy(axes, title, x_label, y_label, aspect=0.72)
     axes.legend(frameon=False, fontsize=9)
-
-
-def save(figure: Figure, name: str, footer: str = "") -> None:
-    if footer:
-        figure.supxlabel(footer, x=0.01, ha="left", fontsize=10.5, color=DARK)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150)
-    picture = Image.open(buffer).convert("RGB")
-    height = round(WIDTH * picture.height / picture.width)
-    picture.resize((WIDTH, height), Image.Resampling.LANCZOS).save(HERE / name, optimize=True)
-    print(f"wrote {HERE / name}")
 
 
 def range_of(image: FloatArray, share: float = 0.5) -> tuple[float, float]:

@@ -7,25 +7,17 @@ Everything is simulated, so that the truth is known.
 
 from __future__ import annotations
 
-import io
-from pathlib import Path
-
 import numpy as np
+from _drawing import DARK, ORANGE, FloatArray, save, show, tidy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from PIL import Image
 
 from napari_shadowinv import Uncertainty, invert, synthetic_image, uncertainty
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
-HERE = Path(__file__).parent
-WIDTH = 1500  # of a picture, in px
-ORANGE, DARK = "#e8711a", "#333333"
 SHAPE = (160, 160)
 COUNTS = 30.0
-
-FloatArray = NDArray[np.float64]
+ASPECT = 0.8  # of a plot
 
 
 def page(title: str, columns: int, rows: int, height: float) -> tuple[Figure, list[Axes]]:
@@ -34,34 +26,6 @@ def page(title: str, columns: int, rows: int, height: float) -> tuple[Figure, li
     figure.get_layout_engine().set(wspace=0.06, hspace=0.06)
     axes = figure.subplots(rows, columns, squeeze=False)
     return figure, list(axes.ravel())
-
-
-def save(figure: Figure, name: str) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150)
-    picture = Image.open(buffer).convert("RGB")
-    height = round(WIDTH * picture.height / picture.width)
-    picture.resize((WIDTH, height), Image.Resampling.LANCZOS).save(HERE / name, optimize=True)
-    print(f"wrote {HERE / name}")
-
-
-def show(
-    axes: Axes, plane: FloatArray, title: str, label: str, limits: tuple[float, float], cmap: str
-) -> None:
-    mapped = axes.imshow(plane, cmap=cmap, vmin=limits[0], vmax=limits[1])
-    axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
-    axes.set_xlabel("x (px)")
-    axes.set_ylabel("y (px)")
-    axes.figure.colorbar(mapped, cax=axes.inset_axes((1.03, 0, 0.045, 1))).set_label(label)
-
-
-def tidy(axes: Axes, title: str, x_label: str, y_label: str) -> None:
-    axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_box_aspect(0.8)
 
 
 def draw_cut(axes: Axes, values: FloatArray, std: FloatArray, truth: FloatArray) -> None:
@@ -98,7 +62,7 @@ def field_picture() -> None:
     axes[1].axhline(row, color=DARK, lw=1, ls="--")
     axes[2].axhline(row, color="white", lw=1, ls="--")
     draw_cut(axes[3], field[row], std[row], truth[1, row])
-    tidy(axes[3], f"Cut at y = {row} px", "x (px)", "Displacement along x (px)")
+    tidy(axes[3], f"Cut at y = {row} px", "x (px)", "Displacement along x (px)", ASPECT)
     show_potential(axes[4], found)
     others = [invert(shot, source=source).displacement - truth for shot in shots]
     draw_calibration(axes[5], np.array(others) / found.displacement_std)
@@ -124,7 +88,7 @@ def draw_calibration(axes: Axes, miss: FloatArray) -> None:
     axes.plot(edges, normal, color=DARK, lw=1.3, ls="--", label="normal distribution")
     axes.legend(frameon=False, fontsize=9, loc="upper right")
     axes.set_ylim(0, 0.56)
-    tidy(axes, f"{held:.0%} within one error bar", "Error / error bar", "Share per unit")
+    tidy(axes, f"{held:.0%} within one error bar", "Error / error bar", "Share per unit", ASPECT)
 
 
 def limits_picture() -> None:
@@ -148,7 +112,7 @@ def limits_picture() -> None:
         found = uncertainty(shot, 20, source=flat)
         values, std = found.inversion.displacement[1, 60], found.displacement_std[1, 60]
         draw_cut(panel, values, std, truth[1, 60])
-        tidy(panel, title, "x (px)", "Displacement along x (px)")
+        tidy(panel, title, "x (px)", "Displacement along x (px)", ASPECT)
         held = np.mean(np.abs(found.inversion.displacement - truth) < found.displacement_std)
         panel.set_xlabel(f"x (px)\ntruth within one error bar: {held:.0%} of all pixels")
     save(figure, "uncertainty-limits.png")

@@ -21,10 +21,10 @@ from typer.testing import CliRunner, Result
 from napari_shadowinv import filters, sources
 from napari_shadowinv.cli import app
 from napari_shadowinv.cli._inputs import Experiment, experiment_from
-from napari_shadowinv.cli._preparing import Preparation
+from napari_shadowinv.cli._preparation import Preparation
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import invert
-from napari_shadowinv.io import inversion_from_dataset, read, setup_from_dataset
+from napari_shadowinv.inversion import Inversion, invert
+from napari_shadowinv.io import inversion_from_dataset, read, setup_from_dataset, write
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -303,7 +303,8 @@ def test_files_that_are_no_image_are_refused(
     refused("invert", "notes.tif", names=("notes.tif", "text file"))
     (folder / "cut.npy").write_bytes(shot.read_bytes()[:-100])
     refused("invert", "cut.npy", names=("cut.npy", "cut short"))
-    refused("invert", folder, names="is a folder")
+    for place in (folder, "", "."):
+        refused("invert", place, names="is a folder")
     refused("info", "missing.tif", names="missing.tif")
     refused("forward", "missing.tif", names="missing.tif")
 
@@ -330,9 +331,12 @@ def test_impossible_images_and_sources_are_refused(
     refused("invert", shot, "--source", "small.npy", names=("(20, 20)", "(24, 32)"))
     refused("invert", shot, "--bin", 0, names="by 0")
     refused("invert", shot, "--bin", 20, names="by 20")
+    np.save("pixel.npy", np.ones((1, 1)))
+    refused("invert", "pixel.npy", names=("pixel.npy has 1×1 pixels", "two rows"))
 
 
 def test_impossible_numbers_of_sites_are_refused(shot: Path, refused: Callable[..., None]) -> None:
+    refused("invert", shot, "--margin", 4, names=("--margin", "needs --boundary free"))
     refused("invert", shot, "--n-sites", 3, names=("n_sites", "3", "at least 4"))
     refused("invert", shot, "--n-sites", 10**12, names=("1,000,000,000,000 sites", "GB"))
 
@@ -710,6 +714,18 @@ def test_info_of_a_result_tells_options_and_peak(folder: Path, shot: Path) -> No
     assert f"peak |d| {peak:.3g} px" in text
 
 
+def test_info_tells_a_field_of_another_program(folder: Path, inversion: Inversion) -> None:
+    setup = ProtonSetup(
+        energy=14.7, source_object_distance=0.01, object_image_distance=0.3, pixel_size=1e-5
+    )
+    write("field.h5", inversion, setup=setup)
+    write("kept.shadowinv", read("field.h5"))
+    for name, kind in (("field.h5", "pradformat inversion"), ("kept.shadowinv", "another program")):
+        text = " ".join(shadowinv("info", name).stdout.split())
+        assert kind in text
+        assert "14.7 MeV proton" in text
+
+
 def test_demo_finds_the_field_that_it_made(folder: Path) -> None:
     result = shadowinv("demo", "--n-sites", 6000, "--noise", 0, "--out", "tour")
     assert result.exit_code == 0, result.output
@@ -726,9 +742,19 @@ def test_demo_finds_the_field_that_it_made(folder: Path) -> None:
 
 def test_demo_refuses_nonsense(folder: Path, refused: Callable[..., None]) -> None:
     refused("demo", "--noise", -1, names="noise is -1")
+    refused("demo", "--dm", "nan", names=("dm is nan", "MG·µm"))
+    assert not (folder / "demo").exists()
     refused("demo", "--n-sites", 2, names="n_sites")
     (folder / "demo").write_text("a file")
     refused("demo", names=("demo", "cannot be made a folder"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names there are text")
+def test_a_name_that_is_no_text_is_kept_as_its_bytes(folder: Path, shot: Path) -> None:
+    os.rename(shot, b"sh\xf6t.npy")
+    result = shadowinv("invert", os.fsdecode(b"sh\xf6t.npy"), "--out", "a.shadowinv")
+    assert result.exit_code == 0, result.output
+    assert dataset("a.shadowinv").attrs["input_file"] == r"sh\xf6t.npy"
 
 
 def test_our_own_bug_is_not_blamed_on_the_user(shot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -780,6 +806,32 @@ def test_ctrl_c_while_computing_leaves_nothing(folder: Path) -> None:
     code, errors = interrupted(folder, say_when, ["invert", "shot.npy", "--n-sites", "30000"])
     assert (code, errors.strip()) == (130, "Cancelled")
     assert content(folder) == before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
+def test_ctrl_c_that_a_library_makes_another_error_of(folder: Path, shot: Path) -> None:
+    half_imported = """
+        import time
+        from napari_shadowinv import io
+
+        class HalfMade:
+            def __del__(self):
+                raise AttributeError("half made")
+
+        kept = HalfMade()
+
+        def read_radiograph(*arguments, **options):
+            try:
+                print("now")
+                time.sleep(60)
+            except KeyboardInterrupt:
+                raise ImportError("a part of the library failed to import")
+
+        io.read_radiograph = read_radiograph
+    """
+    code, errors = interrupted(folder, half_imported, ["invert", "shot.npy"])
+    assert (code, errors.strip()) == (130, "Cancelled")
+    assert sorted(content(folder)) == ["shot.npy"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")

@@ -154,6 +154,20 @@ def test_inversion_comes_back(
     assert setup.object_pixel_size == 1.5e-6
 
 
+def test_a_field_of_another_program_is_kept_as_a_result(
+    tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup
+) -> None:
+    field = read(written(tmp_path / "field.h5", inversion, proton_setup))
+    assert isinstance(field, xr.Dataset)
+    kept = read(write(tmp_path / "field.shadowinv", field))
+    assert isinstance(kept, xr.Dataset)
+    assert set(kept.variables) == set(field.variables)
+    for name in field.variables:
+        np.testing.assert_array_equal(kept[name], field[name])
+    assert setup_from_dataset(kept) == setup_from_dataset(field)
+    assert setup_from_dataset(kept) is not None
+
+
 def test_potential_alone_gives_the_displacement(
     tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup
 ) -> None:

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -132,6 +133,20 @@ def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
     assert batch("--overwrite").exit_code == 0
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names there are text")
+def test_names_that_are_no_text_are_kept_as_their_bytes(night, folder):
+    os.rename(night.path(0), b"shots/shot_\xf6.npy")
+    Path(os.fsdecode(b"shots/shot_\xfc.npy")).write_bytes(b"no image")
+    assert batch().exit_code == 1
+    names = StackStore(Path("n.shadowinv.zarr")).names
+    assert {r"shot_\xf6.npy", r"shot_\xfc.npy"} <= set(names)
+    result = shadowinv("export", "n.shadowinv.zarr", "--format", "csv", "--out", "n.csv")
+    assert result.exit_code == 0, result.output
+    rows = list(csv.DictReader(Path("n.csv").read_text(encoding="utf-8").splitlines()))
+    (failed,) = [row for row in rows if row["status"] == "failed"]
+    assert failed["name"] == r"shot_\xfc.npy"
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -139,6 +154,7 @@ def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
         (["batch", "shots/*.npy", "--out", "a.zarr"], "ends with .shadowinv.zarr"),
         (["batch", "shots/*.npy", "--out", "a.shadowinv.zarr", "--source", "x.tif"], "not exist"),
         (["status", "shots"], "is no stack of shots"),
+        (["status", "none.shadowinv.zarr"], "none.shadowinv.zarr does not exist"),
         (["export", "shots", "--format", "csv"], "is no stack of shots"),
     ],
 )
@@ -297,3 +313,76 @@ def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch
     resumed = shadowinv(*command, "--resume", "--scheduler", "threads", "--quiet")
     assert resumed.exit_code == 0
     assert (StackStore(out).statuses() == DONE).all()
+
+
+def interrupted(preparation: str, pause: float, *arguments: str) -> tuple[int, str]:
+    """Run a batch in its own processes; Ctrl-C some time after it has said "now"."""
+    script = textwrap.dedent(preparation) + "\nfrom napari_shadowinv.cli import app\napp()\n"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, "batch", "shots/shot_*.npy", "--out", "n.shadowinv.zarr",
+         "--n-sites", "100", *arguments],
+        env={**os.environ, "PYTHONPATH": str(SOURCES), "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "now\n"
+        time.sleep(pause)
+        os.killpg(process.pid, signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    return process.returncode, told
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
+def test_ctrl_c_while_workers_start_is_told_in_one_sentence(night, folder):
+    starting = """
+        import distributed
+
+        class Cluster(distributed.LocalCluster):
+            def __init__(self, *args, **kwargs):
+                print("now")
+                super().__init__(*args, **kwargs)
+
+        distributed.LocalCluster = Cluster
+    """
+    before = sorted(folder.rglob("*"))
+    # When the workers are about to import what they need.
+    code, told = interrupted(starting, 0.6, "--workers", "1")
+    assert code == 130
+    assert told.splitlines() == [
+        "Cancelled: nothing written. Give the same command with --resume to go on."
+    ]
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
+def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
+    # As Zarr does, which would go on after the interrupt.
+    behind_our_back = """
+        import time
+        from concurrent.futures import ThreadPoolExecutor
+        from pathlib import Path
+        from napari_shadowinv.io import store
+
+        create = store._create_array
+        pool = ThreadPoolExecutor(1)
+
+        def create_slowly(group, name, *arguments):
+            create(group, name, *arguments)
+            if name == "status":
+                print("now")
+                time.sleep(0.3)
+                Path(group.store.root, "late").mkdir(parents=True)
+
+        store._create_array = lambda *arguments: pool.submit(create_slowly, *arguments).result()
+    """
+    before = sorted(folder.rglob("*"))
+    code, told = interrupted(behind_our_back, 0.1, "--scheduler", "threads")
+    assert code == 130
+    assert "Cancelled: nothing written" in told
+    assert sorted(folder.rglob("*")) == before

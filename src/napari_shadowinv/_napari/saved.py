@@ -104,13 +104,13 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray
     """
     import xarray as xr
 
-    from napari_shadowinv.io.dataset import FORMAT, dataset_from_inversion
+    from napari_shadowinv.io.dataset import dataset_from_inversion
 
     content = result.content
     looks = {role_of(layer[1]): _look(layer) for layer in layers}
     kept = {_LOOKS: json.dumps(looks)}
     if isinstance(content, xr.Dataset):
-        return content.assign_attrs({"format": FORMAT, **kept})
+        return content.assign_attrs(kept)
     return dataset_from_inversion(
         _with_painted_caustics(content, layers),
         result.setup,

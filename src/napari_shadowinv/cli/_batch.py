@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interruptible
+from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interrupted
 from napari_shadowinv.cli._inputs import setup_from
 from napari_shadowinv.cli._tables import Rows, say, two_columns
 from napari_shadowinv.errors import InputError, InversionCancelled
@@ -98,7 +98,7 @@ def run_batch(
     geometry = None if setup is None else binned_setup(setup_from(setup), factor)
     reader = functools.partial(read_shot, channel=channel, factor=factor)
     try:
-        with interruptible() as should_stop, _display(ledger, quiet) as show:
+        with _display(ledger, quiet) as show:
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
@@ -114,7 +114,7 @@ def run_batch(
                 overwrite=overwrite,
                 redo_failed=redo_failed,
                 on_progress=show,
-                should_stop=should_stop,
+                should_stop=interrupted,
             )
     except (KeyboardInterrupt, InversionCancelled):
         _tell_how_to_resume(out, ledger)

@@ -154,7 +154,7 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
     statuses, reports = content.statuses(), content.reports()
     with (
         replacing(out, overwrite) as temporary,
-        temporary.open("w", newline="", encoding="utf-8") as f,
+        temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as f,
     ):
         rows = csv.writer(f)
         rows.writerow([*_TABLE, *headings])

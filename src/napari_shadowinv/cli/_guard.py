@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,29 +25,40 @@ EXIT_CANCELLED = 130
 P = ParamSpec("P")
 
 
+_ctrl_c = threading.Event()
+
+
 def guarded(command: Callable[P, None]) -> Callable[P, None]:
     """Turn a user's mistake into one sentence, and Ctrl-C into a word."""
 
     @functools.wraps(command)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
-            command(*args, **kwargs)
-        except (KeyboardInterrupt, InversionCancelled):
-            _say_on_stderr("Cancelled")
-            raise typer.Exit(EXIT_CANCELLED) from None
-        except (OSError, MemoryError) as error:
-            _say_on_stderr(str(error) or "There is not enough memory for this")
-            raise typer.Exit(EXIT_MISTAKE) from None
-        except ValueError as error:
-            if not _is_mistake(error):
+            with _noting_interrupts():
+                command(*args, **kwargs)
+        except typer.Exit:
+            raise
+        except BaseException as error:
+            if _is_cancelled(error):
+                code, text = EXIT_CANCELLED, "Cancelled"
+            elif isinstance(error, OSError | MemoryError) or _is_mistake(error):
+                code, text = EXIT_MISTAKE, str(error) or "There is not enough memory for this"
+            else:
                 raise
-            _say_on_stderr(str(error))
-            raise typer.Exit(EXIT_MISTAKE) from None
+            _say_on_stderr(text)
+            raise typer.Exit(code) from None
 
     return run
 
 
-def _is_mistake(error: ValueError) -> bool:
+def _is_cancelled(error: BaseException) -> bool:
+    """Tell Ctrl-C from a failure; some libraries make another error of it."""
+    if isinstance(error, KeyboardInterrupt | InversionCancelled):
+        return True
+    return isinstance(error, Exception) and interrupted()
+
+
+def _is_mistake(error: BaseException) -> bool:
     """Tell a user's mistake from one of ours, which deserves its traceback."""
     from pydantic import ValidationError
 
@@ -71,24 +83,31 @@ def alarm_unless_converged(report: Report, out: Path) -> None:
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
+def interrupted() -> bool:
+    """Whether Ctrl-C was pressed since the command began; for `should_stop`."""
+    return _ctrl_c.is_set()
+
+
 @contextmanager
-def interruptible() -> Iterator[Callable[[], bool]]:
-    """Yield a `should_stop` that Ctrl-C makes true.
+def _noting_interrupts() -> Iterator[None]:
+    """Note Ctrl-C for `interrupted`.
 
     The interrupt is raised as usual, too; should a callback of compiled code swallow it,
     the core still stops at its next step.
     """
-    asked = threading.Event()
+    _ctrl_c.clear()
     if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
+        yield
         return
 
     def stop(number: int, frame: object) -> None:
-        asked.set()
+        _ctrl_c.set()
+        # What is half made now complains when Python clears up.
+        sys.unraisablehook = lambda _: None
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, stop)
     try:
-        yield asked.is_set
+        yield
     finally:
         signal.signal(signal.SIGINT, before)

@@ -132,7 +132,9 @@ def _result_rows(dataset: xarray.Dataset) -> Rows:
     displacement = dataset["displacement"].values
     experiment = [("image", size_text(displacement[0])), ("setup", setup_text(setup))]
     if "options" not in dataset.attrs:
-        return [("kind", "pradformat inversion"), *experiment, *peak_rows(displacement, setup)]
+        is_foreign = dataset.attrs.get("format") == "pradformat"
+        kind = "pradformat inversion" if is_foreign else "field that another program retrieved"
+        return [("kind", kind), *experiment, *peak_rows(displacement, setup)]
     inversion = inversion_from_dataset(dataset)
     return [
         ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),

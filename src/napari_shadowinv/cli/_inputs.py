@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from napari_shadowinv.cli._preparing import Preparation
+    from napari_shadowinv.cli._preparation import Preparation
     from napari_shadowinv.io import Radiograph
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.physics.setup import Setup
@@ -42,10 +42,16 @@ def options_from(
 
     content = {} if path is None else read_toml(path)
     chosen = {name: value for name, value in content.items() if name not in other_tables}
-    chosen |= {name: value for name, value in flags.items() if value is not None}
+    chosen |= flags
     if clip_negative:
         chosen["negative"] = "clip"
     return validated(InversionOptions, chosen, "options" if path is None else str(path))
+
+
+def check_margin(margin: int | None, options: InversionOptions) -> None:
+    """Refuse --margin where the boundary is closed: it would do nothing."""
+    if margin is not None and options.boundary != "free":
+        raise InputError("received --margin: it needs --boundary free")
 
 
 def experiment_from(
@@ -73,22 +79,26 @@ def experiment_from(
         geometry = _setup(entries, shot.metadata.get("geometry", {}), str(setup))
     if geometry is not None:
         geometry = binned_setup(geometry, factor)
-    beam = None
-    if source is not None:
-        beam = read_radiograph(source, channel=channel, variable=source_variable)
-    elif source_variable is not None:
-        beam = read_radiograph(image, channel=channel, variable=source_variable)
-    elif shot.source is not None and (preparation is None or preparation.source_from is None):
-        # Some files hold the image with and without the object.
-        if preparation is not None and preparation.flattens:
-            raise InputError(
-                f"{image} holds its own source, and the image is to be flattened: leave the filter "
-                "out, or put --source-from uniform in place of that source"
-            )
-        beam = replace(shot, image=shot.source, source=None, mask=None)
+    beam: Radiograph | None
+    if source is not None or source_variable is not None:
+        beam = read_radiograph(source or image, channel=channel, variable=source_variable)
+    else:
+        beam = _own_source(image, shot, preparation)
     bare = None if source_mask is None else _picture_mask(source_mask, shot, "source mask")
     shot, beam = _prepared(shot, beam, factor, preparation, bare)
     return Experiment(shot, beam, geometry)
+
+
+def _own_source(path: Path, shot: Radiograph, preparation: Preparation | None) -> Radiograph | None:
+    """Source from the shot's own file: some hold the image with and without the object."""
+    if shot.source is None or (preparation is not None and preparation.source_from is not None):
+        return None
+    if preparation is not None and preparation.flattens:
+        raise InputError(
+            f"{path} holds its own source, and the image is to be flattened: leave the filter "
+            "out, or put --source-from uniform in place of that source"
+        )
+    return replace(shot, image=shot.source, source=None, mask=None)
 
 
 def _prepared(

@@ -11,12 +11,15 @@ from napari_shadowinv.errors import FileFormatError, InputError
 if TYPE_CHECKING:
     from napari_shadowinv.cli._inputs import Experiment
     from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.physics.setup import Setup
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:
     """Choose the names of result and figure; the figure never takes the image's name."""
+    if not image.stem:
+        raise InputError(f"{image} is a folder: expected an image; give the name of a file")
     result = Path(f"{image.stem}.shadowinv") if out is None else out
     if report is not None:
         return result, report
@@ -47,6 +50,14 @@ def _is_same(first: Path, second: Path) -> bool:
     return first.resolve() == second.resolve()
 
 
+def check_setup(result: Path, setup: Setup | None) -> None:
+    """Refuse a setup that the result's format cannot keep."""
+    from napari_shadowinv.io.pradformat import check_pradformat_setup
+
+    if result.suffix.lower() in (".h5", ".hdf5"):
+        check_pradformat_setup(setup)
+
+
 def make_folder(path: Path) -> None:
     """Make a folder, with those above it, unless it is there."""
     try:
@@ -62,10 +73,11 @@ def write_all(
 ) -> None:
     """Write result and figure; should drawing the figure fail, nothing is written."""
     from napari_shadowinv.io import write
+    from napari_shadowinv.io.files import text_of
     from napari_shadowinv.plotting import report_figure, save_figure
 
     shot, setup = experiment.shot, experiment.setup
-    title = "" if shot.path is None else shot.path.name
+    title = "" if shot.path is None else text_of(shot.path.name)
     figure = report_figure(inversion, setup, title=title)
     write(out, inversion, setup=setup, shot=shot, source=experiment.source, overwrite=overwrite)
     save_figure(report, figure, overwrite)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
-from napari_shadowinv.cli._guard import interruptible
+from napari_shadowinv.cli._guard import interrupted
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def inverted(experiment: Experiment, options: InversionOptions, quiet: bool = Fa
     from napari_shadowinv.inversion import invert
 
     shot, source = experiment.shot, experiment.source
-    with interruptible() as should_stop, nullcontext() if quiet else progress_bars() as show:
+    with nullcontext() if quiet else progress_bars() as show:
         try:
             return invert(
                 shot.image,
@@ -31,7 +31,7 @@ def inverted(experiment: Experiment, options: InversionOptions, quiet: bool = Fa
                 mask=shot.mask,
                 options=options,
                 on_progress=show,
-                should_stop=should_stop,
+                should_stop=interrupted,
             )
         except InputError as error:
             raise InputError(f"{shot.path}: {error}" if shot.path else str(error)) from error

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.radiograph import Radiograph
 
 if TYPE_CHECKING:
@@ -386,7 +387,7 @@ def provenance(shot: Radiograph | None, source: Radiograph | None = None) -> dic
         if radiograph is not None and radiograph.metadata.get("preparation"):
             found[f"{role}_preparation"] = json.dumps(radiograph.metadata["preparation"])
         if radiograph is not None and radiograph.path is not None:
-            found[f"{role}_file"] = radiograph.path.name
+            found[f"{role}_file"] = text_of(radiograph.path.name)
             if "sha256" in radiograph.metadata:
                 found[f"{role}_sha256"] = str(radiograph.metadata["sha256"])
     return found
@@ -475,7 +476,9 @@ def write_result(path: Path, dataset: xarray.Dataset) -> None:
         packed = {"zlib": True, "shuffle": True, "complevel": 4} if variable.size > 64 else {}
         if numeric:
             encoding[str(name)] = {**packed, "_FillValue": None}
-    dataset.to_netcdf(path, engine="h5netcdf", encoding=encoding)
+    # A field that was read from a file of another format still says so.
+    marked = dataset.assign_attrs(format=FORMAT)
+    marked.to_netcdf(path, engine="h5netcdf", encoding=encoding)
 
 
 def read_result(path: Path) -> xarray.Dataset:

@@ -1,8 +1,8 @@
 """What every file needs, whatever its format.
 
 - tell the kind of a file from its first bytes: `kind_of`
-- its fingerprint: `sha256`
-- refuse an output before hours of work: `check_output`
+- its fingerprint: `sha256`; its name as text: `text_of`
+- refuse an output before hours of work: `check_output`, `check_folder_of`
 - write all of a file or nothing: `replacing`
 """
 
@@ -20,10 +20,12 @@ from napari_shadowinv.errors import FileFormatError
 
 __all__ = [
     "READABLE",
+    "check_folder_of",
     "check_output",
     "kind_of",
     "replacing",
     "sha256",
+    "text_of",
 ]
 
 READABLE = (
@@ -162,6 +164,24 @@ def sha256(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def text_of(path: str | Path) -> str:
+    """Return a path as text that can be kept in a file.
+
+    Names that are no text in this system's encoding, as an old disk may hold them, show the
+    bytes that are not understood.
+
+    Parameters
+    ----------
+    path : str or Path
+        A path or a name.
+
+    Returns
+    -------
+    str
+    """
+    return os.fsencode(path).decode("utf-8", errors="backslashreplace")
+
+
 def check_output(
     path: str | Path, overwrite: bool = False, *, suffixes: Collection[str] = ()
 ) -> Path:
@@ -201,6 +221,23 @@ def check_output(
             f"{path} exists: choose another name or allow overwriting (overwrite=True, or "
             "--overwrite on the command line)"
         )
+    check_folder_of(path)
+    return path
+
+
+def check_folder_of(path: Path) -> None:
+    """Refuse a path that has no folder to lie in, or one that nothing can be written to.
+
+    Parameters
+    ----------
+    path : Path
+        The file or folder to be made later.
+
+    Raises
+    ------
+    FileFormatError
+        If its folder is missing or read-only.
+    """
     if not path.parent.is_dir():
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} does not exist; create it first"
@@ -209,7 +246,6 @@ def check_output(
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} is read-only; choose another"
         )
-    return path
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 - the array that the user names: `read_hdf5`
 - what there is to choose from: `held_arrays`
+- open it, for a module that knows its layout: `opened_hdf5`
 
 Files of layouts that are known, pradformat and ``.shadowinv``, need no name.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +21,42 @@ from numpy.typing import NDArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.promises import load_dataset
 
-__all__ = ["held_arrays", "read_hdf5"]
+__all__ = ["held_arrays", "opened_hdf5", "read_hdf5"]
 
 # Whoever has more than that to choose from knows what is in the file.
 _MOST_LISTED = 30
+
+
+@contextmanager
+def opened_hdf5(path: Path) -> Iterator[Any]:
+    """Open a file to read; whatever h5py stumbles over in the block is damage to the file.
+
+    Parameters
+    ----------
+    path : Path
+        An HDF5 file.
+
+    Yields
+    ------
+    h5py.File
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged.
+    """
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except FileFormatError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
+        raise FileFormatError(
+            f"{path} begins as HDF5 but is damaged or cut short: expected a complete file; "
+            "copy it again"
+        ) from error
 
 
 def read_hdf5(path: Path, name: str) -> NDArray[Any]:
@@ -49,16 +83,11 @@ def read_hdf5(path: Path, name: str) -> NDArray[Any]:
     """
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            item = file.get(name)
-            if isinstance(item, h5py.Dataset) and _is_numeric(item):
-                return load_dataset(path, item)
-            held = ", ".join(_listed(file)) or "none"
-    except FileFormatError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-        raise _damaged(path) from error
+    with opened_hdf5(path) as file:
+        item = file.get(name)
+        if isinstance(item, h5py.Dataset) and _is_numeric(item):
+            return load_dataset(path, item)
+        held = ", ".join(_listed(file)) or "none"
     raise InputError(f"{path} has no array {name!r}: it holds {held}")
 
 
@@ -81,13 +110,8 @@ def held_arrays(path: Path) -> list[str]:
     FileFormatError
         If the file is damaged.
     """
-    import h5py
-
-    try:
-        with h5py.File(path, "r") as file:
-            return _listed(file)
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-        raise _damaged(path) from error
+    with opened_hdf5(path) as file:
+        return _listed(file)
 
 
 def _listed(file: Any) -> list[str]:
@@ -114,10 +138,3 @@ def _items(file: Any) -> Iterator[tuple[str, Any]]:
 
 def _is_numeric(item: Any) -> bool:
     return bool(np.dtype(item.dtype).kind in "buif" and item.shape)
-
-
-def _damaged(path: Path) -> FileFormatError:
-    return FileFormatError(
-        f"{path} begins as HDF5 but is damaged or cut short: expected a complete file; "
-        "copy it again"
-    )

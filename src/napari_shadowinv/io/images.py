@@ -48,16 +48,8 @@ def read_picture(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
     FileFormatError
         If the file is damaged or holds anything else than one picture.
     """
-    try:
+    with _decoding(f"{path} begins as {kind.upper()} but is", "a complete picture"):
         array, metadata = _reader(kind)(path)
-    except (FileFormatError, InputError, MemoryError):
-        raise
-    except Exception as error:
-        # Decoders raise whatever comes: struct.error, zlib.error, KeyError, SyntaxError …
-        raise FileFormatError(
-            f"{path} begins as {kind.upper()} but is damaged or cut short "
-            f"({_one_line(error)}): expected a complete picture; copy or export it again"
-        ) from error
     _check(path, kind, array)
     return array, metadata
 
@@ -76,6 +68,21 @@ def _reader(kind: str) -> Callable[[Path], tuple[NDArray[Any], dict[str, Any]]]:
         "spe": read_spe,
     }
     return readers.get(kind, _read_eight_bits)
+
+
+@contextmanager
+def _decoding(found: str, expected: str) -> Iterator[None]:
+    """Tell whatever a decoder raises as damage to its file."""
+    try:
+        yield
+    except (FileFormatError, InputError, MemoryError):
+        raise
+    except Exception as error:
+        # Decoders raise whatever comes: struct.error, zlib.error, KeyError, SyntaxError …
+        raise FileFormatError(
+            f"{found} damaged or cut short ({_one_line(error)}): expected {expected}; copy or "
+            "export it again"
+        ) from error
 
 
 def _one_line(error: BaseException) -> str:
@@ -154,14 +161,12 @@ def tiff_pages(path: Path) -> int:
     """
     import tifffile
 
-    try:
-        with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
-            return len(tiff.pages)
-    except Exception as error:
-        raise FileFormatError(
-            f"{path} begins as TIFF but is damaged or cut short ({_one_line(error)}): expected "
-            "complete pages; copy or export it again"
-        ) from error
+    with (
+        _decoding(f"{path} begins as TIFF but is", "complete pages"),
+        _silent("tifffile"),
+        tifffile.TiffFile(path) as tiff,
+    ):
+        return len(tiff.pages)
 
 
 def read_tiff_page(
@@ -190,16 +195,12 @@ def read_tiff_page(
     """
     import tifffile
 
-    try:
-        with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
-            array, _ = _read_page(path, tiff.pages[number].aspage())
-    except (FileFormatError, MemoryError):
-        raise
-    except Exception as error:
-        raise FileFormatError(
-            f"page {number} of {path} is damaged or cut short ({_one_line(error)}): expected a "
-            "complete picture; copy or export it again"
-        ) from error
+    with (
+        _decoding(f"page {number} of {path} is", "a complete picture"),
+        _silent("tifffile"),
+        tifffile.TiffFile(path) as tiff,
+    ):
+        array, _ = _read_page(path, tiff.pages[number].aspage())
     _check(path, "tiff", array)
     return to_grey(array, channel, f"page {number} of {path}")
 

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.dataset import FORMAT, dataset_from_field, displacement_from_potential
-from napari_shadowinv.io.hdf5 import held_arrays
+from napari_shadowinv.io.hdf5 import held_arrays, opened_hdf5
 from napari_shadowinv.io.promises import load_dataset
 
 if TYPE_CHECKING:
@@ -103,17 +103,9 @@ _ATTRIBUTES = (
 
 
 def _root_attributes(path: Path) -> dict[str, Any]:
-    import h5py
-
-    try:
-        with h5py.File(path, "r") as file:
-            known = [name for name in _ATTRIBUTES if name in file.attrs]
-            return {name: _plain(file.attrs[name]) for name in known}
-    except (OSError, RuntimeError, KeyError) as error:
-        raise FileFormatError(
-            f"{path} begins as HDF5 but is damaged or cut short: expected a complete file; "
-            "copy it again"
-        ) from error
+    with opened_hdf5(path) as file:
+        known = [name for name in _ATTRIBUTES if name in file.attrs]
+        return {name: _plain(file.attrs[name]) for name in known}
 
 
 def _plain(value: Any) -> Any:

@@ -66,7 +66,7 @@ class Radiograph:
         Raises
         ------
         InputError
-            If `factor` is less than 1 or leaves less than 2×2 blocks.
+            If `factor` is less than 1 or leaves less than 2×2 blocks, or there are none.
 
         Examples
         --------
@@ -75,6 +75,11 @@ class Radiograph:
                [4., 4., 4.]])
         """
         height, width = self.image.shape
+        if min(height, width) < 2:
+            raise InputError(
+                f"{'image' if self.path is None else self.path} has {height}×{width} pixels: "
+                "expected two rows and two columns at least"
+            )
         if factor < 1 or min(height, width) // factor < 2:
             raise InputError(
                 f"cannot bin {height}×{width} pixels by {factor}: expected a whole number from "

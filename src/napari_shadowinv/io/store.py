@@ -27,7 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.interrupts import interrupts_put_off
 from napari_shadowinv.io.dataset import field_in_si, setup_from_dataset, variable_labels
+from napari_shadowinv.io.files import check_folder_of
 
 if TYPE_CHECKING:
     import xarray
@@ -113,14 +115,7 @@ def check_store_path(path: str | Path) -> Path:
         raise FileFormatError(
             f"{path} cannot be written: expected a name that ends with {STORE_SUFFIX}"
         )
-    if not path.parent.is_dir():
-        raise FileFormatError(
-            f"{path} cannot be written: the folder {path.parent} does not exist; create it first"
-        )
-    if not os.access(path.parent, os.W_OK):
-        raise FileFormatError(
-            f"{path} cannot be written: the folder {path.parent} is read-only; choose another"
-        )
+    check_folder_of(path)
     if path.exists() and not is_stack(path):
         raise FileFormatError(
             f"{path} exists and holds no stack of shots: choose another name, or remove it"
@@ -178,9 +173,18 @@ def create_store(
     """
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
+    arrays = {**coordinates, **variables, **_own_variables(sizes["shot"])}
+    marks = {
+        **attributes,
+        "format": FORMAT,
+        "store_id": secrets.token_hex(8),
+        "coordinates": " ".join(name for name in coordinates if name not in sizes),
+    }
     new = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
     try:
-        _write_template(new, sizes, variables, coordinates, attributes)
+        # Zarr writes in a thread of its own, which would go on behind our back.
+        with interrupts_put_off():
+            _write_arrays(new, sizes, arrays, marks)
         if path.exists():
             old = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
             os.replace(path, old)
@@ -195,26 +199,8 @@ def create_store(
     return StackStore(path)
 
 
-def _write_template(
-    path: Path,
-    sizes: Mapping[str, int],
-    variables: Mapping[str, Variable],
-    coordinates: Mapping[str, Variable],
-    attributes: Mapping[str, str],
-) -> None:
-    import zarr
-
-    extra = [name for name in coordinates if name not in sizes]
-    group = zarr.create_group(
-        path,
-        zarr_format=3,
-        attributes={
-            **attributes,
-            "format": FORMAT,
-            "store_id": secrets.token_hex(8),
-            "coordinates": " ".join(extra),
-        },
-    )
+def _own_variables(shots: int) -> dict[str, Variable]:
+    """What every store holds, whatever was asked for."""
     own = {
         "status": Variable(
             ("shot",),
@@ -230,11 +216,22 @@ def _write_template(
             ("shot",), str, {"units": "1", "long_name": "How it went, or why it failed (JSON)"}
         ),
     }
-    shots = sizes["shot"]
     for name, (kind, labels) in SUMMARY.items():
         nothing: NDArray[Any] = np.full(shots, np.nan if kind is float else 0, dtype=kind)
         own[name] = Variable(("shot",), np.dtype(kind), labels, nothing)
-    for name, variable in {**coordinates, **variables, **own}.items():
+    return own
+
+
+def _write_arrays(
+    path: Path,
+    sizes: Mapping[str, int],
+    arrays: Mapping[str, Variable],
+    attributes: Mapping[str, str],
+) -> None:
+    import zarr
+
+    group = zarr.create_group(path, zarr_format=3, attributes=dict(attributes))
+    for name, variable in arrays.items():
         _create_array(group, name, variable, sizes)
     with warnings.catch_warnings():
         # That other programs may not know it: they read the arrays' own metadata then.
@@ -271,6 +268,12 @@ def _store_error(path: Path, error: OSError) -> StoreError:
     return StoreError(
         f"{path} cannot be written ({error.strerror or error}): make room or see to its folder, "
         "then run again to resume"
+    )
+
+
+def _damaged(path: Path, error: Exception) -> FileFormatError:
+    return FileFormatError(
+        f"{path} is a stack of shots but is damaged ({error}): run it again with overwriting"
     )
 
 
@@ -356,6 +359,11 @@ class StackStore:
         import zarr
 
         self.path = path
+        if not path.exists():
+            raise FileFormatError(
+                f"{path} does not exist: expected a stack of shots, name{STORE_SUFFIX}; check the "
+                "path"
+            )
         self.attributes = _attributes(path)
         if self.attributes.get("format") != FORMAT:
             raise FileFormatError(f"{path} is no stack of shots: expected name{STORE_SUFFIX}")
@@ -364,10 +372,7 @@ class StackStore:
             self.names = tuple(map(str, np.asarray(self._arrays["name"][...]).tolist()))
             self.statuses()
         except Exception as error:
-            raise FileFormatError(
-                f"{path} is a stack of shots but is damaged ({error}): run it again with "
-                "overwriting"
-            ) from error
+            raise _damaged(path, error) from error
 
     @property
     def writer(self) -> ShotWriter:
@@ -442,9 +447,7 @@ def read_stack(path: str | Path) -> xarray.Dataset:
         shown = complete[[name for name in order if name in complete]]
         return shown.assign(status=shown["status"].copy(data=store.statuses()))
     except Exception as error:
-        raise FileFormatError(
-            f"{path} is a stack of shots but is damaged ({error}): run it again with overwriting"
-        ) from error
+        raise _damaged(path, error) from error
 
 
 def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:

@@ -24,7 +24,7 @@ their images. The object is thin: rays go straight through it, whatever their di
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import Literal, TypedDict, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -114,17 +114,20 @@ def project(
     return synthetic_image(moved, source, rays_per_pixel=rays_per_pixel, threads=threads)
 
 
+class _Keywords(TypedDict, total=False):
+    deflector: Deflector | None
+    dispersion: float
+    source: ArrayLike | None
+    shape: tuple[int, int] | None
+    rays_per_pixel: int
+    threads: int | None
+
+
 def project_potential(
     potential: ArrayLike,
     made_with: AnySetup,
     setup: AnySetup,
-    *,
-    deflector: Deflector | None = None,
-    dispersion: float = 1.0,
-    source: ArrayLike | None = None,
-    shape: tuple[int, int] | None = None,
-    rays_per_pixel: int = 16,
-    threads: int | None = None,
+    **keywords: Unpack[_Keywords],
 ) -> FloatArray:
     """Image that a potential in SI units makes, in its own or in another experiment.
 
@@ -148,17 +151,8 @@ def project_potential(
     InputError
         As `project`, and if the potential is no plane.
     """
-    return project(
-        made_with.displacement_from_potential(potential),
-        made_with,
-        setup,
-        deflector=deflector,
-        dispersion=dispersion,
-        source=source,
-        shape=shape,
-        rays_per_pixel=rays_per_pixel,
-        threads=threads,
-    )
+    displacement = made_with.displacement_from_potential(potential)
+    return project(displacement, made_with, setup, **keywords)
 
 
 def transferred_displacement(

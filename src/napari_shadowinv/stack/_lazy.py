@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
+from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT, SUMMARY
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocess import checked_mask, checked_source, number_of_sites
@@ -150,7 +151,7 @@ def describe_stack(
         raise InputError(
             f"got {len(sources)} sources for {len(found)} shots: expected one, or one for each shot"
         )
-    source_file = Path(source).name if isinstance(source, (str, Path)) else ""
+    source_file = text_of(Path(source).name) if isinstance(source, (str, Path)) else ""
     return Stack(found, beam, sources, usable, options, setup, wanted, warm_start, source_file)
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.files import text_of
 
 if TYPE_CHECKING:
     import xarray
@@ -299,7 +300,7 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
         return _from_files([path], reader, shape)
     return _of_files(
         [PageShot(path.absolute(), page, reader) for page in range(pages)],
-        tuple(f"{path.name}[{page}]" for page in range(pages)),
+        tuple(f"{text_of(path.name)}[{page}]" for page in range(pages)),
         shape,
     )
 
@@ -320,9 +321,9 @@ def _page_count(path: Path) -> int:
 def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | None) -> Shots:
     if not paths:
         raise InputError("shots are an empty list: expected one path at least")
-    names = tuple(path.name for path in paths)
+    names = tuple(text_of(path.name) for path in paths)
     if len(set(names)) < len(names):
-        names = tuple(str(path) for path in paths)
+        names = tuple(text_of(path) for path in paths)
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise InputError(f"shots name {twice} twice: expected each file once")

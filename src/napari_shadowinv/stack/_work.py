@@ -161,7 +161,8 @@ def invert_shot(
         If the shot cannot be inverted.
     """
     if np.shape(image) != beam.shape:
-        raise InputError(f"image has shape {np.shape(image)}, expected {beam.shape} as the others")
+        others = "the others" if beam.source is None else "the source"
+        raise InputError(f"image has shape {np.shape(image)}, expected {beam.shape} as {others}")
     began = time.perf_counter()
     plan = shared_plan(beam, options, on_progress=on_progress, should_stop=should_stop)
     on_sites = time.perf_counter() - began

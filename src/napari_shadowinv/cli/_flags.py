@@ -1,0 +1,213 @@
+"""Arguments and options that commands share, each with its name and help.
+
+- what is read: `ImageFile`, `SourceFile`, `MaskFile`, `SetupFile`, `OptionsFile`, `StoreFolder`
+- which part of it: `Channel`, `Variable`, `SourceVariable`, `Bin`, `ChosenShots`
+- the inversion: `SiteCount`, `ClipNegative`, `Threads`, `Seed`, `Boundary`, `Margin`, `Flux`
+- filters before it: `HotPixels`, `BackgroundDegree`, `HighPass`, `LowPass`
+- a source estimated from the image: `SourceFrom`, `SourceDegree`, `SourceWeight`,
+  `SourceWidth`, `SourceMask`
+- what is written: `Result`, `Figure`, `Overwrite`, `Quiet`, `QuietInversion`
+
+`given` tells which of them a user gave.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Argument, Option
+
+_FILTERS = "Filters before the inversion"
+_BOUNDARY = "Flux across the image's edge (docs/boundary.md)"
+_ESTIMATES = "Source estimated from the image (docs/sources.md)"
+
+
+def given(**flags: Any) -> dict[str, Any]:
+    """Flags that the user gave, by name."""
+    return {name: value for name, value in flags.items() if value is not None}
+
+
+ImageFile = Annotated[
+    Path,
+    Argument(
+        help=(
+            "TIFF, PNG, BMP, JPEG, NPY, MATLAB, text, PCO .b16, SPE or HDF5 (pradformat, or with "
+            "--variable)."
+        ),
+        show_default=False,
+    ),
+]
+StoreFolder = Annotated[
+    Path, Argument(help="name.shadowinv.zarr, from shadowinv batch.", show_default=False)
+]
+SourceFile = Annotated[
+    Path | None,
+    Option("--source", help="Image of the undisturbed beam. Default: uniform."),
+]
+MaskFile = Annotated[
+    Path | None,
+    Option("--mask", help="Picture of the image's size, 0 where a pixel is unusable."),
+]
+SetupFile = Annotated[
+    Path | None,
+    Option("--setup", help="TOML file with the experiment's geometry, for SI units."),
+]
+OptionsFile = Annotated[Path | None, Option("--options", help="TOML file with inversion options.")]
+Channel = Annotated[
+    str | None,
+    Option(help="Of a colour image: red, green, blue, mean or a number from 0."),
+]
+Variable = Annotated[
+    str | None,
+    Option(
+        "--variable",
+        metavar="NAME",
+        help="Array to take from a MATLAB file with several images, or from an HDF5 file.",
+    ),
+]
+SourceVariable = Annotated[
+    str | None,
+    Option(
+        metavar="NAME",
+        help="Array with the undisturbed beam, in the file of --source or else of the image.",
+    ),
+]
+Bin = Annotated[int, Option("--bin", help="Sum blocks of so many pixels squared first.")]
+ChosenShots = Annotated[
+    str | None,
+    Option("--shots", help="Which, from 0: 3, 3:20, ::10 or 1,4,9. Default: all done."),
+]
+
+SiteCount = Annotated[int | None, Option(help="Number of sites. Default: as many as pixels.")]
+ClipNegative = Annotated[
+    bool, Option("--clip-negative", help="Set negative pixels to zero and count them.")
+]
+Threads = Annotated[int | None, Option(help="Threads. Default: all cores.")]
+Seed = Annotated[int | None, Option(help="Seed of the random site positions.")]
+Boundary = Annotated[
+    str | None,
+    Option(
+        help="'closed': nothing crosses the edge. 'free': flux may leave and enter.",
+        rich_help_panel=_BOUNDARY,
+    ),
+]
+Margin = Annotated[
+    int | None,
+    Option(
+        metavar="PX",
+        help="Of the free boundary: pixels beyond each edge that flux may come from.",
+        rich_help_panel=_BOUNDARY,
+    ),
+]
+Flux = Annotated[
+    str | None,
+    Option(
+        help=(
+            "Of the free boundary: 'conserve' (units of image and source may differ), 'known' "
+            "(same exposure) or 'fit'."
+        ),
+        rich_help_panel=_BOUNDARY,
+    ),
+]
+
+HotPixels = Annotated[
+    float | None,
+    Option(
+        metavar="DEVIATIONS",
+        help=(
+            "Replace hot and dead pixels that differ from their neighbours' median by more "
+            "standard deviations of the noise; 6 suits most. Before --bin."
+        ),
+        rich_help_panel=_FILTERS,
+    ),
+]
+BackgroundDegree = Annotated[
+    int | None,
+    Option(
+        metavar="DEGREE",
+        help="Divide the image by a polynomial fitted to it, total degree 0 to 10.",
+        rich_help_panel=_FILTERS,
+    ),
+]
+HighPass = Annotated[
+    float | None,
+    Option(
+        metavar="PX",
+        help="Take away structures much larger than this width in px (after --bin).",
+        rich_help_panel=_FILTERS,
+    ),
+]
+LowPass = Annotated[
+    float | None,
+    Option(
+        metavar="PX",
+        help="Blur image and source by a Gaussian of this standard deviation in px (after --bin).",
+        rich_help_panel=_FILTERS,
+    ),
+]
+
+SourceFrom = Annotated[
+    str | None,
+    Option(
+        metavar="ESTIMATE",
+        help=(
+            "Guess the undisturbed beam from the (filtered) image: uniform, gaussian, "
+            "polynomial, low-pass, total-variation or interpolated."
+        ),
+        rich_help_panel=_ESTIMATES,
+    ),
+]
+SourceDegree = Annotated[
+    int | None,
+    Option(
+        help="For polynomial: total degree in y and x, 0 to 10. Default: 2.",
+        rich_help_panel=_ESTIMATES,
+    ),
+]
+SourceWeight = Annotated[
+    float | None,
+    Option(
+        help=(
+            "For total-variation: in px (after --bin); c·r/2 removes a disc of contrast c and "
+            "radius r px. Default: 2."
+        ),
+        rich_help_panel=_ESTIMATES,
+    ),
+]
+SourceWidth = Annotated[
+    float | None,
+    Option(
+        help=(
+            "For low-pass and interpolated: standard deviation of the blur in px (after --bin). "
+            "Default for interpolated: 5."
+        ),
+        rich_help_panel=_ESTIMATES,
+    ),
+]
+SourceMask = Annotated[
+    Path | None,
+    Option(
+        help="Picture of the image's size, 0 where the object hides the bare beam.",
+        rich_help_panel=_ESTIMATES,
+    ),
+]
+
+Result = Annotated[
+    Path | None,
+    Option(
+        help=(
+            "Result: .shadowinv (all of it), .h5 (pradformat) or .csv (sites). "
+            "Default: the image's name with .shadowinv, in the current folder."
+        )
+    ),
+]
+Figure = Annotated[
+    Path | None,
+    Option(help="Figure: .png, .pdf or .svg. Default: a PNG beside the result."),
+]
+Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="Print nothing but errors.")]
+QuietInversion = Annotated[
+    bool, Option("--quiet", "-q", help="Print nothing but errors and alarms.")
+]

@@ -1,0 +1,148 @@
+"""What is to be done to an image before it is inverted: filters, and an estimate of its source.
+
+- the choices, from flags and the table ``[prepare]`` of an options file: `preparation_from`
+- apply them: `napari_shadowinv.cli._preparing`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io import read_toml
+from napari_shadowinv.validation import validated
+
+__all__ = ["KEYWORDS", "TABLE", "Estimate", "Preparation", "preparation_from"]
+
+TABLE = "prepare"
+"""Name of the table in an options file."""
+
+Estimate = Literal[
+    "uniform", "gaussian", "polynomial", "low-pass", "total-variation", "interpolated"
+]
+
+
+class Preparation(BaseModel):
+    """Choices before an inversion; what is None is not done, or left to the function's default."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    hot_pixels: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Hot pixels (standard deviations)",
+        description="Pixels that stand out by more are replaced by their neighbours' median.",
+    )
+    background_degree: int | None = Field(
+        default=None,
+        ge=0,
+        le=10,
+        title="Degree of the background",
+        description="The image is divided by a polynomial of this degree fitted to it.",
+    )
+    high_pass: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Width of the high pass (px)",
+        description="Structures much larger than this are taken away; the mean stays.",
+    )
+    low_pass: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Width of the low pass (px)",
+        description="Image and source are blurred by a Gaussian of this standard deviation.",
+    )
+    source_from: Estimate | None = Field(
+        default=None, title="Source from", description="How the source is guessed from the image."
+    )
+    source_degree: int | None = Field(
+        default=None,
+        ge=0,
+        le=10,
+        title="Degree of the source",
+        description="Of a polynomial source.",
+    )
+    source_weight: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Weight (px)",
+        description="Of a total-variation source: c r/2 removes a disc of contrast c, radius r.",
+    )
+    source_width: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Width of the source's blur (px)",
+        description="Of a low-pass or interpolated source.",
+    )
+
+    @property
+    def flattens(self) -> bool:
+        """Whether the beam is taken out of the image."""
+        return self.background_degree is not None or self.high_pass is not None
+
+
+KEYWORDS: dict[str, tuple[str, tuple[Estimate, ...]]] = {
+    "source_degree": ("degree", ("polynomial",)),
+    "source_weight": ("weight", ("total-variation",)),
+    "source_width": ("width", ("low-pass", "interpolated")),
+}
+"""The keyword of an estimate's function for each parameter, and which estimates take it."""
+
+
+def preparation_from(
+    path: Path | None, flags: Mapping[str, Any], *, has_source: bool, has_source_mask: bool
+) -> Preparation:
+    """Choices from an options file's table, with flags on top, that make sense together."""
+    where = "options" if path is None else f"{path}, table [{TABLE}]"
+    chosen = {} if path is None else read_toml(path).get(TABLE, {})
+    if isinstance(chosen, Mapping):
+        chosen = {**chosen, **flags}
+    preparation = validated(Preparation, chosen, where)
+    _check(preparation, has_source, has_source_mask)
+    return preparation
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _check(chosen: Preparation, has_source: bool, has_source_mask: bool) -> None:
+    """Refuse choices that contradict each other, before any work."""
+    if has_source and chosen.source_from is not None:
+        raise InputError(
+            f"received --source and --source-from {chosen.source_from}: choose one of them"
+        )
+    if has_source and chosen.flattens:
+        name = "high_pass" if chosen.background_degree is None else "background_degree"
+        raise InputError(
+            f"received --source and {_flag(name)}: what flattens the image takes the beam out of "
+            "it, which the source still has; leave one of them out"
+        )
+    for name, (_, estimates) in KEYWORDS.items():
+        if getattr(chosen, name) is not None and chosen.source_from not in estimates:
+            wanted = " or ".join(f"--source-from {estimate}" for estimate in estimates)
+            raise InputError(f"received {_flag(name)}: it needs {wanted}")
+    if has_source_mask and chosen.source_from in (None, "uniform"):
+        raise InputError(
+            "received --source-mask: it needs --source-from with an estimate that looks at the "
+            "image, such as interpolated or polynomial"
+        )
+    if chosen.source_from == "interpolated" and not has_source_mask:
+        raise InputError(
+            "--source-from interpolated needs --source-mask: a picture of the image's size that "
+            "is 0 where the object covers the beam"
+        )
+    if chosen.source_from == "low-pass" and chosen.source_width is None:
+        raise InputError(
+            "--source-from low-pass needs --source-width: the standard deviation of the blur in "
+            "px, a few times the size of the object"
+        )

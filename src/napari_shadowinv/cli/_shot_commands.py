@@ -1,0 +1,326 @@
+"""What is done with one shot: `invert`, `forward`, `info` and `demo`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from napari_shadowinv.cli._demo import compared_fields, demo_table, simulated_shot, write_demo
+from napari_shadowinv.cli._flags import (
+    BackgroundDegree,
+    Bin,
+    Boundary,
+    Channel,
+    ClipNegative,
+    Figure,
+    Flux,
+    HighPass,
+    HotPixels,
+    ImageFile,
+    LowPass,
+    Margin,
+    MaskFile,
+    OptionsFile,
+    Overwrite,
+    Quiet,
+    QuietInversion,
+    Result,
+    Seed,
+    SetupFile,
+    SiteCount,
+    SourceDegree,
+    SourceFile,
+    SourceFrom,
+    SourceMask,
+    SourceVariable,
+    SourceWeight,
+    SourceWidth,
+    Threads,
+    Variable,
+    given,
+)
+from napari_shadowinv.cli._forward import predicted, seen_with
+from napari_shadowinv.cli._guard import alarm_unless_converged, guarded
+from napari_shadowinv.cli._info import described
+from napari_shadowinv.cli._inputs import (
+    Experiment,
+    check_margin,
+    experiment_from,
+    field_from,
+    options_from,
+    setup_from,
+)
+from napari_shadowinv.cli._outputs import (
+    FIGURE_SUFFIXES,
+    check_outputs,
+    check_setup,
+    make_folder,
+    protect,
+    result_and_figure,
+    write_all,
+)
+from napari_shadowinv.cli._progress import inverted
+from napari_shadowinv.cli._tables import say, size_text, summary
+from napari_shadowinv.errors import InputError
+
+INVERT_EPILOG = r"""
+[bold]Examples[/bold]
+shadowinv invert shot.tif
+shadowinv invert shot.tif --source reference.tif --setup setup.toml --bin 4
+shadowinv invert film.tif --channel red --clip-negative --out film.h5
+shadowinv invert shots.mat --variable shot3 --source-variable beam
+shadowinv invert shot.tif --hot-pixels 6 --source-from polynomial --source-degree 2
+
+[bold]setup.toml[/bold]
+kind = "proton"                  # or "optical"
+energy = 14.7                    # MeV; for light: wavelength = 532e-9 (m)
+source_object_distance = 0.01    # m; inf for a collimated beam
+object_image_distance = 0.28     # m
+detector_pixel_size = 145e-6     # m; or pixel_size at the object
+
+[bold]options.toml[/bold] (any of these and more, see InversionOptions)
+n_sites = 100000
+tolerance = 1e-4
+floor = 1e-3
+\[prepare]                        # the filters and estimates above, with _ for -
+hot_pixels = 6                   # standard deviations
+source_from = "total-variation"
+source_weight = 2                # px
+
+[bold]Exit codes[/bold]
+0 done; 2 a mistake in what was given, nothing is written;
+3 written, but not converged; 130 cancelled.
+"""
+
+
+@guarded
+def invert(
+    image: ImageFile,
+    source: SourceFile = None,
+    mask: MaskFile = None,
+    setup: SetupFile = None,
+    options: OptionsFile = None,
+    n_sites: SiteCount = None,
+    bin_: Bin = 1,
+    channel: Channel = None,
+    variable: Variable = None,
+    source_variable: SourceVariable = None,
+    clip_negative: ClipNegative = False,
+    out: Result = None,
+    report: Figure = None,
+    overwrite: Overwrite = False,
+    threads: Threads = None,
+    seed: Seed = None,
+    quiet: QuietInversion = False,
+    boundary: Boundary = None,
+    margin: Margin = None,
+    flux: Flux = None,
+    source_from: SourceFrom = None,
+    source_degree: SourceDegree = None,
+    source_weight: SourceWeight = None,
+    source_width: SourceWidth = None,
+    source_mask: SourceMask = None,
+    hot_pixels: HotPixels = None,
+    background_degree: BackgroundDegree = None,
+    high_pass: HighPass = None,
+    low_pass: LowPass = None,
+) -> None:
+    """Retrieve the deflection potential of one image.
+
+    Writes potential, displacement, re-projection and residual, with all options,
+    to one file, and a figure beside it.
+    """
+    from napari_shadowinv.cli._preparation import TABLE, preparation_from
+    from napari_shadowinv.io.writing import RESULT_SUFFIXES
+
+    result, figure = result_and_figure(image, out, report)
+    check_outputs({result: RESULT_SUFFIXES, figure: FIGURE_SUFFIXES}, overwrite)
+    protect([result, figure], [image, source, mask, setup, options, source_mask])
+    transport = given(n_sites=n_sites, threads=threads, seed=seed)
+    edge = given(boundary=boundary, margin=margin, flux=flux)
+    chosen = options_from(options, transport | edge, clip_negative, other_tables=(TABLE,))
+    check_margin(margin, chosen)
+    filters = given(
+        hot_pixels=hot_pixels,
+        background_degree=background_degree,
+        high_pass=high_pass,
+        low_pass=low_pass,
+    )
+    estimate = given(
+        source_from=source_from,
+        source_degree=source_degree,
+        source_weight=source_weight,
+        source_width=source_width,
+    )
+    experiment = experiment_from(
+        image,
+        source,
+        setup,
+        channel,
+        bin_,
+        mask,
+        variable=variable,
+        source_variable=source_variable,
+        preparation=preparation_from(
+            options,
+            filters | estimate,
+            has_source=source is not None or source_variable is not None,
+            has_source_mask=source_mask is not None,
+        ),
+        source_mask=source_mask,
+    )
+    check_setup(result, experiment.setup)
+    inversion = inverted(experiment, chosen, quiet)
+    write_all(inversion, experiment, result, figure, overwrite)
+    if not quiet:
+        say(summary(inversion, experiment, [result, figure]))
+    alarm_unless_converged(inversion.report, result)
+
+
+FORWARD_EPILOG = """
+[bold]Examples[/bold]
+shadowinv forward shot.shadowinv
+shadowinv forward shot.shadowinv --setup lower_energy.toml
+shadowinv forward shot.shadowinv --setup lower_energy.toml --deflector electric-field
+shadowinv forward d.npy --made-with first.toml --setup second.toml
+
+[bold]Another experiment[/bold]
+A deflection belongs to its beam. What both experiments have in common is the object's line
+integral, so say what deflects: a magnetic field (∫B dl, angles go with charge / momentum;
+the default for particles), an electric field (∫E dl, with charge / (momentum velocity)), a
+plasma (∫n dz, with the wavelength squared) or a refractive index (∫ln η dz, alike but for
+dispersion). Both images have the same middle; the predicted one has the pixels of --setup
+and covers what is known.
+"""
+
+
+@guarded
+def forward(
+    field: Annotated[
+        Path,
+        typer.Argument(
+            help=(
+                ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) with a "
+                "displacement (2, H, W) in px or a potential (H, W) in px²."
+            ),
+            show_default=False,
+        ),
+    ],
+    source: SourceFile = None,
+    setup: Annotated[
+        Path | None,
+        typer.Option(
+            "--setup",
+            help=(
+                "TOML file with the experiment to predict, such as another energy. Default: that "
+                "of the field."
+            ),
+        ),
+    ] = None,
+    made_with: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML file with the experiment that the field is from, if its file does not tell."
+        ),
+    ] = None,
+    deflector: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHAT",
+            help=(
+                "What deflects, if --setup is another experiment: magnetic-field, electric-field, "
+                "plasma or refractive-index."
+            ),
+        ),
+    ] = None,
+    dispersion: Annotated[
+        float,
+        typer.Option(
+            help="For a refractive index: ln η at the new wavelength over that at the old one."
+        ),
+    ] = 1.0,
+    channel: Channel = None,
+    variable: Variable = None,
+    source_variable: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Array to take from the source's file.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help=(
+                "Image: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
+                "Default: the field's name with _image.tif, in the current folder."
+            )
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Predict the image that a displacement makes of a source, here or in another experiment.
+
+    Without --source, a result's own source is used, or a uniform one; in another experiment a
+    uniform one.
+    """
+    from napari_shadowinv.io import read_radiograph, write
+    from napari_shadowinv.io.writing import IMAGE_SUFFIXES
+
+    path = Path(f"{field.stem}_image.tif") if out is None else out
+    check_outputs({path: IMAGE_SUFFIXES}, overwrite)
+    protect([path], [field, source, setup, made_with])
+    if source_variable is not None and source is None:
+        raise InputError("received --source-variable: it needs --source, the file to look in")
+    seen = None if setup is None else setup_from(setup)
+    told = None if made_with is None else setup_from(made_with)
+    known = seen_with(field_from(field, variable), seen, told, deflector, dispersion)
+    beam = known.source
+    if source is not None:
+        beam = read_radiograph(source, channel=channel, variable=source_variable).image
+    image, note = predicted(known, beam)
+    write(path, image, setup=known.seen, overwrite=overwrite)
+    if not quiet:
+        kept = image.sum() / (image.size if beam is None else beam.sum())
+        say(f"Wrote {path}: {size_text(image)}, {kept:.2%} of the flux lands inside the image")
+        if note:
+            say(note)
+
+
+@guarded
+def info(
+    file: Annotated[Path, typer.Argument(help="An image or a result.", show_default=False)],
+    variable: Variable = None,
+) -> None:
+    """Tell what a file is and what is in it."""
+    say(described(file, variable))
+
+
+@guarded
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path("demo"),
+    dm: Annotated[float, typer.Option(help="Peak path-integrated field in MG·µm.")] = 97.0,
+    noise: Annotated[float, typer.Option(help="Noise, as a share of the mean.")] = 0.1,
+    n_sites: SiteCount = None,
+) -> None:
+    """Simulate a toroidal field in a proton beam, invert the image, compare with the truth.
+
+    The experiment is that of Kasim et al., arXiv:1607.04179, Section IV. Caustics start
+    at about 185 MG·µm.
+    """
+    if not 0 <= noise < float("inf"):
+        raise InputError(f"noise is {noise:g}: it must be 0 or more, as a share of the mean")
+    if not math.isfinite(dm):
+        raise InputError(f"dm is {dm:g}: it must be a finite number, in MG·µm")
+    chosen = options_from(None, given(n_sites=n_sites), clip_negative=True)
+    make_folder(out)
+    from napari_shadowinv.io import Radiograph
+    from napari_shadowinv.physics.phantoms import paper_setup
+
+    setup = paper_setup()
+    image, truth = simulated_shot(setup, dm, noise)
+    inversion = inverted(Experiment(Radiograph(image), setup=setup), chosen)
+    fields = compared_fields(image, truth, inversion)
+    written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
+    say(demo_table(inversion, setup, fields, written))
+    alarm_unless_converged(inversion.report, written[0])

@@ -1,0 +1,194 @@
+"""What is done with many shots: `batch`, `status`, `export` and `movie`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from napari_shadowinv.cli._flags import (
+    Bin,
+    Channel,
+    ChosenShots,
+    ClipNegative,
+    OptionsFile,
+    Overwrite,
+    Quiet,
+    SetupFile,
+    SiteCount,
+    StoreFolder,
+    given,
+)
+from napari_shadowinv.cli._guard import guarded
+from napari_shadowinv.cli._inputs import options_from
+from napari_shadowinv.cli._tables import say
+
+BATCH_EPILOG = """
+[bold]Examples[/bold]
+shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr
+shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr --resume
+shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
+
+[bold]Exit codes[/bold]
+0 all done; 1 some shot failed, the others are written; 2 a mistake in what was given;
+3 all done, but some did not converge; 130 cancelled, --resume goes on.
+"""
+
+
+@guarded
+def batch(
+    shots: Annotated[
+        list[str],
+        typer.Argument(
+            help="A glob in quotes, files, or one TIFF with a page for each shot.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The store to write: name.shadowinv.zarr.")],
+    source: Annotated[
+        str | None,
+        typer.Option(
+            "--source",
+            help="Undisturbed beam: one image, or a glob with one for each shot. Default: uniform.",
+        ),
+    ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option("--mask", help="Picture of the images' size, 0 where a pixel is unusable."),
+    ] = None,
+    setup: SetupFile = None,
+    options: OptionsFile = None,
+    n_sites: SiteCount = None,
+    bin_: Bin = 1,
+    channel: Channel = None,
+    clip_negative: ClipNegative = False,
+    variables: Annotated[
+        str | None,
+        typer.Option(help="What to store, with commas. Default: potential,displacement,caustic."),
+    ] = None,
+    warm_start: Annotated[
+        int, typer.Option(help="Start from the shot before, in runs of so many shots.")
+    ] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Address of a dask scheduler (tcp://host:8786), threads, or processes (default)."
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Shots at once on this machine. Default: one for each core.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where an earlier run stopped.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Throw away an earlier run.")
+    ] = False,
+    redo_failed: Annotated[
+        bool, typer.Option("--redo-failed", help="As --resume, and try failed shots again.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Invert many shots into one store that survives a crash."""
+    from napari_shadowinv.cli._batch import run_batch
+
+    run_batch(
+        shots,
+        out,
+        source=source,
+        mask=mask,
+        setup=setup,
+        options=options_from(options, given(n_sites=n_sites), clip_negative),
+        factor=bin_,
+        channel=channel,
+        variables=variables,
+        warm_start=warm_start,
+        scheduler=scheduler,
+        workers=workers,
+        resume=resume,
+        overwrite=overwrite,
+        redo_failed=redo_failed,
+        quiet=quiet,
+    )
+
+
+@guarded
+def status(
+    store: StoreFolder,
+    every: Annotated[bool, typer.Option("--all", help="A line for each shot.")] = False,
+) -> None:
+    """Tell which shots of a store are done, failed and why, or pending."""
+    from napari_shadowinv.cli._batch import status_tables
+
+    for table in status_tables(store, every):
+        say(table)
+
+
+@guarded
+def export(
+    store: StoreFolder,
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            help=(
+                "tiff (float32, a file for each shot and component), pradformat (a file for each "
+                "shot), or csv (a table with a row for each shot)."
+            ),
+        ),
+    ],
+    shots: ChosenShots = None,
+    variables: Annotated[
+        str, typer.Option(help="Of TIFF: which images, with commas.")
+    ] = "potential",
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder, or file for csv. Default: the store's name, here."),
+    ] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write shots of a store in another format."""
+    from napari_shadowinv.cli._export import export_shots
+    from napari_shadowinv.io.store import STORE_SUFFIX
+
+    stem = store.name.removesuffix(STORE_SUFFIX)
+    target = Path(f"{stem}.csv" if form == "csv" else stem) if out is None else out
+    names = [name.strip() for name in variables.split(",")]
+    written = export_shots(store, target, form, shots, names, overwrite)
+    if not quiet:
+        say(f"Wrote {target}: {len(written)} {'file' if len(written) == 1 else 'files'}")
+
+
+@guarded
+def movie(
+    store: StoreFolder,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The film: .mp4 or .gif.")],
+    variable: Annotated[
+        str | None,
+        typer.Option(help="What to show; of vectors the magnitude. Default: the potential."),
+    ] = None,
+    shots: ChosenShots = None,
+    rate: Annotated[float, typer.Option(help="Shots a second.")] = 10.0,
+    limits: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Ends of the colour scale. Default: those of all shots."),
+    ] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a film of a store, all shots on one colour scale."""
+    from napari_shadowinv.cli._export import write_movie
+
+    frames = write_movie(
+        store,
+        out,
+        variable=variable,
+        shots=shots,
+        rate=rate,
+        limits=limits,
+        overwrite=overwrite,
+    )
+    if not quiet:
+        say(f"Wrote {out}: {frames} shots, {frames / rate:.1f} s")

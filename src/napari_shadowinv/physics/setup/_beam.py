@@ -1,0 +1,199 @@
+"""What every probe has: distances, pixels, magnification, and the angles of its rays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
+
+from napari_shadowinv.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+
+class BeamSetup(BaseModel):
+    """Geometry that every probe has: distances, pixels, magnification.
+
+    Made only as a `ProtonSetup` or an `OpticalSetup`. A dump holds no None and takes
+    inf, so it can be written as TOML or JSON and read back.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+    kind: str = Field(title="Kind", description="Kind of probe: 'proton' or 'optical'.")
+    source_object_distance: float = Field(
+        gt=0,
+        title="Source to object (m)",
+        description="Distance l from the beam's source to the object, in m; inf if collimated.",
+    )
+    object_image_distance: float = Field(
+        gt=0,
+        allow_inf_nan=False,
+        title="Object to image (m)",
+        description="Distance L from the object to the detector, in m.",
+    )
+    pixel_size: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Pixel size at the object (m)",
+        description=(
+            "Side of a pixel in the object plane, in m. Give this or the detector's pixel size."
+        ),
+    )
+    detector_pixel_size: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Pixel size at the detector (m)",
+        description=(
+            "Side of a pixel in the detector plane, in m; the magnification makes it the "
+            "object plane's. Give this or the pixel size at the object."
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _one_pixel_size(self) -> BeamSetup:
+        given = [self.pixel_size is not None, self.detector_pixel_size is not None]
+        if sum(given) != 1:
+            received = "both" if all(given) else "neither"
+            raise ValueError(
+                "give either 'pixel_size' (m, in the object plane) or 'detector_pixel_size' "
+                f"(m, in the detector plane), received {received}"
+            )
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, dump: Callable[[BeamSetup], dict[str, Any]]) -> dict[str, Any]:
+        return {name: value for name, value in dump(self).items() if value is not None}
+
+    @property
+    def magnification(self) -> float:
+        """Magnification M = 1 + L / l of the object on the detector; 1 if collimated.
+
+        References
+        ----------
+        Kasim et al., arXiv:1607.04179, text after Eq. 3.
+        """
+        return 1 + self.object_image_distance / self.source_object_distance
+
+    @property
+    def collimated(self) -> bool:
+        """Whether the beam is parallel before the object."""
+        return math.isinf(self.source_object_distance)
+
+    @property
+    def object_pixel_size(self) -> float:
+        """Side p of a pixel in the object plane in m, whichever pixel size was given."""
+        if self.pixel_size is not None:
+            return self.pixel_size
+        assert self.detector_pixel_size is not None
+        return self.detector_pixel_size / self.magnification
+
+    @property
+    def _angle_per_pixel(self) -> float:
+        return self.object_pixel_size * self.magnification / self.object_image_distance
+
+    def deflection_angle(self, displacement: ArrayLike) -> FloatArray:
+        """Angle a = d p M / L by which rays are deflected.
+
+        Parameters
+        ----------
+        displacement : array_like
+            Displacement d in px of the object plane.
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Angle in rad.
+
+        References
+        ----------
+        Kasim et al., arXiv:1607.04179, Eq. 3.
+        """
+        return scaled(displacement, self._angle_per_pixel)
+
+    def displacement(self, angle: ArrayLike) -> FloatArray:
+        """Displacement d = a L / (p M); the inverse of `deflection_angle`.
+
+        Parameters
+        ----------
+        angle : array_like
+            Deflection angle a in rad.
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Displacement in px of the object plane.
+        """
+        return scaled(angle, 1 / self._angle_per_pixel)
+
+    def potential(self, phi: ArrayLike) -> FloatArray:
+        """Deflection potential in SI units, Φ = φ p² M / L, with a = -∇Φ.
+
+        Parameters
+        ----------
+        phi : array_like
+            Normalised potential φ in px².
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Potential Φ in m (rad m).
+
+        References
+        ----------
+        Kasim et al., arXiv:1607.04179, Eq. 1.
+        """
+        return scaled(phi, self.object_pixel_size * self._angle_per_pixel)
+
+    def normalized_potential(self, potential: ArrayLike) -> FloatArray:
+        """Potential in pixels, φ = Φ L / (p² M); the inverse of `potential`.
+
+        Parameters
+        ----------
+        potential : array_like
+            Potential Φ in m.
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Normalised potential in px².
+        """
+        return scaled(potential, 1 / (self.object_pixel_size * self._angle_per_pixel))
+
+    def displacement_from_potential(self, potential: ArrayLike) -> FloatArray:
+        """Displacement in pixels of a potential in SI units, d = -∇φ.
+
+        Parameters
+        ----------
+        potential : array_like, shape (H, W)
+            Potential Φ in m at the centres of this setup's pixels.
+
+        Returns
+        -------
+        ndarray, shape (2, H, W)
+            Displacement in px of the object plane, axis order (y, x), by differences that
+            are of second order up to the border.
+
+        Raises
+        ------
+        InputError
+            If the potential is no plane or too small to have a gradient.
+        """
+        plane = self.normalized_potential(potential)
+        if plane.ndim != 2 or min(plane.shape) < 3:
+            raise InputError(
+                f"potential has shape {plane.shape}: expected (height, width), 3 pixels at least"
+            )
+        return -np.stack([np.gradient(plane, axis=axis, edge_order=2) for axis in (0, 1)])
+
+
+def scaled(values: ArrayLike, factor: float) -> FloatArray:
+    """Values times a factor, as float64."""
+    product: FloatArray = np.asarray(values, dtype=np.float64) * factor
+    return product

@@ -1,0 +1,196 @@
+"""Beams of light, and the line integrals of the refractive index that deflect them."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from numpy.typing import ArrayLike
+from pydantic import Field
+from scipy import constants
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.setup._beam import BeamSetup, FloatArray, scaled
+
+
+class OpticalSetup(BeamSetup):
+    """A beam of light through a transparent object, onto a detector.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        (a `ValueError`) if a value is out of range, a name is unknown, or not exactly one
+        pixel size is given.
+
+    References
+    ----------
+    Kasim et al., arXiv:1607.04179, Sections II A and V.
+
+    Examples
+    --------
+    >>> setup = OpticalSetup(wavelength=810e-9, object_image_distance=0.01, pixel_size=1e-6)
+    >>> setup.magnification
+    1.0
+    >>> round(setup.critical_density * 1e-27, 2)
+    1.7
+    """
+
+    kind: Literal["optical"] = Field(
+        default="optical", title="Kind", description="Kind of probe: a beam of light."
+    )
+    source_object_distance: float = Field(
+        default=math.inf,
+        gt=0,
+        title="Source to object (m)",
+        description=(
+            "Distance l from the beam's source to the object, in m. "
+            "Default: inf, a collimated beam."
+        ),
+    )
+    wavelength: float = Field(
+        gt=0,
+        allow_inf_nan=False,
+        title="Wavelength (m)",
+        description="Wavelength of the light in vacuum, in m.",
+    )
+
+    @property
+    def critical_density(self) -> float:
+        """Electron density n_c = ε₀ m ω² / e² in m⁻³ beyond which the light does not travel."""
+        frequency = 2 * math.pi * constants.c / self.wavelength
+        density: float = constants.epsilon_0 * constants.m_e * frequency**2 / constants.e**2
+        return density
+
+    def line_integrated_log_index(self, phi: ArrayLike) -> FloatArray:
+        """Logarithm of the refractive index integrated along the beam: ∫ln η dz = -Φ.
+
+        Parameters
+        ----------
+        phi : array_like
+            Normalised potential φ in px².
+
+        Returns
+        -------
+        ndarray, of the same shape
+            ∫ln η dz in m, relative to where the potential is zero.
+
+        References
+        ----------
+        Kasim et al., arXiv:1607.04179, Eq. 2a.
+        """
+        return -self.potential(phi)
+
+    def normalized_potential_from_log_index(self, integral: ArrayLike) -> FloatArray:
+        """Potential φ of a refracting object; the inverse of `line_integrated_log_index`.
+
+        Parameters
+        ----------
+        integral : array_like
+            ∫ln η dz in m.
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Normalised potential in px².
+        """
+        return -self.normalized_potential(integral)
+
+    def line_integrated_density(self, phi: ArrayLike) -> FloatArray:
+        """Electron density of a thin plasma integrated along the beam: ∫n dz = 2 n_c Φ.
+
+        To first order in n / n_c, ln η = ½ ln(1 - n/n_c) ≈ -n / (2 n_c).
+
+        Parameters
+        ----------
+        phi : array_like
+            Normalised potential φ in px².
+
+        Returns
+        -------
+        ndarray, of the same shape
+            ∫n dz in m⁻², relative to where the potential is zero.
+
+        Notes
+        -----
+        Eq. 12 of the paper leaves out the ½ that the root in Eq. 11 brings; its
+        densities are half of these.
+
+        References
+        ----------
+        Kasim et al., arXiv:1607.04179, Eqs. 2a, 11 and 12.
+        """
+        return 2 * self.critical_density * self.potential(phi)
+
+    def normalized_potential_from_density(self, integral: ArrayLike) -> FloatArray:
+        """Potential φ of a thin plasma; the inverse of `line_integrated_density`.
+
+        Parameters
+        ----------
+        integral : array_like
+            ∫n dz in m⁻².
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Normalised potential in px².
+        """
+        return self.normalized_potential(integral) / (2 * self.critical_density)
+
+    def relative_density_modulation(self, phi: ArrayLike, density: float) -> FloatArray:
+        """Modulation of a plasma's density, relative to its mean: ∫Δn/n₀ dz.
+
+        Parameters
+        ----------
+        phi : array_like
+            Normalised potential φ in px², zero where the plasma is undisturbed.
+        density : float
+            Density n₀ of the undisturbed plasma in m⁻³.
+
+        Returns
+        -------
+        ndarray, of the same shape
+            ∫Δn/n₀ dz in m.
+
+        Raises
+        ------
+        InputError
+            If the density is not positive and finite.
+
+        References
+        ----------
+        Kasim et al., arXiv:1607.04179, Section V; see `line_integrated_density` for the
+        factor of 2.
+        """
+        return self.line_integrated_density(phi) / _positive_density(density)
+
+    def normalized_potential_from_modulation(
+        self, modulation: ArrayLike, density: float
+    ) -> FloatArray:
+        """Potential φ of a modulated plasma; the inverse of `relative_density_modulation`.
+
+        Parameters
+        ----------
+        modulation : array_like
+            ∫Δn/n₀ dz in m.
+        density : float
+            Density n₀ of the undisturbed plasma in m⁻³.
+
+        Returns
+        -------
+        ndarray, of the same shape
+            Normalised potential in px².
+
+        Raises
+        ------
+        InputError
+            If the density is not positive and finite.
+        """
+        return self.normalized_potential_from_density(
+            scaled(modulation, _positive_density(density))
+        )
+
+
+def _positive_density(density: float) -> float:
+    if not (density > 0 and math.isfinite(density)):
+        raise InputError(f"density is {density:g}: it must be positive, in electrons per m³")
+    return density
