@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 from slow_reading import die, hang_once
+from store_content import content
 
 from napari_shadowinv import FileFormatError, InversionOptions, invert_stack, read, run_stack
 from napari_shadowinv.geometry._threads import available_threads
@@ -49,25 +50,11 @@ def cluster(compiled):
 
 
 @pytest.fixture
-def out(tmp_path: Path) -> Path:
-    return tmp_path / "night.shadowinv.zarr"
-
-
-@pytest.fixture
 def expected(night, tmp_path) -> dict[str, bytes]:
     """What is written where nothing goes wrong."""
     store = tmp_path / "expected.shadowinv.zarr"
     run_stack(night.glob, store, source=night.source, options=OPTIONS)
-    return values(store)
-
-
-def values(store: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(store)): path.read_bytes()
-        for name in ("potential", "displacement", "caustic", "status")
-        for path in sorted((store / name).rglob("*"))
-        if path.is_file()
-    }
+    return content(store)
 
 
 class InThread(threading.Thread):
@@ -109,7 +96,7 @@ def test_a_worker_killed_in_the_middle_of_a_shot(night, out, expected, cluster):
     assert victim != os.getpid()
     os.kill(victim, signal.SIGKILL)
     assert run.ended() is None
-    assert values(out) == expected
+    assert content(out) == expected
     assert (read(out).status == DONE).all()
     # Another worker did it again, and nothing else was done twice.
     assert Counter(night.reads)["shot_2"] == 1
@@ -172,7 +159,7 @@ def test_the_client_killed_and_resumed_while_a_second_one_is_refused(night, out,
     run.start()
     (night.folder / "release").touch()
     assert run.ended() is None
-    assert values(out) == expected
+    assert content(out) == expected
     again = Counter(night.reads) - reads
     assert not {"shot_4", "shot_5"} & set(again)
 
@@ -210,7 +197,7 @@ def test_a_dask_array_on_the_cluster_is_inverted_there(night, out, expected, clu
     with Client(cluster) as client:
         shots = client.persist(da.from_array(night.images, chunks=(2, 24, 28)))
         run_stack(shots, out, source=night.source, options=OPTIONS)  # dask's current client
-    assert values(out) == expected
+    assert content(out) == expected
 
 
 def count_plans() -> None:
@@ -323,7 +310,7 @@ def test_the_scheduler_restarted_and_the_run_resumed(night, out, expected):
     finally:
         dask.kill()
     assert (written.status == DONE).all()
-    assert values(out) == expected
+    assert content(out) == expected
 
 
 def test_no_scheduler_answers(night, out, monkeypatch):
@@ -365,17 +352,16 @@ def test_the_disk_full_while_writing(make_night, small_disk):
     assert 0 < done.sum() < 40
     assert not (before.status == FAILED).any()
     assert np.isfinite(before.potential.values[done]).all()
-    kept = {name: text for name, text in values(out).items() if done[shot_of(name)]}
+    kept = {name: text for name, text in content(out).items() if done[shot_of(name)]}
     assert enlarge()
     after = run_stack(night.glob, out, **arguments)
     assert (after.status == DONE).all()
     assert np.isfinite(after.potential.values).all()
-    assert kept.items() <= values(out).items()
+    assert kept.items() <= content(out).items()
 
 
 def shot_of(name: str) -> int:
-    parts = Path(name).parts
-    return int(parts[2]) if parts[1] == "c" else 0
+    return int(Path(name).parts[2])
 
 
 class TestLocks:

@@ -20,6 +20,7 @@ from napari_shadowinv.errors import FileFormatError
 
 __all__ = [
     "READABLE",
+    "check_folder_of",
     "check_output",
     "kind_of",
     "replacing",
@@ -201,6 +202,18 @@ def check_output(
             f"{path} exists: choose another name or allow overwriting (overwrite=True, or "
             "--overwrite on the command line)"
         )
+    check_folder_of(path)
+    return path
+
+
+def check_folder_of(path: Path) -> None:
+    """Refuse a path whose folder is not there or cannot be written.
+
+    Raises
+    ------
+    FileFormatError
+        If so.
+    """
     if not path.parent.is_dir():
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} does not exist; create it first"
@@ -209,7 +222,6 @@ def check_output(
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} is read-only; choose another"
         )
-    return path
 
 
 @contextmanager

@@ -10,18 +10,20 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any, Protocol
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry._threads import available_threads
-from napari_shadowinv.stack._shots import BlockShot, Shot
+from napari_shadowinv.progress import ShouldStop
+from napari_shadowinv.stack._shot import BlockShot, Shot
 
 __all__ = ["Engine", "EngineError", "WorkerDied", "engine_for"]
 
 _CONNECT_SECONDS = 10.0
+_POLL = 0.1  # seconds between two looks at `should_stop` while connecting
 _ASKED_AGAIN_AFTER = 2.0  # seconds: clusters grow and shrink
 _AHEAD = 2  # tasks for each slot: one that runs, one that waits for it to end
 _AHEAD_OF_FILES = 64  # references to files are small; a cluster that grows wants to see work
@@ -163,7 +165,9 @@ def _same(value: Any) -> Any:
 
 
 @contextmanager
-def engine_for(scheduler: Any = None, workers: int | None = None) -> Iterator[Engine]:
+def engine_for(
+    scheduler: Any = None, workers: int | None = None, should_stop: ShouldStop | None = None
+) -> Iterator[Engine]:
     """Make or find an engine; what was made here is taken down at the end.
 
     Parameters
@@ -173,6 +177,8 @@ def engine_for(scheduler: Any = None, workers: int | None = None) -> Iterator[En
         or a cluster. Default: the current client of dask, else threads.
     workers : int, optional
         Shots that are inverted at once on this machine. Default: as many as cores.
+    should_stop : callable, optional
+        Asked while a scheduler has not answered yet.
 
     Yields
     ------
@@ -184,6 +190,8 @@ def engine_for(scheduler: Any = None, workers: int | None = None) -> Iterator[En
         If there is no such engine.
     EngineError
         If the scheduler does not answer.
+    InversionCancelled
+        If `should_stop` returned true.
     """
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}: expected 1 or more")
@@ -200,7 +208,7 @@ def engine_for(scheduler: Any = None, workers: int | None = None) -> Iterator[En
             "address such as tcp://host:8786, a Client or a cluster"
         )
     else:
-        yield from _given(scheduler)
+        yield from _given(scheduler, should_stop)
 
 
 def _current_client() -> Any:
@@ -248,13 +256,13 @@ def _processes(count: int) -> Iterator[Engine]:
         yield _Cluster(client, name, count)
 
 
-def _given(scheduler: Any) -> Iterator[Engine]:
+def _given(scheduler: Any, should_stop: ShouldStop | None) -> Iterator[Engine]:
     distributed: Any = import_module("distributed")
     if isinstance(scheduler, distributed.Client):
         yield _Cluster(scheduler, f"the scheduler at {_address(scheduler)}")
         return
     try:
-        client = distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+        client = _connected(scheduler, should_stop)
     except (OSError, TypeError, ValueError) as error:
         raise EngineError(
             f"no scheduler answers at {scheduler} ({type(error).__name__}): start it with "
@@ -262,6 +270,35 @@ def _given(scheduler: Any) -> Iterator[Engine]:
         ) from None
     with client:
         yield _Cluster(client, f"the scheduler at {_address(client)}")
+
+
+def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:
+    """Connect in a thread: only so can the wait for a scheduler that is not there be ended."""
+    distributed: Any = import_module("distributed")
+    answer: Future[Any] = Future()
+
+    def connect() -> None:
+        try:
+            answer.set_result(
+                distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+            )
+        except BaseException as error:
+            answer.set_exception(error)
+
+    threading.Thread(target=connect, name="connect", daemon=True).start()
+    try:
+        while not wait([answer], timeout=_POLL).done:
+            if should_stop is not None and should_stop():
+                raise InversionCancelled("stopped on request; run again to resume")
+    except BaseException:
+        answer.add_done_callback(_hang_up)
+        raise
+    return answer.result()
+
+
+def _hang_up(answer: Future[Any]) -> None:
+    if answer.exception() is None:
+        answer.result().close()
 
 
 def _address(client: Any) -> str:
