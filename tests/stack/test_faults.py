@@ -20,7 +20,14 @@ from distributed import Client, LocalCluster
 from slow_reading import die, hang_once
 from store_content import content
 
-from napari_shadowinv import FileFormatError, InversionOptions, invert_stack, read, run_stack
+from napari_shadowinv import (
+    FileFormatError,
+    InversionCancelled,
+    InversionOptions,
+    invert_stack,
+    read,
+    run_stack,
+)
 from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.io.locking import locked
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
@@ -320,6 +327,26 @@ def test_no_scheduler_answers(night, out, monkeypatch):
         address = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
         with pytest.raises(OSError, match=f"no scheduler answers at {address}"):
             run_stack(night.images, out, options=OPTIONS, scheduler=address)
+    assert not out.exists()
+
+
+def test_the_wait_for_a_scheduler_that_is_not_there_can_be_ended(night, out):
+    asked = []
+
+    def should_stop() -> bool:
+        asked.append(time.monotonic())
+        return len(asked) > 2
+
+    # It takes the call and says nothing.
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(InversionCancelled, match="run again to resume"):
+            run_stack(
+                night.images, out, options=OPTIONS, scheduler=address, should_stop=should_stop
+            )
+    assert time.monotonic() - asked[0] < 1
     assert not out.exists()
 
 

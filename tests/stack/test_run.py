@@ -68,17 +68,19 @@ def test_read_opens_it_and_so_does_plain_xarray(night, out, recwarn):
     assert not [w for w in recwarn if "zarr" in str(w.message).lower()]
 
 
-def test_what_is_stored_can_be_chosen_and_sites_are_stored_once(night, out):
-    names = ("weights", "sites", "source", "reprojection")
+@pytest.mark.parametrize("boundary", ["closed", "free"])
+def test_what_is_stored_can_be_chosen_and_sites_are_stored_once(night, out, boundary):
+    options = OPTIONS.model_copy(update={"boundary": boundary})
+    names = ("weights", "sites", "site_flux", "source", "reprojection")
     written = run_stack(
         night.images,
         out,
         source=night.source,
-        options=OPTIONS,
+        options=options,
         variables=names,
         dtype="float64",
     )
-    lazy = invert_stack(night.images, source=night.source, options=OPTIONS)
+    lazy = invert_stack(night.images, source=night.source, options=options)
     assert written.sites.dims == ("site", "component")
     assert written.source.dims == ("y", "x")
     assert "potential" not in written

@@ -79,7 +79,9 @@ def invert_stack(
     xarray.Dataset
         The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
         chunk, and ``converged``, ``flux_residual`` and ``iterations``. Sites have no
-        dimension ``shot`` where all shots share a source. Nothing is computed yet.
+        dimension ``shot`` where all shots share a source. With a free boundary and a source
+        for each shot, shots differ in their number of sites, and there are no variables of
+        sites. Nothing is computed yet.
 
     Raises
     ------
