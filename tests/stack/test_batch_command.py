@@ -132,6 +132,18 @@ def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
     assert batch("--overwrite").exit_code == 0
 
 
+def test_shots_that_came_since_are_appended_when_it_is_resumed(night, store):
+    np.save(night.path(6), night.images[3])
+    np.save(night.folder / "shot_00.npy", night.images[1])  # sorts before others
+    result = batch("--setup", "setup.toml", "--resume")
+    assert result.exit_code == 0
+    assert "8 done, 0 failed, 0 pending" in flat(result.output)
+    assert "2 shots in" in flat(result.output)
+    names = StackStore(store).names
+    assert names[:6] == tuple(f"shot_{i}.npy" for i in range(6))
+    assert set(names[6:]) == {"shot_00.npy", "shot_6.npy"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -93,13 +93,14 @@ def run_stack(
     """Invert every shot into one store; run again, it goes on where it stopped.
 
     A shot that cannot be inverted fails alone, with its reason. What is written of a shot counts
-    once it is complete, so a run may be interrupted or killed at any time.
+    once it is complete, so a run may be interrupted or killed at any time. Shots that have
+    arrived since the store was begun are appended, whatever their names: a shot keeps its number.
 
     Parameters
     ----------
     shots, source, mask, options, setup, reader, warm_start
-        See `invert_stack`. Options, setup, source, mask and shots must be those of the store
-        where it is resumed.
+        See `invert_stack`. Options, setup, source, mask and earlier shots must be those of the
+        store where it is resumed.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
     variables : collection of str, optional
