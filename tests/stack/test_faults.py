@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
+from distributed.client import FuturesCancelledError
 from slow_reading import die, hang_once
 from store_content import content
 
@@ -32,6 +33,7 @@ from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.io.locking import locked
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import _engines
+from napari_shadowinv.stack._engines import engine_for
 from napari_shadowinv.stack._work import threads_here
 
 OPTIONS = InversionOptions(n_sites=100)
@@ -260,6 +262,35 @@ def test_a_shot_whose_worker_always_dies_fails_with_this_reason(make_night, out,
     )
     assert list(written.status) == [FAILED]
     assert "the worker died each time" in StackStore(out).report(0)["reason"]
+
+
+@pytest.mark.parametrize("error", [ValueError("sample larger"), FuturesCancelledError([])])
+def test_a_worker_lost_while_it_gets_the_beam(night, out, expected, cluster, monkeypatch, error):
+    def replicate(*_):
+        raise error
+
+    monkeypatch.setattr(Client, "replicate", replicate)
+    address = cluster.scheduler_address
+    run_stack(night.glob, out, source=night.source, options=OPTIONS, scheduler=address)
+    assert content(out) == expected
+
+
+def test_workers_that_die_of_what_all_shots_share_end_the_run_and_blame_no_shot(cluster):
+    from distributed.scheduler import KilledWorker
+
+    class Future:
+        def __init__(self, key: str) -> None:
+            self.key = key
+
+        def result(self, timeout: float) -> None:
+            raise KilledWorker(self.key, None, 3)  # type: ignore[arg-type]
+
+    with Client(cluster, set_as_default=False) as client, engine_for(client) as engine:
+        engine.share(1, "beam-of-all")
+        with pytest.raises(_engines.EngineError, match="die before they begin a shot"):
+            engine.result(Future("beam-of-all"))
+        with pytest.raises(_engines.WorkerDied):
+            engine.result(Future("a-shot"))
 
 
 class Dask:

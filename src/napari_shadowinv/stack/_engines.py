@@ -124,40 +124,64 @@ class _Cluster:
 
     def share(self, value: Any, name: str) -> Any:
         # A task and not scattered data: it is made again when the worker that had it dies.
-        future = self._client.submit(_same, value, key=name)
+        with self._connected_or_lost():
+            future = self._client.submit(_same, value, key=name)
         self._shared.append(future)
         if self._slots():
-            # On all workers at once: dask gives tasks to those that have it first.
-            with suppress(OSError, TimeoutError):
-                self._client.replicate([future])
+            self._spread(future)
         return future
+
+    def _spread(self, future: Any) -> None:
+        """Bring a value to all workers at once: dask gives tasks to those that have it first."""
+        distributed: Any = import_module("distributed")
+        # Only to save time: a worker or scheduler that dies meanwhile shows where it matters.
+        with suppress(Exception), self._client.as_current():
+            distributed.wait([future], timeout=_CONNECT_SECONDS)
+            self._client.replicate([future])
 
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
         # A dask array may live on the cluster already, so its blocks are the cluster's tasks.
-        handed = [self._block(shot) if isinstance(shot, BlockShot) else shot for shot in shots]
-        return self._client.submit(task, handed, *args, pure=False)
+        with self._connected_or_lost():
+            handed = [self._block(shot) if isinstance(shot, BlockShot) else shot for shot in shots]
+            return self._client.submit(task, handed, *args, pure=False)
 
     def _block(self, shot: BlockShot) -> Any:
         return self._client.compute(shot.block.to_delayed().ravel()[0])
 
     def result(self, future: Any) -> Any:
-        from distributed import CancelledError as Cancelled
-        from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
 
         try:
-            return future.result(timeout=_CONNECT_SECONDS)
+            with self._connected_or_lost():
+                return future.result(timeout=_CONNECT_SECONDS)
         except KilledWorker as error:
+            if str(error.task) in {shared.key for shared in self._shared}:
+                raise EngineError(
+                    f"the workers of {self.name} die before they begin a shot: give them more "
+                    "memory, or look at their logs, then run again to resume"
+                ) from error
             raise WorkerDied(
                 "the worker died each time it was tried: too little memory for such a shot, or "
                 "the machine went down"
             ) from error
-        except (Cancelled, CancelledError, CommClosedError, TimeoutError) as error:
-            raise EngineError(f"lost {self.name}: start it and run again to resume") from error
 
     def check(self) -> None:
         if self._client.status != "running":
-            raise EngineError(f"lost {self.name}: start it and run again to resume")
+            raise self._lost()
+
+    def _lost(self) -> EngineError:
+        return EngineError(f"lost {self.name}: start it and run again to resume")
+
+    @contextmanager
+    def _connected_or_lost(self) -> Iterator[None]:
+        """Turn all the ways in which dask says that the scheduler is gone into one."""
+        from distributed import CancelledError as Cancelled
+        from distributed.comm.core import CommClosedError
+
+        try:
+            yield
+        except (Cancelled, CancelledError, CommClosedError, TimeoutError) as error:
+            raise self._lost() from error
 
 
 def _same(value: Any) -> Any:
