@@ -1,47 +1,45 @@
 """How well stacks of shots use more workers, and what dask costs.
 
-    python benchmarks/stack.py [--shots 10] [--side 100 120] [--stream 1000] [--sites N]
+    python benchmarks/stack.py [--shots 10] [--side 464 576] [--stream 1000] [--sites N]
 
-Three tables. First burner frames, summed over 2 × 2 pixels, with their reference beam (or
-simulated plumes of the same size where the data are not there): the same run on one and on two
-workers with one thread each; what dask adds to a shot's time; and what sites cost the first and
-the later shots of a worker. Then a stream of small shots that exist only while they are needed:
-memory of a worker against the number of shots, and the share of the time that workers compute.
-Ratios do not depend on the machine as seconds do; nothing else should run beside it.
+First burner frames, summed over 2 × 2 pixels, with their reference beam (or simulated plumes):
+the same run on one and on two workers with one thread each, beside what the machine itself gains
+where two processes without dask do the same; what dask, reading and writing add to a shot; and
+what sites cost the first and the later shots of a worker. Then a stream of small shots that exist
+only while they are needed: memory of a worker against the number of shots, and the share of the
+time that workers compute. Ratios do not depend on the machine as seconds do; nothing else should
+run beside it.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
-import sys
+import multiprocessing
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import dask
 import numpy as np
-import tifffile
+import psutil  # dask needs it, too
 from distributed import Client, LocalCluster
 
-from napari_shadowinv import InversionOptions, plan_sites, run_stack, synthetic_image
+from napari_shadowinv import InversionOptions, run_stack, synthetic_image
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.stack import ShotOutcome, read_shot
+from napari_shadowinv.stack._work import Beam, invert_shot
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 
 
 def worker_memory() -> int:
-    """Resident memory of this process in bytes now, or its peak where that is not told."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        return pages * resource.getpagesize()
-    except OSError:
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else 1024 * peak
+    """Resident memory of this process in bytes."""
+    return int(psutil.Process().memory_info().rss)
 
 
 def plume(shape: tuple[int, int], number: int) -> np.ndarray:
@@ -60,20 +58,37 @@ def streamed(path: Path) -> np.ndarray:
     return plume((100, 100), int(path.read_text()))
 
 
-def frames(
-    folder: Path, count: int, shape: tuple[int, int], small: bool
-) -> tuple[list[Path], Path, int, str]:
-    """Return paths of shots and reference, how to bin them, and what they are."""
+@dataclass(frozen=True)
+class Night:
+    """Shots, their source, and how to read and invert them."""
+
+    shots: list[Path]
+    source: Path
+    reader: Callable[[Path], np.ndarray]
+    options: InversionOptions
+    name: str
+
+
+def night(folder: Path, count: int, shape: tuple[int, int], sites: int | None) -> Night:
+    """Return burner frames, or plumes of another size or where there are no frames."""
+    options = InversionOptions(n_sites=sites, threads=1)
     reference, shots = BURNER / "Image_00000.bmp", sorted(BURNER.glob("Image_2*.bmp"))[:count]
-    if len(shots) == count and not small:
-        return shots, reference, 2, "burner, binned by 2"
-    paths = []
-    for number in range(count):
-        paths.append(folder / f"shot_{number}.tif")
-        tifffile.imwrite(paths[-1], plume(shape, number).astype(np.float32))
-    reference_path = folder / "reference.tif"
-    tifffile.imwrite(reference_path, np.full(shape, 1000, np.float32))
-    return paths, reference_path, 1, "simulated plumes"
+    if len(shots) == count and shape == (464, 576):
+        binned = partial(read_shot, channel="mean", factor=2)
+        return Night(shots, reference, binned, options, "burner, binned by 2")
+    shots = [folder / f"shot_{number}.npy" for number in range(count)]
+    for number, path in enumerate(shots):
+        np.save(path, plume(shape, number))
+    np.save(folder / "reference.npy", np.full(shape, 1000.0))
+    return Night(shots, folder / "reference.npy", read_shot, options, "simulated plumes")
+
+
+def warm_up(shots: int, folder: Path, scheduler: Any) -> None:
+    """Let processes load what they need with a few tiny shots."""
+    few = np.ones((shots, 24, 24)) + np.eye(24)
+    options = InversionOptions(n_sites=100, threads=1)
+    out = folder / "warm.shadowinv.zarr"
+    run_stack(few, out, options=options, scheduler=scheduler, overwrite=True)
 
 
 def on_workers(count: int, run: Callable[[Client], float], folder: Path) -> float:
@@ -89,65 +104,91 @@ def on_workers(count: int, run: Callable[[Client], float], folder: Path) -> floa
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):
-        few = np.ones((6 * count, 24, 24)) + np.eye(24)
-        options = InversionOptions(n_sites=100, threads=1)
-        warm = folder / "warm.shadowinv.zarr"
-        run_stack(few, warm, options=options, scheduler=client, overwrite=True)
+        warm_up(6 * count, folder, client)
         return run(client)
 
 
+def plainly(night: Night, shots: list[Path], folder: Path, start: Any, ended: Any) -> None:
+    """Invert shots in this process, as a worker does but without dask and store."""
+    folder.mkdir()
+    warm_up(3, folder, "synchronous")
+    start.wait()
+    began = time.perf_counter()
+    source = night.reader(night.source)
+    beam = Beam.of((source.shape[0], source.shape[1]), source, None)
+    for path in shots:
+        invert_shot(night.reader(path), beam, night.options)
+    ended.put(time.perf_counter() - began)
+
+
+def in_processes(count: int, night: Night, folder: Path) -> float:
+    """Time the same shots in so many processes that know nothing of each other."""
+    context = multiprocessing.get_context("spawn")
+    start, ended = context.Barrier(count), context.SimpleQueue()
+    processes = []
+    for number in range(count):
+        own = folder / f"plain_{count}_{number}"
+        arguments = (night, night.shots[number::count], own, start, ended)
+        processes.append(context.Process(target=plainly, args=arguments))
+        processes[-1].start()
+    for process in processes:
+        process.join()
+    return max(ended.get() for _ in processes)
+
+
 def speedup(arguments: argparse.Namespace, folder: Path) -> None:
-    shape = (arguments.side[0], arguments.side[1])
-    small = shape != (464, 576)
-    shots, source, factor, name = frames(folder, arguments.shots, shape, small)
-    reader = partial(read_shot, channel="mean", factor=factor)
-    beam = reader(source)
-    options = InversionOptions(n_sites=arguments.sites, threads=1)
-    n_sites = arguments.sites or beam.size
-    size = f"{beam.shape[1]} × {beam.shape[0]} px, {n_sites:,} sites"
-    print(f"\n{len(shots)} shots ({name}), {size}\n")
+    shots = night(folder, arguments.shots, tuple(arguments.side), arguments.sites)
+    beam = shots.reader(shots.source)
+    size = f"{beam.shape[1]} × {beam.shape[0]} px, {shots.options.n_sites or beam.size:,} sites"
+    print(f"\n{arguments.shots} shots ({shots.name}), {size}\n")
+
+    def run(client: Client) -> float:
+        start = time.perf_counter()
+        run_stack(
+            shots.shots,
+            folder / "night.shadowinv.zarr",
+            source=shots.source,
+            reader=shots.reader,
+            options=shots.options,
+            scheduler=client,
+            overwrite=True,
+            on_progress=lambda told: told.outcome and ended.append(told.outcome),
+        )
+        return time.perf_counter() - start
 
     times: dict[int, float] = {}
-    for workers in (1, 2):
-        out = folder / f"{workers}.shadowinv.zarr"
-        outcomes: list[ShotOutcome] = []
-
-        def run(client: Client, out: Path = out, ended: list[ShotOutcome] = outcomes) -> float:
-            start = time.perf_counter()
-            run_stack(
-                shots,
-                out,
-                source=source,
-                reader=reader,
-                options=options,
-                scheduler=client,
-                on_progress=lambda told: told.outcome and ended.append(told.outcome),
-            )
-            return time.perf_counter() - start
-
+    for workers in (2, 1):
+        ended: list[ShotOutcome] = []
         times[workers] = on_workers(workers, run, folder)
-        assert (StackStore(out).statuses() == DONE).all()
-        if workers == 1:
-            spent = sum(outcome.seconds for outcome in outcomes)
-            first = max(outcome.seconds for outcome in outcomes)
-    reports = StackStore(folder / "1.shadowinv.zarr").reports()
-    overhead = (times[1] - spent) / len(shots)
-    per_shot = spent / len(shots)
+        assert all(outcome.status == DONE for outcome in ended)
+    plain = {count: in_processes(count, shots, folder) for count in (1, 2)}
+    # Of the run on one worker.
+    spent = [outcome.seconds for outcome in ended]
+    reports = StackStore(folder / "night.shadowinv.zarr").reports()
     sites = sorted((report["stages"]["sites"] for report in reports), reverse=True)
-    started = time.perf_counter()
-    plan_sites(beam, options)
-    alone = time.perf_counter() - started
-    rest = (spent - first) / max(1, len(shots) - 1)
-    print("| | |\n|---|---|")
-    print(f"| one worker | {times[1]:.1f} s, {per_shot:.2f} s a shot |")
-    print(f"| two workers | {times[2]:.1f} s |")
-    print(f"| speed-up with two workers | {times[1] / times[2]:.2f} (wanted: 1.8) |")
-    print(f"| dask, per shot | {1e3 * overhead:.0f} ms, {overhead / per_shot:.1%} (wanted: 3 %) |")
-    print(f"| sites alone | {alone:.2f} s |")
-    print(f"| a worker's first shot, later ones | {first:.2f} s, {rest:.2f} s |")
-    print(
-        f"| of it on sites | {sites[0]:.2f} s, {1e3 * max(sites[1:], default=0):.2f} ms at most |"
+    inverting = sum(sum(report["stages"].values()) for report in reports)
+    mean, overhead = sum(spent) / len(spent), (times[1] - sum(spent)) / len(spent)
+    gain, possible = times[1] / times[2], plain[1] / plain[2]
+    rest = (sum(spent) - max(spent)) / max(1, len(spent) - 1)
+    around = 1 - inverting / sum(spent)
+    table(
+        ("one worker", f"{times[1]:.1f} s, {mean:.2f} s a shot"),
+        ("two workers", f"{times[2]:.1f} s"),
+        ("speed-up with two workers", f"{gain:.2f} (wanted: 1.8)"),
+        ("one plain process, two at once", f"{plain[1]:.1f} s, {plain[2]:.1f} s"),
+        ("speed-up of the machine itself", f"{possible:.2f}"),
+        ("share of it that dask reaches", f"{gain / possible:.1%}"),
+        ("dask, per shot", f"{1e3 * overhead:.0f} ms, {overhead / mean:.1%} (wanted: 3 %)"),
+        ("reading and writing, per shot", f"{1e3 * around * mean:.0f} ms, {around:.1%}"),
+        ("a worker's first shot, later ones", f"{max(spent):.2f} s, {rest:.2f} s"),
+        ("of it on sites", f"{sites[0]:.2f} s, {1e3 * max(sites[1:], default=0):.2f} ms at most"),
     )
+
+
+def table(*rows: tuple[str, str]) -> None:
+    print("| | |\n|---|---|")
+    for row in rows:
+        print("| {} | {} |".format(*row))
 
 
 def stream(arguments: argparse.Namespace, folder: Path) -> None:
@@ -191,11 +232,13 @@ def stream(arguments: argparse.Namespace, folder: Path) -> None:
         print(f"| {ended} | {worker:.0f} | {client_memory:.0f} |")
     half = [row[1] for row in curve[len(curve) // 2 :]]
     growth = (half[-1] - half[0]) / max(1, count // 2) * 1000
-    print("\n| | |\n|---|---|")
-    print(f"| done | {int((statuses == DONE).sum())} of {count} |")
-    print(f"| rate | {count / seconds:.1f} shots/s |")
-    print(f"| growth of a worker in the second half | {growth:+.1f} kB a shot |")
-    print(f"| workers computing | {busy[0] / (2 * seconds):.1%} of the time (wanted: 90 %) |")
+    print()
+    table(
+        ("done", f"{int((statuses == DONE).sum())} of {count}"),
+        ("rate", f"{count / seconds:.1f} shots/s"),
+        ("growth of a worker in the second half", f"{growth:+.1f} kB a shot"),
+        ("workers computing", f"{busy[0] / (2 * seconds):.1%} of the time (wanted: 90 %)"),
+    )
 
 
 def main() -> None:

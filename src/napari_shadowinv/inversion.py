@@ -1,7 +1,7 @@
 """The whole way from an image to a deflection potential.
 
 - invert an image: `invert`
-- prepare the sites once for many images with one source: `plan_sites`
+- prepare the sites once for many images with one source: `plan_sites`; how many: `count_sites`
 - what comes out: `Inversion`, with a `Report` of how it went
 """
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
-__all__ = ["Inversion", "Report", "invert", "plan_sites"]
+__all__ = ["Inversion", "Report", "count_sites", "invert", "plan_sites"]
 
 Array = NDArray[np.float64]
 
@@ -224,25 +224,64 @@ def plan_sites(
         If `should_stop` returned true.
     """
     options = options or InversionOptions()
-    usable = None if mask is None else checked_mask(mask, np.shape(source))
-    beam = checked_source(source, usable)
-    if usable is not None:
-        beam = masked_source(beam, usable, options)
-    n_sites = number_of_sites(beam.shape, options)
-    outside = None
-    if options.boundary == "free":
-        outside = Outside.around(beam, margin_around(beam.shape, options), usable)
-        n_sites = round(n_sites * outside.beam.sum() / beam.sum())
+    ground = _ground(source, options, mask)
     plan = plan_levels(
-        beam if outside is None else outside.beam,
-        n_sites,
+        ground.beam if ground.outside is None else ground.outside.beam,
+        ground.n_sites,
         lloyd_iterations=options.lloyd_iterations,
         lloyd_tolerance=options.lloyd_tolerance,
         seed=options.seed,
         threads=options.threads,
         report=Reporter(on_progress, should_stop),
     )
-    return replace(plan, source=beam, mask=usable, outside=outside)
+    return replace(plan, source=ground.beam, mask=ground.mask, outside=ground.outside)
+
+
+def count_sites(
+    source: ArrayLike, options: InversionOptions, *, mask: ArrayLike | None = None
+) -> int:
+    """Return how many sites `plan_sites` would spread, which takes no time.
+
+    Parameters
+    ----------
+    source, options, mask
+        See `plan_sites`.
+
+    Returns
+    -------
+    int
+        With a free boundary those in the margin, too.
+
+    Raises
+    ------
+    InputError
+        See `plan_sites`.
+    """
+    if options.boundary != "free":
+        height, width = np.shape(source)
+        return number_of_sites((height, width), options)
+    return _ground(source, options, mask).n_sites
+
+
+class _Ground(NamedTuple):
+    """What sites are to be spread over, and how many."""
+
+    beam: Array
+    mask: NDArray[np.bool_] | None
+    outside: Outside | None
+    n_sites: int
+
+
+def _ground(source: ArrayLike, options: InversionOptions, mask: ArrayLike | None) -> _Ground:
+    usable = None if mask is None else checked_mask(mask, np.shape(source))
+    beam = checked_source(source, usable)
+    if usable is not None:
+        beam = masked_source(beam, usable, options)
+    n_sites = number_of_sites(beam.shape, options)
+    if options.boundary != "free":
+        return _Ground(beam, usable, None, n_sites)
+    outside = Outside.around(beam, margin_around(beam.shape, options), usable)
+    return _Ground(beam, usable, outside, round(n_sites * outside.beam.sum() / beam.sum()))
 
 
 def invert(

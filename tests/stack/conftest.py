@@ -81,3 +81,8 @@ def any_night(tmp_path_factory, compiled) -> Night:
 @pytest.fixture
 def night(make_night) -> Night:
     return make_night(6)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "night.shadowinv.zarr"

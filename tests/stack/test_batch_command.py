@@ -147,6 +147,18 @@ def test_names_that_are_no_text_are_kept_as_their_bytes(night, folder):
     assert failed["name"] == r"shot_\xfc.npy"
 
 
+def test_shots_that_came_since_are_appended_when_it_is_resumed(night, store):
+    np.save(night.path(6), night.images[3])
+    np.save(night.folder / "shot_00.npy", night.images[1])  # sorts before others
+    result = batch("--setup", "setup.toml", "--resume")
+    assert result.exit_code == 0
+    assert "8 done, 0 failed, 0 pending" in flat(result.output)
+    assert "2 shots in" in flat(result.output)
+    names = StackStore(store).names
+    assert names[:6] == tuple(f"shot_{i}.npy" for i in range(6))
+    assert set(names[6:]) == {"shot_00.npy", "shot_6.npy"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -367,7 +379,7 @@ def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
         import time
         from concurrent.futures import ThreadPoolExecutor
         from pathlib import Path
-        from napari_shadowinv.io import store
+        from napari_shadowinv.io import store_layout as store
 
         create = store._create_array
         pool = ThreadPoolExecutor(1)

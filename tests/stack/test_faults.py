@@ -17,13 +17,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
+from distributed.client import FuturesCancelledError
 from slow_reading import die, hang_once
+from store_content import content
 
-from napari_shadowinv import FileFormatError, InversionOptions, invert_stack, read, run_stack
+from napari_shadowinv import (
+    FileFormatError,
+    InversionCancelled,
+    InversionOptions,
+    invert_stack,
+    read,
+    run_stack,
+)
 from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.io.locking import locked
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import _engines
+from napari_shadowinv.stack._engines import engine_for
 from napari_shadowinv.stack._work import threads_here
 
 OPTIONS = InversionOptions(n_sites=100)
@@ -49,25 +59,11 @@ def cluster(compiled):
 
 
 @pytest.fixture
-def out(tmp_path: Path) -> Path:
-    return tmp_path / "night.shadowinv.zarr"
-
-
-@pytest.fixture
 def expected(night, tmp_path) -> dict[str, bytes]:
     """What is written where nothing goes wrong."""
     store = tmp_path / "expected.shadowinv.zarr"
     run_stack(night.glob, store, source=night.source, options=OPTIONS)
-    return values(store)
-
-
-def values(store: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(store)): path.read_bytes()
-        for name in ("potential", "displacement", "caustic", "status")
-        for path in sorted((store / name).rglob("*"))
-        if path.is_file()
-    }
+    return content(store)
 
 
 class InThread(threading.Thread):
@@ -109,7 +105,7 @@ def test_a_worker_killed_in_the_middle_of_a_shot(night, out, expected, cluster):
     assert victim != os.getpid()
     os.kill(victim, signal.SIGKILL)
     assert run.ended() is None
-    assert values(out) == expected
+    assert content(out) == expected
     assert (read(out).status == DONE).all()
     # Another worker did it again, and nothing else was done twice.
     assert Counter(night.reads)["shot_2"] == 1
@@ -172,7 +168,7 @@ def test_the_client_killed_and_resumed_while_a_second_one_is_refused(night, out,
     run.start()
     (night.folder / "release").touch()
     assert run.ended() is None
-    assert values(out) == expected
+    assert content(out) == expected
     again = Counter(night.reads) - reads
     assert not {"shot_4", "shot_5"} & set(again)
 
@@ -210,7 +206,7 @@ def test_a_dask_array_on_the_cluster_is_inverted_there(night, out, expected, clu
     with Client(cluster) as client:
         shots = client.persist(da.from_array(night.images, chunks=(2, 24, 28)))
         run_stack(shots, out, source=night.source, options=OPTIONS)  # dask's current client
-    assert values(out) == expected
+    assert content(out) == expected
 
 
 def count_plans() -> None:
@@ -268,6 +264,35 @@ def test_a_shot_whose_worker_always_dies_fails_with_this_reason(make_night, out,
     assert "the worker died each time" in StackStore(out).report(0)["reason"]
 
 
+@pytest.mark.parametrize("error", [ValueError("sample larger"), FuturesCancelledError([])])
+def test_a_worker_lost_while_it_gets_the_beam(night, out, expected, cluster, monkeypatch, error):
+    def replicate(*_):
+        raise error
+
+    monkeypatch.setattr(Client, "replicate", replicate)
+    address = cluster.scheduler_address
+    run_stack(night.glob, out, source=night.source, options=OPTIONS, scheduler=address)
+    assert content(out) == expected
+
+
+def test_workers_that_die_of_what_all_shots_share_end_the_run_and_blame_no_shot(cluster):
+    from distributed.scheduler import KilledWorker
+
+    class Future:
+        def __init__(self, key: str) -> None:
+            self.key = key
+
+        def result(self, timeout: float) -> None:
+            raise KilledWorker(self.key, None, 3)  # type: ignore[arg-type]
+
+    with Client(cluster, set_as_default=False) as client, engine_for(client) as engine:
+        engine.share(1, "beam-of-all")
+        with pytest.raises(_engines.EngineError, match="die before they begin a shot"):
+            engine.result(Future("beam-of-all"))
+        with pytest.raises(_engines.WorkerDied):
+            engine.result(Future("a-shot"))
+
+
 class Dask:
     """A scheduler and a worker, each a process of its own."""
 
@@ -323,7 +348,7 @@ def test_the_scheduler_restarted_and_the_run_resumed(night, out, expected):
     finally:
         dask.kill()
     assert (written.status == DONE).all()
-    assert values(out) == expected
+    assert content(out) == expected
 
 
 def test_no_scheduler_answers(night, out, monkeypatch):
@@ -333,6 +358,26 @@ def test_no_scheduler_answers(night, out, monkeypatch):
         address = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
         with pytest.raises(OSError, match=f"no scheduler answers at {address}"):
             run_stack(night.images, out, options=OPTIONS, scheduler=address)
+    assert not out.exists()
+
+
+def test_the_wait_for_a_scheduler_that_is_not_there_can_be_ended(night, out):
+    asked = []
+
+    def should_stop() -> bool:
+        asked.append(time.monotonic())
+        return len(asked) > 2
+
+    # It takes the call and says nothing.
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(InversionCancelled, match="run again to resume"):
+            run_stack(
+                night.images, out, options=OPTIONS, scheduler=address, should_stop=should_stop
+            )
+    assert time.monotonic() - asked[0] < 1
     assert not out.exists()
 
 
@@ -365,17 +410,16 @@ def test_the_disk_full_while_writing(make_night, small_disk):
     assert 0 < done.sum() < 40
     assert not (before.status == FAILED).any()
     assert np.isfinite(before.potential.values[done]).all()
-    kept = {name: text for name, text in values(out).items() if done[shot_of(name)]}
+    kept = {name: text for name, text in content(out).items() if done[shot_of(name)]}
     assert enlarge()
     after = run_stack(night.glob, out, **arguments)
     assert (after.status == DONE).all()
     assert np.isfinite(after.potential.values).all()
-    assert kept.items() <= values(out).items()
+    assert kept.items() <= content(out).items()
 
 
 def shot_of(name: str) -> int:
-    parts = Path(name).parts
-    return int(parts[2]) if parts[1] == "c" else 0
+    return int(Path(name).parts[2])
 
 
 class TestLocks:

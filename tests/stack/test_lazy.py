@@ -38,13 +38,16 @@ def plans_made(monkeypatch):
     return made
 
 
-def test_each_shot_has_the_variables_of_its_own_inversion(night, optical_setup):
-    stack = invert_stack(night.images, source=night.source, options=OPTIONS, setup=optical_setup)
+@pytest.mark.parametrize("boundary", ["closed", "free"])
+def test_each_shot_has_the_variables_of_its_own_inversion(night, optical_setup, boundary):
+    options = OPTIONS.model_copy(update={"boundary": boundary})
+    stack = invert_stack(night.images, source=night.source, options=options, setup=optical_setup)
     computed = stack.compute()
+    assert computed.sizes == stack.sizes
     for index, image in enumerate(night.images):
-        inversion = invert(image, source=night.source, options=OPTIONS)
+        inversion = invert(image, source=night.source, options=options)
         alone = inversion.to_dataset(optical_setup)
-        assert set(alone.data_vars) <= set(stack.data_vars)
+        assert {"site_flux", *alone.data_vars} <= set(stack.data_vars)
         for name in alone.data_vars:
             values = computed[name]
             values = values.isel(shot=index) if "shot" in values.dims else values
@@ -170,6 +173,13 @@ def test_a_source_for_each_shot(night, plans_made):
         alone = invert(night.images[index], source=sources[index], options=OPTIONS)
         np.testing.assert_array_equal(shots.potential[index], alone.potential)
         np.testing.assert_array_equal(shots.sites[index], alone.sites)
+    free = OPTIONS.model_copy(update={"boundary": "free"})
+    ragged = invert_stack(night.images, source=sources, options=free)
+    assert "site" not in ragged.dims
+    alone = invert(night.images[4], source=sources[4], options=free)
+    np.testing.assert_array_equal(ragged.potential[4], alone.potential)
+    with pytest.raises(InputError, match=r"'site_flux' \(sites differ between shots: a free"):
+        invert_stack(night.images, source=sources, options=free, variables=["site_flux"])
     with pytest.raises(InputError, match="got 2 sources for 6 shots"):
         invert_stack(night.images, source=sources[:2], options=OPTIONS)
 

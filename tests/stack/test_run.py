@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 from slow_reading import log_and_read
+from store_content import content
 
 from napari_shadowinv import (
     FileFormatError,
@@ -23,21 +23,6 @@ from napari_shadowinv import (
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 
 OPTIONS = InversionOptions(n_sites=100)
-
-
-@pytest.fixture
-def out(tmp_path: Path) -> Path:
-    return tmp_path / "night.shadowinv.zarr"
-
-
-def content(store: Path, *names: str) -> dict[str, bytes]:
-    """Files with the values of shots."""
-    return {
-        str(path.relative_to(store)): path.read_bytes()
-        for name in names or ("potential", "displacement", "caustic", "status")
-        for path in sorted((store / name).rglob("*"))
-        if path.is_file()
-    }
 
 
 def stop_after(count: int):
@@ -83,17 +68,19 @@ def test_read_opens_it_and_so_does_plain_xarray(night, out, recwarn):
     assert not [w for w in recwarn if "zarr" in str(w.message).lower()]
 
 
-def test_what_is_stored_can_be_chosen_and_sites_are_stored_once(night, out):
-    names = ("weights", "sites", "source", "reprojection")
+@pytest.mark.parametrize("boundary", ["closed", "free"])
+def test_what_is_stored_can_be_chosen_and_sites_are_stored_once(night, out, boundary):
+    options = OPTIONS.model_copy(update={"boundary": boundary})
+    names = ("weights", "sites", "site_flux", "source", "reprojection")
     written = run_stack(
         night.images,
         out,
         source=night.source,
-        options=OPTIONS,
+        options=options,
         variables=names,
         dtype="float64",
     )
-    lazy = invert_stack(night.images, source=night.source, options=OPTIONS)
+    lazy = invert_stack(night.images, source=night.source, options=options)
     assert written.sites.dims == ("site", "component")
     assert written.source.dims == ("y", "x")
     assert "potential" not in written
@@ -210,22 +197,21 @@ def test_a_warm_start_does_not_depend_on_where_a_run_stopped(night, out, tmp_pat
     assert content(out, "weights") == content(other, "weights")
 
 
-class TestRefusals:
-    @pytest.fixture(scope="class")
-    def finished(self, any_night, tmp_path_factory):
-        return self.begin(any_night, tmp_path_factory.mktemp("finished") / "n.shadowinv.zarr")
+@pytest.fixture(scope="module")
+def finished(any_night, tmp_path_factory):
+    out = tmp_path_factory.mktemp("finished") / "n.shadowinv.zarr"
+    TestRefusals.run(any_night, out)
+    return out
 
+
+class TestRefusals:
     @pytest.fixture(autouse=True)
     def begun(self, night, out, finished):
         """A finished store of the very same files."""
         shutil.copytree(finished, out)
-        self.before = content(out)
+        before = content(out)
         yield
-        assert content(out) == self.before
-
-    def begin(self, night, out):
-        self.run(night, out)
-        return out
+        assert content(out) == before
 
     @staticmethod
     def run(night, out, **changes):
@@ -257,10 +243,15 @@ class TestRefusals:
         with pytest.raises(InputError, match="another stored"):
             self.run(night, out, variables=("potential",))
 
-    def test_more_shots(self, night, out):
-        np.save(night.path(6), night.images[0])
-        with pytest.raises(InputError, match=r"other shots \(6 there, 7 now\)"):
+    def test_a_shot_that_is_not_given_any_more(self, night, out):
+        night.path(3).unlink()
+        with pytest.raises(InputError, match=r"other shots \(6 there, 5 given, without shot_3.npy"):
             self.run(night, out)
+
+    def test_another_order(self, night, out):
+        paths = [night.path(index) for index in (0, 1, 3, 2, 4, 5)]
+        with pytest.raises(InputError, match=r"another order \(shot_2.npy before shot_3.npy\)"):
+            self.run(night, out, shots=paths)
 
     def test_a_shot_that_changed(self, night, out):
         np.save(night.path(3), night.images[3] + 1)

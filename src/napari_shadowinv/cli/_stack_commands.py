@@ -80,7 +80,8 @@ def batch(
         int | None, typer.Option(help="Shots at once on this machine. Default: one for each core.")
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on where an earlier run stopped.")
+        bool,
+        typer.Option("--resume", help="Go on where a run stopped; append shots that came since."),
     ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Throw away an earlier run.")

@@ -1,6 +1,6 @@
 """Results of many shots in one Zarr store, written shot by shot.
 
-- make a store for shots that are still to be inverted: `create_store`
+- how it is laid out, and made: `napari_shadowinv.io.store_layout`
 - write one shot, or why it failed: `ShotWriter`
 - what has been written: `read_stack` (lazy, for everyone), `StackStore` (for a run)
 - tell such a store from other folders: `is_stack`
@@ -13,10 +13,6 @@ written again. So workers can write side by side, and any of them may die.
 from __future__ import annotations
 
 import json
-import os
-import secrets
-import shutil
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.interrupts import interrupts_put_off
 from napari_shadowinv.io.dataset import field_in_si, setup_from_dataset, variable_labels
 from napari_shadowinv.io.files import check_folder_of
 
@@ -45,11 +40,10 @@ __all__ = [
     "ShotWriter",
     "StackStore",
     "StoreError",
-    "Variable",
     "check_store_path",
-    "create_store",
     "is_stack",
     "read_stack",
+    "store_error",
 ]
 
 FORMAT = "shadowinv stack"
@@ -68,28 +62,6 @@ _OWN_ORDER = ("status", *SUMMARY, "report")
 
 class StoreError(OSError):
     """A store that cannot be written: the run must end, no shot is to blame."""
-
-
-@dataclass(frozen=True)
-class Variable:
-    """What a store shall hold under one name.
-
-    Attributes
-    ----------
-    dims : tuple of str
-        Dimensions; ``shot`` first where there is one value for each shot.
-    dtype : numpy.dtype
-        Type of the values.
-    attributes : mapping
-        ``units`` and ``long_name``.
-    values : ndarray, optional
-        Written at once; else shot by shot.
-    """
-
-    dims: tuple[str, ...]
-    dtype: Any
-    attributes: Mapping[str, Any]
-    values: NDArray[Any] | None = None
 
 
 def check_store_path(path: str | Path) -> Path:
@@ -136,135 +108,8 @@ def _attributes(path: Path) -> dict[str, Any]:
         return {}
 
 
-def create_store(
-    path: Path,
-    sizes: Mapping[str, int],
-    variables: Mapping[str, Variable],
-    coordinates: Mapping[str, Variable],
-    attributes: Mapping[str, str],
-    *,
-    overwrite: bool = False,
-) -> StackStore:
-    """Make a store in which every shot is pending, whole or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        The folder to make.
-    sizes : mapping of str to int
-        Length of each dimension.
-    variables, coordinates : mapping of str to Variable
-        What it shall hold.
-    attributes : mapping of str to str
-        What is known about all shots.
-    overwrite : bool
-        Whether a store that is there may be replaced.
-
-    Returns
-    -------
-    StackStore
-
-    Raises
-    ------
-    FileFormatError
-        If there is one and it must not be replaced.
-    StoreError
-        If it cannot be written.
-    """
-    if path.exists() and not overwrite:
-        raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
-    arrays = {**coordinates, **variables, **_own_variables(sizes["shot"])}
-    marks = {
-        **attributes,
-        "format": FORMAT,
-        "store_id": secrets.token_hex(8),
-        "coordinates": " ".join(name for name in coordinates if name not in sizes),
-    }
-    new = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
-    try:
-        # Zarr writes in a thread of its own, which would go on behind our back.
-        with interrupts_put_off():
-            _write_arrays(new, sizes, arrays, marks)
-        if path.exists():
-            old = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
-            os.replace(path, old)
-            os.replace(new, path)
-            shutil.rmtree(old, ignore_errors=True)
-        else:
-            os.replace(new, path)
-    except OSError as error:
-        raise _store_error(path, error) from error
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
-    return StackStore(path)
-
-
-def _own_variables(shots: int) -> dict[str, Variable]:
-    """What every store holds, whatever was asked for."""
-    own = {
-        "status": Variable(
-            ("shot",),
-            np.dtype("int8"),
-            {
-                "units": "1",
-                "long_name": "What became of the shot",
-                "flag_values": [PENDING, DONE, FAILED],
-                "flag_meanings": " ".join(STATUS_NAMES),
-            },
-        ),
-        "report": Variable(
-            ("shot",), str, {"units": "1", "long_name": "How it went, or why it failed (JSON)"}
-        ),
-    }
-    for name, (kind, labels) in SUMMARY.items():
-        nothing: NDArray[Any] = np.full(shots, np.nan if kind is float else 0, dtype=kind)
-        own[name] = Variable(("shot",), np.dtype(kind), labels, nothing)
-    return own
-
-
-def _write_arrays(
-    path: Path,
-    sizes: Mapping[str, int],
-    arrays: Mapping[str, Variable],
-    attributes: Mapping[str, str],
-) -> None:
-    import zarr
-
-    group = zarr.create_group(path, zarr_format=3, attributes=dict(attributes))
-    for name, variable in arrays.items():
-        _create_array(group, name, variable, sizes)
-    with warnings.catch_warnings():
-        # That other programs may not know it: they read the arrays' own metadata then.
-        warnings.simplefilter("ignore")
-        zarr.consolidate_metadata(path)
-
-
-def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str, int]) -> None:
-    from zarr.codecs import BloscCodec
-
-    shape = tuple(sizes[dim] for dim in variable.dims)
-    each = variable.dims[:1] == ("shot",) and variable.values is None
-    is_text = variable.dtype is str
-    is_float = not is_text and np.dtype(variable.dtype).kind == "f"
-    small = int(np.prod(shape[1:] if each else shape)) <= 64
-    array = group.create_array(
-        name,
-        shape=shape,
-        chunks=(1, *shape[1:]) if each else tuple(max(1, length) for length in shape),
-        dtype=variable.dtype,
-        fill_value="" if is_text else np.nan if is_float else 0,
-        # Bytes that change slowly side by side: that is what makes fields compressible.
-        compressors=None
-        if small or is_text
-        else BloscCodec(cname="zstd", clevel=3, shuffle="shuffle"),
-        dimension_names=variable.dims,
-        attributes=dict(variable.attributes),
-    )
-    if variable.values is not None:
-        array[...] = variable.values
-
-
-def _store_error(path: Path, error: OSError) -> StoreError:
+def store_error(path: Path, error: OSError) -> StoreError:
+    """Say that a store cannot be written, why, and what to do."""
     return StoreError(
         f"{path} cannot be written ({error.strerror or error}): make room or see to its folder, "
         "then run again to resume"
@@ -287,10 +132,13 @@ class ShotWriter:
         The store.
     store_id : str
         Which store it must be: another one may have taken its place.
+    shots : int
+        How many it has: it may have been shorter when this process opened it before.
     """
 
     path: Path
     store_id: str
+    shots: int
 
     def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
         """Write a shot; it is done when this returns.
@@ -323,22 +171,33 @@ class ShotWriter:
                 f"{self.path} is not there or is another store than at the start: every worker "
                 "must see the same file system, and nobody may replace the store meanwhile"
             )
-        group = _opened(self.path, self.store_id)
+        group = self.arrays()
         try:
             for name, values in arrays.items():
                 group[name][index : index + 1] = np.asarray(values)[np.newaxis]
             group["report"][index : index + 1] = np.array([json.dumps(report)], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
         except OSError as error:
-            raise _store_error(self.path, error) from error
+            raise store_error(self.path, error) from error
+
+    def arrays(self) -> dict[str, Any]:
+        """Return the arrays by name, to write to."""
+        return _opened(self.path, self.store_id, self.shots)
 
 
 @lru_cache(maxsize=4)
-def _opened(path: Path, store_id: str) -> dict[str, Any]:
+def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
     """Arrays of a store; it takes milliseconds to open them."""
     import zarr
 
-    return dict(zarr.open_group(path, mode="r+").arrays())
+    arrays: dict[str, Any] = dict(zarr.open_group(path, mode="r+").arrays())
+    found = arrays["status"].shape[0]
+    if found != shots:
+        raise StoreError(
+            f"{path} has {found} shots here and {shots} where the run was started: "
+            "wait until the file system shows the same everywhere, then run again to resume"
+        )
+    return arrays
 
 
 class StackStore:
@@ -377,7 +236,7 @@ class StackStore:
     @property
     def writer(self) -> ShotWriter:
         """What workers write to it with."""
-        return ShotWriter(self.path, self.attributes["store_id"])
+        return ShotWriter(self.path, self.attributes["store_id"], len(self.names))
 
     def statuses(self) -> NDArray[np.int8]:
         """Return the status of each shot, shape (shot,): PENDING, DONE or FAILED."""
@@ -402,7 +261,7 @@ class StackStore:
             If it cannot be written.
         """
         reports = self.reports()
-        group = _opened(self.path, self.attributes["store_id"])
+        group = self.writer.arrays()
         try:
             for name, (kind, _) in SUMMARY.items():
                 missing = np.nan if kind is float else 0
@@ -410,7 +269,7 @@ class StackStore:
                 values = [report.get(key, missing) for report in reports]
                 group[name][...] = np.array(values, dtype=kind)
         except OSError as error:
-            raise _store_error(self.path, error) from error
+            raise store_error(self.path, error) from error
 
 
 def read_stack(path: str | Path) -> xarray.Dataset:

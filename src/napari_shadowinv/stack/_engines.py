@@ -11,20 +11,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from multiprocessing import resource_tracker
 from typing import Any, Protocol
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.interrupts import interrupts_put_off
-from napari_shadowinv.stack._shots import BlockShot, Shot
+from napari_shadowinv.progress import ShouldStop
+from napari_shadowinv.stack._shot import BlockShot, Shot
 
 __all__ = ["Engine", "EngineError", "WorkerDied", "engine_for"]
 
 _CONNECT_SECONDS = 10.0
+_POLL = 0.1  # seconds between two looks at `should_stop` while connecting
 _ASKED_AGAIN_AFTER = 2.0  # seconds: clusters grow and shrink
 _AHEAD = 2  # tasks for each slot: one that runs, one that waits for it to end
 _AHEAD_OF_FILES = 64  # references to files are small; a cluster that grows wants to see work
@@ -125,40 +127,64 @@ class _Cluster:
 
     def share(self, value: Any, name: str) -> Any:
         # A task and not scattered data: it is made again when the worker that had it dies.
-        future = self._client.submit(_same, value, key=name)
+        with self._connected_or_lost():
+            future = self._client.submit(_same, value, key=name)
         self._shared.append(future)
         if self._slots():
-            # On all workers at once: dask gives tasks to those that have it first.
-            with suppress(OSError, TimeoutError):
-                self._client.replicate([future])
+            self._spread(future)
         return future
+
+    def _spread(self, future: Any) -> None:
+        """Bring a value to all workers at once: dask gives tasks to those that have it first."""
+        distributed: Any = import_module("distributed")
+        # Only to save time: a worker or scheduler that dies meanwhile shows where it matters.
+        with suppress(Exception), self._client.as_current():
+            distributed.wait([future], timeout=_CONNECT_SECONDS)
+            self._client.replicate([future])
 
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
         # A dask array may live on the cluster already, so its blocks are the cluster's tasks.
-        handed = [self._block(shot) if isinstance(shot, BlockShot) else shot for shot in shots]
-        return self._client.submit(task, handed, *args, pure=False)
+        with self._connected_or_lost():
+            handed = [self._block(shot) if isinstance(shot, BlockShot) else shot for shot in shots]
+            return self._client.submit(task, handed, *args, pure=False)
 
     def _block(self, shot: BlockShot) -> Any:
         return self._client.compute(shot.block.to_delayed().ravel()[0])
 
     def result(self, future: Any) -> Any:
-        from distributed import CancelledError as Cancelled
-        from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
 
         try:
-            return future.result(timeout=_CONNECT_SECONDS)
+            with self._connected_or_lost():
+                return future.result(timeout=_CONNECT_SECONDS)
         except KilledWorker as error:
+            if str(error.task) in {shared.key for shared in self._shared}:
+                raise EngineError(
+                    f"the workers of {self.name} die before they begin a shot: give them more "
+                    "memory, or look at their logs, then run again to resume"
+                ) from error
             raise WorkerDied(
                 "the worker died each time it was tried: too little memory for such a shot, or "
                 "the machine went down"
             ) from error
-        except (Cancelled, CancelledError, CommClosedError, TimeoutError) as error:
-            raise EngineError(f"lost {self.name}: start it and run again to resume") from error
 
     def check(self) -> None:
         if self._client.status != "running":
-            raise EngineError(f"lost {self.name}: start it and run again to resume")
+            raise self._lost()
+
+    def _lost(self) -> EngineError:
+        return EngineError(f"lost {self.name}: start it and run again to resume")
+
+    @contextmanager
+    def _connected_or_lost(self) -> Iterator[None]:
+        """Turn all the ways in which dask says that the scheduler is gone into one."""
+        from distributed import CancelledError as Cancelled
+        from distributed.comm.core import CommClosedError
+
+        try:
+            yield
+        except (Cancelled, CancelledError, CommClosedError, TimeoutError) as error:
+            raise self._lost() from error
 
 
 def _same(value: Any) -> Any:
@@ -166,7 +192,9 @@ def _same(value: Any) -> Any:
 
 
 @contextmanager
-def engine_for(scheduler: Any = None, workers: int | None = None) -> Iterator[Engine]:
+def engine_for(
+    scheduler: Any = None, workers: int | None = None, should_stop: ShouldStop | None = None
+) -> Iterator[Engine]:
     """Make or find an engine; what was made here is taken down at the end.
 
     Parameters
@@ -176,6 +204,8 @@ def engine_for(scheduler: Any = None, workers: int | None = None) -> Iterator[En
         or a cluster. Default: the current client of dask, else threads.
     workers : int, optional
         Shots that are inverted at once on this machine. Default: as many as cores.
+    should_stop : callable, optional
+        Asked while a scheduler has not answered yet.
 
     Yields
     ------
@@ -187,6 +217,8 @@ def engine_for(scheduler: Any = None, workers: int | None = None) -> Iterator[En
         If there is no such engine.
     EngineError
         If the scheduler does not answer.
+    InversionCancelled
+        If `should_stop` returned true.
     """
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}: expected 1 or more")
@@ -203,7 +235,7 @@ def engine_for(scheduler: Any = None, workers: int | None = None) -> Iterator[En
             "address such as tcp://host:8786, a Client or a cluster"
         )
     else:
-        yield from _given(scheduler)
+        yield from _given(scheduler, should_stop)
 
 
 def _current_client() -> Any:
@@ -271,13 +303,13 @@ def _hidden_from_workers() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _given(scheduler: Any) -> Iterator[Engine]:
+def _given(scheduler: Any, should_stop: ShouldStop | None) -> Iterator[Engine]:
     distributed: Any = import_module("distributed")
     if isinstance(scheduler, distributed.Client):
         yield _Cluster(scheduler, f"the scheduler at {_address(scheduler)}")
         return
     try:
-        client = distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+        client = _connected(scheduler, should_stop)
     except (OSError, TypeError, ValueError) as error:
         raise EngineError(
             f"no scheduler answers at {scheduler} ({type(error).__name__}): start it with "
@@ -285,6 +317,35 @@ def _given(scheduler: Any) -> Iterator[Engine]:
         ) from None
     with client:
         yield _Cluster(client, f"the scheduler at {_address(client)}")
+
+
+def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:
+    """Connect in a thread: only so can the wait for a scheduler that is not there be ended."""
+    distributed: Any = import_module("distributed")
+    answer: Future[Any] = Future()
+
+    def connect() -> None:
+        try:
+            answer.set_result(
+                distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+            )
+        except BaseException as error:
+            answer.set_exception(error)
+
+    threading.Thread(target=connect, name="connect", daemon=True).start()
+    try:
+        while not wait([answer], timeout=_POLL).done:
+            if should_stop is not None and should_stop():
+                raise InversionCancelled("stopped on request; run again to resume")
+    except BaseException:
+        answer.add_done_callback(_hang_up)
+        raise
+    return answer.result()
+
+
+def _hang_up(answer: Future[Any]) -> None:
+    if answer.exception() is None:
+        answer.result().close()
 
 
 def _address(client: Any) -> str:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,156 +11,29 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
-from napari_shadowinv.io.files import text_of
-from napari_shadowinv.io.store import FORMAT, SUMMARY
+from napari_shadowinv.io.dataset import variable_labels
+from napari_shadowinv.io.store import SUMMARY
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocess import checked_mask, checked_source, number_of_sites
-from napari_shadowinv.stack._shots import Reader, Shot, Shots, find_shots, find_source, read_shot
-from napari_shadowinv.stack._work import Beam, arrays_of, invert_shot, shared_plan, threads_here
+from napari_shadowinv.stack._shot import Reader, Shot, read_shot
+from napari_shadowinv.stack._stack import (
+    Stack,
+    attributes_of,
+    coordinates_of,
+    describe_stack,
+    dtype_of,
+    values_of_beam,
+)
+from napari_shadowinv.stack._work import Beam, arrays_of, invert_shot, threads_here
 
 if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
-__all__ = ["Stack", "describe_stack", "invert_stack"]
+__all__ = ["invert_stack"]
 
 # One number for each shot, beside the arrays of an inversion.
 _NUMBERS = ("converged", "flux_residual", "iterations")
-_OF_PLAN = ("sites", "site_mass")
-
-
-@dataclass(frozen=True, eq=False)
-class Stack:
-    """Everything about a stack that is known before any shot is inverted.
-
-    Attributes
-    ----------
-    shots : Shots
-        The shots.
-    beam : Beam or None
-        Source and mask of all shots; None if each has a source of its own.
-    sources : Shots or None
-        Source of each shot, if each has its own.
-    mask : ndarray of bool, shape (H, W), or None
-        The pixels that can be used.
-    options : InversionOptions
-        Choices.
-    setup : ProtonSetup or OpticalSetup or None
-        For fields in SI units.
-    variables : tuple of str
-        The variables that are wanted.
-    warm_start : int
-        So many shots in a row start from the answer to the one before; 1 for none.
-    source_file : str
-        Where the source comes from, if it was named by a path.
-    """
-
-    shots: Shots
-    beam: Beam | None
-    sources: Shots | None
-    mask: NDArray[np.bool_] | None
-    options: InversionOptions
-    setup: ProtonSetup | OpticalSetup | None
-    variables: tuple[str, ...]
-    warm_start: int = 1
-    source_file: str = ""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Shape (H, W) of each shot."""
-        return self.shots.shape
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Length of each dimension."""
-        height, width = self.shape
-        sites = number_of_sites(self.shape, self.options)
-        return {"shot": len(self.shots), "y": height, "x": width, "component": 2, "site": sites}
-
-    def is_shared(self, name: str) -> bool:
-        """Whether all shots have one such variable together."""
-        return (
-            self.beam is not None
-            and name in (*_OF_PLAN, "source", "mask")
-            and not (name == "source" and self.beam.source is None)
-        )
-
-    def source_of(self, index: int) -> Shot | None:
-        """Reference to the source of one shot; None if all share one."""
-        return None if self.sources is None else self.sources.items[index]
-
-
-def describe_stack(
-    shots: Any,
-    source: Any,
-    mask: ArrayLike | None,
-    options: InversionOptions | None,
-    setup: ProtonSetup | OpticalSetup | None,
-    variables: Collection[str] | None,
-    reader: Reader,
-    warm_start: int,
-) -> Stack:
-    """Check everything that can be checked before a shot is read.
-
-    Parameters
-    ----------
-    shots, source, mask, options, setup, variables, reader, warm_start
-        See `invert_stack`.
-
-    Returns
-    -------
-    Stack
-
-    Raises
-    ------
-    InputError
-        If something does not fit.
-    """
-    options = options or InversionOptions()
-    if warm_start < 1:
-        raise InputError(f"warm_start is {warm_start}: expected a number of shots, 1 for no start")
-    known = _variables_of(options, setup)
-    wanted = tuple(known) if variables is None else tuple(variables)
-    for name in wanted:
-        if name not in known:
-            hint = " (it needs a setup)" if setup is None else ""
-            raise InputError(
-                f"there is no variable {name!r}{hint}: expected some of {', '.join(known)}"
-            )
-    sources = find_source(source, reader=reader)
-    # Where the source tells it, no shot needs to be read for its shape.
-    shape: tuple[int, ...] = () if mask is None else np.shape(mask)
-    if sources is not None:
-        shape = sources.shape
-    found = find_shots(
-        shots, reader=reader, shape=(shape[0], shape[1]) if len(shape) == 2 else None
-    )
-    if sources is not None and sources.shape != found.shape:
-        raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
-    usable = None if mask is None else checked_mask(mask, found.shape)
-    beam = None
-    if not isinstance(sources, Shots):
-        if sources is not None:
-            checked_source(sources, usable)
-        beam, sources = Beam.of(found.shape, sources, usable), None
-    elif len(sources) != len(found):
-        raise InputError(
-            f"got {len(sources)} sources for {len(found)} shots: expected one, or one for each shot"
-        )
-    source_file = text_of(Path(source).name) if isinstance(source, (str, Path)) else ""
-    return Stack(found, beam, sources, usable, options, setup, wanted, warm_start, source_file)
-
-
-def _variables_of(
-    options: InversionOptions, setup: ProtonSetup | OpticalSetup | None
-) -> dict[str, tuple[str, ...]]:
-    """Dimensions of the variables that a stack can have."""
-    labels = variable_labels(setup)
-    # Where sites cover a margin too, how many there are depends on the source.
-    is_free = getattr(options, "boundary", "closed") == "free"
-    return {name: dims for name, (dims, _) in labels.items() if not (is_free and "site" in dims)}
 
 
 def invert_stack(
@@ -208,7 +79,9 @@ def invert_stack(
     xarray.Dataset
         The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
         chunk, and ``converged``, ``flux_residual`` and ``iterations``. Sites have no
-        dimension ``shot`` where all shots share a source. Nothing is computed yet.
+        dimension ``shot`` where all shots share a source. With a free boundary and a source
+        for each shot, shots differ in their number of sites, and there are no variables of
+        sites. Nothing is computed yet.
 
     Raises
     ------
@@ -234,25 +107,6 @@ def invert_stack(
     """
     stack = describe_stack(shots, source, mask, options, setup, variables, reader, warm_start)
     return _Graph(stack).dataset()
-
-
-def coordinates_of(stack: Stack) -> dict[str, Any]:
-    """Return the coordinates of a stack's dataset."""
-    plane = dataset_from_field(np.zeros((2, *stack.shape)), None, stack.setup)
-    shots = stack.shots
-    numbers = np.arange(len(shots)) if shots.coordinate is None else shots.coordinate
-    coords: dict[str, Any] = {str(name): value for name, value in plane.coords.items()}
-    coords["shot"] = ("shot", numbers, {"long_name": "Shot"})
-    coords["name"] = ("shot", np.array(shots.names, dtype=str), {"long_name": "Name of the shot"})
-    return coords
-
-
-def attributes_of(stack: Stack) -> dict[str, str]:
-    """Return the attributes of a stack's dataset."""
-    attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.setup).attrs
-    if stack.source_file:
-        attributes["source_file"] = stack.source_file
-    return {"format": FORMAT, **attributes, "options": stack.options.model_dump_json()}
 
 
 def _invert(
@@ -290,16 +144,6 @@ def _numbers_of(inversion: Inversion) -> dict[str, Any]:
         "flux_residual": np.float64(report.residual),
         "iterations": np.int64(report.iterations),
     }
-
-
-def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
-    """Return the variables that all shots share, by name; a task, too."""
-    if options.threads is None:
-        options = options.model_copy(update={"threads": threads_here()})
-    level = shared_plan(beam, options).levels[-1]
-    mask = np.ones(beam.shape, bool) if beam.mask is None else beam.mask
-    source = None if beam.source is None else checked_source(beam.source, beam.mask)
-    return {"sites": level.sites, "site_mass": level.mass, "mask": mask, "source": source}
 
 
 def _pick(record: dict[str, Any], name: str, with_shot: bool) -> NDArray[Any]:
@@ -400,8 +244,3 @@ class _Graph:
         shape = tuple(self._stack.sizes[dim] for dim in dims)
         da: Any = import_module("dask.array")
         return da.from_delayed(value, shape, dtype=dtype_of(name))
-
-
-def dtype_of(name: str) -> Any:
-    """Type of a variable as an inversion has it."""
-    return np.dtype(bool) if name in ("caustic", "mask") else np.dtype(np.float64)

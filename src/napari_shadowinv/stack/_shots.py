@@ -1,209 +1,47 @@
-"""Where shots come from: files, pages, arrays; each is read when it is needed.
+"""Where shots come from: globs, lists of files, pages, arrays.
 
-- any input as references to single shots: `find_shots`
-- the image of one shot: `Shot.load`; of one file, chosen and binned: `read_shot`
-- sources and masks in the same ways: `find_source`
+- any input as references to single shots: `find_shots`, which gives `Shots`
+- sources in the same ways: `find_source`
 """
 
 from __future__ import annotations
 
-import functools
 import glob
-import hashlib
 import inspect
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import text_of
+from napari_shadowinv.stack._shot import (
+    ArrayShot,
+    BlockShot,
+    FileShot,
+    PageShot,
+    Reader,
+    Shot,
+    read_shot,
+)
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = [
-    "ArrayShot",
-    "BlockShot",
-    "Reader",
-    "Shot",
-    "Shots",
-    "find_shots",
-    "find_source",
-    "read_shot",
-]
-
-Reader = Callable[..., ArrayLike]
+__all__ = ["Shots", "find_shots", "find_source"]
 
 _MAGIC = re.compile(r"[*?\[]")
 _LOOKED_AT = 3  # files that are asked for the shape of all
 
 
-class Shot(Protocol):
-    """One image that is read when it is asked for; it can be sent to a worker."""
-
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Return the image, and what tells it from others: a checksum at least."""
-        ...
-
-    def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Whether it is still the image of which `load` said this."""
-        ...
-
-
-def read_shot(
-    path: Path, *, page: int | None = None, channel: str | int | None = None, factor: int = 1
-) -> NDArray[np.float64]:
-    """Read the image of a shot; this is the reader where none is given.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    page : int, optional
-        Of a TIFF with many pages.
-    channel : {"red", "green", "blue", "mean"} or int, optional
-        What to take of a colour image.
-    factor : int, optional
-        Sum blocks of so many pixels squared.
-
-    Returns
-    -------
-    ndarray, shape (H, W)
-
-    Raises
-    ------
-    FileFormatError, InputError
-        See `napari_shadowinv.io.read_radiograph`.
-    """
-    from napari_shadowinv.io.images import read_tiff_page
-    from napari_shadowinv.io.radiograph import Radiograph
-    from napari_shadowinv.io.reading import read_radiograph
-
-    if page is None:
-        return read_radiograph(path, channel=channel).binned(factor).image
-    return Radiograph(read_tiff_page(path, page, channel=channel)).binned(factor).image
-
-
 def _knows_pages(reader: Reader) -> bool:
     return "page" in inspect.signature(reader).parameters
-
-
-@dataclass(frozen=True)
-class FileShot:
-    """A file that holds one image.
-
-    Attributes
-    ----------
-    path : Path
-        Absolute, so that a worker elsewhere finds it.
-    reader : callable, optional
-        Makes an image of the path.
-    """
-
-    path: Path
-    reader: Reader = read_shot
-
-    def __dask_tokenize__(self) -> tuple[Any, ...]:
-        # A file that changed is another input, and what dask has of it another result.
-        from dask.base import normalize_token
-
-        stamp = _stamp(self.path) if self.path.exists() else {}
-        return (
-            str(self.path),
-            normalize_token(self.reader),
-            stamp.get("size"),
-            stamp.get("mtime_ns"),
-        )
-
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Read the file, with its checksum."""
-        from napari_shadowinv.io.files import sha256
-
-        image = np.asarray(self.reader(self.path))
-        return image, {**_stamp(self.path), "sha256": sha256(self.path)}
-
-    def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Compare size and time, and only where these differ the checksum."""
-        from napari_shadowinv.io.files import sha256
-
-        if not self.path.exists():
-            return True  # put away after it was inverted
-        if _stamp(self.path).items() <= origin.items():
-            return True
-        return bool(sha256(self.path) == origin.get("sha256"))
-
-
-def _stamp(path: Path) -> dict[str, int]:
-    status = path.stat()
-    return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
-
-
-@dataclass(frozen=True)
-class PageShot:
-    """A page of a TIFF that holds many; its reader takes the keyword ``page``."""
-
-    path: Path
-    page: int
-    reader: Reader = read_shot
-
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Read the page, with its checksum."""
-        image = np.asarray(self.reader(self.path, page=self.page))
-        return image, {"sha256": checksum(image)}
-
-    def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Read the page again and compare."""
-        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
-
-
-@dataclass(frozen=True, eq=False)
-class ArrayShot:
-    """An image in memory."""
-
-    image: NDArray[Any] = field(repr=False)
-
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Return the array, with its checksum."""
-        return self.image, {"sha256": checksum(self.image)}
-
-    def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Compare the checksum."""
-        return bool(checksum(self.image) == origin.get("sha256"))
-
-
-@dataclass(frozen=True, eq=False)
-class BlockShot:
-    """An image of a dask array, computed when it is needed.
-
-    Attributes
-    ----------
-    block : dask.array.Array
-        Shape (1, H, W), one chunk.
-    """
-
-    block: Any = field(repr=False)
-
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Compute the image by dask's current scheduler."""
-        return ArrayShot(np.asarray(self.block.compute())[0]).load()
-
-    def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Compute the image and compare."""
-        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
-
-
-def checksum(array: NDArray[Any]) -> str:
-    """Return the SHA-256 of an array's values, shape and type, in hexadecimal."""
-    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
-    digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +75,20 @@ class Shots:
         """Name and number of a shot, for messages."""
         name = self.names[index]
         return f"shot {index}" if name == str(index) else f"shot {index} ({name})"
+
+    def chosen(self, order: Sequence[int]) -> Shots:
+        """Return these shots in another order."""
+        if list(order) == list(range(len(self))):
+            return self
+        array = None if self.array is None else self.array[list(order)].rechunk((1, -1, -1))
+        is_lazy = isinstance(self.items, _Blocks)
+        return replace(
+            self,
+            items=_Blocks(array) if is_lazy else [self.items[index] for index in order],
+            names=tuple(self.names[index] for index in order),
+            coordinate=None if self.coordinate is None else self.coordinate[list(order)],
+            array=array,
+        )
 
 
 def find_shots(
@@ -434,11 +286,3 @@ def find_source(source: Any, *, reader: Reader = read_shot) -> NDArray[Any] | Sh
         return np.asarray(source)
     sources = find_shots(source, reader=reader)
     return sources.items[0].load()[0] if len(sources) == 1 else sources
-
-
-def described_reader(reader: Reader) -> str:
-    """Name a reader, so that a store is not continued with another."""
-    if isinstance(reader, functools.partial):
-        named = ", ".join(f"{name}={value!r}" for name, value in sorted(reader.keywords.items()))
-        return f"{described_reader(reader.func)}({named})"
-    return f"{reader.__module__}.{getattr(reader, '__qualname__', type(reader).__qualname__)}"

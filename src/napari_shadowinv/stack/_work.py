@@ -28,7 +28,7 @@ from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import OnProgress, ShouldStop
-from napari_shadowinv.stack._shots import checksum
+from napari_shadowinv.stack._shot import checksum
 from napari_shadowinv.transport.sites import SitePlan
 
 if TYPE_CHECKING:
@@ -60,6 +60,11 @@ class Beam:
     source: NDArray[Any] | None = field(default=None, repr=False)
     mask: NDArray[np.bool_] | None = field(default=None, repr=False)
     key: str = ""
+
+    @property
+    def image(self) -> NDArray[Any]:
+        """The source; ones for a uniform beam."""
+        return np.ones(self.shape) if self.source is None else self.source
 
     @classmethod
     def of(
@@ -115,7 +120,7 @@ def shared_plan(
     with entry.lock:
         if entry.plan is None:
             entry.plan = plan_sites(
-                np.ones(beam.shape) if beam.source is None else beam.source,
+                beam.image,
                 options,
                 mask=beam.mask,
                 on_progress=on_progress,

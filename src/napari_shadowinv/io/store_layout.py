@@ -1,0 +1,270 @@
+"""How a store of many shots is laid out: made once, and made longer when shots arrive.
+
+- make a store for shots that are still to be inverted: `create_store`
+- make room for more shots at its end: `grow_store`
+
+The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
+by that copy. So a store changes its length in one moment: when that one file is replaced.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.interrupts import interrupts_put_off
+from napari_shadowinv.io.files import replacing
+from napari_shadowinv.io.store import (
+    DONE,
+    FAILED,
+    FORMAT,
+    PENDING,
+    STATUS_NAMES,
+    SUMMARY,
+    StackStore,
+    store_error,
+)
+
+__all__ = ["Contents", "Variable", "create_store", "grow_store"]
+
+_TOGETHER = 1024  # values of a coordinate along shots that are one file
+_SMALL = 64  # values that are not worth compressing
+
+
+@dataclass(frozen=True)
+class Variable:
+    """What a store shall hold under one name.
+
+    Attributes
+    ----------
+    dims : tuple of str
+        Dimensions; ``shot`` first where there is one value for each shot.
+    dtype : numpy.dtype or str
+        Type of the values.
+    attributes : mapping
+        ``units`` and ``long_name``.
+    values : ndarray, optional
+        Written at once; else shot by shot.
+    """
+
+    dims: tuple[str, ...]
+    dtype: Any
+    attributes: Mapping[str, Any]
+    values: NDArray[Any] | None = None
+
+    @property
+    def along_shots(self) -> bool:
+        """Whether there is a value for each shot."""
+        return self.dims[:1] == ("shot",)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a store shall hold.
+
+    Attributes
+    ----------
+    sizes : mapping of str to int
+        Length of each dimension.
+    variables, coordinates : mapping of str to Variable
+        The arrays.
+    attributes : mapping
+        What is known about all shots.
+    """
+
+    sizes: Mapping[str, int]
+    variables: Mapping[str, Variable]
+    coordinates: Mapping[str, Variable]
+    attributes: Mapping[str, Any]
+
+
+def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> StackStore:
+    """Make a store, all its shots pending; it appears whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        The folder to make.
+    contents : Contents
+        What it shall hold.
+    overwrite : bool
+        Whether a store that is there may be replaced.
+
+    Returns
+    -------
+    StackStore
+
+    Raises
+    ------
+    FileFormatError
+        If there is one and it must not be replaced.
+    StoreError
+        If it cannot be written.
+    """
+    if path.exists() and not overwrite:
+        raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
+    new = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+    try:
+        # Zarr writes in a thread of its own, which would go on behind our back.
+        with interrupts_put_off():
+            _write_template(new, contents)
+        if path.exists():
+            old = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+            os.replace(path, old)
+            os.replace(new, path)
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            os.replace(new, path)
+    except OSError as error:
+        raise store_error(path, error) from error
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    return StackStore(path)
+
+
+def grow_store(
+    path: Path, length: int, values: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
+) -> StackStore:
+    """Make room for more shots at the end of a store, all of them pending.
+
+    Whoever is killed on the way leaves the store as it was: it can be read, and be grown again.
+
+    Parameters
+    ----------
+    path : Path
+        The store.
+    length : int
+        How many shots it shall have.
+    values : mapping of str to ndarray, shape (length,)
+        The coordinates of all of them, by name.
+    attributes : mapping
+        What is to be replaced of the attributes.
+
+    Returns
+    -------
+    StackStore
+
+    Raises
+    ------
+    StoreError
+        If it cannot be written; the store is as before then.
+    """
+    import zarr
+
+    try:
+        arrays = dict(zarr.open_group(path, mode="r+").arrays())
+        longer = [name for name, array in arrays.items() if _is_along_shots(array)]
+        for name in longer:
+            array: Any = arrays[name]
+            before = array.shape[0]
+            # Beyond the end that the folder's own copy tells of: nobody sees it yet.
+            array.resize((length, *array.shape[1:]))
+            if name in values:
+                array[before:] = values[name][before:]
+        _tell_length(path, longer, length, attributes)
+    except OSError as error:
+        raise store_error(path, error) from error
+    return StackStore(path)
+
+
+def _is_along_shots(array: Any) -> bool:
+    return tuple(array.metadata.dimension_names or ())[:1] == ("shot",)
+
+
+def _tell_length(path: Path, names: list[str], length: int, attributes: Mapping[str, Any]) -> None:
+    """Replace the folder's own metadata: from here on the store is longer."""
+    file = path / "zarr.json"
+    metadata = json.loads(file.read_text(encoding="utf-8"))
+    metadata["attributes"].update(attributes)
+    for name in names:
+        metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
+    with replacing(file, overwrite=True) as draft:
+        draft.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
+
+
+def _write_template(path: Path, contents: Contents) -> None:
+    import zarr
+
+    extra = [name for name in contents.coordinates if name not in contents.sizes]
+    group = zarr.create_group(
+        path,
+        zarr_format=3,
+        attributes={
+            **contents.attributes,
+            "format": FORMAT,
+            "store_id": secrets.token_hex(8),
+            "coordinates": " ".join(extra),
+        },
+    )
+    arrays = {
+        **contents.coordinates,
+        **contents.variables,
+        **_own_variables(contents.sizes["shot"]),
+    }
+    for name, variable in arrays.items():
+        _create_array(group, name, variable, contents.sizes)
+    with warnings.catch_warnings():
+        # That other programs may not know it: they read the arrays' own metadata then.
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(path)
+
+
+def _own_variables(shots: int) -> dict[str, Variable]:
+    """What every store tells of its shots."""
+    status = {
+        "units": "1",
+        "long_name": "What became of the shot",
+        "flag_values": [PENDING, DONE, FAILED],
+        "flag_meanings": " ".join(STATUS_NAMES),
+    }
+    report = {"units": "1", "long_name": "How it went, or why it failed (JSON)"}
+    own = {
+        "status": Variable(("shot",), np.dtype("int8"), status),
+        "report": Variable(("shot",), str, report),
+    }
+    for name, (kind, labels) in SUMMARY.items():
+        nothing: NDArray[Any] = np.full(shots, np.nan if kind is float else 0, dtype=kind)
+        own[name] = Variable(("shot",), np.dtype(kind), labels, nothing)
+    return own
+
+
+def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str, int]) -> None:
+    from zarr.codecs import BloscCodec
+
+    shape = tuple(sizes[dim] for dim in variable.dims)
+    chunks = _chunks(variable, shape)
+    is_text = variable.dtype is str
+    is_float = not is_text and np.dtype(variable.dtype).kind == "f"
+    # Bytes that change slowly side by side: that is what makes fields compressible.
+    fields = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
+    array = group.create_array(
+        name,
+        shape=shape,
+        chunks=chunks,
+        dtype=variable.dtype,
+        fill_value="" if is_text else np.nan if is_float else 0,
+        compressors=None if is_text or np.prod(chunks) <= _SMALL else fields,
+        dimension_names=variable.dims,
+        attributes=dict(variable.attributes),
+    )
+    if variable.values is not None:
+        array[...] = variable.values
+
+
+def _chunks(variable: Variable, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Shape of what is one file."""
+    if not variable.along_shots:
+        return tuple(max(1, length) for length in shape)
+    # What is known at once in few files, with room for shots to come; else one for each shot.
+    return (1 if variable.values is None else _TOGETHER, *shape[1:])

@@ -1,0 +1,231 @@
+"""The store of a run: what a new one holds, what may go on in one that is there.
+
+- a new store: `contents_of`
+- one of an earlier run: `continued` refuses what does not belong into it
+- room in it for shots that arrived since: `lengthened`
+"""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import version
+from itertools import pairwise
+from textwrap import shorten
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.dataset import variable_labels
+from napari_shadowinv.io.store import DONE, StackStore
+from napari_shadowinv.io.store_layout import Contents, Variable, grow_store
+from napari_shadowinv.stack._shot import checksum
+from napari_shadowinv.stack._stack import (
+    Stack,
+    attributes_of,
+    coordinates_of,
+    dtype_of,
+    values_of_beam,
+)
+
+__all__ = ["contents_of", "continued", "lengthened"]
+
+_APPENDED = "appended_at"  # attribute: where later runs began to append shots
+_INSTEAD = "give the same again, overwrite it, or choose another name"
+
+
+def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
+    """Say what the store of a stack holds.
+
+    Parameters
+    ----------
+    stack : Stack
+        The shots and everything about them.
+    dtype : numpy.dtype
+        Type of stored images.
+
+    Returns
+    -------
+    Contents
+    """
+    identity = {name: value for name, value in _identity(stack, dtype).items() if value}
+    return Contents(
+        stack.sizes,
+        _variables(stack, dtype),
+        _coordinates(stack),
+        {**attributes_of(stack), **identity},
+    )
+
+
+def _coordinates(stack: Stack) -> dict[str, Variable]:
+    return {
+        name: _stored_coordinate(coordinate) for name, coordinate in coordinates_of(stack).items()
+    }
+
+
+def _stored_coordinate(coordinate: Any) -> Variable:
+    if isinstance(coordinate, tuple):
+        dim, values, attributes = coordinate
+        dims: tuple[str, ...] = (dim,)
+    else:
+        dims, values, attributes = coordinate.dims, coordinate.values, dict(coordinate.attrs)
+    values = np.asarray(values)
+    if values.dtype.kind in "UO":
+        return Variable(dims, str, attributes, values.astype(object))
+    if values.dtype.kind in "mM":
+        # As numbers, because Zarr has no times; the units say which.
+        attributes = {**attributes, "units": "ns since 1970-01-01"}
+        numbers = values.astype("datetime64[ns]").astype("int64")
+        return Variable(dims, np.dtype("int64"), attributes, numbers)
+    return Variable(dims, values.dtype, attributes, values)
+
+
+def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
+    found: dict[str, Variable] = {}
+    for name, (dims, labels) in variable_labels(stack.setup).items():
+        if name not in stack.variables:
+            continue
+        exact = dtype_of(name).kind != "f" or "site" in dims
+        kept = dtype_of(name) if exact else dtype
+        shared = stack.is_shared(name)
+        values = _shared_values(stack, name) if shared else None
+        found[name] = Variable(dims if shared else ("shot", *dims), kept, labels, values)
+    return found
+
+
+def _shared_values(stack: Stack, name: str) -> NDArray[Any]:
+    assert stack.beam is not None
+    return np.asarray(values_of_beam(stack.beam, stack.options)[name])
+
+
+def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> dict[str, str]:
+    """What must be the same for a store to be continued; of so many of its shots."""
+    height, width = stack.shape
+    source = "uniform"
+    if stack.sources is not None:
+        source = f"one for each shot: {', '.join(stack.sources.names[:shots])}"
+    elif stack.beam is not None and stack.beam.source is not None:
+        source = f"sha256 {checksum(stack.beam.source)}"
+    return {
+        "options": stack.options.model_dump_json(exclude={"threads"}),
+        "setup": "" if stack.setup is None else stack.setup.model_dump_json(),
+        "source_image": source,
+        "mask_image": "none" if stack.mask is None else f"sha256 {checksum(stack.mask)}",
+        "image_size": f"{width} × {height} px",
+        "stored": f"{', '.join(stack.variables)} as {dtype}",
+        "reader": stack.reader,
+        "warm_start": str(stack.warm_start),
+    }
+
+
+def continued(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
+    """Refuse to mix what does not belong together in one store.
+
+    Parameters
+    ----------
+    store : StackStore
+        Of an earlier run.
+    stack, dtype
+        See `contents_of`.
+
+    Returns
+    -------
+    Stack
+        The same in the order of the store; shots that it does not hold yet are the last.
+
+    Raises
+    ------
+    InputError
+        If anything differs but that there are more shots.
+    """
+    stack = stack.chosen(_order(store, stack.shots.names))
+    found = _identity(stack, dtype, len(store.names))
+    for name, value in {**found, "package_version": version("napari-shadowinv")}.items():
+        before = str(store.attributes.get(name, ""))
+        if before != value:
+            raise InputError(
+                f"{store.path} was begun with another {name.replace('_', ' ')} "
+                f"({_difference(before, value)}): {_INSTEAD}"
+            )
+    for index in np.flatnonzero(store.statuses() == DONE):
+        changed = stack.changed(int(index), store.report(int(index)))
+        if changed:
+            raise InputError(
+                f"{changed} has changed since it was inverted into {store.path}: overwrite the "
+                "store or choose another name"
+            )
+    return stack
+
+
+def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
+    """Places of the store's shots among those that are given, then of the new ones.
+
+    A shot keeps its number for good, so new ones go to the end wherever their names sort.
+    """
+    count = len(store.names)
+    if names[:count] == store.names:
+        return list(range(len(names)))
+    places = {name: place for place, name in enumerate(names)}
+    lost = [name for name in store.names if name not in places]
+    if lost or len(places) < len(names):
+        missing = f"{count} there, {len(names)} given, without {lost[0]}" if lost else "other order"
+        raise InputError(f"{store.path} was begun with other shots ({missing}): {_INSTEAD}")
+    known = [places[name] for name in store.names]
+    # What came in one run keeps its order; later runs may have brought what sorts before it.
+    ends = [0, *store.attributes.get(_APPENDED, []), count]
+    for first, last in pairwise(ends):
+        for index in range(first + 1, last):
+            if known[index] < known[index - 1]:
+                raise InputError(
+                    f"{store.path} was begun with the shots in another order "
+                    f"({store.names[index - 1]} before {store.names[index]}): {_INSTEAD}"
+                )
+    return [*known, *sorted(set(range(len(names))) - set(known))]
+
+
+def _difference(before: str, now: str) -> str:
+    try:
+        old, new = json.loads(before), json.loads(now)
+        names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+        return ", ".join(f"{name}: {old.get(name)} there, {new.get(name)} now" for name in names)
+    except (ValueError, AttributeError):
+        return f"{shorten(before or 'none', 80)} there, {shorten(now or 'none', 80)} now"
+
+
+def lengthened(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackStore:
+    """Append shots that arrived since the last run, pending, to its store.
+
+    Parameters
+    ----------
+    store : StackStore
+        The store.
+    stack : Stack
+        As `continued` returned it.
+    dtype : numpy.dtype
+        Type of stored images.
+
+    Returns
+    -------
+    StackStore
+        With all shots of the stack.
+
+    Raises
+    ------
+    StoreError
+        If it cannot be written.
+    """
+    coordinates = {
+        name: np.asarray(coordinate.values)
+        for name, coordinate in _coordinates(stack).items()
+        if coordinate.along_shots
+    }
+    return grow_store(
+        store.path,
+        len(stack.shots),
+        coordinates,
+        {
+            "source_image": _identity(stack, dtype)["source_image"],
+            _APPENDED: [*store.attributes.get(_APPENDED, []), len(store.names)],
+        },
+    )

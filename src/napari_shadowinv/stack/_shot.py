@@ -1,0 +1,198 @@
+"""One shot of a stack: a reference that is read when it is needed.
+
+- what every reference can do: `Shot`; a file: `FileShot`; a page: `PageShot`; an array:
+  `ArrayShot`, `BlockShot`
+- a file with a colour channel chosen, or binned: `read_shot`
+- tell arrays and readers from others: `checksum`, `described_reader`
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "ArrayShot",
+    "BlockShot",
+    "FileShot",
+    "PageShot",
+    "Reader",
+    "Shot",
+    "checksum",
+    "described_reader",
+    "read_shot",
+]
+
+Reader = Callable[..., ArrayLike]
+
+
+class Shot(Protocol):
+    """One image that is read when it is asked for; it can be sent to a worker."""
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Return the image, and what tells it from others: a checksum at least."""
+        ...
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Whether it is still the image of which `load` said this."""
+        ...
+
+
+def read_shot(
+    path: Path, *, page: int | None = None, channel: str | int | None = None, factor: int = 1
+) -> NDArray[np.float64]:
+    """Read the image of a shot; this is the reader where none is given.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    page : int, optional
+        Of a TIFF with many pages.
+    channel : {"red", "green", "blue", "mean"} or int, optional
+        What to take of a colour image.
+    factor : int, optional
+        Sum blocks of so many pixels squared.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+
+    Raises
+    ------
+    FileFormatError, InputError
+        See `napari_shadowinv.io.read_radiograph`.
+    """
+    from napari_shadowinv.io.images import read_tiff_page
+    from napari_shadowinv.io.radiograph import Radiograph
+    from napari_shadowinv.io.reading import read_radiograph
+
+    if page is None:
+        return read_radiograph(path, channel=channel).binned(factor).image
+    return Radiograph(read_tiff_page(path, page, channel=channel)).binned(factor).image
+
+
+@dataclass(frozen=True)
+class FileShot:
+    """A file that holds one image.
+
+    Attributes
+    ----------
+    path : Path
+        Absolute, so that a worker elsewhere finds it.
+    reader : callable, optional
+        Makes an image of the path.
+    """
+
+    path: Path
+    reader: Reader = read_shot
+
+    def __dask_tokenize__(self) -> tuple[Any, ...]:
+        # A file that changed is another input, and what dask has of it another result.
+        from dask.base import normalize_token
+
+        stamp = _stamp(self.path) if self.path.exists() else {}
+        return (
+            str(self.path),
+            normalize_token(self.reader),
+            stamp.get("size"),
+            stamp.get("mtime_ns"),
+        )
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Read the file, with its checksum."""
+        from napari_shadowinv.io.files import sha256
+
+        image = np.asarray(self.reader(self.path))
+        return image, {**_stamp(self.path), "sha256": sha256(self.path)}
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Compare size and time, and only where these differ the checksum."""
+        from napari_shadowinv.io.files import sha256
+
+        if not self.path.exists():
+            return True  # put away after it was inverted
+        if _stamp(self.path).items() <= origin.items():
+            return True
+        return bool(sha256(self.path) == origin.get("sha256"))
+
+
+def _stamp(path: Path) -> dict[str, int]:
+    status = path.stat()
+    return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
+
+
+@dataclass(frozen=True)
+class PageShot:
+    """A page of a TIFF that holds many; its reader takes the keyword ``page``."""
+
+    path: Path
+    page: int
+    reader: Reader = read_shot
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Read the page, with its checksum."""
+        image = np.asarray(self.reader(self.path, page=self.page))
+        return image, {"sha256": checksum(image)}
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Read the page again and compare."""
+        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayShot:
+    """An image in memory."""
+
+    image: NDArray[Any] = field(repr=False)
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Return the array, with its checksum."""
+        return self.image, {"sha256": checksum(self.image)}
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Compare the checksum."""
+        return bool(checksum(self.image) == origin.get("sha256"))
+
+
+@dataclass(frozen=True, eq=False)
+class BlockShot:
+    """An image of a dask array, computed when it is needed.
+
+    Attributes
+    ----------
+    block : dask.array.Array
+        Shape (1, H, W), one chunk.
+    """
+
+    block: Any = field(repr=False)
+
+    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Compute the image by dask's current scheduler."""
+        return ArrayShot(np.asarray(self.block.compute())[0]).load()
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Compute the image and compare."""
+        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
+
+
+def checksum(array: NDArray[Any]) -> str:
+    """Return the SHA-256 of an array's values, shape and type, in hexadecimal."""
+    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
+    digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def described_reader(reader: Reader) -> str:
+    """Name a reader, so that a store is not continued with another."""
+    if isinstance(reader, functools.partial):
+        named = ", ".join(f"{name}={value!r}" for name, value in sorted(reader.keywords.items()))
+        return f"{described_reader(reader.func)}({named})"
+    return f"{reader.__module__}.{getattr(reader, '__qualname__', type(reader).__qualname__)}"

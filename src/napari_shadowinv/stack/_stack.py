@@ -1,0 +1,247 @@
+"""What is known about a stack before any shot is inverted.
+
+- check everything that can be checked: `describe_stack`, which gives a `Stack`
+- the labels of its dataset: `coordinates_of`, `attributes_of`, `dtype_of`
+- what its shots have together: `values_of_beam`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion import count_sites
+from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
+from napari_shadowinv.io.files import text_of
+from napari_shadowinv.io.store import FORMAT
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocess import checked_mask, checked_source
+from napari_shadowinv.stack._shot import Reader, Shot, described_reader
+from napari_shadowinv.stack._shots import Shots, find_shots, find_source
+from napari_shadowinv.stack._work import Beam, shared_plan, threads_here
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+__all__ = [
+    "Stack",
+    "attributes_of",
+    "coordinates_of",
+    "describe_stack",
+    "dtype_of",
+    "values_of_beam",
+]
+
+_OF_PLAN = ("sites", "site_mass")
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Everything about a stack that is known before any shot is inverted.
+
+    Attributes
+    ----------
+    shots : Shots
+        The shots.
+    beam : Beam or None
+        Source and mask of all shots; None if each has a source of its own.
+    sources : Shots or None
+        Source of each shot, if each has its own.
+    mask : ndarray of bool, shape (H, W), or None
+        The pixels that can be used.
+    options : InversionOptions
+        Choices.
+    setup : ProtonSetup or OpticalSetup or None
+        For fields in SI units.
+    variables : tuple of str
+        The variables that are wanted.
+    warm_start : int
+        So many shots in a row start from the answer to the one before; 1 for none.
+    source_file : str
+        Where the source comes from, if it was named by a path.
+    reader : str
+        Name of what reads the files.
+    """
+
+    shots: Shots
+    beam: Beam | None
+    sources: Shots | None
+    mask: NDArray[np.bool_] | None
+    options: InversionOptions
+    setup: ProtonSetup | OpticalSetup | None
+    variables: tuple[str, ...]
+    warm_start: int = 1
+    source_file: str = ""
+    reader: str = ""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (H, W) of each shot."""
+        return self.shots.shape
+
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        """Length of each dimension."""
+        height, width = self.shape
+        # Where each shot has its own, there are sites only if they do not depend on it.
+        beam = self.beam or Beam.of(self.shape, None, self.mask)
+        sites = count_sites(beam.image, self.options, mask=beam.mask)
+        return {"shot": len(self.shots), "y": height, "x": width, "component": 2, "site": sites}
+
+    def is_shared(self, name: str) -> bool:
+        """Whether all shots have one such variable together."""
+        return (
+            self.beam is not None
+            and name in (*_OF_PLAN, "source", "mask")
+            and not (name == "source" and self.beam.source is None)
+        )
+
+    def source_of(self, index: int) -> Shot | None:
+        """Reference to the source of one shot; None if all share one."""
+        return None if self.sources is None else self.sources.items[index]
+
+    def chosen(self, order: Sequence[int]) -> Stack:
+        """Return the stack with its shots, and their sources, in another order."""
+        sources = None if self.sources is None else self.sources.chosen(order)
+        return replace(self, shots=self.shots.chosen(order), sources=sources)
+
+    def changed(self, index: int, origin: dict[str, Any]) -> str:
+        """Say what of a shot is not what it was when this was said of it; empty if nothing."""
+        if not self.shots.items[index].unchanged(origin):
+            return self.shots.label(index)
+        if self.sources is None or self.sources.items[index].unchanged(origin["source"]):
+            return ""
+        return f"the source of {self.shots.label(index)}"
+
+
+def describe_stack(
+    shots: Any,
+    source: Any,
+    mask: ArrayLike | None,
+    options: InversionOptions | None,
+    setup: ProtonSetup | OpticalSetup | None,
+    variables: Collection[str] | None,
+    reader: Reader,
+    warm_start: int,
+) -> Stack:
+    """Check everything that can be checked before a shot is read.
+
+    Parameters
+    ----------
+    shots, source, mask, options, setup, variables, reader, warm_start
+        See `invert_stack`.
+
+    Returns
+    -------
+    Stack
+
+    Raises
+    ------
+    InputError
+        If something does not fit.
+    """
+    options = options or InversionOptions()
+    if warm_start < 1:
+        raise InputError(f"warm_start is {warm_start}: expected a number of shots, 1 for no start")
+    sources = find_source(source, reader=reader)
+    # Where the source tells it, no shot needs to be read for its shape.
+    shape: tuple[int, ...] = () if mask is None else np.shape(mask)
+    if sources is not None:
+        shape = sources.shape
+    found = find_shots(
+        shots, reader=reader, shape=(shape[0], shape[1]) if len(shape) == 2 else None
+    )
+    if sources is not None and sources.shape != found.shape:
+        raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
+    usable = None if mask is None else checked_mask(mask, found.shape)
+    beam = None
+    if not isinstance(sources, Shots):
+        if sources is not None:
+            checked_source(sources, usable)
+        beam, sources = Beam.of(found.shape, sources, usable), None
+    elif len(sources) != len(found):
+        raise InputError(
+            f"got {len(sources)} sources for {len(found)} shots: expected one, or one for each shot"
+        )
+    return Stack(
+        found,
+        beam,
+        sources,
+        usable,
+        options,
+        setup,
+        _checked_variables(variables, options, setup, sources is not None),
+        warm_start,
+        source_file=text_of(Path(source).name) if isinstance(source, (str, Path)) else "",
+        reader=described_reader(reader),
+    )
+
+
+def _checked_variables(
+    wanted: Collection[str] | None,
+    options: InversionOptions,
+    setup: ProtonSetup | OpticalSetup | None,
+    own_sources: bool,
+) -> tuple[str, ...]:
+    """Names of the variables that a stack shall have."""
+    labels = variable_labels(setup)
+    # As many sites then as the source shines into the margin: shots would differ.
+    ragged = own_sources and options.boundary == "free"
+    known = tuple(name for name, (dims, _) in labels.items() if not (ragged and "site" in dims))
+    for name in wanted or ():
+        if name in known:
+            continue
+        hint = " (it needs a setup)" if setup is None else ""
+        if name in labels:
+            hint = " (sites differ between shots: a free boundary, and a source for each)"
+        raise InputError(
+            f"there is no variable {name!r}{hint}: expected some of {', '.join(known)}"
+        )
+    return known if wanted is None else tuple(wanted)
+
+
+def coordinates_of(stack: Stack) -> dict[str, Any]:
+    """Return the coordinates of a stack's dataset."""
+    plane = dataset_from_field(np.zeros((2, *stack.shape)), None, stack.setup)
+    shots = stack.shots
+    numbers = np.arange(len(shots)) if shots.coordinate is None else shots.coordinate
+    coords: dict[str, Any] = {str(name): value for name, value in plane.coords.items()}
+    coords["shot"] = ("shot", numbers, {"long_name": "Shot"})
+    coords["name"] = ("shot", np.array(shots.names, dtype=str), {"long_name": "Name of the shot"})
+    return coords
+
+
+def attributes_of(stack: Stack) -> dict[str, str]:
+    """Return the attributes of a stack's dataset."""
+    attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.setup).attrs
+    if stack.source_file:
+        attributes["source_file"] = stack.source_file
+    return {"format": FORMAT, **attributes, "options": stack.options.model_dump_json()}
+
+
+def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
+    """Return the variables that all shots share, by name; a task, too."""
+    if options.threads is None:
+        options = options.model_copy(update={"threads": threads_here()})
+    plan = shared_plan(beam, options)
+    level = plan.levels[-1]
+    mask = np.ones(beam.shape, bool) if beam.mask is None else beam.mask
+    source = None if beam.source is None else checked_source(beam.source, beam.mask)
+    return {
+        "sites": level.sites - plan.margin,
+        "site_mass": level.mass,
+        "mask": mask,
+        "source": source,
+    }
+
+
+def dtype_of(name: str) -> Any:
+    """Type of a variable as an inversion has it."""
+    return np.dtype(bool) if name in ("caustic", "mask") else np.dtype(np.float64)

@@ -1,0 +1,146 @@
+"""What a worker of a run is asked to do: invert some shots, and write each.
+
+- the task: `run_shots`, with its `Settings`
+- what it tells of a shot: `ShotOutcome`
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.stack._shot import Shot, checksum
+from napari_shadowinv.stack._work import Beam, arrays_of, invert_shot, threads_here
+
+__all__ = ["Settings", "ShotOutcome", "run_shots"]
+
+
+@dataclass(frozen=True)
+class ShotOutcome:
+    """What became of one shot.
+
+    Attributes
+    ----------
+    index : int
+        Which.
+    status : int
+        DONE or FAILED of `napari_shadowinv.io.store`.
+    seconds : float
+        Time that its worker spent on it, reading and writing included.
+    reason : str
+        Why it failed.
+    converged : bool
+        Whether the solver reached its tolerance.
+    """
+
+    index: int
+    status: int
+    seconds: float
+    reason: str = ""
+    converged: bool = True
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the task of every shot needs to know."""
+
+    writer: ShotWriter
+    options: InversionOptions
+    setup: Any
+    variables: tuple[str, ...]
+    mask: NDArray[np.bool_] | None
+    workers: int | None
+
+
+def run_shots(
+    shots: list[Any],
+    labels: list[tuple[int, bool, Shot | None]],
+    beam: Beam | None,
+    settings: Settings,
+    stop: Any = None,
+) -> list[ShotOutcome]:
+    """Task: invert some shots one after the other and write each."""
+    options = _with_threads(settings)
+    previous: Inversion | None = None
+    outcomes = []
+    for shot, (index, wanted, source) in zip(shots, labels, strict=True):
+        start = time.perf_counter()
+        try:
+            image, origin = _loaded(shot)
+            here = beam
+            if here is None:
+                assert source is not None
+                own, origin["source"] = source.load()
+                here = Beam.of(np.shape(image), own, settings.mask)
+            previous = invert_shot(
+                image,
+                here,
+                options,
+                start=previous,
+                should_stop=None if stop is None else stop.is_set,
+            )
+        except InversionCancelled:
+            raise
+        except MemoryError:
+            failure = "there is not enough memory for this shot on its worker"
+        except (InputError, OSError) as error:
+            failure = str(error) or type(error).__name__
+        except Exception as error:
+            # Whatever a reader or a solver stumbles over, the other shots shall go on.
+            failure = f"{type(error).__name__}: {error}"
+        else:
+            failure = ""
+        if failure:
+            previous = None
+        if not wanted:
+            continue
+        seconds = time.perf_counter() - start
+        if failure or previous is None:
+            settings.writer.fail(index, {"reason": failure, "seconds": seconds})
+            outcomes.append(ShotOutcome(index, FAILED, seconds, failure))
+        else:
+            _write(settings, index, previous, origin, seconds)
+            spent = time.perf_counter() - start
+            outcomes.append(ShotOutcome(index, DONE, spent, converged=previous.report.converged))
+    return outcomes
+
+
+def _loaded(shot: Any) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Image of a shot; a block of a dask array on a cluster has been computed already."""
+    if isinstance(shot, np.ndarray):
+        return shot[0], {"sha256": checksum(shot[0])}
+    image, origin = shot.load()
+    return image, origin
+
+
+def _with_threads(settings: Settings) -> InversionOptions:
+    if settings.options.threads is not None:
+        return settings.options
+    threads = threads_here(settings.workers)
+    return settings.options.model_copy(update={"threads": threads})
+
+
+def _write(
+    settings: Settings,
+    index: int,
+    inversion: Inversion,
+    origin: dict[str, Any],
+    seconds: float,
+) -> None:
+    names = dict.fromkeys(settings.variables)
+    report = {
+        **dataclasses.asdict(inversion.report),
+        "stages": inversion.report.seconds,
+        "seconds": seconds,
+        **origin,
+    }
+    settings.writer.write(index, arrays_of(inversion, names, settings.setup), report)

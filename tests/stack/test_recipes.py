@@ -1,0 +1,177 @@
+"""The recipes for clusters, as the page has them, with what a cluster would do played by a shell.
+
+`sbatch` starts the job on this machine and `scancel` ends it; scheduler, workers and the store are
+real. Of Kubernetes nothing is played: only what the recipe asks for is looked at.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from napari_shadowinv import read
+from napari_shadowinv.io.store import DONE
+
+PAGE = (Path(__file__).parents[2] / "docs" / "batch.md").read_text(encoding="utf-8")
+SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
+PATIENCE = 120
+
+SBATCH = """#!/bin/sh
+job=$(ls "$FAKE_SLURM" | grep -c sh$)
+cp "$1" "$FAKE_SLURM/$job.sh"
+SLURM_JOB_ID=$job setsid sh "$FAKE_SLURM/$job.sh" >"$FAKE_SLURM/$job.log" 2>&1 &
+echo $! >"$FAKE_SLURM/$job.pid"
+echo "Submitted batch job $job"
+"""
+SCANCEL = """#!/bin/sh
+kill -TERM -- -$(cat "$FAKE_SLURM/$1.pid")
+touch "$FAKE_SLURM/$1.cancelled"
+"""
+SRUN = """#!/bin/sh
+exec "$@"
+"""
+# The commands of this very Python and this very code.
+DASK = f"""#!/bin/sh
+exec {sys.executable} -m dask "$@"
+"""
+SHADOWINV = f"""#!/bin/sh
+exec {sys.executable} -c "from napari_shadowinv.cli import app; app()" "$@"
+"""
+
+
+def block(word: str) -> str:
+    """Return the block of the page in which a word is."""
+    blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    (found,) = [text for text in blocks if word in text]
+    return found
+
+
+@pytest.fixture
+def project(night, tmp_path) -> Path:
+    """The folder that the recipes call /project."""
+    folder = tmp_path / "project"
+    (folder / "shots").mkdir(parents=True)
+    for index, image in enumerate(night.images):
+        tifffile.imwrite(folder / "shots" / f"shot_{index}.tif", image.astype(np.float32))
+    tifffile.imwrite(folder / "reference.tif", night.source.astype(np.float32))
+    return folder
+
+
+@pytest.fixture
+def slurm(tmp_path):
+    """An environment with Slurm's commands; jobs that are left are ended."""
+    if os.name != "posix" or not shutil.which("setsid"):
+        pytest.skip("the jobs are groups of processes")
+    commands, jobs = tmp_path / "bin", tmp_path / "jobs"
+    commands.mkdir()
+    jobs.mkdir()
+    scripts = {"sbatch": SBATCH, "scancel": SCANCEL, "srun": SRUN, "dask": DASK}
+    for name, text in {**scripts, "shadowinv": SHADOWINV}.items():
+        (commands / name).write_text(text)
+        (commands / name).chmod(0o755)
+    yield {
+        **os.environ,
+        "PATH": os.pathsep.join([str(commands), os.environ["PATH"]]),
+        "PYTHONPATH": os.pathsep.join([str(SOURCES), os.environ.get("PYTHONPATH", "")]),
+        "FAKE_SLURM": str(jobs),
+        # Everything on this machine's loopback.
+        "DASK_JOBQUEUE__SLURM__INTERFACE": "lo",
+        "DASK_JOBQUEUE__SLURM__SCHEDULER_OPTIONS": '{"dashboard_address": "127.0.0.1:0"}',
+        "DASK_JOBQUEUE__SLURM__WORKER_EXTRA_ARGS": '["--no-dashboard"]',
+    }
+    for pid in jobs.glob("*.pid"):
+        end_group(int(pid.read_text()))
+
+
+def end_group(leader: int) -> None:
+    try:
+        os.killpg(leader, signal.SIGKILL)
+    except ProcessLookupError:
+        return
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the loopback's name is lo")
+def test_the_recipe_for_slurm_inverts_a_stack(project, slurm, tmp_path):
+    pytest.importorskip("dask_jobqueue")
+    recipe = block("SLURMCluster")
+    for there, here in (("/project", str(project)), ("32,", "2,"), ("64GB", "2GB")):
+        assert there in recipe
+        recipe = recipe.replace(there, here)
+    # Small, as the machine of a test is; else as it stands there.
+    recipe = recipe.replace("maximum_jobs=8", "maximum_jobs=1").replace(
+        '"/tmp"', repr(str(tmp_path))
+    )
+    script = tmp_path / "recipe.py"
+    script.write_text(recipe)
+    subprocess.run([sys.executable, script], env=slurm, timeout=PATIENCE, check=True, cwd=tmp_path)
+    assert list(read(project / "night.shadowinv.zarr").status) == [DONE] * 6
+    jobs = Path(slurm["FAKE_SLURM"])
+    job = (jobs / "0.sh").read_text()
+    assert "#SBATCH --cpus-per-task=2" in job
+    assert "#SBATCH -t 04:00:00" in job
+    for words in ("--nthreads 1 ", "--nworkers 2 ", "--memory-limit 0.93GiB "):
+        assert words in job
+    # The job is given back as soon as the run is over.
+    assert (jobs / "0.cancelled").exists()
+
+
+def test_the_recipe_without_dask_jobqueue(project, slurm, tmp_path):
+    (lines,) = re.findall(r"^    (dask scheduler .*\n(?:    .*\n)+)", PAGE, re.MULTILINE)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    ours = "--host 127.0.0.1 --dashboard-address 127.0.0.1:0"
+    for there, here in (
+        ("/project", str(project)),
+        ("dask scheduler", f"dask scheduler {ours} --port {port}"),
+        ("dask worker", f"dask worker {ours}"),
+        ("--nworkers 32", "--nworkers 1"),
+        ("$(hostname):8786", f"127.0.0.1:{port}"),
+    ):
+        assert there in lines
+        lines = lines.replace(there, here)
+    job = subprocess.Popen(
+        ["sh", "-c", lines], env=slurm, cwd=tmp_path, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    try:
+        code = job.wait(PATIENCE)
+    finally:
+        end_group(job.pid)
+    assert code == 0, job.communicate()[0]
+    assert list(read(project / "night.shadowinv.zarr").status) == [DONE] * 6
+
+
+def test_the_recipe_for_kubernetes_asks_for_what_the_page_says():
+    pytest.importorskip("dask_kubernetes.operator")
+    asking = block("KubeCluster").partition("cluster = ")[0]
+    names: dict[str, object] = {}
+    exec(compile(asking, "batch.md", "exec"), names)
+    spec = names["spec"]["spec"]  # type: ignore[index]
+    assert spec["worker"]["replicas"] == 16
+    (container,) = spec["worker"]["spec"]["containers"]
+    assert container["image"] == spec["scheduler"]["spec"]["containers"][0]["image"]
+    assert container["image"].startswith("registry.example.org/")
+    assert container["volumeMounts"] == [{"name": "data", "mountPath": "/data"}]
+    assert [volume["name"] for volume in spec["worker"]["spec"]["volumes"]] == ["data"]
+    assert container["resources"] == {
+        "requests": {"cpu": "1", "memory": "2Gi"},
+        "limits": {"memory": "2Gi"},
+    }
+    assert {"name": "NUMBA_CACHE_DIR", "value": "/data/.numba"} in container["env"]
+    # What a worker is started with must be what dask's command takes.
+    assert container["args"][:4] == ["dask", "worker", "--nthreads", "1"]
+    command = import_module("distributed.cli.dask_worker").main
+    taken = command.make_context("dask worker", container["args"][2:]).params
+    assert taken["nthreads"] == 1
