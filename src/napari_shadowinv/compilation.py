@@ -1,12 +1,49 @@
-"""Whether a first inversion will have to wait for the compiler: `is_compiled`."""
+"""The compiler's work, done once after an installation.
+
+- do it before an inversion that somebody waits for: `ensure_compiled`
+- whether it was done: `is_compiled`
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["COMPILING", "is_compiled"]
+import numpy as np
 
-COMPILING = "First run: compiling for this machine, once; this takes a minute or so"
+from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
+
+__all__ = ["ensure_compiled", "is_compiled"]
+
+_SIDE = 64  # enough sites for every kernel to be used
+
+
+def ensure_compiled(
+    on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+) -> None:
+    """Compile all kernels, unless an earlier run has; they are kept for later ones.
+
+    Without it the first inversion does the same, in the middle of its stages.
+
+    Parameters
+    ----------
+    on_progress : callable, optional
+        Told of the stage ``"compile"``, where there is something to compile.
+    should_stop : callable, optional
+        Asked between kernels; a true answer cancels.
+
+    Raises
+    ------
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    if is_compiled():
+        return
+    from napari_shadowinv.inversion import invert
+
+    Reporter(on_progress, should_stop)("compile", 0, None, "once, for a minute or so")
+    y, x = np.indices((_SIDE, _SIDE)) / _SIDE
+    uneven = np.exp(-4 * (y + x))
+    invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)
 
 
 def is_compiled() -> bool:

@@ -22,8 +22,8 @@ class Progress:
     Attributes
     ----------
     stage : str
-        What is being done: ``"prepare"``, ``"sites"``, ``"transport"``, ``"read-out"``,
-        ``"samples"``.
+        What is being done: ``"compile"``, ``"prepare"``, ``"sites"``, ``"transport"``,
+        ``"read-out"``, ``"samples"``.
     step : int
         Steps of this stage that are finished.
     total : int or None

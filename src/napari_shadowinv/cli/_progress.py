@@ -20,10 +20,12 @@ if TYPE_CHECKING:
 
 def inverted(experiment: Experiment, options: InversionOptions, quiet: bool = False) -> Inversion:
     """Invert an experiment's shot; a mistake in it is told with the file's name."""
+    from napari_shadowinv.compilation import ensure_compiled
     from napari_shadowinv.inversion import invert
 
     shot, source = experiment.shot, experiment.source
     with nullcontext() if quiet else progress_bars() as show:
+        ensure_compiled(show, interrupted)
         try:
             return invert(
                 shot.image,

@@ -141,9 +141,11 @@ class ShotJob:
         InversionCancelled
             If `should_stop` returned true.
         """
+        from napari_shadowinv.compilation import ensure_compiled
         from napari_shadowinv.inversion import invert
         from napari_shadowinv.preprocess import number_of_sites, prepare
 
+        ensure_compiled(on_progress, should_stop)
         report = Reporter(on_progress, should_stop)
         seconds: dict[str, float] = {}
         clock = time.perf_counter()

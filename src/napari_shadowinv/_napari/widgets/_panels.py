@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["ReportTable", "RunPanel", "report_rows", "section"]
 
 _STAGES = {
+    "compile": "Compiling",
     "prepare": "Preparing the image",
     "sites": "Spreading the sites",
     "transport": "Solving the transport",
