@@ -178,6 +178,33 @@ def test_mistakes_are_told_in_one_sentence_and_nothing_is_written(folder, argume
     assert sorted(folder.rglob("*")) == before
 
 
+def test_nothing_is_written_among_the_files_of_a_store(store):
+    before = sorted(store.rglob("*"))
+    for arguments in (
+        ["export", store, "--format", "tiff", "--out", store, "--overwrite"],
+        ["export", store, "--format", "csv", "--out", store / "table.csv"],
+        ["movie", store, "--out", store / "film.gif"],
+    ):
+        result = shadowinv(*arguments)
+        assert result.exit_code == 2
+        assert "lies in the store that is read" in flat(result.output)
+    assert sorted(store.rglob("*")) == before
+
+
+def test_a_store_whose_reports_are_lost_or_damaged_is_told(store):
+    assert "n_sites = 100, floor" in flat(shadowinv("status", store).stdout)
+    (chunk, *_) = sorted(path for path in (store / "report" / "c").rglob("*") if path.is_file())
+    chunk.unlink()
+    result = shadowinv("status", store)
+    assert result.exit_code == 0, result.output
+    assert "1 shots did not converge: shot_0.npy" in flat(result.output)
+    chunk.write_bytes(b"junk")
+    result = shadowinv("status", store)
+    assert result.exit_code == 2
+    (line,) = result.stderr.splitlines()
+    assert "is a stack of shots but is damaged" in line
+
+
 def test_a_tiff_with_pages_a_mask_and_bins(night, folder):
     tifffile.imwrite("film.tif", night.images.astype(np.float32), photometric="minisblack")
     mask = np.ones(night.source.shape, np.uint8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ import typer
 
 from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interrupted
 from napari_shadowinv.cli._inputs import setup_from
-from napari_shadowinv.cli._tables import Rows, say, two_columns
+from napari_shadowinv.cli._tables import Rows, options_text, say, two_columns
 from napari_shadowinv.errors import InputError, InversionCancelled
 
 if TYPE_CHECKING:
@@ -244,13 +245,16 @@ def _trouble_rows(out: Path) -> Rows:
     store = StackStore(out)
     statuses = store.statuses()
     failed = [int(index) for index in np.flatnonzero(statuses == FAILED)]
-    rows = [("failed", f"{store.names[i]}: {store.report(i)['reason']}") for i in failed[:_NAMED]]
+    rows = [
+        ("failed", f"{store.names[i]}: {store.report(i).get('reason', 'its report is lost')}")
+        for i in failed[:_NAMED]
+    ]
     if len(failed) > _NAMED:
         rows.append(("failed", f"and {len(failed) - _NAMED} more: shadowinv status {out} --all"))
     rough = [
         store.names[index]
         for index, report in enumerate(store.reports())
-        if statuses[index] == DONE and not report["converged"]
+        if statuses[index] == DONE and not report.get("converged")
     ]
     if rough:
         named = ", ".join(rough[:_NAMED]) + (", …" if len(rough) > _NAMED else "")
@@ -265,7 +269,7 @@ def _end(out: Path) -> None:
     statuses = store.statuses()
     if (statuses != DONE).any():
         raise typer.Exit(EXIT_FAILED_SHOTS)
-    if not all(report["converged"] for report in store.reports()):
+    if not all(report.get("converged") for report in store.reports()):
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
@@ -311,7 +315,7 @@ def store_rows(path: Path, *, trouble: bool = True) -> Rows:
         ("image", str(attributes["image_size"])),
         ("source", str(attributes.get("source_file", attributes["source_image"]))),
         ("stored", str(attributes["stored"])),
-        ("options", str(attributes["options"])),
+        ("options", options_text(json.loads(attributes["options"]))),
     ]
     if seconds:
         mean = sum(seconds) / len(seconds)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from napari_shadowinv.cli._outputs import make_folder, protect_store
 from napari_shadowinv.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
@@ -74,11 +75,11 @@ def export_shots(
     """
     if form not in FORMATS:
         raise InputError(f"format is {form!r}: expected one of {', '.join(FORMATS)}")
+    protect_store(store, out)
     if form == "csv":
         return [_write_table(store, out, shots, overwrite)]
     dataset = opened(store, shots)
     jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
-    from napari_shadowinv.cli._outputs import make_folder
     from napari_shadowinv.io import check_output
 
     make_folder(out)
@@ -196,6 +197,7 @@ def write_movie(
     from napari_shadowinv.plotting import stack_frames
 
     check_output(out, overwrite, suffixes=(".mp4", ".gif"))
+    protect_store(store, out)
     if out.suffix.lower() == ".mp4":
         _require_ffmpeg(out)
     if not 0 < rate <= 120:

@@ -10,6 +10,7 @@ from napari_shadowinv.cli._tables import (
     Rows,
     closing_rows,
     inversion_rows,
+    options_text,
     peak_rows,
     setup_text,
     size_text,
@@ -154,5 +155,5 @@ def _result_rows(dataset: xarray.Dataset) -> Rows:
         *experiment,
         *inversion_rows(inversion, setup),
         *closing_rows(inversion.report),
-        ("options", ", ".join(f"{k} = {v}" for k, v in inversion.options.model_dump().items())),
+        ("options", options_text(inversion.options.model_dump())),
     ]

@@ -46,6 +46,14 @@ def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
         raise InputError(f"{outputs[0]} is to be written twice: choose two names")
 
 
+def protect_store(store: Path, output: Path) -> None:
+    """Refuse to write among the files of a store that is read."""
+    if output.resolve().is_relative_to(store.resolve()):
+        raise InputError(
+            f"{output} lies in the store that is read: choose another name for the output"
+        )
+
+
 def _is_same(first: Path, second: Path) -> bool:
     return first.resolve() == second.resolve()
 

@@ -2,7 +2,7 @@
 
 - after an inversion: `summary`
 - rows that other tables share: `inversion_rows`, `peak_rows`, `closing_rows`
-- texts: `setup_text`, `size_text`; all of it goes out through `say`
+- texts: `setup_text`, `options_text`, `size_text`; all of it goes out through `say`
 """
 
 from __future__ import annotations
@@ -146,6 +146,11 @@ def _missing(geometry: Mapping[str, Any]) -> str:
     if not {"pixel_size", "detector_pixel_size"} & geometry.keys():
         missing.append("pixel size")
     return ", nor the ".join(missing)
+
+
+def options_text(options: Mapping[str, Any]) -> str:
+    """Options in a line that wraps between words."""
+    return ", ".join(f"{name} = {value}" for name, value in options.items())
 
 
 def size_text(array: NDArray[Any]) -> str:

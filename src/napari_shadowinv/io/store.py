@@ -244,13 +244,27 @@ class StackStore:
 
     def report(self, index: int) -> dict[str, Any]:
         """Return how a shot went; ``reason`` tells why it failed."""
-        text = str(self._arrays["report"][index])
-        return dict(json.loads(text)) if text else {}
+        return self._parsed([str(self._arrays["report"][index])])[0]
 
     def reports(self) -> Sequence[dict[str, Any]]:
-        """Return how each shot went."""
-        texts = np.asarray(self._arrays["report"][...]).tolist()
-        return [json.loads(text) if text else {} for text in texts]
+        """Return how each shot went.
+
+        Raises
+        ------
+        FileFormatError
+            If the reports are damaged.
+        """
+        try:
+            texts = np.asarray(self._arrays["report"][...]).tolist()
+        except Exception as error:
+            raise _damaged(self.path, error) from error
+        return self._parsed(texts)
+
+    def _parsed(self, texts: Sequence[str]) -> list[dict[str, Any]]:
+        try:
+            return [dict(json.loads(text)) if text else {} for text in texts]
+        except ValueError as error:
+            raise _damaged(self.path, error) from error
 
     def summarise(self) -> None:
         """Gather numbers of each shot from their reports, for those who open the store.
