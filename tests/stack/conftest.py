@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from napari_shadowinv import InversionOptions, invert, plan_sites, synthetic_image
+from napari_shadowinv import InversionOptions, invert, plan_sites, run_stack, synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
 # Workers import readers from there; they get this process's path.
@@ -40,6 +40,11 @@ class Night:
     @property
     def glob(self) -> str:
         return str(self.folder / "shot_*.npy")
+
+    def run(self, out: Path, **changes):
+        """Invert its files into a store; arguments of `run_stack` may differ."""
+        arguments = {"shots": self.glob, "source": self.source, "options": OPTIONS, **changes}
+        return run_stack(arguments.pop("shots"), out, **arguments)
 
     def path(self, index: int) -> Path:
         return self.folder / f"shot_{index}.npy"

@@ -27,7 +27,6 @@ from napari_shadowinv import (
     InversionOptions,
     invert_stack,
     read,
-    run_stack,
 )
 from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.io.locking import locked
@@ -62,16 +61,16 @@ def cluster(compiled):
 def expected(night, tmp_path) -> dict[str, bytes]:
     """What is written where nothing goes wrong."""
     store = tmp_path / "expected.shadowinv.zarr"
-    run_stack(night.glob, store, source=night.source, options=OPTIONS)
+    night.run(store)
     return content(store)
 
 
 class InThread(threading.Thread):
     """A run that the test watches from outside."""
 
-    def __init__(self, *args, **kwargs) -> None:
+    def __init__(self, night, out: Path, **changes) -> None:
         super().__init__(daemon=True)
-        self._work = lambda: run_stack(*args, **kwargs)
+        self._work = lambda: night.run(out, **changes)
         self.error: BaseException | None = None
 
     def run(self) -> None:
@@ -92,14 +91,7 @@ def environment() -> dict[str, str]:
 
 def test_a_worker_killed_in_the_middle_of_a_shot(night, out, expected, cluster):
     (night.folder / "hang.txt").write_text("shot_2")
-    run = InThread(
-        night.glob,
-        out,
-        source=night.source,
-        options=OPTIONS,
-        reader=hang_once,
-        scheduler=cluster.scheduler_address,
-    )
+    run = InThread(night, out, reader=hang_once, scheduler=cluster.scheduler_address)
     run.start()
     victim = int(wait_for(lambda: read_text(night.folder / "hanging"), "a shot to begin"))
     assert victim != os.getpid()
@@ -136,12 +128,7 @@ DRIVER = """
 def test_the_client_killed_and_resumed_while_a_second_one_is_refused(night, out, expected, cluster):
     np.save(night.folder / "source.npy", night.source)
     (night.folder / "hang.txt").write_text("shot_3")
-    arguments = {
-        "source": night.source,
-        "options": OPTIONS,
-        "reader": hang_once,
-        "scheduler": cluster.scheduler_address,
-    }
+    arguments = {"reader": hang_once, "scheduler": cluster.scheduler_address}
     client = subprocess.Popen(
         [
             sys.executable,
@@ -157,14 +144,14 @@ def test_the_client_killed_and_resumed_while_a_second_one_is_refused(night, out,
         wait_for(lambda: read_text(night.folder / "hanging"), "a shot to begin")
         wait_for(lambda: (StackStore(out).statuses() == DONE).sum() == 5, "the other shots")
         with pytest.raises(FileFormatError, match=f"being written by process {client.pid} on"):
-            run_stack(night.glob, out, **arguments)
+            night.run(out, **arguments)
     finally:
         client.kill()
         client.wait()
     assert list(np.flatnonzero(read(out).status == PENDING)) == [3]
     reads = Counter(night.reads)
     # The lock of the dead is none; the worker that is still at the shot may go on.
-    run = InThread(night.glob, out, **arguments)
+    run = InThread(night, out, **arguments)
     run.start()
     (night.folder / "release").touch()
     assert run.ended() is None
@@ -183,13 +170,7 @@ def test_ten_of_a_hundred_files_corrupt(make_night, out, cluster):
             path.write_bytes(content[: len(content) // 2])
         else:
             np.save(path, np.zeros((3, 3)) if index % 3 else 0 * night.images[index])
-    written = run_stack(
-        night.glob,
-        out,
-        source=night.source,
-        options=OPTIONS,
-        scheduler=cluster.scheduler_address,
-    )
+    written = night.run(out, scheduler=cluster.scheduler_address)
     assert list(np.flatnonzero(written.status == FAILED)) == spoilt
     assert (written.status == DONE).sum() == 90
     done = written.isel(shot=written.status.values == DONE)
@@ -205,7 +186,7 @@ def test_a_dask_array_on_the_cluster_is_inverted_there(night, out, expected, clu
 
     with Client(cluster) as client:
         shots = client.persist(da.from_array(night.images, chunks=(2, 24, 28)))
-        run_stack(shots, out, source=night.source, options=OPTIONS)  # dask's current client
+        night.run(out, shots=shots)  # dask's current client
     assert content(out) == expected
 
 
@@ -252,14 +233,7 @@ def test_a_shot_on_a_worker_gets_its_share_of_the_cores(cluster):
 def test_a_shot_whose_worker_always_dies_fails_with_this_reason(make_night, out, cluster):
     night = make_night(1)
     cluster.scheduler.allowed_failures = 0
-    written = run_stack(
-        night.glob,
-        out,
-        source=night.source,
-        options=OPTIONS,
-        reader=die,
-        scheduler=cluster.scheduler_address,
-    )
+    written = night.run(out, reader=die, scheduler=cluster.scheduler_address)
     assert list(written.status) == [FAILED]
     assert "the worker died each time" in StackStore(out).report(0)["reason"]
 
@@ -270,8 +244,7 @@ def test_a_worker_lost_while_it_gets_the_beam(night, out, expected, cluster, mon
         raise error
 
     monkeypatch.setattr(Client, "replicate", replicate)
-    address = cluster.scheduler_address
-    run_stack(night.glob, out, source=night.source, options=OPTIONS, scheduler=address)
+    night.run(out, scheduler=cluster.scheduler_address)
     assert content(out) == expected
 
 
@@ -325,15 +298,10 @@ class Dask:
 
 def test_the_scheduler_restarted_and_the_run_resumed(night, out, expected):
     (night.folder / "hang.txt").write_text("shot_3")
-    arguments = {
-        "source": night.source,
-        "options": OPTIONS,
-        "reader": hang_once,
-    }
     dask = Dask()
     try:
         dask.start()
-        run = InThread(night.glob, out, **arguments, scheduler=dask.address)
+        run = InThread(night, out, reader=hang_once, scheduler=dask.address)
         run.start()
         wait_for(lambda: read_text(night.folder / "hanging"), "a shot to begin")
         dask.kill()
@@ -344,7 +312,7 @@ def test_the_scheduler_restarted_and_the_run_resumed(night, out, expected):
         assert (before.status == PENDING).any()
         assert not (before.status == FAILED).any()
         dask.start()
-        written = run_stack(night.glob, out, **arguments, scheduler=dask.address)
+        written = night.run(out, reader=hang_once, scheduler=dask.address)
     finally:
         dask.kill()
     assert (written.status == DONE).all()
@@ -357,7 +325,7 @@ def test_no_scheduler_answers(night, out, monkeypatch):
         closed.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
         with pytest.raises(OSError, match=f"no scheduler answers at {address}"):
-            run_stack(night.images, out, options=OPTIONS, scheduler=address)
+            night.run(out, scheduler=address)
     assert not out.exists()
 
 
@@ -374,9 +342,7 @@ def test_the_wait_for_a_scheduler_that_is_not_there_can_be_ended(night, out):
         silent.listen()
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(InversionCancelled, match="run again to resume"):
-            run_stack(
-                night.images, out, options=OPTIONS, scheduler=address, should_stop=should_stop
-            )
+            night.run(out, scheduler=address, should_stop=should_stop)
     assert time.monotonic() - asked[0] < 1
     assert not out.exists()
 
@@ -402,9 +368,8 @@ def test_the_disk_full_while_writing(make_night, small_disk):
     night = make_night(40)
     folder, enlarge = small_disk
     out = folder / "night.shadowinv.zarr"
-    arguments = {"source": night.source, "options": OPTIONS}
     with pytest.raises(OSError, match=r"No space left on device\): make room"):
-        run_stack(night.glob, out, **arguments)
+        night.run(out)
     before = read(out)
     done = before.status.values == DONE
     assert 0 < done.sum() < 40
@@ -412,7 +377,7 @@ def test_the_disk_full_while_writing(make_night, small_disk):
     assert np.isfinite(before.potential.values[done]).all()
     kept = {name: text for name, text in content(out).items() if done[shot_of(name)]}
     assert enlarge()
-    after = run_stack(night.glob, out, **arguments)
+    after = night.run(out)
     assert (after.status == DONE).all()
     assert np.isfinite(after.potential.values).all()
     assert kept.items() <= content(out).items()

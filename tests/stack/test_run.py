@@ -37,9 +37,7 @@ def stop_after(count: int):
 
 
 def test_the_store_holds_what_the_lazy_stack_computes(night, out, optical_setup):
-    written = run_stack(
-        night.images, out, source=night.source, options=OPTIONS, setup=optical_setup
-    )
+    written = night.run(out, shots=night.images, setup=optical_setup)
     lazy = invert_stack(night.images, source=night.source, options=OPTIONS, setup=optical_setup)
     assert (written.status == DONE).all()
     assert written.potential.dtype == np.float32
@@ -56,7 +54,7 @@ def test_the_store_holds_what_the_lazy_stack_computes(night, out, optical_setup)
 
 
 def test_read_opens_it_and_so_does_plain_xarray(night, out, recwarn):
-    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    night.run(out, shots=night.images)
     dataset = read(out)
     assert isinstance(dataset, xr.Dataset)
     assert dataset.potential.attrs["units"] == "px²"
@@ -90,17 +88,16 @@ def test_what_is_stored_can_be_chosen_and_sites_are_stored_once(night, out, boun
 
 def test_the_bytes_do_not_depend_on_threads_or_order(night, out, tmp_path):
     other = tmp_path / "other.shadowinv.zarr"
-    run_stack(night.images, out, source=night.source, options=OPTIONS, scheduler="synchronous")
+    night.run(out, shots=night.images, scheduler="synchronous")
     run_stack(night.images, other, source=night.source, options=OPTIONS, workers=3)
     assert content(out) == content(other)
 
 
 def test_a_run_goes_on_where_it_stopped(night, out):
     note, enough = stop_after(2)
-    arguments = {"source": night.source, "options": OPTIONS, "reader": log_and_read}
+    arguments = {"reader": log_and_read}
     with pytest.raises(InversionCancelled, match="run again to resume"):
-        run_stack(
-            night.glob,
+        night.run(
             out,
             **arguments,
             scheduler="synchronous",
@@ -115,7 +112,7 @@ def test_a_run_goes_on_where_it_stopped(night, out):
     first = content(out)
     reads = len(night.reads)
     told = []
-    after = run_stack(night.glob, out, **arguments, on_progress=told.append)
+    after = night.run(out, **arguments, on_progress=told.append)
     assert (after.status == DONE).all()
     assert (told[0].done, told[0].total) == (len(done), 6)
     # What was done is neither read nor written again.
@@ -126,9 +123,9 @@ def test_a_run_goes_on_where_it_stopped(night, out):
 
 
 def test_a_finished_run_has_nothing_to_do(night, out):
-    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    night.run(out, shots=night.images)
     told = []
-    run_stack(night.images, out, source=night.source, options=OPTIONS, on_progress=told.append)
+    night.run(out, shots=night.images, on_progress=told.append)
     assert [(p.engine, p.done, p.outcome) for p in told] == [("nothing to do", 6, None)]
 
 
@@ -146,7 +143,7 @@ def test_bad_shots_fail_alone_with_their_reason_and_can_be_redone(make_night, ou
     night = make_night(8)
     words = spoil(night)
     arguments = {"source": night.source, "options": OPTIONS}
-    written = run_stack(night.glob, out, **arguments)
+    written = night.run(out, **arguments)
     assert list(np.flatnonzero(written.status == FAILED)) == [0, 1, 2, 3, 4]
     assert list(np.flatnonzero(written.status == DONE)) == [5, 6, 7]
     store = StackStore(out)
@@ -155,8 +152,8 @@ def test_bad_shots_fail_alone_with_their_reason_and_can_be_redone(make_night, ou
     before = content(out, "potential")
     for index in words:
         np.save(night.path(index), night.images[index])
-    assert (run_stack(night.glob, out, **arguments).status == FAILED).sum() == 5
-    redone = run_stack(night.glob, out, **arguments, redo_failed=True)
+    assert (night.run(out, **arguments).status == FAILED).sum() == 5
+    redone = night.run(out, **arguments, redo_failed=True)
     assert (redone.status == DONE).all()
     assert before.items() <= content(out, "potential").items()
     assert "reason" not in StackStore(out).report(0)
@@ -200,7 +197,7 @@ def test_a_warm_start_does_not_depend_on_where_a_run_stopped(night, out, tmp_pat
 @pytest.fixture(scope="module")
 def finished(any_night, tmp_path_factory):
     out = tmp_path_factory.mktemp("finished") / "n.shadowinv.zarr"
-    TestRefusals.run(any_night, out)
+    any_night.run(out)
     return out
 
 
@@ -213,54 +210,49 @@ class TestRefusals:
         yield
         assert content(out) == before
 
-    @staticmethod
-    def run(night, out, **changes):
-        arguments = {"source": night.source, "options": OPTIONS, **changes}
-        return run_stack(arguments.pop("shots", night.glob), out, **arguments)
-
     def test_other_options(self, night, out):
         with pytest.raises(InputError, match=r"another options \(n_sites: 100 there, 50 now\)"):
-            self.run(night, out, options=InversionOptions(n_sites=50))
+            night.run(out, options=InversionOptions(n_sites=50))
 
     def test_threads_are_no_other_option(self, night, out):
-        self.run(night, out, options=OPTIONS.model_copy(update={"threads": 1}))
+        night.run(out, options=OPTIONS.model_copy(update={"threads": 1}))
 
     def test_another_source(self, night, out):
         with pytest.raises(InputError, match="another source image"):
-            self.run(night, out, source=night.source + 1)
+            night.run(out, source=night.source + 1)
 
     def test_another_mask(self, night, out):
         mask = np.ones(night.source.shape, bool)
         mask[0] = False
         with pytest.raises(InputError, match="another mask image"):
-            self.run(night, out, mask=mask)
+            night.run(out, mask=mask)
 
     def test_another_setup(self, night, out, optical_setup):
         with pytest.raises(InputError, match="another setup"):
-            self.run(night, out, setup=optical_setup)
+            night.run(out, setup=optical_setup)
 
     def test_other_variables(self, night, out):
         with pytest.raises(InputError, match="another stored"):
-            self.run(night, out, variables=("potential",))
+            night.run(out, variables=("potential",))
 
     def test_a_shot_that_is_not_given_any_more(self, night, out):
         night.path(3).unlink()
         with pytest.raises(InputError, match=r"other shots \(6 there, 5 given, without shot_3.npy"):
-            self.run(night, out)
+            night.run(out)
 
     def test_another_order(self, night, out):
         paths = [night.path(index) for index in (0, 1, 3, 2, 4, 5)]
         with pytest.raises(InputError, match=r"another order \(shot_2.npy before shot_3.npy\)"):
-            self.run(night, out, shots=paths)
+            night.run(out, shots=paths)
 
     def test_a_shot_that_changed(self, night, out):
         np.save(night.path(3), night.images[3] + 1)
         with pytest.raises(InputError, match=r"shot 3 \(shot_3.npy\) has changed"):
-            self.run(night, out)
+            night.run(out)
 
     def test_a_shot_that_was_only_touched(self, night, out):
         np.save(night.path(3), night.images[3])
-        self.run(night, out)
+        night.run(out)
 
     def test_a_name_with_another_ending(self, night, tmp_path):
         with pytest.raises(FileFormatError, match=r"ends with \.shadowinv\.zarr"):
@@ -285,12 +277,12 @@ class TestRefusals:
     )
     def test_arguments_that_mean_nothing(self, night, tmp_path, changes, words):
         with pytest.raises(InputError, match=words):
-            self.run(night, tmp_path / "new.shadowinv.zarr", **changes)
+            night.run(tmp_path / "new.shadowinv.zarr", **changes)
         assert not (tmp_path / "new.shadowinv.zarr").exists()
 
 
 def test_overwriting_begins_anew(night, out):
-    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    night.run(out, shots=night.images)
     other = InversionOptions(n_sites=60)
     written = run_stack(night.images[:2], out, source=night.source, options=other, overwrite=True)
     assert written.sizes["shot"] == 2
@@ -298,9 +290,9 @@ def test_overwriting_begins_anew(night, out):
 
 
 def test_a_writer_of_a_store_that_was_replaced_writes_nothing(night, out):
-    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    night.run(out, shots=night.images)
     old = StackStore(out).writer
-    run_stack(night.images, out, source=night.source, options=OPTIONS, overwrite=True)
+    night.run(out, shots=night.images, overwrite=True)
     before = content(out)
     with pytest.raises(OSError, match="is another store than at the start"):
         old.write(0, {"potential": np.zeros(night.source.shape)}, {})
@@ -308,7 +300,7 @@ def test_a_writer_of_a_store_that_was_replaced_writes_nothing(night, out):
 
 
 def test_a_damaged_store_is_told_in_one_sentence(night, out):
-    run_stack(night.images, out, source=night.source, options=OPTIONS)
+    night.run(out, shots=night.images)
     (out / "status" / "c" / "2").write_bytes(b"")
     with pytest.raises(FileFormatError, match="stack of shots but is damaged"):
         read(out)

@@ -146,19 +146,19 @@ def run_stack(
     stack = describe_stack(shots, source, mask, options, setup, variables, reader, warm_start)
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
     with locked(path) as live:
-        store = None
-        if path.exists() and not overwrite:
-            store = StackStore(path)
+        store = StackStore(path) if path.exists() and not overwrite else None
+        arrived = False
+        if store is not None:
             stack = continued(store, stack, kept)
-            is_longer = len(stack.shots) > len(store.names)
-            if not is_longer and not np.isin(store.statuses(), again).any():
+            arrived = len(stack.shots) > len(store.names)
+            if not arrived and not np.isin(store.statuses(), again).any():
                 _Run(stack, store, (), on_progress, should_stop, live).tell("nothing to do")
                 return read_stack(path)
         # Before a store is made: a scheduler that does not answer shall leave nothing behind.
         with engine_for(scheduler, workers, should_stop) as engine:
             if store is None:
                 store = create_store(path, contents_of(stack, kept), overwrite=overwrite)
-            elif len(stack.shots) > len(store.names):
+            elif arrived:
                 store = lengthened(store, stack, kept)
             _Run(stack, store, again, on_progress, should_stop, live).on(engine)
     return read_stack(path)
@@ -210,26 +210,11 @@ class _Run:
 
     def _work_on(self, engine: Engine) -> None:
         self.tell(engine.name)
-        stack = self._stack
-        variables = tuple(name for name in stack.variables if not stack.is_shared(name))
-        settings = engine.share(
-            Settings(
-                self._store.writer,
-                stack.options,
-                stack.setup,
-                variables,
-                stack.mask,
-                engine.workers,
-            ),
-            f"settings-{self._store.attributes['store_id']}-{time.time_ns()}",
-        )
-        beam = None
-        if stack.beam is not None:
-            beam = engine.share(stack.beam, f"beam-{stack.beam.key}")
+        settings, beam = self._shared(engine)
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         running: dict[Any, list[int]] = {}
         batches = self._batches()
-        is_file = stack.shots.array is None
+        is_file = self._stack.shots.array is None
         try:
             window = engine.window(files=is_file)
             while True:
@@ -247,6 +232,22 @@ class _Run:
             for future in running:
                 future.cancel()
             raise
+
+    def _shared(self, engine: Engine) -> tuple[Any, Any]:
+        """Bring what all shots need to where they are inverted."""
+        stack = self._stack
+        settings = Settings(
+            self._store.writer,
+            stack.options,
+            stack.setup,
+            tuple(name for name in stack.variables if not stack.is_shared(name)),
+            stack.mask,
+            engine.workers,
+        )
+        # A name that no earlier run has used: what dask has under a name it does not take again.
+        name = f"settings-{self._store.attributes['store_id']}-{time.time_ns()}"
+        beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")
+        return engine.share(settings, name), beam
 
     def _batches(self) -> Iterator[list[int]]:
         """Yield the shots that go to one task: one, or a run that starts from each other."""

@@ -116,9 +116,9 @@ class Stack:
         """Say what of a shot is not what it was when this was said of it; empty if nothing."""
         if not self.shots.items[index].unchanged(origin):
             return self.shots.label(index)
-        if self.sources is None or self.sources.items[index].unchanged(origin["source"]):
-            return ""
-        return f"the source of {self.shots.label(index)}"
+        if self.sources is not None and not self.sources.items[index].unchanged(origin["source"]):
+            return f"the source of {self.shots.label(index)}"
+        return ""
 
 
 def describe_stack(

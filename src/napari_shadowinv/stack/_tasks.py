@@ -74,6 +74,7 @@ def run_shots(
     outcomes = []
     for shot, (index, wanted, source) in zip(shots, labels, strict=True):
         start = time.perf_counter()
+        failure = ""
         try:
             image, origin = _loaded(shot)
             here = beam
@@ -81,30 +82,17 @@ def run_shots(
                 assert source is not None
                 own, origin["source"] = source.load()
                 here = Beam.of(np.shape(image), own, settings.mask)
-            previous = invert_shot(
-                image,
-                here,
-                options,
-                start=previous,
-                should_stop=None if stop is None else stop.is_set,
-            )
+            stopping = None if stop is None else stop.is_set
+            previous = invert_shot(image, here, options, start=previous, should_stop=stopping)
         except InversionCancelled:
             raise
-        except MemoryError:
-            failure = "there is not enough memory for this shot on its worker"
-        except (InputError, OSError) as error:
-            failure = str(error) or type(error).__name__
         except Exception as error:
             # Whatever a reader or a solver stumbles over, the other shots shall go on.
-            failure = f"{type(error).__name__}: {error}"
-        else:
-            failure = ""
-        if failure:
-            previous = None
+            previous, failure = None, _reason(error)
         if not wanted:
             continue
         seconds = time.perf_counter() - start
-        if failure or previous is None:
+        if previous is None:
             settings.writer.fail(index, {"reason": failure, "seconds": seconds})
             outcomes.append(ShotOutcome(index, FAILED, seconds, failure))
         else:
@@ -112,6 +100,15 @@ def run_shots(
             spent = time.perf_counter() - start
             outcomes.append(ShotOutcome(index, DONE, spent, converged=previous.report.converged))
     return outcomes
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        return "there is not enough memory for this shot on its worker"
+    kind = type(error).__name__
+    if isinstance(error, InputError | OSError):
+        return str(error) or kind
+    return f"{kind}: {error}"
 
 
 def _loaded(shot: Any) -> tuple[NDArray[Any], dict[str, Any]]:
