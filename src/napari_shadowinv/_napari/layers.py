@@ -150,7 +150,9 @@ def add_inversion(
     return add_layers(viewer, inversion_layers(inversion, setup, name=name, **keywords))
 
 
-def add_layers(viewer: Any, described: Sequence[FullLayerData]) -> list[Any]:
+def add_layers(
+    viewer: Any, described: Sequence[FullLayerData], *, below: Any | None = None
+) -> list[Any]:
     """Add described layers to a viewer, select the field and switch on the scale bar.
 
     Parameters
@@ -159,6 +161,8 @@ def add_layers(viewer: Any, described: Sequence[FullLayerData]) -> list[Any]:
         Where to add them.
     described : sequence of (data, keywords, layer type)
         The layers.
+    below : napari.layers.Layer, optional
+        A layer of the viewer to put them under. Default: on top of all.
 
     Returns
     -------
@@ -167,7 +171,10 @@ def add_layers(viewer: Any, described: Sequence[FullLayerData]) -> list[Any]:
     """
     from napari.layers import Layer
 
-    added = [viewer.add_layer(Layer.create(*layer)) for layer in described]
+    added = [Layer.create(*layer) for layer in described]
+    for layer in added:
+        place = len(viewer.layers) if below is None else viewer.layers.index(below)
+        viewer.layers.insert(place, layer)
     for layer in added:
         if role_of(layer) == "field":
             # The status line then tells the field below the mouse.

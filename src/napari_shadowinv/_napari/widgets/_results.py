@@ -100,6 +100,7 @@ class ResultLayers(QObject):
         super().__init__(parent)
         self._viewer = viewer
         self._layers: dict[str, Any] = {}
+        self._order: list[str] = []
         self._waiting: list[FullLayerData] = []
         self._select, self._before = True, None
         self._timer = QTimer(self)
@@ -120,7 +121,8 @@ class ResultLayers(QObject):
         """Replace the data of the layers; add those that are not there.
 
         Adding a layer takes napari some tenths of a second, so they are added one by one
-        while the window stays alive.
+        while the window stays alive: what is visible first, the hidden ones below and between
+        afterwards.
 
         Parameters
         ----------
@@ -132,13 +134,15 @@ class ResultLayers(QObject):
         self._select = select
         self._before = self._viewer.layers.selection.active
         here = self.layers
-        self._waiting = []
+        self._order = [_role(keywords) for _, keywords, _ in described]
+        waiting = []
         for data, keywords, kind in described:
             layer = self._layers.get(_role(keywords))
             if layer is not None and layer in here and kind_of(layer) == kind:
                 _update(layer, data, keywords)
             else:
-                self._waiting.append((data, keywords, kind))
+                waiting.append((data, keywords, kind))
+        self._waiting = sorted(waiting, key=lambda layer: not layer[1].get("visible", True))
         if self._waiting:
             self._timer.start()
         else:
@@ -154,13 +158,23 @@ class ResultLayers(QObject):
 
         if self._waiting:
             described = self._waiting.pop(0)
-            (self._layers[_role(described[1])],) = add_layers(self._viewer, [described])
-        if not self._waiting:
-            self._timer.stop()
+            role = _role(described[1])
+            (self._layers[role],) = add_layers(
+                self._viewer, [described], below=self._next_above(role)
+            )
+            # Layers that nobody sees yet must not take the selection.
             active = self._layers.get("field") if self._select else self._before
             if active is not None and active in self._viewer.layers:
                 self._viewer.layers.selection.active = active
+        if not self._waiting:
+            self._timer.stop()
             self.complete.emit()
+
+    def _next_above(self, role: str) -> Any | None:
+        """The lowest layer of the result that lies above this one and is there already."""
+        higher = self._order[self._order.index(role) + 1 :]
+        layers = (self._layers.get(one) for one in higher)
+        return next((layer for layer in layers if layer in self._viewer.layers), None)
 
 
 def _role(keywords: dict[str, Any]) -> str:
