@@ -108,7 +108,7 @@ def _step_row(
     """One row of a step, from the smooth row and the one below it; returns its energy."""
     last = len(here) - 1
     rate = _STEP / weight
-    energy = 0.0
+    energy: float = 0.0
     for column in range(last):
         slope_y, slope_x = below[column] - here[column], here[column + 1] - here[column]
         size = math.sqrt(slope_y * slope_y + slope_x * slope_x)

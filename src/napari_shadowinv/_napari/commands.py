@@ -220,7 +220,7 @@ def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
 def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     from napari_shadowinv.filters import remove_hot_pixels as remove
 
-    image, hot, dead = remove(picked.image)
+    image, hot, dead = remove(picked.image, should_stop=should_stop)
     return [_filtered(picked, image, f"without {int((hot | dead).sum())} hot or dead pixels")]
 
 
@@ -234,7 +234,7 @@ def _high_passed(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData
 def _beam(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     from napari_shadowinv.sources import total_variation_source
 
-    source = total_variation_source(picked.image)
+    source = total_variation_source(picked.image, should_stop=should_stop)
     return [_filtered(picked, source, "source by total variation", role="source")]
 
 

@@ -153,11 +153,11 @@ class ShotJob:
         report("prepare", 0, None, "image and source")
         image, mask = self._image_and_mask()
         if self.cleaning is not None:
-            image = self.cleaning.filtered(image, mask)
+            image = self.cleaning.filtered(image, mask, should_stop)
         # Before the sites are spread: a mistake is told at once.
         report("prepare", 0, None)
         prepare(image, None, self.options, mask)
-        source = self._source(image, mask)
+        source = self._source(image, mask, should_stop)
         report("prepare", 0, None)
         seconds["source"], clock = time.perf_counter() - clock, time.perf_counter()
         n_sites = number_of_sites((image.shape[0], image.shape[1]), self.options)
@@ -180,15 +180,14 @@ class ShotJob:
             return image, mask
         return _cropped(image, self.crop), None if mask is None else mask[self.crop]
 
-    def _source(self, image: Image, mask: Mask | None) -> Image:
+    def _source(self, image: Image, mask: Mask | None, should_stop: ShouldStop | None) -> Image:
         from napari_shadowinv.preprocess import checked_source
 
         if isinstance(self.source, Estimate):
             # What an inversion would clip must not spoil the estimate.
             clipped = np.maximum(np.where(mask, image, 0) if mask is not None else image, 0)
-            return self.estimates.source(
-                self.source, clipped, mask, PREVIEW_PIXELS if self.preview else None
-            )
+            most_pixels = PREVIEW_PIXELS if self.preview else None
+            return self.estimates.source(self.source, clipped, mask, most_pixels, should_stop)
         given = self.source
         if isinstance(given, Path):
             from napari_shadowinv.io import read_radiograph
@@ -240,9 +239,9 @@ class SourceJob:
         report("source", 0, None, type(self.estimate).title)
         image = plane_of(self.image, "the image")
         if self.quick:
-            source = quick_source(self.estimate, image, self.mask, PREVIEW_PIXELS)
+            source = quick_source(self.estimate, image, self.mask, PREVIEW_PIXELS, should_stop)
         else:
-            source = self.estimate.source(image, self.mask)
+            source = self.estimate.source(image, self.mask, should_stop)
         report("source", 1, 1)
         return source
 
