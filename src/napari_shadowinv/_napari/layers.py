@@ -29,6 +29,7 @@ __all__ = [
     "FullLayerData",
     "add_inversion",
     "add_layers",
+    "arrow_keywords",
     "caustic_keywords",
     "component_symbols",
     "intensity_limits",
@@ -354,23 +355,23 @@ def caustic_keywords() -> dict[str, Any]:
 def _arrows(make: _Maker, displacement: Array) -> FullLayerData:
     """Displacements of few enough rays that each arrow can be seen."""
     data, spacing = thinned_arrows(displacement)
+    return make.layer(data, "vectors", "arrows", "arrows", "px", **arrow_keywords(data, spacing))
+
+
+def arrow_keywords(data: Array, spacing: float) -> dict[str, Any]:
+    """Return how arrows look, from those of one result; see `thinned_arrows`."""
     lengths = np.hypot(*data[:, 1].T)
     # Most arrows keep to their own place; the strongest reach to the next but one at most.
     usual = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
-    return make.layer(
-        data,
-        "vectors",
-        "arrows",
-        "arrows",
-        "px",
-        features={"displacement": lengths},
-        vector_style="arrow",
-        edge_color=_ARROW_COLOUR,
-        edge_width=spacing / 9,
+    return {
+        "features": {"displacement": lengths},
+        "vector_style": "arrow",
+        "edge_color": _ARROW_COLOUR,
+        "edge_width": spacing / 9,
         # The data are displacements in px; only the drawing is stretched.
-        length=float(0.95 * spacing / usual) if usual else 1.0,
-        opacity=0.75,
-    )
+        "length": float(0.95 * spacing / usual) if usual else 1.0,
+        "opacity": 0.75,
+    }
 
 
 def thinned_arrows(displacement: Array, along: int = _ARROWS_ALONG) -> tuple[Array, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +10,8 @@ from numpy.typing import ArrayLike
 from qtpy.QtCore import QTimer
 from qtpy.QtWidgets import QCheckBox, QLabel
 
+from napari_shadowinv._napari.leafing import follow_shots
+from napari_shadowinv._napari.marks import role_of
 from napari_shadowinv._napari.widgets._base import ToolPanel, with_button
 from napari_shadowinv._napari.widgets._drawing import new_mask
 from napari_shadowinv._napari.widgets._forms import ModelForm, labelled
@@ -56,6 +59,8 @@ class InvertStack(ToolPanel):
         self._running: StackRequest | None = None
         self._heard = 0
         self._look_at = False
+        self._arrows: Any = None
+        self._read_arrows: Callable[[], None] | None = None
         self._soon = QTimer(self)
         self._soon.setSingleShot(True)
         self._soon.setInterval(_REFRESH_AFTER)
@@ -233,6 +238,10 @@ class InvertStack(ToolPanel):
         if self._look_at:
             self._look_at = False
             self.viewer.reset_view()
+        arrows = next((one for one in self.results.layers if role_of(one) == "arrows"), None)
+        if arrows is not self._arrows:
+            self._arrows = arrows
+            self._read_arrows = None if arrows is None else follow_shots(self.viewer, arrows)
         self._soon.start()
 
     def _refresh(self) -> None:
@@ -240,6 +249,8 @@ class InvertStack(ToolPanel):
             self._shown.follow(self.results.layers)
         for layer in self.results.layers:
             layer.refresh()
+        if self._read_arrows is not None:
+            self._read_arrows()
 
     def _show_failures(self, failures: list[tuple[str, str]]) -> None:
         self.failures.show_failures(failures)
