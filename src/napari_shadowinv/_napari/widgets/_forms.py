@@ -100,6 +100,13 @@ class ModelForm(QWidget):
         self._problem = wrapping_label(style=PROBLEM_STYLE)
         column.addWidget(self._problem)
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is filled in of what has no default."""
+        fields = self._model_class.model_fields
+        needed = [name for name in self.editors if fields[name].is_required()]
+        return all(self.editors[name].value() in (None, "") for name in needed)
+
     def values(self) -> dict[str, Any]:
         """What the form holds, as a TOML file does: what is not given is left out."""
         edited = {name: editor.value() for name, editor in self.editors.items()}
