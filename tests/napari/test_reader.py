@@ -245,12 +245,12 @@ def test_bad_files_raise_one_sentence_in_a_script(
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_one_notification_in_a_window(
-    viewer: ViewerModel, tmp_path: Path, name: str, in_loop: Any, told_of: list[str]
+    viewer: ViewerModel, tmp_path: Path, name: str, in_loop: Any, told: list[str]
 ) -> None:
     content, words = BAD[name]
     (tmp_path / name).write_bytes(content)
     assert in_loop(lambda: viewer.open(tmp_path / name, plugin=None)) == []
-    (text,) = told_of
+    (text,) = told
     assert words in text
     assert "Traceback" not in text
     assert "\n" not in text

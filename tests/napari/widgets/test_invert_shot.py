@@ -217,13 +217,13 @@ def test_crop_mask_and_source_are_used(
     np.testing.assert_allclose(computed(tool).potential, cropped.potential, atol=1e-9)
     tool.crop.layer = None
 
-    tool._paint_mask()
+    tool.masks.paint()
     tool.masks.layer.data[30:36, 5:12] = 1
     usable = np.ones(shot.shape, bool)
     usable[30:36, 5:12] = False
     masked = invert(shot, mask=usable, options=few)
     np.testing.assert_allclose(computed(tool).potential, masked.potential, atol=1e-6)
-    tool.painted_is_unusable.setChecked(False)
+    tool.masks.painted_is_unusable.setChecked(False)
     assert (computed(tool).mask == ~usable).all()
     tool.masks.layer = None
 
@@ -362,7 +362,7 @@ def test_the_preview_follows_in_its_own_layers(
         qtbot.waitUntil(lambda: potential.data is not old, timeout=PATIENCE)
         return time.perf_counter() - start
 
-    tool._paint_mask()
+    tool.masks.paint()
     follows(lambda: tool.cleaning.set_kind("low_pass"))
     follows(lambda: tool.cleaning.form.editors["width"].set_value(2.0))
     follows(lambda: tool.options.editors["floor"].set_value(0.5))

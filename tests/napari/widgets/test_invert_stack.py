@@ -319,7 +319,7 @@ def test_the_source_is_guessed_for_each_shot(
 ) -> None:
     mask = np.ones(SHAPE, bool)
     mask[:3, :4] = False
-    tool._paint_mask()
+    tool.masks.paint()
     tool.masks.layer.data[:3, :4] = 1
     tool.source.picker.set_kind("low_pass")
     tool.source.picker.form.editors["width"].set_value(6.0)

@@ -63,7 +63,7 @@ def test_an_estimate_becomes_a_layer_after_its_preview(
     tool.method.form.editors["degree"].set_value(0)
     qtbot.waitUntil(lambda: preview.data is not old, timeout=PATIENCE)
     assert np.ptp(preview.data) == pytest.approx(0, abs=1e-9)
-    tool._paint_mask()
+    tool.masks.paint()
     tool.masks.layer.data[10:20, 20:30] = 1
     tool.method.form.editors["degree"].set_value(2)
     tool.panel.button.click()
