@@ -202,19 +202,12 @@ def _work_beside(picked: _Picked, work: Work, title: str, viewer: Any) -> None:
 
 
 def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
-    from napari_shadowinv._napari.layers import inversion_layers
+    from napari_shadowinv._napari.layers import result_layers
+    from napari_shadowinv._napari.marks import Result
     from napari_shadowinv.inversion import invert
 
     inversion = invert(picked.image, should_stop=should_stop)
-    frame = picked.frame
-    return inversion_layers(
-        inversion,
-        picked.setup,
-        name=picked.name,
-        scale=frame.scale,
-        translate=frame.translate,
-        units=frame.units,
-    )
+    return result_layers(Result(inversion, picked.setup), picked.frame, picked.name)
 
 
 def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:

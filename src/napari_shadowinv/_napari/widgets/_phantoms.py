@@ -107,7 +107,9 @@ class CoaxialRecipe(PhantomRecipe):
     probe = "proton"
     peak: float = _peak(60.0, "the inner conductor's surface")
     inner: float = _metres(21e-6, "Inner conductor", "Radius of the conductor on the axis.")
-    outer: float = _metres(66e-6, "Outer conductor from", "Inner radius of the conductor around it.")
+    outer: float = _metres(
+        66e-6, "Outer conductor from", "Inner radius of the conductor around it."
+    )
     rim: float = _metres(78e-6, "Outer conductor to", "Outer radius of the conductor around it.")
 
     def shadow(self, shape: tuple[int, int], setup: Any) -> NDArray[np.bool_]:

@@ -43,14 +43,9 @@ def result_frame(image: Any, setup: Any | None, crop: tuple[slice, slice] | None
     """
     frame = frame_of(image)
     if setup is not None:
-        frame = frame_for(image.data.shape, setup, translate=frame.translate)
-    if crop is None:
-        return frame
-    y, x = (
-        origin + part.start * side
-        for origin, part, side in zip(frame.translate, crop, frame.scale, strict=True)
-    )
-    return replace(frame, translate=(y, x))
+        upright = frame_for(image.data.shape, setup)
+        frame = replace(frame, scale=upright.scale, units=upright.units)
+    return frame if crop is None else frame.cropped(crop[0].start, crop[1].start)
 
 
 def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> None:
@@ -65,10 +60,12 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
     setup : ProtonSetup or OpticalSetup
         The experiment.
     companions : sequence of napari.layers.Layer
-        Source, mask and crop: those that lie as the image does go with it.
+        Source, mask and crop: those that lie as the image does go with it, and so do other
+        images of its size. Pixels and lengths side by side would make napari warn at each layer.
     """
     before = frame_of(image)
-    followers = [layer for layer in companions if frame_of(layer) == before]
+    others = [layer for layer in viewer.layers if _is_alike(layer, image)]
+    followers = [layer for layer in (*companions, *others) if frame_of(layer) == before]
     place(image, setup)
     if frame_of(image) == before:
         return
@@ -76,6 +73,13 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
         layer.scale = (*layer.scale[:-2], *image.scale[-2:])
         layer.units = (*layer.units[:-2], *image.units[-2:])
     viewer.reset_view()
+
+
+def _is_alike(layer: Any, image: Any) -> bool:
+    """Whether another layer holds images of the same size."""
+    if layer is image or kind_of(layer) not in ("image", "labels"):
+        return False
+    return tuple(layer.data.shape[-2:]) == tuple(image.data.shape[-2:])
 
 
 class ResultLayers(QObject):

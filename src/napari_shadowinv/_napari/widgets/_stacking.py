@@ -123,10 +123,11 @@ class StackJob:
         def tell(news: RunProgress) -> None:
             if news.outcome is None:
                 self._recall()
-            self.books.take(news)
+            # The window looks into the books at any time: what they tell of must be seen to.
             if news.done:
                 ended = news.outcome
                 on_done(None if ended is None or ended.reason else ended.index)
+            self.books.take(news)
             step = news.done + news.failed
             on_progress(Progress("shots", step, news.total, self.books.text))
 

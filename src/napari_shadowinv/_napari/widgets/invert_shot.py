@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.marks import Result, role_of
 from napari_shadowinv._napari.widgets._base import Part, with_button
 from napari_shadowinv._napari.widgets._drawing import new_shapes
 from napari_shadowinv._napari.widgets._estimating import SourceCache
@@ -55,16 +55,10 @@ class _Request:
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> _Answer:
         """Invert the shot and describe its layers, all of it beside the window."""
         inversion = self.job.run(on_progress, should_stop)
-        from napari_shadowinv._napari.layers import inversion_layers
+        from napari_shadowinv._napari.layers import result_layers
 
-        described = inversion_layers(
-            inversion,
-            self.setup,
-            name=f"{self.image.name} preview" if self.preview else self.image.name,
-            scale=self.frame.scale,
-            translate=self.frame.translate,
-            units=self.frame.units,
-        )
+        name = f"{self.image.name} preview" if self.preview else self.image.name
+        described = result_layers(Result(inversion, self.setup), self.frame, name)
         if self.preview:
             described = [layer for layer in described if role_of(layer[1]) in _PREVIEW_ROLES]
         return _Answer(inversion, described)
