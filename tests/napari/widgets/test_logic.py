@@ -6,6 +6,7 @@ import inspect
 import math
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ from napari_shadowinv._napari.widgets._quantities import parsed, shown
 from napari_shadowinv._napari.widgets._reading import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._sampling import Profile, along, sampled, table_text
 from napari_shadowinv._napari.widgets._stacking import StackJob
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
 
 FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]
@@ -110,6 +114,35 @@ def test_sites_are_kept_while_the_source_stays(shot: Array) -> None:
     run(shot, source + np.linspace(0, 1, shot.shape[1]))
     run(shot, source, seed=1)
     assert cache.hits == 2
+
+
+def test_other_boundaries_have_other_sites(shot: Array) -> None:
+    cache = PlanCache()
+    for boundary in ("closed", "free"):
+        options = FEW.model_copy(update={"boundary": boundary})
+        ShotJob(shot, recipes.UniformEstimate(), options=options, cache=cache).run()
+    assert cache.hits == 0
+
+
+def test_a_preview_starts_from_the_one_before_and_a_run_does_not() -> None:
+    shot = synthetic_image(gaussian_blob((48, 60), 45.0, 8.0).displacement)
+    cache = PlanCache()
+    job = ShotJob(shot, recipes.UniformEstimate(), options=FEW, cache=cache)
+
+    def run(width: float, preview: bool) -> Inversion:
+        cleaned = replace(job, cleaning=recipes.LowPassFilter(width=width))
+        return (cleaned.for_preview() if preview else cleaned).run()
+
+    run(1.0, preview=True)
+    warm, cold = run(1.2, preview=True), run(1.2, preview=False)
+    assert warm.report.iterations < cold.report.iterations
+    assert warm.report.residual <= FEW.tolerance
+    np.testing.assert_allclose(warm.displacement, cold.displacement, atol=0.01)
+    # The same whatever was tried before.
+    alone = replace(job, cleaning=recipes.LowPassFilter(width=1.2), cache=PlanCache()).run()
+    np.testing.assert_array_equal(cold.displacement, alone.displacement)
+    job.cache.plan(2 + np.eye(*shot.shape), None, FEW, None, None)
+    assert cache.last is None
 
 
 def test_a_uniform_source_is_the_same_after_a_filter(shot: Array) -> None:

@@ -44,9 +44,12 @@ class PlanCache:
     ----------
     hits : int
         How often the work was saved.
+    last : Inversion or None
+        The latest preview with these sites, which the next one starts from.
     """
 
     hits: int = 0
+    last: Inversion | None = field(default=None, repr=False)
     _key: tuple[Any, ...] = ()
     _arrays: tuple[Image, Mask | None] | None = None
     _plan: SitePlan | None = field(default=None, repr=False)
@@ -67,11 +70,14 @@ class PlanCache:
             options.lloyd_iterations,
             options.lloyd_tolerance,
             options.seed,
+            options.boundary,
+            options.margin,
             None if mask is None else options.floor,
         )
         if self._plan is not None and key == self._key and self._same(source, mask):
             self.hits += 1
             return self._plan
+        self.last = None
         self._plan = plan_sites(
             source, options, mask=mask, on_progress=on_progress, should_stop=should_stop
         )
@@ -165,8 +171,16 @@ class ShotJob:
         plan = self.cache.plan(source, mask, options, on_progress, should_stop)
         seconds["sites"] = time.perf_counter() - clock
         inversion = invert(
-            image, plan=plan, options=self.options, on_progress=on_progress, should_stop=should_stop
+            image,
+            plan=plan,
+            options=self.options,
+            # What is kept must not depend on what was tried before it.
+            start=self.cache.last if self.preview else None,
+            on_progress=on_progress,
+            should_stop=should_stop,
         )
+        if self.preview:
+            self.cache.last = inversion
         spent = inversion.report.seconds
         seconds |= {stage: spent[stage] + seconds.get(stage, 0.0) for stage in spent}
         return replace(inversion, report=replace(inversion.report, seconds=seconds))
