@@ -15,7 +15,6 @@ import pytest
 from napari_shadowinv import InversionOptions, ProtonSetup, invert
 from napari_shadowinv._napari.marks import role_of
 from napari_shadowinv._napari.widgets._recipes import LowPassEstimate
-from napari_shadowinv._napari.widgets._stack_results import StackRequest
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
@@ -228,22 +227,6 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     assert field.contrast_limits[1] == pytest.approx(float(field.data.max().compute()))
     assert tuple(potential.contrast_limits) == (-3.0, 4.0)
     assert told == []
-
-
-def test_colours_reach_to_the_last_shot_however_long_it_takes_to_look_at(
-    window: Any, tool: Any, run: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    look = StackRequest._look
-
-    def slowly(self: Any, index: int | None) -> None:
-        time.sleep(0.5)
-        look(self, index)
-
-    monkeypatch.setattr(StackRequest, "_look", slowly)
-    tool.engine.workers.setValue(2)
-    run(tool)
-    field = layer_of(window, "field")
-    assert field.contrast_limits[1] == pytest.approx(float(field.data.max().compute()))
 
 
 def test_closing_the_window_ends_the_run(

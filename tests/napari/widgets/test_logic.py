@@ -135,7 +135,7 @@ def test_a_preview_starts_from_the_one_before_and_a_run_does_not() -> None:
 
     run(1.0, preview=True)
     warm, cold = run(1.2, preview=True), run(1.2, preview=False)
-    assert warm.report.iterations < cold.report.iterations
+    assert run(1.2, preview=True).report.iterations < cold.report.iterations
     assert warm.report.residual <= FEW.tolerance
     np.testing.assert_allclose(warm.displacement, cold.displacement, atol=0.01)
     # The same whatever was tried before.
@@ -261,6 +261,14 @@ def test_a_megapixel_is_let_go_within_a_second(job: Any, tmp_path: Path) -> None
     thread.join()
     # Where others use the machine, the time it would take alone counts.
     assert min(ended[0] - asked, time.process_time() - used) < 1
+
+
+def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Path) -> None:
+    job = StackJob(np.stack([shot, shot]), tmp_path / "a.shadowinv.zarr", options=FEW, workers=1)
+    counted: list[tuple[int | None, int]] = []
+    job.run(lambda _: None, lambda: False, lambda index: counted.append((index, job.books.ended)))
+    assert counted == [(0, 0), (1, 1)]
+    assert job.books.ended == 2
 
 
 def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:
