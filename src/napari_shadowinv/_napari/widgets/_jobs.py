@@ -163,6 +163,8 @@ class ShotJob:
         # Before the sites are spread: a mistake is told at once.
         report("prepare", 0, None)
         prepare(image, None, self.options, mask)
+        if isinstance(self.source, Estimate):
+            report("source", 0, None, self.source.title)
         source = self._source(image, mask, should_stop)
         report("prepare", 0, None)
         seconds["source"], clock = time.perf_counter() - clock, time.perf_counter()
