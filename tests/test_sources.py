@@ -1,13 +1,20 @@
 from __future__ import annotations
 
+import time
+from contextlib import suppress
+
 import numpy as np
 import pytest
+from skimage.restoration import denoise_tv_chambolle
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv._total_variation import least_variation
+from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.filters import remove_background, remove_hot_pixels
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair, gaussian_blob
+from napari_shadowinv.progress import Reporter
 from napari_shadowinv.sources import (
     gaussian_source,
     interpolated_source,
@@ -163,6 +170,15 @@ def test_total_variation_lowers_a_disc_by_twice_the_weight_over_its_radius():
         assert lowered == pytest.approx(2 * weight / 10 * image.mean(), rel=0.1)
 
 
+def test_total_variation_agrees_with_another_program():
+    image = 1 + 0.3 * np.random.default_rng(0).random((60, 48))
+    image[10:30, 10:20] += 1
+    expected = denoise_tv_chambolle(image, weight=2.0, eps=1e-9, max_num_iter=5000)
+    np.testing.assert_allclose(
+        least_variation(image, 2.0, 5000, Reporter()), expected, rtol=0, atol=1e-3
+    )
+
+
 def test_total_variation_keeps_an_edge_that_a_blur_washes_out():
     edge = np.where(np.arange(80) < 40, 1.0, 3.0) * np.ones((80, 1))
     edge[20:26, 20:26] *= 1.3
@@ -280,3 +296,52 @@ def test_the_plan_of_an_estimate_can_be_inverted(estimate):
     shot = synthetic_image(truth, gaussian_beam(constant=200.0))
     inversion = invert(shot, source=estimate(shot), options=InversionOptions(n_sites=300))
     assert inversion.report.converged
+
+
+class Clock:
+    """Notes when it is asked whether to stop; says yes after a while."""
+
+    def __init__(self, patience=1.5):
+        self.patience = patience
+        self.start = time.perf_counter()
+        self.asked = []
+        self.note()
+
+    def note(self):
+        self.asked.append((time.perf_counter(), time.process_time()))
+
+    def __call__(self):
+        self.note()
+        return time.perf_counter() - self.start > self.patience
+
+    @property
+    def longest_wait(self):
+        # Where others use the machine, the time it would take alone counts.
+        return float(np.diff(self.asked, axis=0).min(axis=1).max())
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda image, mask, stop: gaussian_source(image, should_stop=stop),
+        lambda image, mask, stop: polynomial_source(image, degree=10, should_stop=stop),
+        lambda image, mask, stop: low_pass_source(image, 200.0, mask=mask, should_stop=stop),
+        lambda image, mask, stop: total_variation_source(image, should_stop=stop),
+        lambda image, mask, stop: interpolated_source(image, mask, should_stop=stop),
+        lambda image, mask, stop: remove_background(image, 10, should_stop=stop),
+        lambda image, mask, stop: remove_hot_pixels(image, should_stop=stop),
+    ],
+    ids=["gaussian", "polynomial", "low pass", "total variation", "interpolated", "background",
+         "hot pixels"],
+)  # fmt: skip
+def test_work_on_a_megapixel_asks_every_second_whether_to_stop(work, record_property):
+    shape = (1024, 1024)
+    rng = np.random.default_rng(0)
+    image = gaussian_beam(shape, constant=200.0) * ripples(shape, 0.3) + rng.normal(0, 5, shape)
+    clock = Clock()
+    with suppress(InversionCancelled):
+        work(image, gap(shape, 200), clock)
+    clock.note()
+    record_property("longest wait (s)", clock.longest_wait)
+    assert len(clock.asked) > 3
+    assert clock.longest_wait < 1

@@ -29,6 +29,7 @@ from scipy.optimize import nnls
 from scipy.special import expit
 
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.progress import Reporter, ShouldStop
 
 __all__ = [
     "butterworth",
@@ -202,6 +203,7 @@ def remove_background(
     *,
     kind: Literal["divide", "subtract"] = "divide",
     mask: ArrayLike | None = None,
+    should_stop: ShouldStop | None = None,
 ) -> FloatArray:
     """Flatten an image by a polynomial fitted to it; the mean stays.
 
@@ -217,6 +219,8 @@ def remove_background(
     mask : array_like of bool, shape (H, W), optional
         True where the fit may look; leave the object out if it is large. The pixels left out
         are flattened as well. Their values must be finite.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the fit ends.
 
     Returns
     -------
@@ -229,6 +233,8 @@ def remove_background(
         If the image is not two-dimensional and finite, the mask of another shape or without
         enough pixels, the degree or kind unknown, or the polynomial to divide by is not
         positive all over the image.
+    InversionCancelled
+        If `should_stop` returned true.
 
     See Also
     --------
@@ -244,7 +250,7 @@ def remove_background(
     if kind not in ("divide", "subtract"):
         raise InputError(f"kind is {kind!r}, expected 'divide' or 'subtract'")
     values, _ = checked_pixels(image)
-    background = fit_polynomial(values, degree, mask=mask)
+    background = fit_polynomial(values, degree, mask=mask, should_stop=should_stop)
     if kind == "subtract":
         return np.asarray(values - background + background.mean())
     if background.min() <= 0 or values.mean() <= 0:
@@ -258,7 +264,11 @@ def remove_background(
 
 
 def remove_hot_pixels(
-    image: ArrayLike, *, threshold: float = 6.0, size: int = 3
+    image: ArrayLike,
+    *,
+    threshold: float = 6.0,
+    size: int = 3,
+    should_stop: ShouldStop | None = None,
 ) -> tuple[FloatArray, BoolArray, BoolArray]:
     """Replace pixels that stand out of their neighbourhood by its median.
 
@@ -272,6 +282,8 @@ def remove_hot_pixels(
     size : int, default 3
         Side of the neighbourhood in px, odd. Clusters of up to an eighth of its area plus one
         are found: pairs with 3, four pixels with 5.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the search ends.
 
     Returns
     -------
@@ -285,6 +297,8 @@ def remove_hot_pixels(
     InputError
         If the image is not two-dimensional and finite, the threshold not positive, or the
         size not an odd number of at least 3.
+    InversionCancelled
+        If `should_stop` returned true.
 
     Notes
     -----
@@ -316,7 +330,7 @@ def remove_hot_pixels(
     size = checked_integer("size", size, least=3)
     if size % 2 == 0:
         raise InputError(f"size is {size}, expected an odd number: a pixel is in the middle")
-    local, bright, dark = _neighbours(values, size)
+    local, bright, dark = _neighbours(values, size, Reporter(None, should_stop))
     difference = values - local
     limit = threshold * _noise(difference, local)
     hot = (difference > limit) & (values - bright > _OUTSTANDING * limit)
@@ -324,7 +338,9 @@ def remove_hot_pixels(
     return np.where(hot | dead, local, values), hot, dead
 
 
-def _neighbours(values: FloatArray, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _neighbours(
+    values: FloatArray, size: int, report: Reporter
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Median of the pixels around each, and the brightest and darkest that may be sound.
 
     The pixel itself does not count: with it, the noise would seem smaller than it is.
@@ -335,6 +351,7 @@ def _neighbours(values: FloatArray, size: int) -> tuple[FloatArray, FloatArray, 
     broken = n // 8
 
     def ranked(rank: int, mode: Literal["mirror", "reflect"]) -> FloatArray:
+        report("hot pixels", 0)
         return np.asarray(rank_filter(values, rank, footprint=footprint, mode=mode))
 
     # 'reflect' lets no neighbour of a corner pixel fill half of its neighbourhood; 'mirror'
@@ -369,7 +386,13 @@ def _deviation(difference: FloatArray) -> float:
     return float(_NORMAL_MAD * np.median(size)) or float(_NORMAL_MEAN * size.mean())
 
 
-def fit_polynomial(image: ArrayLike, degree: int, *, mask: ArrayLike | None = None) -> FloatArray:
+def fit_polynomial(
+    image: ArrayLike,
+    degree: int,
+    *,
+    mask: ArrayLike | None = None,
+    should_stop: ShouldStop | None = None,
+) -> FloatArray:
     """Polynomial in y and x fitted to an image, little moved by what stands out of it.
 
     Parameters
@@ -380,6 +403,8 @@ def fit_polynomial(image: ArrayLike, degree: int, *, mask: ArrayLike | None = No
         Total degree of the polynomial, from 0 to 10.
     mask : array_like of bool, shape (H, W), optional
         True where the fit may look. Default: everywhere.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the fit ends.
 
     Returns
     -------
@@ -391,6 +416,8 @@ def fit_polynomial(image: ArrayLike, degree: int, *, mask: ArrayLike | None = No
     InputError
         If image and mask cannot be used, the degree is out of range, or there are fewer
         usable pixels than coefficients.
+    InversionCancelled
+        If `should_stop` returned true.
 
     Notes
     -----
@@ -416,7 +443,9 @@ def fit_polynomial(image: ArrayLike, degree: int, *, mask: ArrayLike | None = No
     rows, columns = (_basis(side, degree) for side in values.shape)
     fit = _weighted_fit(values, usable.astype(np.float64), rows, columns)
     rounding = 1e-12 * float(np.abs(values).max())
-    for _ in range(_MOST_REWEIGHTINGS):
+    report = Reporter(None, should_stop)
+    for step in range(_MOST_REWEIGHTINGS):
+        report("fit", step)
         residual = values - fit
         scale = _NORMAL_MAD * float(np.median(np.abs(residual[usable])))
         if scale <= rounding:

@@ -12,6 +12,7 @@ none was recorded, or the beam changes from shot to shot, it has to be guessed f
 Each takes an image ``[y, x]`` and returns one of the same shape that is positive everywhere
 and has the same flux over the usable pixels. A `mask` is True where a pixel is usable; the
 others (dead areas, handwriting, a shadow) may hold anything, NaN too, and are filled in.
+Those that take long ask `should_stop` at each of their steps.
 
 What an estimate takes for the beam is lost from the object, and the other way round. The
 choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179, section V.
@@ -19,7 +20,6 @@ choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -28,15 +28,17 @@ from scipy.fft import dctn, idctn
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.sparse.linalg import LinearOperator, cg
-from skimage.restoration import denoise_tv_chambolle
 
+from napari_shadowinv._total_variation import least_variation
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.filters import (
     checked_integer,
     checked_number,
     checked_pixels,
     fit_polynomial,
+    low_pass,
 )
+from napari_shadowinv.progress import Reporter, ShouldStop
 
 __all__ = [
     "gaussian_source",
@@ -58,10 +60,8 @@ _MOST_FITS = 10
 _LEAST_SUPPORT = 1e-6
 _COARSEST_SIDE = 32
 _FILL_WIDTH = 5.0
+_NARROWEST_WAVES = 2.0  # px; a Gaussian that is narrower has waves too short for the pixels
 _FILL_TOLERANCE = 1e-6
-
-# It comes without types.
-_denoised: Callable[..., FloatArray] = denoise_tv_chambolle
 
 
 def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatArray:
@@ -93,7 +93,9 @@ def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatA
     return np.full(values.shape, values[usable].mean())
 
 
-def gaussian_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatArray:
+def gaussian_source(
+    image: ArrayLike, *, mask: ArrayLike | None = None, should_stop: ShouldStop | None = None
+) -> FloatArray:
     """Elliptical Gaussian plus a constant, fitted to the image.
 
     Parameters
@@ -102,6 +104,8 @@ def gaussian_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> Float
         The shot; counts or any linear measure of fluence.
     mask : array_like of bool, shape (H, W), optional
         True where a pixel is usable. Default: everywhere.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the estimate ends.
 
     Returns
     -------
@@ -112,6 +116,8 @@ def gaussian_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> Float
     ------
     InputError
         If image and mask cannot be used, or the image has no flux.
+    InversionCancelled
+        If `should_stop` returned true.
 
     Notes
     -----
@@ -131,14 +137,19 @@ def gaussian_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> Float
     values, usable = _beam_pixels(image, mask)
     side, mean = max(values.shape), values[usable].mean()
     y, x, sample = _samples(values / mean, usable)
-    parameters = _fitted_gaussian(y / side, x / side, sample)
+    report = Reporter(None, should_stop)
+    parameters = _fitted_gaussian(y / side, x / side, sample, report)
     rows, columns = (np.arange(n) / side for n in values.shape)
     beam = mean * _gaussian(parameters, rows[:, None], columns)
     return _with_flux_of(beam, values, usable)
 
 
 def polynomial_source(
-    image: ArrayLike, *, degree: int = 2, mask: ArrayLike | None = None
+    image: ArrayLike,
+    *,
+    degree: int = 2,
+    mask: ArrayLike | None = None,
+    should_stop: ShouldStop | None = None,
 ) -> FloatArray:
     """Polynomial in y and x, fitted to the image and little moved by its modulation.
 
@@ -150,6 +161,8 @@ def polynomial_source(
         Total degree of the polynomial in y and x, from 0 to 10.
     mask : array_like of bool, shape (H, W), optional
         True where a pixel is usable. Default: everywhere.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the estimate ends.
 
     Returns
     -------
@@ -162,6 +175,8 @@ def polynomial_source(
     InputError
         If image and mask cannot be used, the image has no flux, the degree is out of range,
         or there are fewer usable pixels than coefficients.
+    InversionCancelled
+        If `should_stop` returned true.
 
     See Also
     --------
@@ -175,10 +190,17 @@ def polynomial_source(
     True
     """
     values, usable = _beam_pixels(image, mask)
-    return _with_flux_of(fit_polynomial(values, degree, mask=usable), values, usable)
+    fit = fit_polynomial(values, degree, mask=usable, should_stop=should_stop)
+    return _with_flux_of(fit, values, usable)
 
 
-def low_pass_source(image: ArrayLike, width: float, *, mask: ArrayLike | None = None) -> FloatArray:
+def low_pass_source(
+    image: ArrayLike,
+    width: float,
+    *,
+    mask: ArrayLike | None = None,
+    should_stop: ShouldStop | None = None,
+) -> FloatArray:
     """The image, blurred until the object is gone.
 
     Parameters
@@ -189,6 +211,8 @@ def low_pass_source(image: ArrayLike, width: float, *, mask: ArrayLike | None = 
         Standard deviation of the Gaussian blur in px; a few times the size of the object.
     mask : array_like of bool, shape (H, W), optional
         True where a pixel is usable. Default: everywhere.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the estimate ends.
 
     Returns
     -------
@@ -200,6 +224,8 @@ def low_pass_source(image: ArrayLike, width: float, *, mask: ArrayLike | None = 
     ------
     InputError
         If image and mask cannot be used, the image has no flux, or the width is not positive.
+    InversionCancelled
+        If `should_stop` returned true.
 
     Notes
     -----
@@ -214,10 +240,11 @@ def low_pass_source(image: ArrayLike, width: float, *, mask: ArrayLike | None = 
     """
     values, usable = _beam_pixels(image, mask)
     width = checked_number("width", width, above=0, unit="px")
-    beam, support = _masked_blur(values, usable, width)
+    report = Reporter(None, should_stop)
+    beam, support = _masked_blur(values, usable, width, report)
     while not support.all():
         width *= 2
-        wider, reached = _masked_blur(values, usable, width)
+        wider, reached = _masked_blur(values, usable, width, report)
         beam, support = np.where(support, beam, wider), support | reached
     return _with_flux_of(beam, values, usable)
 
@@ -228,6 +255,7 @@ def total_variation_source(
     weight: float = 2.0,
     iterations: int = 1000,
     mask: ArrayLike | None = None,
+    should_stop: ShouldStop | None = None,
 ) -> FloatArray:
     """The image without small structures, but with its edges.
 
@@ -243,6 +271,8 @@ def total_variation_source(
     mask : array_like of bool, shape (H, W), optional
         True where a pixel is usable. Default: everywhere. The others are first filled as by
         `interpolated_source`.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the estimate ends.
 
     Returns
     -------
@@ -254,6 +284,8 @@ def total_variation_source(
     InputError
         If image and mask cannot be used, the image has no flux, or the weight or the number
         of iterations is not positive.
+    InversionCancelled
+        If `should_stop` returned true.
 
     References
     ----------
@@ -272,9 +304,10 @@ def total_variation_source(
     values, usable = _beam_pixels(image, mask)
     weight = checked_number("weight", weight, above=0, unit="px")
     iterations = checked_integer("iterations", iterations, least=1)
-    filled = values if usable.all() else _filled(values, usable, _FILL_WIDTH, power=2)
+    report = Reporter(None, should_stop)
+    filled = values if usable.all() else _filled(values, usable, _FILL_WIDTH, 2, report)
     mean = values[usable].mean()
-    beam = mean * _denoised(filled / mean, weight=weight, eps=1e-7, max_num_iter=iterations)
+    beam = mean * least_variation(filled / mean, weight, iterations, report)
     return _with_flux_of(beam, values, usable)
 
 
@@ -284,6 +317,7 @@ def interpolated_source(
     *,
     width: float = _FILL_WIDTH,
     kind: Literal["biharmonic", "laplace"] = "biharmonic",
+    should_stop: ShouldStop | None = None,
 ) -> FloatArray:
     """The image itself, with the part that the object covers filled in from around it.
 
@@ -299,6 +333,8 @@ def interpolated_source(
     kind : {"biharmonic", "laplace"}, default "biharmonic"
         "biharmonic" continues slope and curvature of the beam: for gaps inside the image.
         "laplace" never leaves the range of the surroundings: for gaps at the image's edge.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the estimate ends.
 
     Returns
     -------
@@ -310,6 +346,8 @@ def interpolated_source(
     InputError
         If image and mask cannot be used, the image has no flux, the width is not positive, or
         the kind unknown.
+    InversionCancelled
+        If `should_stop` returned true.
 
     Notes
     -----
@@ -337,7 +375,8 @@ def interpolated_source(
     values, usable = _beam_pixels(image, mask)
     width = checked_number("width", width, above=0, unit="px")
     power = 2 if kind == "biharmonic" else 1
-    beam = np.where(usable, values, _filled(values, usable, width, power))
+    report = Reporter(None, should_stop)
+    beam = np.where(usable, values, _filled(values, usable, width, power, report))
     return _with_flux_of(beam, values, usable)
 
 
@@ -382,18 +421,20 @@ def _block_means(values: FloatArray, block: int) -> FloatArray:
     return np.asarray(blocks.mean(axis=(1, 3)))
 
 
-def _fitted_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
+def _fitted_gaussian(
+    y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter
+) -> FloatArray:
     """Parameters of `_gaussian` that fit samples, by repeated robust least squares."""
     parameters = _first_gaussian(y, x, sample)
     # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
-    parameters = _refitted(parameters, y, x, sample, loss="linear", scale=1.0)
+    parameters = _refitted(parameters, y, x, sample, report, loss="linear", scale=1.0)
     scale = 0.0
     for _ in range(_MOST_FITS):
         residual = _gaussian(parameters, y, x) - sample
         previous, scale = scale, max(_NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
         if abs(scale - previous) < 1e-2 * scale:
             break
-        parameters = _refitted(parameters, y, x, sample, loss="soft_l1", scale=scale)
+        parameters = _refitted(parameters, y, x, sample, report, loss="soft_l1", scale=scale)
     return parameters
 
 
@@ -402,6 +443,7 @@ def _refitted(
     y: FloatArray,
     x: FloatArray,
     sample: FloatArray,
+    report: Reporter,
     *,
     loss: Literal["linear", "soft_l1"],
     scale: float,
@@ -409,8 +451,13 @@ def _refitted(
     """Parameters of `_gaussian` nearest to samples, in the sense of a loss of some scale."""
     least = np.full(len(parameters), -np.inf)
     least[:2] = 0  # height and constant
+
+    def excess(p: FloatArray) -> FloatArray:
+        report("source", 0)
+        return _gaussian(p, y, x) - sample
+
     fit = least_squares(
-        lambda p: _gaussian(p, y, x) - sample,
+        excess,
         parameters,
         jac=lambda p: _gaussian_slopes(p, y, x),
         bounds=(least, np.inf),
@@ -467,27 +514,43 @@ def _gaussian_slopes(parameters: FloatArray, y: FloatArray, x: FloatArray) -> Fl
 
 
 def _masked_blur(
-    values: FloatArray, usable: BoolArray, width: float
+    values: FloatArray, usable: BoolArray, width: float, report: Reporter
 ) -> tuple[FloatArray, BoolArray]:
     """Blur of the usable pixels, and where there was enough of them to tell."""
-    support = np.asarray(gaussian_filter(usable.astype(np.float64), width, mode="reflect"))
-    blurred = gaussian_filter(np.where(usable, values, 0.0), width, mode="reflect")
+    report("source", 0, 2)
+    support = _blurred(usable.astype(np.float64), width)
+    report("source", 1, 2)
+    blurred = _blurred(np.where(usable, values, 0.0), width)
     return blurred / np.maximum(support, _LEAST_SUPPORT), support >= _LEAST_SUPPORT
 
 
-def _filled(values: FloatArray, usable: BoolArray, width: float, power: int) -> FloatArray:
+def _blurred(values: FloatArray, width: float) -> FloatArray:
+    """Gaussian blur with a mirrored border."""
+    if width < _NARROWEST_WAVES:
+        return np.asarray(gaussian_filter(values, width, mode="reflect"))
+    # Takes no longer for a wide Gaussian than for a narrow one.
+    return low_pass(values, width)
+
+
+def _filled(
+    values: FloatArray, usable: BoolArray, width: float, power: int, report: Reporter
+) -> FloatArray:
     """Smoothing spline through the usable pixels, continued over the others."""
     mean = values[usable].mean()
     known = np.where(usable, values / mean, 0.0)
-    return np.asarray(_spline(known, usable.astype(np.float64), width, power) * mean)
+    share = usable.astype(np.float64)
+    return np.asarray(_spline(known, share, width, power, report) * mean)
 
 
-def _spline(known: FloatArray, share: FloatArray, width: float, power: int) -> FloatArray:
+def _spline(
+    known: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
+) -> FloatArray:
     """Minimise ∑ share·(u - value)² + width^2p ∑ u(-Δ)ᵖu, `known` being share·value."""
     squares = [4 * np.sin(0.5 * np.pi * np.arange(side) / side) ** 2 for side in known.shape]
     roughness = (width**2 * np.add.outer(*squares)) ** power
 
     def stiffness(flat: FloatArray) -> FloatArray:
+        report("source", 0)
         u = flat.reshape(known.shape)
         bent = idctn(roughness * dctn(u, norm="ortho"), norm="ortho")
         return np.asarray(share * u + bent).ravel()
@@ -502,7 +565,7 @@ def _spline(known: FloatArray, share: FloatArray, width: float, power: int) -> F
     solution, _ = cg(
         LinearOperator(shape, matvec=stiffness, dtype=np.float64),
         known.ravel(),
-        x0=_coarse_spline(known, share, width, power).ravel(),
+        x0=_coarse_spline(known, share, width, power, report).ravel(),
         M=LinearOperator(shape, matvec=nearly_inverse, dtype=np.float64),
         rtol=_FILL_TOLERANCE,
         maxiter=500,
@@ -510,11 +573,13 @@ def _spline(known: FloatArray, share: FloatArray, width: float, power: int) -> F
     return np.asarray(solution.reshape(known.shape))
 
 
-def _coarse_spline(known: FloatArray, share: FloatArray, width: float, power: int) -> FloatArray:
+def _coarse_spline(
+    known: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
+) -> FloatArray:
     """First guess of `_spline`, from pixels twice as large."""
     if min(known.shape) < _COARSEST_SIDE:
         return np.full(known.shape, known.sum() / share.sum())
-    coarse = _spline(_block_means(known, 2), _block_means(share, 2), width / 2, power)
+    coarse = _spline(_block_means(known, 2), _block_means(share, 2), width / 2, power, report)
     height, length = known.shape
     return _doubled(_doubled(coarse, height).T, length).T
 

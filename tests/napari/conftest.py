@@ -36,7 +36,7 @@ def solved() -> Inversion:
 
 
 @pytest.fixture
-def told_of(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What napari's user is told, as texts."""
     from napari.utils import notifications
 

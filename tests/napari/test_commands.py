@@ -117,20 +117,20 @@ def test_from_the_menu_an_inversion_brings_its_layers_and_the_scale_bar(
 
 
 def test_from_the_menu_a_mistake_is_one_notification(
-    make_napari_viewer: Any, in_loop: Any, qtbot: Any, told_of: list[str]
+    make_napari_viewer: Any, in_loop: Any, qtbot: Any, told: list[str]
 ) -> None:
     window = make_napari_viewer()
     in_loop(registered("invert_uniform"))
-    assert told_of == ["No layer is selected: select one image in the layer list"]
+    assert told == ["No layer is selected: select one image in the layer list"]
     add_shot(window, np.full((20, 20), -1.0))
     in_loop(registered("invert_uniform"))
-    qtbot.waitUntil(lambda: len(told_of) == 2, timeout=30_000)
-    assert told_of[1].startswith("Image has 400 negative pixels")
+    qtbot.waitUntil(lambda: len(told) == 2, timeout=30_000)
+    assert told[1].startswith("Image has 400 negative pixels")
     assert len(window.layers) == 1
 
 
 def test_the_cross_of_the_progress_bar_ends_an_inversion(
-    make_napari_viewer: Any, in_loop: Any, qtbot: Any, told_of: list[str]
+    make_napari_viewer: Any, in_loop: Any, qtbot: Any, told: list[str]
 ) -> None:
     from napari.utils.progress import cancelable_progress, progress
 
@@ -143,4 +143,4 @@ def test_the_cross_of_the_progress_bar_ends_an_inversion(
     bar.cancel()
     qtbot.waitUntil(lambda: bar not in progress._all_instances, timeout=30_000)
     assert len(window.layers) == 1
-    assert told_of == []
+    assert told == []

@@ -14,6 +14,8 @@ from napari.components import ViewerModel
 from scipy.io import savemat
 
 from napari_shadowinv import FileFormatError, ProtonSetup, write
+from napari_shadowinv._napari.layers import thinned_arrows
+from napari_shadowinv._napari.leafing import follow_shots
 from napari_shadowinv._napari.marks import mark_of, result_of, role_of, setup_of, source_of
 from napari_shadowinv._napari.reader import get_reader, read_paths
 from napari_shadowinv.inversion import Inversion
@@ -243,12 +245,12 @@ def test_bad_files_raise_one_sentence_in_a_script(
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_one_notification_in_a_window(
-    viewer: ViewerModel, tmp_path: Path, name: str, in_loop: Any, told_of: list[str]
+    viewer: ViewerModel, tmp_path: Path, name: str, in_loop: Any, told: list[str]
 ) -> None:
     content, words = BAD[name]
     (tmp_path / name).write_bytes(content)
     assert in_loop(lambda: viewer.open(tmp_path / name, plugin=None)) == []
-    (text,) = told_of
+    (text,) = told
     assert words in text
     assert "Traceback" not in text
     assert "\n" not in text
@@ -280,7 +282,11 @@ def test_a_store_opens_as_lazy_layers(
     layers = {role_of(layer): layer for layer in viewer.open(store, plugin=PLUGIN)}
     assert set(layers) == {
         "image", "reprojection", "residual", "potential", "field y", "field x", "field", "caustic",
+        "arrows",
     }  # fmt: skip
+    arrows = layers.pop("arrows")
+    assert arrows.visible
+    np.testing.assert_allclose(arrows.scale, layers["field"].scale)
     for layer in layers.values():
         assert type(layer.data).__module__.startswith("dask")
         assert layer.data.shape[0] == 3
@@ -295,6 +301,52 @@ def test_a_store_opens_as_lazy_layers(
     np.testing.assert_allclose(layers["field x"].data[1].compute(), 1e3 * field[1])
     assert layers["field"].contrast_limits[1] == pytest.approx(1e3 * np.hypot(*field).max())
     assert [name for name, layer in layers.items() if layer.visible] == ["field"]
+
+
+def rays(solved: Inversion, factor: float = 1.0) -> Any:
+    """Start and displacement of the arrows of a shot of the store."""
+    return thinned_arrows(factor * solved.displacement)[0]
+
+
+def test_arrows_follow_the_shot_in_view(
+    viewer: ViewerModel, store: Path, solved: Inversion
+) -> None:
+    layers = {role_of(layer): layer for layer in viewer.open(store, plugin=PLUGIN)}
+    arrows = layers["arrows"]
+    assert (arrows.data[:, 0, 0] == 1).all()  # the first that is done
+    follow_shots(viewer, arrows)
+    length = arrows.length
+    for shot, expected in ((2, rays(solved, 0.5)), (1, rays(solved))):
+        viewer.dims.set_point(0, shot)
+        np.testing.assert_allclose(arrows.data[:, 0, 0], shot)
+        np.testing.assert_allclose(arrows.data[:, 1, 0], 0)
+        np.testing.assert_allclose(arrows.data[:, :, 1:], expected)
+        np.testing.assert_allclose(
+            arrows.features["displacement"], np.hypot(*expected[:, 1].T), rtol=1e-6
+        )
+        assert arrows._view_data.shape == expected.shape
+    viewer.dims.set_point(0, 0)
+    assert len(arrows.data) == 0
+    assert arrows.length == length
+
+    # Nothing is read for arrows that nobody sees.
+    arrows.visible = False
+    viewer.dims.set_point(0, 1)
+    assert len(arrows.data) == 0
+    arrows.visible = True
+    np.testing.assert_allclose(arrows.data[:, :, 1:], rays(solved))
+    viewer.layers.remove(arrows)
+    viewer.dims.set_point(0, 2)
+    assert (arrows.data[:, 0, 0] == 1).all()
+
+
+def test_arrows_of_a_store_follow_in_a_window(
+    make_napari_viewer: Any, store: Path, solved: Inversion
+) -> None:
+    window = make_napari_viewer()
+    layers = {role_of(layer): layer for layer in window.open(store, plugin=PLUGIN)}
+    window.dims.set_point(0, 2)
+    np.testing.assert_allclose(layers["arrows"].data[:, :, 1:], rays(solved, 0.5))
 
 
 def test_shots_that_are_marked_as_pending_are_not_looked_at(store: Path, solved: Inversion) -> None:

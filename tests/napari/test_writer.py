@@ -136,14 +136,14 @@ def test_painted_caustics_are_kept(viewer: ViewerModel, solved: Inversion, tmp_p
 
 
 def test_a_layer_that_was_changed_is_named(
-    viewer: ViewerModel, solved: Inversion, tmp_path: Path, told_of: list[str]
+    viewer: ViewerModel, solved: Inversion, tmp_path: Path, told: list[str]
 ) -> None:
     layers = by_role(add_inversion(viewer, solved))
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
-    assert told_of == []
+    assert told == []
     layers["potential"].data = layers["potential"].data + 1
     viewer.layers.save(str(tmp_path / "b.shadowinv"), plugin=PLUGIN)
-    (text,) = told_of
+    (text,) = told
     assert "'potential (px²)' changed since the inversion" in text
 
 

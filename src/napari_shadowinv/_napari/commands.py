@@ -202,25 +202,18 @@ def _work_beside(picked: _Picked, work: Work, title: str, viewer: Any) -> None:
 
 
 def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
-    from napari_shadowinv._napari.layers import inversion_layers
+    from napari_shadowinv._napari.layers import result_layers
+    from napari_shadowinv._napari.marks import Result
     from napari_shadowinv.inversion import invert
 
     inversion = invert(picked.image, should_stop=should_stop)
-    frame = picked.frame
-    return inversion_layers(
-        inversion,
-        picked.setup,
-        name=picked.name,
-        scale=frame.scale,
-        translate=frame.translate,
-        units=frame.units,
-    )
+    return result_layers(Result(inversion, picked.setup), picked.frame, picked.name)
 
 
 def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     from napari_shadowinv.filters import remove_hot_pixels as remove
 
-    image, hot, dead = remove(picked.image)
+    image, hot, dead = remove(picked.image, should_stop=should_stop)
     return [_filtered(picked, image, f"without {int((hot | dead).sum())} hot or dead pixels")]
 
 
@@ -234,7 +227,7 @@ def _high_passed(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData
 def _beam(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     from napari_shadowinv.sources import total_variation_source
 
-    source = total_variation_source(picked.image)
+    source = total_variation_source(picked.image, should_stop=should_stop)
     return [_filtered(picked, source, "source by total variation", role="source")]
 
 

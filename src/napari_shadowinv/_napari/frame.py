@@ -10,10 +10,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 __all__ = ["Frame", "frame_for", "frame_of", "place"]
+
+Matrix = tuple[tuple[float, ...], ...]
 
 _MICROMETRES_PER_METRE = 1e6
 # Up to here a length in µm has four digits at most.
@@ -32,11 +37,27 @@ class Frame:
         Position of the centre of pixel (0, 0), in `units`.
     units : tuple of str
         Unit of each axis, as pint knows them: ``"um"``, ``"mm"`` or ``"pixel"``.
+    rotate : tuple of tuple of float
+        Rotation matrix, as of a camera that was turned.
+    shear : float
+        Slant of the rows.
+    affine : tuple of tuple of float
+        What is done to the place after all that: a homogeneous 3 × 3 matrix.
     """
 
     scale: tuple[float, float] = (1.0, 1.0)
     translate: tuple[float, float] = (0.0, 0.0)
     units: tuple[str, str] = ("pixel", "pixel")
+    rotate: Matrix = ((1.0, 0.0), (0.0, 1.0))
+    shear: float = 0.0
+    affine: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+    def cropped(self, y: int, x: int) -> Frame:
+        """Return the frame of a part that begins at pixel (y, x)."""
+        slanted = np.array([[1.0, self.shear], [0.0, 1.0]]) * self.scale
+        shift = np.array(self.rotate) @ slanted @ [y, x]
+        origin = self.translate + shift
+        return replace(self, translate=(float(origin[0]), float(origin[1])))
 
     def keywords(self, *, stacked: bool = False) -> dict[str, Any]:
         """Return the keywords that place a layer.
@@ -49,14 +70,27 @@ class Frame:
         Returns
         -------
         dict
-            ``scale``, ``translate``, ``units``, ``axis_labels``.
+            ``scale``, ``translate``, ``units``, ``axis_labels``; ``rotate``, ``shear`` and
+            ``affine`` where a frame is not upright.
         """
         first: tuple[tuple[Any, ...], ...] = (
             ((1.0,), (0.0,), ("pixel",), ("shot",)) if stacked else ((), (), (), ())
         )
         own = (self.scale, self.translate, self.units, ("y", "x"))
         names = ("scale", "translate", "units", "axis_labels")
-        return {name: one + two for name, one, two in zip(names, first, own, strict=True)}
+        placed = {name: one + two for name, one, two in zip(names, first, own, strict=True)}
+        return placed | self._tilt(stacked)
+
+    def _tilt(self, stacked: bool) -> dict[str, Any]:
+        upright = Frame()
+        tilt: dict[str, Any] = {}
+        if self.rotate != upright.rotate:
+            tilt["rotate"] = _with_shots(self.rotate, stacked)
+        if self.shear != upright.shear:
+            tilt["shear"] = [0.0, 0.0, self.shear] if stacked else [self.shear]
+        if self.affine != upright.affine:
+            tilt["affine"] = _with_shots(self.affine, stacked)
+        return tilt
 
 
 def frame_for(
@@ -102,7 +136,23 @@ def frame_of(layer: Any) -> Frame:
         scale=tuple(float(value) for value in layer.scale[-2:]),  # type: ignore[arg-type]
         translate=tuple(float(value) for value in layer.translate[-2:]),  # type: ignore[arg-type]
         units=tuple(str(unit) for unit in layer.units[-2:]),  # type: ignore[arg-type]
+        rotate=_matrix(layer.rotate[-2:, -2:]),
+        shear=float(layer.shear[-1]),
+        affine=_matrix(layer.affine.affine_matrix[-3:, -3:]),
     )
+
+
+def _matrix(values: NDArray[np.float64]) -> Matrix:
+    return tuple(tuple(float(value) for value in row) for row in values)
+
+
+def _with_shots(matrix: Matrix, stacked: bool) -> NDArray[np.float64]:
+    """A matrix of the axes y and x that leaves an axis of shots before them alone."""
+    if not stacked:
+        return np.array(matrix)
+    whole = np.eye(len(matrix) + 1)
+    whole[1:, 1:] = matrix
+    return whole
 
 
 def place(layer: Any, setup: ProtonSetup | OpticalSetup) -> None:

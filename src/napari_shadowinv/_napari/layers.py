@@ -29,6 +29,7 @@ __all__ = [
     "FullLayerData",
     "add_inversion",
     "add_layers",
+    "arrow_keywords",
     "caustic_keywords",
     "component_symbols",
     "intensity_limits",
@@ -150,7 +151,9 @@ def add_inversion(
     return add_layers(viewer, inversion_layers(inversion, setup, name=name, **keywords))
 
 
-def add_layers(viewer: Any, described: Sequence[FullLayerData]) -> list[Any]:
+def add_layers(
+    viewer: Any, described: Sequence[FullLayerData], *, below: Any | None = None
+) -> list[Any]:
     """Add described layers to a viewer, select the field and switch on the scale bar.
 
     Parameters
@@ -159,6 +162,8 @@ def add_layers(viewer: Any, described: Sequence[FullLayerData]) -> list[Any]:
         Where to add them.
     described : sequence of (data, keywords, layer type)
         The layers.
+    below : napari.layers.Layer, optional
+        A layer of the viewer to put them under. Default: on top of all.
 
     Returns
     -------
@@ -167,7 +172,10 @@ def add_layers(viewer: Any, described: Sequence[FullLayerData]) -> list[Any]:
     """
     from napari.layers import Layer
 
-    added = [viewer.add_layer(Layer.create(*layer)) for layer in described]
+    added = [Layer.create(*layer) for layer in described]
+    for layer in added:
+        place = len(viewer.layers) if below is None else viewer.layers.index(below)
+        viewer.layers.insert(place, layer)
     for layer in added:
         if role_of(layer) == "field":
             # The status line then tells the field below the mouse.
@@ -347,23 +355,23 @@ def caustic_keywords() -> dict[str, Any]:
 def _arrows(make: _Maker, displacement: Array) -> FullLayerData:
     """Displacements of few enough rays that each arrow can be seen."""
     data, spacing = thinned_arrows(displacement)
+    return make.layer(data, "vectors", "arrows", "arrows", "px", **arrow_keywords(data, spacing))
+
+
+def arrow_keywords(data: Array, spacing: float) -> dict[str, Any]:
+    """Return how arrows look, from those of one result; see `thinned_arrows`."""
     lengths = np.hypot(*data[:, 1].T)
     # Most arrows keep to their own place; the strongest reach to the next but one at most.
     usual = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
-    return make.layer(
-        data,
-        "vectors",
-        "arrows",
-        "arrows",
-        "px",
-        features={"displacement": lengths},
-        vector_style="arrow",
-        edge_color=_ARROW_COLOUR,
-        edge_width=spacing / 9,
+    return {
+        "features": {"displacement": lengths},
+        "vector_style": "arrow",
+        "edge_color": _ARROW_COLOUR,
+        "edge_width": spacing / 9,
         # The data are displacements in px; only the drawing is stretched.
-        length=float(0.95 * spacing / usual) if usual else 1.0,
-        opacity=0.75,
-    )
+        "length": float(0.95 * spacing / usual) if usual else 1.0,
+        "opacity": 0.75,
+    }
 
 
 def thinned_arrows(displacement: Array, along: int = _ARROWS_ALONG) -> tuple[Array, float]:

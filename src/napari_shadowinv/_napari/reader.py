@@ -101,9 +101,12 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
     if not isinstance(path, str):
         return list(stack_layers([Path(item) for item in path]))
     if path.rstrip("/").endswith(_STORE_SUFFIX):
+        from napari_shadowinv._napari.leafing import follow_once_added
         from napari_shadowinv._napari.stores import store_layers
 
-        return list(store_layers(Path(path)))
+        layers = store_layers(Path(path))
+        follow_once_added(layers)
+        return list(layers)
     if "*" in path:
         return list(stack_layers(_matches(path)))
     if Path(path).is_dir():

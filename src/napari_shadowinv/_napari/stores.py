@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layers import (
     FullLayerData,
+    arrow_keywords,
     caustic_keywords,
     component_symbols,
     intensity_limits,
     opened,
     symmetric_limits,
+    thinned_arrows,
 )
 from napari_shadowinv._napari.marks import mark
 from napari_shadowinv.errors import FileFormatError
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
     Setup = ProtonSetup | OpticalSetup
 
-__all__ = ["store_layers"]
+__all__ = ["at_shot", "opened_store", "store_layers"]
 
 _SHOT = "shot"
 _DONE = 1  # as a store's variable "status" marks a shot
@@ -53,19 +55,22 @@ def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
     -------
     list of (data, keywords, layer type)
         Layers over dask arrays of shape (shots, H, W), the lowest first: those of a single
-        result as far as the store has them, without arrows and sites.
+        result as far as the store has them, without sites. The arrows are those of the first
+        finished shot; see
+        `napari_shadowinv._napari.leafing`.
 
     Raises
     ------
     FileFormatError
         If there is no such store or no shot in it is done.
     """
-    dataset = _opened(path)
+    dataset = opened_store(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(".shadowinv")
     return _StoreLayers(path, dataset, name).layers()
 
 
-def _opened(path: Path) -> xarray.Dataset:
+def opened_store(path: Path) -> xarray.Dataset:
+    """Open a store lazily, or say why it is none."""
     import xarray as xr
 
     if not path.is_dir():
@@ -120,6 +125,7 @@ class _StoreLayers:
             *self._potential(),
             *self._field(),
             *self._caustics(),
+            self._arrows(),
         ]
 
     def _layer(
@@ -240,6 +246,21 @@ class _StoreLayers:
             return []
         caustic = self._data("caustic").astype(np.uint8)
         return [self._layer(caustic, "labels", "caustic", "caustics", "", **caustic_keywords())]
+
+    def _arrows(self) -> FullLayerData:
+        data, spacing = thinned_arrows(self._plane("displacement"))
+        keywords = {"visible": True, **arrow_keywords(data, spacing)}
+        return self._layer(
+            at_shot(data, self._done), "vectors", "arrows", "arrows", "px", **keywords
+        )
+
+
+def at_shot(arrows: NDArray[np.float64], shot: int) -> NDArray[np.float64]:
+    """Return arrows of a plane, shape (n, 2, 2), as those of a shot, shape (n, 2, 3)."""
+    stacked = np.zeros((len(arrows), 2, 3))
+    stacked[:, 0, 0] = shot
+    stacked[:, :, 1:] = arrows
+    return stacked
 
 
 def _field_of_unit_displacements(setup: Setup | None) -> NDArray[np.float64]:

@@ -60,20 +60,6 @@ def open_widget(window: Any) -> Callable[[str], Any]:
     return opened
 
 
-@pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What the user is told, one text for each notification."""
-    from napari.utils import notifications
-
-    texts: list[str] = []
-    monkeypatch.setattr(
-        notifications.notification_manager,
-        "dispatch",
-        lambda notification: texts.append(str(notification.message)),
-    )
-    return texts
-
-
 def running_threads() -> list[Any]:
     import threading
 

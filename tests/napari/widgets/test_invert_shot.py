@@ -12,12 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import dask.array
 import numpy as np
 import pytest
 from napari.utils import progress
 from qtpy.QtCore import QTimer
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert
+from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.marks import mark, result_of, role_of, unit_of
 from napari_shadowinv._napari.widgets import _runner
 from napari_shadowinv._napari.widgets._jobs import ShotJob
@@ -217,13 +219,13 @@ def test_crop_mask_and_source_are_used(
     np.testing.assert_allclose(computed(tool).potential, cropped.potential, atol=1e-9)
     tool.crop.layer = None
 
-    tool._paint_mask()
+    tool.masks.paint()
     tool.masks.layer.data[30:36, 5:12] = 1
     usable = np.ones(shot.shape, bool)
     usable[30:36, 5:12] = False
     masked = invert(shot, mask=usable, options=few)
     np.testing.assert_allclose(computed(tool).potential, masked.potential, atol=1e-6)
-    tool.painted_is_unusable.setChecked(False)
+    tool.masks.painted_is_unusable.setChecked(False)
     assert (computed(tool).mask == ~usable).all()
     tool.masks.layer = None
 
@@ -338,6 +340,75 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
     expect("a fault of the program's")
 
 
+def test_a_mistake_in_a_layer_of_another_kind_is_told_once(
+    window: Any, tool: Any, shot: Array, told: list[str], qtbot: Any
+) -> None:
+    def expect(words: str) -> None:
+        told.clear()
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: bool(told) and not tool.panel.runner.running, timeout=PATIENCE)
+        qtbot.wait(30)
+        assert len(told) == 1, told
+        assert words in told[0]
+        assert "\n" not in told[0]
+
+    some = shot.copy()
+    some[3, 5] = np.nan
+    tool.image.layer = window.add_image(some, name="nan", contrast_limits=(0, 500))
+    expect("1 pixel")
+    lazy = dask.array.ones((3, 20, 20), chunks=(1, 20, 20))
+    tool.image.layer = window.add_image(lazy, name="stack", contrast_limits=(0, 1))
+    expect("Split Stack")
+    tool.image.layer = window.layers["shot"]
+    tool._draw_crop()
+    tool.crop.layer.add_rectangles(np.array([[500, 500], [500, 600], [600, 600], [600, 500]]))
+    expect("0 × 0 pixels")
+    assert window.layers["shot"] in window.layers
+
+
+def test_whole_numbers_and_the_finest_of_many_scales_are_inverted(
+    window: Any, tool: Any, shot: Array, run: Any, told: list[str]
+) -> None:
+    counts = np.round(shot).astype(np.uint16)
+    tool.image.layer = window.add_image(counts, name="counts")
+    np.testing.assert_allclose(computed(tool).image, counts)
+    pyramid = window.add_image([counts, counts[::2, ::2]], name="pyramid", multiscale=True)
+    tool.image.layer = pyramid
+    tool.setup.show_setup(paper_setup().model_dump())
+    run(tool)
+    field = layer_of(window, "field")
+    assert field.data.shape == shot.shape
+    np.testing.assert_allclose(pyramid.scale, 1.5)
+    np.testing.assert_allclose(field.data_to_world((20, 30)), pyramid.data_to_world((20, 30)))
+    assert told == []
+
+
+def test_the_result_lies_on_an_image_that_was_turned(
+    window: Any, tool: Any, shot: Array, run: Any, told: list[str]
+) -> None:
+    turned = window.add_image(
+        shot, name="turned", rotate=30, shear=[0.2], scale=(2, 3), translate=(7, -4),
+        affine=[[1, 0.1, 5], [0, 1.2, 6], [0, 0, 1]],
+    )  # fmt: skip
+    tool.image.layer = turned
+    tool.crop.layer = window.add_shapes(
+        np.array([[5, 8], [5, 50], [40, 50], [40, 8]]),
+        **frame_of(turned).keywords(),
+    )
+    run(tool)
+    for role in ("field", "arrows", "sites", "caustic"):
+        layer = layer_of(window, role)
+        for y, x in ((0.0, 0.0), (20.0, 30.0)):
+            np.testing.assert_allclose(
+                layer.data_to_world((y, x)), turned.data_to_world((y + 5, x + 8))
+            )
+    stacked = frame_of(turned).keywords(stacked=True)
+    stack = window.add_image(np.ones((2, *shot.shape)), name="stacked", **stacked)
+    np.testing.assert_allclose(stack.data_to_world((1, 3, 4))[1:], turned.data_to_world((3, 4)))
+    assert frame_of(stack) == frame_of(turned)
+    assert told == []
+
+
 def test_the_preview_follows_in_its_own_layers(
     window: Any, tool: Any, qtbot: Any, told: list[str], record_property: Any
 ) -> None:
@@ -362,7 +433,7 @@ def test_the_preview_follows_in_its_own_layers(
         qtbot.waitUntil(lambda: potential.data is not old, timeout=PATIENCE)
         return time.perf_counter() - start
 
-    tool._paint_mask()
+    tool.masks.paint()
     follows(lambda: tool.cleaning.set_kind("low_pass"))
     follows(lambda: tool.cleaning.form.editors["width"].set_value(2.0))
     follows(lambda: tool.options.editors["floor"].set_value(0.5))

@@ -204,6 +204,8 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     field = layer_of(window, "field")
     window.dims.set_current_step(0, 3)
     qtbot.waitUntil(lambda: np.isnan(field._slice.image.raw).all(), timeout=PATIENCE)
+    arrows = layer_of(window, "arrows")
+    assert len(arrows.data) == 0
     tool.panel.button.click()
     assert tool.panel.button.text() == "Cancelling…"
     qtbot.waitUntil(lambda: at_rest(tool), timeout=PATIENCE)
@@ -219,6 +221,8 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     assert before.items() <= written(out).items()
     # The shot in view was pending, and is seen now.
     assert np.isfinite(field._slice.image.raw).all()
+    qtbot.waitUntil(lambda: len(arrows.data) > 0, timeout=PATIENCE)
+    assert (arrows.data[:, 0, 0] == 3).all()
     assert layer_of(window, "field") is field
     assert field.contrast_limits[1] == pytest.approx(float(field.data.max().compute()))
     assert tuple(potential.contrast_limits) == (-3.0, 4.0)
@@ -315,7 +319,7 @@ def test_the_source_is_guessed_for_each_shot(
 ) -> None:
     mask = np.ones(SHAPE, bool)
     mask[:3, :4] = False
-    tool._paint_mask()
+    tool.masks.paint()
     tool.masks.layer.data[:3, :4] = 1
     tool.source.picker.set_kind("low_pass")
     tool.source.picker.form.editors["width"].set_value(6.0)

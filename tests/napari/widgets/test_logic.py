@@ -5,6 +5,8 @@ from __future__ import annotations
 import inspect
 import math
 import threading
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,15 @@ from napari_shadowinv import InputError, InversionCancelled, InversionOptions, f
 from napari_shadowinv._napari.widgets import _recipes as recipes
 from napari_shadowinv._napari.widgets._estimating import quick_source
 from napari_shadowinv._napari.widgets._forecast import ForwardJob
-from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
+from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob, SourceJob
 from napari_shadowinv._napari.widgets._phantoms import BlobRecipe, ToroidRecipe
 from napari_shadowinv._napari.widgets._quantities import parsed, shown
 from napari_shadowinv._napari.widgets._reading import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._sampling import Profile, along, sampled, table_text
+from napari_shadowinv._napari.widgets._stacking import StackJob
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
 
 FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]
@@ -110,6 +116,35 @@ def test_sites_are_kept_while_the_source_stays(shot: Array) -> None:
     assert cache.hits == 2
 
 
+def test_other_boundaries_have_other_sites(shot: Array) -> None:
+    cache = PlanCache()
+    for boundary in ("closed", "free"):
+        options = FEW.model_copy(update={"boundary": boundary})
+        ShotJob(shot, recipes.UniformEstimate(), options=options, cache=cache).run()
+    assert cache.hits == 0
+
+
+def test_a_preview_starts_from_the_one_before_and_a_run_does_not() -> None:
+    shot = synthetic_image(gaussian_blob((48, 60), 45.0, 8.0).displacement)
+    cache = PlanCache()
+    job = ShotJob(shot, recipes.UniformEstimate(), options=FEW, cache=cache)
+
+    def run(width: float, preview: bool) -> Inversion:
+        cleaned = replace(job, cleaning=recipes.LowPassFilter(width=width))
+        return (cleaned.for_preview() if preview else cleaned).run()
+
+    run(1.0, preview=True)
+    warm, cold = run(1.2, preview=True), run(1.2, preview=False)
+    assert run(1.2, preview=True).report.iterations < cold.report.iterations
+    assert warm.report.residual <= FEW.tolerance
+    np.testing.assert_allclose(warm.displacement, cold.displacement, atol=0.01)
+    # The same whatever was tried before.
+    alone = replace(job, cleaning=recipes.LowPassFilter(width=1.2), cache=PlanCache()).run()
+    np.testing.assert_array_equal(cold.displacement, alone.displacement)
+    other = cache.plan(2 + np.eye(*shot.shape), None, FEW, None, None)
+    assert cache.solved(other) is None
+
+
 def test_a_uniform_source_is_the_same_after_a_filter(shot: Array) -> None:
     cache = PlanCache()
     for width in (1.0, 1.5, 2.0):
@@ -190,6 +225,50 @@ def test_a_job_ends_when_it_is_asked_to(shot: Array) -> None:
     with pytest.raises(InversionCancelled):
         ShotJob(shot, recipes.UniformEstimate(), options=FEW).run(hear, stop.is_set)
     assert "read-out" not in stages
+
+
+LARGE = np.random.default_rng(0).normal(100, 5, (1024, 1024))
+
+
+@pytest.mark.parametrize(
+    "job",
+    [
+        lambda tmp_path: SourceJob(LARGE, recipes.TotalVariationEstimate()),
+        lambda tmp_path: ShotJob(LARGE, recipes.TotalVariationEstimate()),
+        lambda tmp_path: ShotJob(
+            LARGE, recipes.UniformEstimate(), cleaning=recipes.BackgroundFilter(degree=10)
+        ),
+        lambda tmp_path: StackJob(
+            LARGE[None], tmp_path / "a.shadowinv.zarr", recipes.TotalVariationEstimate()
+        ),
+    ],
+    ids=["source", "shot", "cleaning", "stack"],
+)
+def test_a_megapixel_is_let_go_within_a_second(job: Any, tmp_path: Path) -> None:
+    stop = threading.Event()
+    ended: list[float] = []
+
+    def work() -> None:
+        with pytest.raises(InversionCancelled):
+            job(tmp_path).run(lambda _: None, stop.is_set)
+        ended.append(time.perf_counter())
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    time.sleep(1.0)
+    asked, used = time.perf_counter(), time.process_time()
+    stop.set()
+    thread.join()
+    # Where others use the machine, the time it would take alone counts.
+    assert min(ended[0] - asked, time.process_time() - used) < 1
+
+
+def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Path) -> None:
+    job = StackJob(np.stack([shot, shot]), tmp_path / "a.shadowinv.zarr", options=FEW, workers=1)
+    counted: list[tuple[int | None, int]] = []
+    job.run(lambda _: None, lambda: False, lambda index: counted.append((index, job.books.ended)))
+    assert counted == [(0, 0), (1, 1)]
+    assert job.books.ended == 2
 
 
 def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:

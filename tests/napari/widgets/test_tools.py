@@ -13,10 +13,16 @@ from qtpy.QtWidgets import QFileDialog
 
 from napari_shadowinv import ProtonSetup, sources
 from napari_shadowinv._napari.layers import add_inversion
-from napari_shadowinv._napari.marks import mark, role_of, unit_of
+from napari_shadowinv._napari.marks import mark, role_of, source_of, unit_of
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import four_toroids, paper_setup
+from napari_shadowinv.physics.phantoms import (
+    coaxial_line,
+    four_toroids,
+    paper_setup,
+    wakefield,
+    wakefield_setup,
+)
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
@@ -57,7 +63,7 @@ def test_an_estimate_becomes_a_layer_after_its_preview(
     tool.method.form.editors["degree"].set_value(0)
     qtbot.waitUntil(lambda: preview.data is not old, timeout=PATIENCE)
     assert np.ptp(preview.data) == pytest.approx(0, abs=1e-9)
-    tool._paint_mask()
+    tool.masks.paint()
     tool.masks.layer.data[10:20, 20:30] = 1
     tool.method.form.editors["degree"].set_value(2)
     tool.panel.button.click()
@@ -117,6 +123,52 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     tool.panel.button.click()
     assert len(told) == 1
     assert "choose the setup" in told[0]
+
+
+def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
+    window: Any, open_widget: Any, qtbot: Any, told: list[str]
+) -> None:
+    tool = open_widget("Forward model")
+    tool.object.set_kind("coaxial")
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: len(window.layers) == 1, timeout=PATIENCE)
+    (layer,) = window.layers
+    phantom, obstructed = coaxial_line((200, 200), paper_setup())
+    dark = np.where(obstructed, 0.0, 1.0)
+    np.testing.assert_allclose(layer.data, synthetic_image(phantom.displacement, dark))
+    np.testing.assert_array_equal(source_of(layer), dark)
+    shot = open_widget("Invert shot")
+    np.testing.assert_array_equal(shot.source.source(shot.image.layer), dark)
+    assert told == []
+
+
+def test_an_object_brings_the_beam_that_it_needs(
+    window: Any, open_widget: Any, qtbot: Any, told: list[str]
+) -> None:
+    tool = open_widget("Forward model")
+    tool.object.set_kind("wakefield")
+    assert tool.setup.setup() == wakefield_setup()
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: len(window.layers) == 1, timeout=PATIENCE)
+    wave = wakefield((200, 200), wakefield_setup())
+    np.testing.assert_allclose(window.layers[0].data, synthetic_image(wave.displacement))
+    density = tool.object.form.editors["density"]
+    density.inner.setText("2e19 cm⁻³")
+    density.inner.editingFinished.emit()
+    assert tool.object.model().density == pytest.approx(2e25)
+
+    # What somebody has typed is not replaced.
+    own = wakefield_setup().model_copy(update={"wavelength": 532e-9})
+    tool.setup.show_setup(own.model_dump())
+    tool.object.set_kind("toroid")
+    assert tool.setup.setup() == paper_setup()
+    tool.object.set_kind("wakefield")
+    assert tool.setup.setup() == own
+    tool.setup.picker.set_kind("none")
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: bool(told), timeout=PATIENCE)
+    assert len(told) == 1
+    assert "choose the setup 'light'" in told[0]
 
 
 @pytest.fixture

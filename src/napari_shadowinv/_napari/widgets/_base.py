@@ -1,9 +1,9 @@
-"""What every dock widget of the plugin is: `ToolPanel`, `PathEdit`, `with_button`."""
+"""What dock widgets of the plugin are made of: `ToolPanel`, `PathEdit`, `with_button`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 from qtpy.QtCore import QSize, Qt, Signal
 from qtpy.QtWidgets import (
@@ -20,9 +20,21 @@ from qtpy.QtWidgets import (
 
 from napari_shadowinv._napari.widgets._state import StateKeeper
 
-__all__ = ["PathEdit", "ToolPanel", "with_button"]
+__all__ = ["Part", "PathEdit", "ToolPanel", "with_button"]
 
 _WIDTH = 330
+
+
+class Part(Protocol):
+    """A control with a state."""
+
+    def state(self) -> Any:
+        """What is kept, made of what JSON knows."""
+        ...
+
+    def restore(self, state: Any) -> None:
+        """Show what `state` has returned."""
+        ...
 
 
 class ToolPanel(QWidget):
@@ -60,9 +72,23 @@ class ToolPanel(QWidget):
     def sizeHint(self) -> QSize:
         return QSize(_WIDTH + 30, 600)
 
+    def parts(self) -> dict[str, Part]:
+        """The controls whose states are kept between sessions, by name."""
+        return {}
+
     def state(self) -> dict[str, Any]:
         """What is kept between sessions, made of what JSON knows."""
-        return {}
+        return {name: part.state() for name, part in self.parts().items()}
+
+    def restore(self, kept: Mapping[str, Any]) -> None:
+        """Show what `state` has returned."""
+        for name, part in self.parts().items():
+            if name in kept:
+                part.restore(kept[name])
+
+    def restore_last(self) -> None:
+        """Show what was kept when the widget was used last."""
+        self.restore(self._keeper.load())
 
     def keep(self) -> None:
         """The state has changed: write it soon."""

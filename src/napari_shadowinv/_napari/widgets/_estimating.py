@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._napari.widgets._recipes import Estimate
+from napari_shadowinv.progress import ShouldStop
 
 __all__ = ["SourceCache", "quick_source", "same_array"]
 
@@ -30,7 +31,12 @@ class SourceCache:
     )
 
     def source(
-        self, estimate: Estimate, image: Image, mask: Mask | None, most_pixels: int | None
+        self,
+        estimate: Estimate,
+        image: Image,
+        mask: Mask | None,
+        most_pixels: int | None = None,
+        should_stop: ShouldStop | None = None,
     ) -> Image:
         """Return the source of an image.
 
@@ -42,8 +48,10 @@ class SourceCache:
             The shot.
         mask : ndarray of bool, shape (H, W), or None
             True where a pixel is usable.
-        most_pixels : int or None
+        most_pixels : int, optional
             Merge pixels until there are no more than these, to be quick.
+        should_stop : callable, optional
+            Asked at each step of an estimate that takes long.
 
         Returns
         -------
@@ -56,19 +64,25 @@ class SourceCache:
             if key == last_key and same:
                 return source
         if most_pixels is None:
-            source = estimate.source(image, mask)
+            source = estimate.source(image, mask, should_stop)
         else:
-            source = quick_source(estimate, image, mask, most_pixels)
+            source = quick_source(estimate, image, mask, most_pixels, should_stop)
         self._kept = key, image, mask, source
         return source
 
 
-def quick_source(estimate: Estimate, image: Image, mask: Mask | None, most_pixels: int) -> Image:
+def quick_source(
+    estimate: Estimate,
+    image: Image,
+    mask: Mask | None,
+    most_pixels: int,
+    should_stop: ShouldStop | None = None,
+) -> Image:
     """Estimate the source from an image whose pixels are merged, and spread it again.
 
     Parameters
     ----------
-    estimate, image, mask, most_pixels
+    estimate, image, mask, most_pixels, should_stop
         See `SourceCache.source`.
 
     Returns
@@ -78,7 +92,7 @@ def quick_source(estimate: Estimate, image: Image, mask: Mask | None, most_pixel
     """
     factor = int(np.ceil(np.sqrt(image.size / most_pixels)))
     if factor == 1 or min(image.shape) < 8 * factor:
-        return estimate.source(image, mask)
+        return estimate.source(image, mask, should_stop)
     from scipy.ndimage import map_coordinates
     from skimage.transform import downscale_local_mean
 
@@ -89,7 +103,7 @@ def quick_source(estimate: Estimate, image: Image, mask: Mask | None, most_pixel
     sums = merged(np.where(usable, image, 0.0), (factor, factor))
     known = share > 0
     coarse = np.where(known, sums / np.where(known, share, 1.0), 0.0)
-    beam = estimate.coarser(factor).source(coarse, None if known.all() else known)
+    beam = estimate.coarser(factor).source(coarse, None if known.all() else known, should_stop)
     middle = (factor - 1) / 2
     places = np.meshgrid(*((np.arange(n) - middle) / factor for n in image.shape), indexing="ij")
     fine = map_coordinates(beam, places, order=1, mode="nearest")

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["Forecast", "ForwardJob"]
 
 Image = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,8 @@ class Forecast:
         Flux of each pixel, in the unit of the source.
     displacement : ndarray, shape (2, H, W)
         Displacement of the rays, px.
+    source : ndarray, shape (H, W), or None
+        The undisturbed beam, without what the object stops; None if it is uniform.
     caustic_share : float
         Share of the pixels whose rays cross or nearly do.
     kept : float
@@ -42,6 +45,7 @@ class Forecast:
 
     image: Image
     displacement: Image
+    source: Image | None
     caustic_share: float
     kept: float
 
@@ -103,13 +107,26 @@ class ForwardJob:
         report = Reporter(on_progress, should_stop)
         report("field", 0, None)
         displacement = self._displacement()
-        source = None if self.source is None else plane_of(self.source, "the source")
+        source, shadow = self._source(displacement.shape[1:])
         report("image", 0, None)
         image = synthetic_image(displacement, source)
         report("image", 1, 1)
         caustic = jacobian_determinant(displacement) < self.caustic_jacobian
+        if shadow is not None:
+            caustic &= ~shadow
         flux = image.size if source is None else source.sum()
-        return Forecast(image, displacement, float(caustic.mean()), float(image.sum() / flux))
+        kept = float(image.sum() / flux) if flux else 1.0
+        return Forecast(image, displacement, source, float(caustic.mean()), kept)
+
+    def _source(self, shape: tuple[int, ...]) -> tuple[Image | None, Mask | None]:
+        """The beam that passes, and where the object stops it."""
+        source = None if self.source is None else plane_of(self.source, "the source")
+        if not isinstance(self.field, PhantomRecipe):
+            return source, None
+        shadow = self.field.shadow(self.shape, self.setup)
+        if shadow is None:
+            return source, None
+        return np.where(shadow, 0.0, np.ones(shape) if source is None else source), shadow
 
     def _displacement(self) -> Image:
         from napari_shadowinv.io.dataset import displacement_from_potential

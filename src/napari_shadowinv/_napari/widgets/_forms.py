@@ -2,6 +2,7 @@
 
 - edit a model: `ModelForm`
 - edit one of several kinds of models: `ModelPicker`
+- choose one of several kinds of things, with other controls: `RowPicker`
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from napari_shadowinv._napari.widgets._quantities import unit_of_title
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.validation import validated
 
-__all__ = ["Kinds", "ModelForm", "ModelPicker", "kinds_of", "labelled", "wrapping_label"]
+__all__ = [
+    "Kinds",
+    "ModelForm",
+    "ModelPicker",
+    "RowPicker",
+    "kinds_of",
+    "labelled",
+    "wrapping_label",
+]
 
 Kinds = dict[str, tuple[str, Callable[[], type[BaseModel]] | None]]
 
@@ -100,6 +109,13 @@ class ModelForm(QWidget):
         self._problem = wrapping_label(style=PROBLEM_STYLE)
         column.addWidget(self._problem)
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is filled in of what has no default."""
+        fields = self._model_class.model_fields
+        needed = [name for name in self.editors if fields[name].is_required()]
+        return all(self.editors[name].value() in (None, "") for name in needed)
+
     def values(self) -> dict[str, Any]:
         """What the form holds, as a TOML file does: what is not given is left out."""
         edited = {name: editor.value() for name, editor in self.editors.items()}
@@ -115,6 +131,14 @@ class ModelForm(QWidget):
                 if value is not None or default is None:
                     _set_or_default(editor, value, default)
         self._on_change()
+
+    def state(self) -> dict[str, Any]:
+        """What is kept."""
+        return self.values()
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Show what `state` has returned."""
+        self.set_values(state)
 
     def model(self) -> BaseModel:
         """The validated model.
@@ -265,3 +289,41 @@ class ModelPicker(QWidget):
             self._forms[kind] = form
             self.layout().addWidget(form)
         return self._forms.get(kind)
+
+
+class RowPicker(QWidget):
+    """A choice between kinds of things, some with a control of their own in a row below.
+
+    Parameters
+    ----------
+    label, kinds
+        See `ModelPicker`.
+    tip : str
+        Tooltip of the choice.
+    rows : mapping of str to QWidget
+        For some kinds, what is shown below while they are chosen.
+
+    Signals
+    -------
+    changed
+        The kind or a value changed; for the rows, their owner connects it.
+    """
+
+    changed = Signal()
+
+    def __init__(self, label: str, kinds: Kinds, tip: str, rows: Mapping[str, QWidget]) -> None:
+        super().__init__()
+        self.picker = ModelPicker(label, kinds)
+        self.picker.choice.setToolTip(f"<qt>{tip}</qt>")
+        self._rows = dict(rows)
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        for widget in (self.picker, *self._rows.values()):
+            column.addWidget(widget)
+        self.picker.changed.connect(self._on_kind)
+        self._on_kind()
+
+    def _on_kind(self) -> None:
+        for kind, row in self._rows.items():
+            row.setVisible(kind == self.picker.kind)
+        self.changed.emit()

@@ -50,6 +50,7 @@ class PlanCache:
     _kept: tuple[tuple[Any, ...], Image, Mask | None, SitePlan] | None = field(
         default=None, repr=False
     )
+    _solved: tuple[SitePlan, Inversion] | None = field(default=None, repr=False)
 
     def plan(
         self,
@@ -67,6 +68,8 @@ class PlanCache:
             options.lloyd_iterations,
             options.lloyd_tolerance,
             options.seed,
+            options.boundary,
+            options.margin,
             None if mask is None else options.floor,
         )
         if self._kept is not None:
@@ -80,6 +83,15 @@ class PlanCache:
         # At once: a run that was cancelled may still be about to do the same.
         self._kept = key, source, mask, plan
         return plan
+
+    def solved(self, plan: SitePlan) -> Inversion | None:
+        """Return what `keep` was last given, if it was made with these sites."""
+        solved = self._solved
+        return solved[1] if solved is not None and solved[0] is plan else None
+
+    def keep(self, plan: SitePlan, inversion: Inversion) -> None:
+        """Remember an inversion made with these sites, to start the next one from."""
+        self._solved = plan, inversion
 
 
 def _alike(one: Image, other: Image) -> bool:
@@ -145,27 +157,38 @@ class ShotJob:
         from napari_shadowinv.inversion import invert
         from napari_shadowinv.preprocess import number_of_sites, prepare
 
-        ensure_compiled(on_progress, should_stop)
         report = Reporter(on_progress, should_stop)
         seconds: dict[str, float] = {}
         clock = time.perf_counter()
         report("prepare", 0, None, "image and source")
         image, mask = self._image_and_mask()
         if self.cleaning is not None:
-            image = self.cleaning.filtered(image, mask)
+            image = self.cleaning.filtered(image, mask, should_stop)
         # Before the sites are spread: a mistake is told at once.
         report("prepare", 0, None)
         prepare(image, None, self.options, mask)
-        source = self._source(image, mask)
+        if isinstance(self.source, Estimate):
+            report("source", 0, None, self.source.title)
+        source = self._source(image, mask, should_stop)
         report("prepare", 0, None)
-        seconds["source"], clock = time.perf_counter() - clock, time.perf_counter()
+        seconds["source"] = time.perf_counter() - clock
+        ensure_compiled(on_progress, should_stop)
+        clock = time.perf_counter()
         n_sites = number_of_sites((image.shape[0], image.shape[1]), self.options)
         options = self.options.model_copy(update={"n_sites": n_sites})
         plan = self.cache.plan(source, mask, options, on_progress, should_stop)
         seconds["sites"] = time.perf_counter() - clock
         inversion = invert(
-            image, plan=plan, options=self.options, on_progress=on_progress, should_stop=should_stop
+            image,
+            plan=plan,
+            options=self.options,
+            # What is kept must not depend on what was tried before it.
+            start=self.cache.solved(plan) if self.preview else None,
+            on_progress=on_progress,
+            should_stop=should_stop,
         )
+        if self.preview:
+            self.cache.keep(plan, inversion)
         spent = inversion.report.seconds
         seconds |= {stage: spent[stage] + seconds.get(stage, 0.0) for stage in spent}
         return replace(inversion, report=replace(inversion.report, seconds=seconds))
@@ -179,15 +202,14 @@ class ShotJob:
             return image, mask
         return _cropped(image, self.crop), None if mask is None else mask[self.crop]
 
-    def _source(self, image: Image, mask: Mask | None) -> Image:
+    def _source(self, image: Image, mask: Mask | None, should_stop: ShouldStop | None) -> Image:
         from napari_shadowinv.preprocess import checked_source
 
         if isinstance(self.source, Estimate):
             # What an inversion would clip must not spoil the estimate.
             clipped = np.maximum(np.where(mask, image, 0) if mask is not None else image, 0)
-            return self.estimates.source(
-                self.source, clipped, mask, PREVIEW_PIXELS if self.preview else None
-            )
+            most_pixels = PREVIEW_PIXELS if self.preview else None
+            return self.estimates.source(self.source, clipped, mask, most_pixels, should_stop)
         given = self.source
         if isinstance(given, Path):
             from napari_shadowinv.io import read_radiograph
@@ -239,9 +261,9 @@ class SourceJob:
         report("source", 0, None, type(self.estimate).title)
         image = plane_of(self.image, "the image")
         if self.quick:
-            source = quick_source(self.estimate, image, self.mask, PREVIEW_PIXELS)
+            source = quick_source(self.estimate, image, self.mask, PREVIEW_PIXELS, should_stop)
         else:
-            source = self.estimate.source(image, self.mask)
+            source = self.estimate.source(image, self.mask, should_stop)
         report("source", 1, 1)
         return source
 

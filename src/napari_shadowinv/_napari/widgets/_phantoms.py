@@ -12,6 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from napari_shadowinv.physics.phantoms import Phantom
 
 __all__ = ["PHANTOMS", "PhantomRecipe"]
@@ -22,32 +25,137 @@ class PhantomRecipe(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     title: ClassVar[str]
+    probe: ClassVar[str] = ""
+    """Kind of setup that the object needs; empty for any, or none."""
 
     def phantom(self, shape: tuple[int, int], setup: Any) -> Phantom:
-        """Make it in the middle of an image; see `napari_shadowinv.physics.phantoms`."""
+        """Make it in the middle of an image; see `napari_shadowinv.physics.phantoms`.
+
+        Raises
+        ------
+        InputError
+            If the setup is of another kind than the object needs.
+        """
+        if self.probe and getattr(setup, "kind", None) != self.probe:
+            raise InputError(_NEEDS[self.probe])
+        return self._made(shape, setup)
+
+    def shadow(self, shape: tuple[int, int], setup: Any) -> NDArray[np.bool_] | None:
+        """Pixels where the object stops the beam; None if it is transparent."""
+        return None
+
+    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
         raise NotImplementedError
+
+
+_NEEDS = {
+    "proton": ("a magnetic field deflects particles: choose the setup 'particles' for this object"),
+    "optical": "a plasma wave is probed by light: choose the setup 'light' for this object",
+}
+
+
+def _metres(default: float, title: str, description: str) -> Any:
+    return Field(default=default, gt=0, title=f"{title} (m)", description=description)
+
+
+def _peak(default: float, where: str) -> Any:
+    return Field(
+        default=default,
+        title="Peak field (MG µm)",
+        description=f"Path-integrated field at {where}, in MG µm; negative focuses.",
+    )
 
 
 class ToroidRecipe(PhantomRecipe):
     """The paper's toroidal field."""
 
     title = "toroidal magnetic field"
-    peak: float = Field(
-        default=97.0,
-        title="Peak field (MG µm)",
-        description="Path-integrated field at the radius, in MG µm; negative focuses.",
-    )
-    radius: float = Field(
-        default=30e-6,
-        gt=0,
-        title="Radius (m)",
-        description="Radius σ at which the field is largest, in the object plane.",
+    probe = "proton"
+    peak: float = _peak(97.0, "the radius")
+    radius: float = _metres(
+        30e-6, "Radius", "Radius σ at which the field is largest, in the object plane."
     )
 
-    def phantom(self, shape: tuple[int, int], setup: Any) -> Phantom:
+    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
         from napari_shadowinv.physics.phantoms import toroid
 
-        return toroid(shape, _particles(setup), self.peak, self.radius)
+        return toroid(shape, setup, self.peak, self.radius)
+
+
+class FourToroidsRecipe(PhantomRecipe):
+    """The paper's four toroids."""
+
+    title = "four toroids"
+    probe = "proton"
+    strength: float = Field(
+        default=1.0,
+        title="Strength",
+        description="Factor on the fields, whose largest peak is 135 MG µm; caustics form at 1.",
+        json_schema_extra={"slider": [0.05, 3.0]},
+    )
+
+    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
+        from napari_shadowinv.physics.phantoms import four_toroids
+
+        return four_toroids(shape, setup, self.strength)
+
+
+class CoaxialRecipe(PhantomRecipe):
+    """The paper's two conductors, with equal and opposite currents along the beam."""
+
+    title = "coaxial conductors"
+    probe = "proton"
+    peak: float = _peak(60.0, "the inner conductor's surface")
+    inner: float = _metres(21e-6, "Inner conductor", "Radius of the conductor on the axis.")
+    outer: float = _metres(
+        66e-6, "Outer conductor from", "Inner radius of the conductor around it."
+    )
+    rim: float = _metres(78e-6, "Outer conductor to", "Outer radius of the conductor around it.")
+
+    def shadow(self, shape: tuple[int, int], setup: Any) -> NDArray[np.bool_]:
+        return self._line(shape, setup)[1]
+
+    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
+        return self._line(shape, setup)[0]
+
+    def _line(self, shape: tuple[int, int], setup: Any) -> tuple[Phantom, NDArray[np.bool_]]:
+        from napari_shadowinv.physics.phantoms import coaxial_line
+
+        return coaxial_line(shape, setup, self.peak, (self.inner, self.outer, self.rim))
+
+
+class WakefieldRecipe(PhantomRecipe):
+    """The paper's plasma wave, seen from the side."""
+
+    title = "plasma wakefield"
+    probe = "optical"
+    amplitude: float = Field(
+        default=0.8,
+        title="Amplitude Δn/n₀",
+        description="Relative change of the electron density in the middle; below 1.",
+        json_schema_extra={"slider": [0.0, 1.0]},
+    )
+    density: float = Field(
+        default=1.65e25,
+        gt=0,
+        title="Density n₀ (m⁻³)",
+        description="Electron density of the undisturbed plasma; it sets the wave's length.",
+    )
+    width: float = _metres(6e-6, "Width", "Radius of the wave across its axis.")
+    length: float = _metres(14e-6, "Length", "Radius of the wave along its axis.")
+    curvature_radius: float = Field(
+        default=20e-6,
+        title="Curvature of the fronts (m)",
+        description=(
+            "Radius of the wavefronts on the axis: positive where they lag behind there, "
+            "negative the other way round, inf for plane ones."
+        ),
+    )
+
+    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
+        from napari_shadowinv.physics.phantoms import wakefield
+
+        return wakefield(shape, setup, **self.model_dump())
 
 
 class BlobRecipe(PhantomRecipe):
@@ -66,39 +174,16 @@ class BlobRecipe(PhantomRecipe):
         description="Standard deviation in px of the object plane.",
     )
 
-    def phantom(self, shape: tuple[int, int], setup: Any) -> Phantom:
+    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
         from napari_shadowinv.physics.phantoms import gaussian_blob
 
         return gaussian_blob(shape, self.amplitude, self.sigma)
 
 
-class FourToroidsRecipe(PhantomRecipe):
-    """The paper's four toroids."""
-
-    title = "four toroids"
-    strength: float = Field(
-        default=1.0,
-        title="Strength",
-        description="Factor on the fields, whose largest peak is 135 MG µm; caustics form at 1.",
-        json_schema_extra={"slider": [0.05, 3.0]},
-    )
-
-    def phantom(self, shape: tuple[int, int], setup: Any) -> Phantom:
-        from napari_shadowinv.physics.phantoms import four_toroids
-
-        return four_toroids(shape, _particles(setup), self.strength)
-
-
-def _particles(setup: Any) -> Any:
-    if getattr(setup, "kind", None) != "proton":
-        raise InputError(
-            "a magnetic field deflects particles: choose the setup 'particles' for this object"
-        )
-    return setup
-
-
 PHANTOMS: dict[str, type[PhantomRecipe]] = {
     "toroid": ToroidRecipe,
     "four_toroids": FourToroidsRecipe,
+    "coaxial": CoaxialRecipe,
+    "wakefield": WakefieldRecipe,
     "blob": BlobRecipe,
 }

@@ -98,7 +98,7 @@ class LayerWatch(QObject):
 
     Parameters
     ----------
-    pickers : sequence of LayerPicker
+    pickers : sequence of LayerPicker or MaskPicker
         Where the layers are chosen.
 
     Signals
@@ -109,7 +109,7 @@ class LayerWatch(QObject):
 
     edited = Signal()
 
-    def __init__(self, pickers: Sequence[LayerPicker]) -> None:
+    def __init__(self, pickers: Sequence[Any]) -> None:
         super().__init__()
         self._pickers = pickers
         self._watched: list[Any] = []

@@ -99,8 +99,9 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> Mask | 
     ----------
     layer : napari.layers.Labels or napari.layers.Shapes or None
         What was painted; None, or nothing painted, for no mask.
-    image : napari.layers.Image
-        The image that it belongs to.
+    image : napari.layers.Image or None
+        The image, or the stack of them, that it belongs to; None for files, whose shape is
+        not known yet.
     painted_is_unusable : bool
         Whether the paint marks what to leave out, or what to use.
 
@@ -115,15 +116,16 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> Mask | 
     """
     if layer is None:
         return None
-    shape = tuple(image_of(image).shape)
+    shape = None if image is None else tuple(_grey(image, "image").shape[-2:])
     if kind_of(layer) == "labels":
         painted = np.asarray(layer.data) != 0
-        if painted.shape != shape:
+        if shape is not None and painted.shape != shape:
             raise InputError(
                 f"the mask '{layer.name}' has shape {painted.shape}, the image {shape}: they "
                 "must match; make new labels while the image is the only layer"
             )
     else:
+        assert shape is not None
         painted = _drawn(layer, image, shape)
     if not painted.any():
         return None

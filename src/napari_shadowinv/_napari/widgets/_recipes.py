@@ -3,15 +3,15 @@
 - how to guess the source: `ESTIMATES`
 - how to clean the image beforehand: `FILTERS`
 
-Each is a pydantic model with a method that does it. Defaults are those of the functions
-that do the work, wherever these have one.
+Each is a pydantic model, named after the function that does it and with fields that are its
+keywords. Defaults are those of the function, wherever it has one.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import BaseModel, ConfigDict, Field
 
 from napari_shadowinv.errors import InputError
 
@@ -19,23 +19,35 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from napari_shadowinv.progress import ShouldStop
+
     Image = NDArray[np.float64]
     Mask = NDArray[np.bool_]
 
 __all__ = ["ESTIMATES", "FILTERS", "Estimate", "Filter"]
 
-_WIDTHS: dict[str, JsonValue] = {"slider": [1.0, 200.0]}
 
-
-class Estimate(BaseModel):
-    """A way to guess the undisturbed beam from the shot."""
+class _Recipe(BaseModel):
+    """Something done to an image."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     title: ClassVar[str]
+    function: ClassVar[str]
 
-    def source(self, image: Image, mask: Mask | None) -> Image:
-        """Estimate the source; see `napari_shadowinv.sources`."""
-        raise NotImplementedError
+
+class Estimate(_Recipe):
+    """A way to guess the undisturbed beam from the shot."""
+
+    def source(
+        self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
+    ) -> Image:
+        """Estimate the source by a function of `napari_shadowinv.sources`."""
+        from napari_shadowinv import sources
+
+        estimated: Image = getattr(sources, self.function)(
+            image, mask=mask, should_stop=should_stop, **self.model_dump()
+        )
+        return estimated
 
     def coarser(self, factor: int) -> Estimate:
         """The same for an image with pixels `factor` times as large."""
@@ -47,12 +59,58 @@ class Estimate(BaseModel):
         return self.model_copy(update=lengths)
 
 
+class Filter(_Recipe):
+    """Something done to the image before its inversion."""
+
+    def filtered(
+        self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
+    ) -> Image:
+        """Apply it, so that what is masked does not touch the rest."""
+        import numpy as np
+
+        # Masked pixels may hold NaN.
+        if mask is not None and mask.any() and not mask.all():
+            image = np.where(mask, image, image[mask].mean())
+        return self._applied(image, mask, should_stop)
+
+    def _applied(self, image: Image, mask: Mask | None, should_stop: ShouldStop | None) -> Image:
+        """Apply a function of `napari_shadowinv.filters`."""
+        from napari_shadowinv import filters
+
+        result: Image = getattr(filters, self.function)(image, **self.model_dump())
+        return result
+
+
+def _degree(description: str) -> Any:
+    return Field(
+        default=2,
+        ge=0,
+        le=10,
+        title="Degree",
+        description=f"Total degree of the polynomial{description}",
+        json_schema_extra={"slider": [0, 10]},
+    )
+
+
+def _width(default: float, description: str, least: float, most: float) -> Any:
+    return Field(
+        default=default,
+        gt=0,
+        title="Width (px)",
+        description=description,
+        json_schema_extra={"slider": [least, most]},
+    )
+
+
 class UniformEstimate(Estimate):
     """The same everywhere."""
 
     title = "uniform"
+    function = "uniform_source"
 
-    def source(self, image: Image, mask: Mask | None) -> Image:
+    def source(
+        self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
+    ) -> Image:
         from napari_shadowinv.sources import uniform_source
 
         return uniform_source(image, mask=mask)
@@ -62,54 +120,32 @@ class GaussianEstimate(Estimate):
     """A fitted elliptical spot."""
 
     title = "fitted Gaussian"
-
-    def source(self, image: Image, mask: Mask | None) -> Image:
-        from napari_shadowinv.sources import gaussian_source
-
-        return gaussian_source(image, mask=mask)
+    function = "gaussian_source"
 
 
 class PolynomialEstimate(Estimate):
     """A fitted polynomial."""
 
     title = "fitted polynomial"
-    degree: int = Field(
-        default=2,
-        ge=0,
-        le=10,
-        title="Degree",
-        description="Total degree of the polynomial: 0 is flat, 2 a bowl, 10 follows much.",
-        json_schema_extra={"slider": [0, 10]},
-    )
-
-    def source(self, image: Image, mask: Mask | None) -> Image:
-        from napari_shadowinv.sources import polynomial_source
-
-        return polynomial_source(image, degree=self.degree, mask=mask)
+    function = "polynomial_source"
+    degree: int = _degree(": 0 is flat, 2 a bowl, 10 follows much.")
 
 
 class LowPassEstimate(Estimate):
     """The blurred shot."""
 
     title = "blurred shot"
-    width: float = Field(
-        default=30.0,
-        gt=0,
-        title="Width (px)",
-        description="Standard deviation of the Gaussian blur in px: a few times the object.",
-        json_schema_extra=_WIDTHS,
+    function = "low_pass_source"
+    width: float = _width(
+        30.0, "Standard deviation of the Gaussian blur in px: a few times the object.", 1.0, 200.0
     )
-
-    def source(self, image: Image, mask: Mask | None) -> Image:
-        from napari_shadowinv.sources import low_pass_source
-
-        return low_pass_source(image, self.width, mask=mask)
 
 
 class TotalVariationEstimate(Estimate):
     """The shot without small structures, but with its edges."""
 
     title = "total variation"
+    function = "total_variation_source"
     weight: float = Field(
         default=2.0,
         gt=0,
@@ -127,13 +163,6 @@ class TotalVariationEstimate(Estimate):
         description="Most steps; an object of radius r px needs about r² of them.",
     )
 
-    def source(self, image: Image, mask: Mask | None) -> Image:
-        from napari_shadowinv.sources import total_variation_source
-
-        return total_variation_source(
-            image, weight=self.weight, iterations=self.iterations, mask=mask
-        )
-
     def coarser(self, factor: int) -> Estimate:
         # A step reaches one pixel farther: fewer steps go as far in larger pixels.
         steps = max(1, self.iterations // factor**2)
@@ -144,12 +173,9 @@ class InterpolatedEstimate(Estimate):
     """The shot, with the masked part filled in from around it."""
 
     title = "filled in under the mask"
-    width: float = Field(
-        default=5.0,
-        gt=0,
-        title="Width (px)",
-        description="Length in px over which the surroundings are smoothed before they go on.",
-        json_schema_extra={"slider": [0.5, 50.0]},
+    function = "interpolated_source"
+    width: float = _width(
+        5.0, "Length in px over which the surroundings are smoothed before they go on.", 0.5, 50.0
     )
     kind: Literal["biharmonic", "laplace"] = Field(
         default="biharmonic",
@@ -160,92 +186,60 @@ class InterpolatedEstimate(Estimate):
         ),
     )
 
-    def source(self, image: Image, mask: Mask | None) -> Image:
-        from napari_shadowinv.sources import interpolated_source
-
+    def source(
+        self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
+    ) -> Image:
         if mask is None:
             raise InputError(
                 "this estimate fills in what the mask marks: choose a mask layer that covers "
                 "the object"
             )
-        return interpolated_source(image, mask, width=self.width, kind=self.kind)
-
-
-class Filter(BaseModel):
-    """Something done to the image before its inversion."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-    title: ClassVar[str]
-
-    def filtered(self, image: Image, mask: Mask | None) -> Image:
-        """Apply it; what is masked does not touch the rest. See `napari_shadowinv.filters`."""
-        raise NotImplementedError
+        return super().source(image, mask, should_stop)
 
 
 class LowPassFilter(Filter):
     """Take away small structures."""
 
     title = "low-pass (smooth)"
-    width: float = Field(
-        default=1.0,
-        gt=0,
-        title="Width (px)",
-        description="Standard deviation of the Gaussian blur in px.",
-        json_schema_extra={"slider": [0.1, 20.0]},
-    )
-
-    def filtered(self, image: Image, mask: Mask | None) -> Image:
-        from napari_shadowinv.filters import low_pass
-
-        return low_pass(_filled(image, mask), self.width)
+    function = "low_pass"
+    width: float = _width(1.0, "Standard deviation of the Gaussian blur in px.", 0.1, 20.0)
 
 
 class HighPassFilter(Filter):
     """Take away large structures."""
 
     title = "high-pass"
-    width: float = Field(
-        default=50.0,
-        gt=0,
-        title="Width (px)",
-        description="Structures much larger than this standard deviation, in px, vanish.",
-        json_schema_extra=_WIDTHS,
+    function = "high_pass"
+    width: float = _width(
+        50.0, "Structures much larger than this standard deviation, in px, vanish.", 1.0, 200.0
     )
-
-    def filtered(self, image: Image, mask: Mask | None) -> Image:
-        from napari_shadowinv.filters import high_pass
-
-        return high_pass(_filled(image, mask), self.width)
 
 
 class BackgroundFilter(Filter):
     """Flatten by a polynomial."""
 
     title = "flatten (polynomial)"
-    degree: int = Field(
-        default=2,
-        ge=0,
-        le=10,
-        title="Degree",
-        description="Total degree of the polynomial that is taken out of the image.",
-        json_schema_extra={"slider": [0, 10]},
-    )
+    function = "remove_background"
+    degree: int = _degree(" that is taken out of the image.")
     kind: Literal["divide", "subtract"] = Field(
         default="divide",
         title="How",
         description="'divide' by it, for an uneven beam, or 'subtract' it, for stray light.",
     )
 
-    def filtered(self, image: Image, mask: Mask | None) -> Image:
+    def _applied(self, image: Image, mask: Mask | None, should_stop: ShouldStop | None) -> Image:
         from napari_shadowinv.filters import remove_background
 
-        return remove_background(_filled(image, mask), self.degree, kind=self.kind, mask=mask)
+        return remove_background(
+            image, self.degree, kind=self.kind, mask=mask, should_stop=should_stop
+        )
 
 
 class HotPixelFilter(Filter):
     """Replace broken pixels."""
 
     title = "remove hot pixels"
+    function = "remove_hot_pixels"
     threshold: float = Field(
         default=6.0,
         gt=0,
@@ -257,19 +251,10 @@ class HotPixelFilter(Filter):
         json_schema_extra={"slider": [2.0, 20.0]},
     )
 
-    def filtered(self, image: Image, mask: Mask | None) -> Image:
+    def _applied(self, image: Image, mask: Mask | None, should_stop: ShouldStop | None) -> Image:
         from napari_shadowinv.filters import remove_hot_pixels
 
-        return remove_hot_pixels(_filled(image, mask), threshold=self.threshold)[0]
-
-
-def _filled(image: Image, mask: Mask | None) -> Image:
-    """The image with the mean in its masked pixels, which may hold NaN."""
-    import numpy as np
-
-    if mask is None or mask.all() or not mask.any():
-        return image
-    return np.where(mask, image, image[mask].mean())
+        return remove_hot_pixels(image, threshold=self.threshold, should_stop=should_stop)[0]
 
 
 ESTIMATES: dict[str, type[Estimate]] = {

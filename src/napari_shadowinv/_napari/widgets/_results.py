@@ -43,14 +43,9 @@ def result_frame(image: Any, setup: Any | None, crop: tuple[slice, slice] | None
     """
     frame = frame_of(image)
     if setup is not None:
-        frame = frame_for(image.data.shape, setup, translate=frame.translate)
-    if crop is None:
-        return frame
-    y, x = (
-        origin + part.start * side
-        for origin, part, side in zip(frame.translate, crop, frame.scale, strict=True)
-    )
-    return replace(frame, translate=(y, x))
+        upright = frame_for(image.data.shape, setup)
+        frame = replace(frame, scale=upright.scale, units=upright.units)
+    return frame if crop is None else frame.cropped(crop[0].start, crop[1].start)
 
 
 def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> None:
@@ -65,10 +60,12 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
     setup : ProtonSetup or OpticalSetup
         The experiment.
     companions : sequence of napari.layers.Layer
-        Source, mask and crop: those that lie as the image does go with it.
+        Source, mask and crop: those that lie as the image does go with it, and so do other
+        images of its size. Pixels and lengths side by side would make napari warn at each layer.
     """
     before = frame_of(image)
-    followers = [layer for layer in companions if frame_of(layer) == before]
+    others = [layer for layer in viewer.layers if _is_alike(layer, image)]
+    followers = [layer for layer in (*companions, *others) if frame_of(layer) == before]
     place(image, setup)
     if frame_of(image) == before:
         return
@@ -76,6 +73,13 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
         layer.scale = (*layer.scale[:-2], *image.scale[-2:])
         layer.units = (*layer.units[:-2], *image.units[-2:])
     viewer.reset_view()
+
+
+def _is_alike(layer: Any, image: Any) -> bool:
+    """Whether another layer holds images of the same size."""
+    if layer is image or kind_of(layer) not in ("image", "labels"):
+        return False
+    return tuple(layer.data.shape[-2:]) == tuple(image.data.shape[-2:])
 
 
 class ResultLayers(QObject):
@@ -100,6 +104,7 @@ class ResultLayers(QObject):
         super().__init__(parent)
         self._viewer = viewer
         self._layers: dict[str, Any] = {}
+        self._order: list[str] = []
         self._waiting: list[FullLayerData] = []
         self._select, self._before = True, None
         self._timer = QTimer(self)
@@ -120,7 +125,8 @@ class ResultLayers(QObject):
         """Replace the data of the layers; add those that are not there.
 
         Adding a layer takes napari some tenths of a second, so they are added one by one
-        while the window stays alive.
+        while the window stays alive: what is visible first, the hidden ones below and between
+        afterwards.
 
         Parameters
         ----------
@@ -132,13 +138,15 @@ class ResultLayers(QObject):
         self._select = select
         self._before = self._viewer.layers.selection.active
         here = self.layers
-        self._waiting = []
+        self._order = [_role(keywords) for _, keywords, _ in described]
+        waiting = []
         for data, keywords, kind in described:
             layer = self._layers.get(_role(keywords))
             if layer is not None and layer in here and kind_of(layer) == kind:
                 _update(layer, data, keywords)
             else:
-                self._waiting.append((data, keywords, kind))
+                waiting.append((data, keywords, kind))
+        self._waiting = sorted(waiting, key=lambda layer: not layer[1].get("visible", True))
         if self._waiting:
             self._timer.start()
         else:
@@ -154,13 +162,23 @@ class ResultLayers(QObject):
 
         if self._waiting:
             described = self._waiting.pop(0)
-            (self._layers[_role(described[1])],) = add_layers(self._viewer, [described])
-        if not self._waiting:
-            self._timer.stop()
+            role = _role(described[1])
+            (self._layers[role],) = add_layers(
+                self._viewer, [described], below=self._next_above(role)
+            )
+            # Layers that nobody sees yet must not take the selection.
             active = self._layers.get("field") if self._select else self._before
             if active is not None and active in self._viewer.layers:
                 self._viewer.layers.selection.active = active
+        if not self._waiting:
+            self._timer.stop()
             self.complete.emit()
+
+    def _next_above(self, role: str) -> Any | None:
+        """The lowest layer of the result that lies above this one and is there already."""
+        higher = self._order[self._order.index(role) + 1 :]
+        layers = (self._layers.get(one) for one in higher)
+        return next((layer for layer in layers if layer in self._viewer.layers), None)
 
 
 def _role(keywords: dict[str, Any]) -> str:

@@ -75,6 +75,14 @@ class SetupPicker(QWidget):
         """
         return self.picker.model()  # type: ignore[return-value]
 
+    def state(self) -> dict[str, Any]:
+        """What is kept."""
+        return self.picker.state()
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Show what `state` has returned."""
+        self.picker.restore(state)
+
     def show_setup(self, values: Mapping[str, Any]) -> None:
         """Fill in a setup, as a TOML file or a model's dump holds it."""
         kind = str(values["kind"])

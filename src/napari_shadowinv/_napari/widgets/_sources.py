@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from numpy.typing import ArrayLike
-from qtpy.QtCore import Signal
-from qtpy.QtWidgets import QVBoxLayout, QWidget
 
 from napari_shadowinv._napari.marks import source_of
 from napari_shadowinv._napari.widgets._base import PathEdit
-from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
+from napari_shadowinv._napari.widgets._forms import RowPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._picking import LayerPicker
 from napari_shadowinv._napari.widgets._reading import image_of
 from napari_shadowinv._napari.widgets._recipes import ESTIMATES, Estimate
@@ -23,7 +21,7 @@ __all__ = ["SourcePicker"]
 _OWN, _LAYER, _FILE = "own", "layer", "file"
 
 
-class SourcePicker(QWidget):
+class SourcePicker(RowPicker):
     """Uniform, a layer, a file, what came with the shot, or an estimate from it.
 
     Signals
@@ -32,13 +30,13 @@ class SourcePicker(QWidget):
         Another source, or another parameter of its estimate.
     """
 
-    changed = Signal()
-
     def __init__(self, viewer: Any) -> None:
-        super().__init__()
+        self.layers = LayerPicker(viewer, ("image",))
+        self.layers.setToolTip("Image layer of the undisturbed beam.")
+        self.file = PathEdit("Image of the undisturbed beam")
         kinds = kinds_of(ESTIMATES, "estimate: ")
         _, uniform = kinds.pop("uniform")
-        self.picker = ModelPicker(
+        super().__init__(
             "Source",
             {
                 "uniform": ("uniform", uniform),
@@ -47,23 +45,12 @@ class SourcePicker(QWidget):
                 _OWN: ("the one that came with the shot", None),
                 **kinds,
             },
+            "The beam without the object. Best is a measured reference image; without one "
+            "it is uniform, or estimated from the shot itself.",
+            {_LAYER: labelled("", self.layers), _FILE: labelled("", self.file)},
         )
-        self.picker.choice.setToolTip(
-            "<qt>The beam without the object. Best is a measured reference image; without one "
-            "it is uniform, or estimated from the shot itself.</qt>"
-        )
-        self.layers = LayerPicker(viewer, ("image",))
-        self.layers.setToolTip("Image layer of the undisturbed beam.")
-        self.file = PathEdit("Image of the undisturbed beam")
-        column = QVBoxLayout(self)
-        column.setContentsMargins(0, 0, 0, 0)
-        self._layer_row, self._file_row = labelled("", self.layers), labelled("", self.file)
-        for widget in (self.picker, self._layer_row, self._file_row):
-            column.addWidget(widget)
-        self.picker.changed.connect(self._on_change)
         self.layers.picked.connect(self.changed)
         self.file.changed.connect(self.changed)
-        self._on_change()
 
     def source(self, image_layer: Any) -> ArrayLike | Path | Estimate:
         """The chosen source of an image layer, as a job takes it.
@@ -106,8 +93,3 @@ class SourcePicker(QWidget):
             self.picker.set_kind(_OWN)
         elif self.picker.kind == _OWN:
             self.picker.set_kind("uniform")
-
-    def _on_change(self) -> None:
-        self._layer_row.setVisible(self.picker.kind == _LAYER)
-        self._file_row.setVisible(self.picker.kind == _FILE)
-        self.changed.emit()

@@ -12,11 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from qtpy.QtCore import Signal
-from qtpy.QtWidgets import QFileDialog, QLineEdit, QSpinBox, QVBoxLayout, QWidget
+from qtpy.QtWidgets import QFileDialog, QLineEdit, QSpinBox
 
 from napari_shadowinv._napari.widgets._base import PathEdit
-from napari_shadowinv._napari.widgets._forms import ModelPicker, labelled
+from napari_shadowinv._napari.widgets._forms import RowPicker, labelled
 from napari_shadowinv._napari.widgets._picking import LayerPicker
 from napari_shadowinv._napari.widgets._reading import stack_of
 from napari_shadowinv.errors import InputError
@@ -81,7 +80,7 @@ class StoreEdit(PathEdit):
         return path + STORE_SUFFIX
 
 
-class ShotsPicker(QWidget):
+class ShotsPicker(RowPicker):
     """A stack layer, or files.
 
     Signals
@@ -90,14 +89,7 @@ class ShotsPicker(QWidget):
         Other shots were chosen.
     """
 
-    changed = Signal()
-
     def __init__(self, viewer: Any) -> None:
-        super().__init__()
-        self.picker = ModelPicker(
-            "Shots", {_LAYER: ("a stack layer", None), _FILES: ("files", None)}
-        )
-        self.picker.choice.setToolTip("Where the shots are.")
         self.layers = LayerPicker(viewer, ("image",))
         self.layers.setToolTip("Image layer (shot, y, x); one on a disk is read shot by shot.")
         self.files = _FilesEdit("Files of the shots", "shots/*.tif")
@@ -105,15 +97,14 @@ class ShotsPicker(QWidget):
             "<qt>A pattern such as shots/*.tif, files with ; between them, or a TIFF with many "
             "pages.</qt>"
         )
-        column = QVBoxLayout(self)
-        column.setContentsMargins(0, 0, 0, 0)
-        self._layer_row, self._files_row = labelled("", self.layers), labelled("", self.files)
-        for widget in (self.picker, self._layer_row, self._files_row):
-            column.addWidget(widget)
-        self.picker.changed.connect(self._on_change)
+        super().__init__(
+            "Shots",
+            {_LAYER: ("a stack layer", None), _FILES: ("files", None)},
+            "Where the shots are.",
+            {_LAYER: labelled("", self.layers), _FILES: labelled("", self.files)},
+        )
         self.layers.picked.connect(self.changed)
         self.files.changed.connect(self.changed)
-        self._on_change()
 
     @property
     def layer(self) -> Any | None:
@@ -136,13 +127,8 @@ class ShotsPicker(QWidget):
             raise InputError("no files are given: type a pattern such as shots/*.tif, or choose")
         return paths[0] if len(paths) == 1 else paths
 
-    def _on_change(self) -> None:
-        self._layer_row.setVisible(self.picker.kind == _LAYER)
-        self._files_row.setVisible(self.picker.kind == _FILES)
-        self.changed.emit()
 
-
-class EnginePicker(QWidget):
+class EnginePicker(RowPicker):
     """The computer in front of the user, or a scheduler of dask.
 
     Signals
@@ -151,18 +137,7 @@ class EnginePicker(QWidget):
         Another was chosen.
     """
 
-    changed = Signal()
-
     def __init__(self) -> None:
-        super().__init__()
-        self.picker = ModelPicker(
-            "Run on",
-            {_HERE: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
-        )
-        self.picker.choice.setToolTip(
-            "<qt>The values do not depend on it. Workers of a cluster must see the folders of "
-            "shots and store under the same names.</qt>"
-        )
         self.workers = QSpinBox()
         self.workers.setRange(0, 1024)
         self.workers.setSuffix(" at once")
@@ -172,16 +147,15 @@ class EnginePicker(QWidget):
         self.address.setPlaceholderText("tcp://host:8786")
         self.address.setToolTip("What 'dask scheduler' prints when it starts.")
         self.address.setMinimumWidth(60)
-        column = QVBoxLayout(self)
-        column.setContentsMargins(0, 0, 0, 0)
-        self._workers_row = labelled("Jobs", self.workers)
-        self._address_row = labelled("Address", self.address)
-        for widget in (self.picker, self._workers_row, self._address_row):
-            column.addWidget(widget)
-        self.picker.changed.connect(self._on_change)
+        super().__init__(
+            "Run on",
+            {_HERE: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
+            "The values do not depend on it. Workers of a cluster must see the folders of "
+            "shots and store under the same names.",
+            {_HERE: labelled("Jobs", self.workers), _SCHEDULER: labelled("Address", self.address)},
+        )
         self.workers.valueChanged.connect(lambda _: self.changed.emit())
         self.address.editingFinished.connect(self.changed)
-        self._on_change()
 
     def engine(self) -> tuple[str, int | None]:
         """Scheduler and number of workers, as `napari_shadowinv.stack.run_stack` takes them.
@@ -214,8 +188,3 @@ class EnginePicker(QWidget):
         self.picker.set_kind(str(state.get("kind", _HERE)))
         self.workers.setValue(int(state.get("workers", 0)))
         self.address.setText(str(state.get("address", "")))
-
-    def _on_change(self) -> None:
-        self._workers_row.setVisible(self.picker.kind == _HERE)
-        self._address_row.setVisible(self.picker.kind == _SCHEDULER)
-        self.changed.emit()

@@ -56,7 +56,9 @@ class StackRequest:
     companions: tuple[Any, ...]
     place: dict[str, Any]
     described: list[FullLayerData] = field(default_factory=list)
+    # Written by the run's thread, so that the window only reads them.
     _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _earlier: dict[str, tuple[float, float]] = field(default_factory=dict)
     _given: set[tuple[float, float]] = field(default_factory=set)
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
@@ -69,8 +71,11 @@ class StackRequest:
         Where the user has chosen other contrast limits, they stay.
         """
         for layer in filter(_is_image, layers):
-            wanted = self._limits.get(str(role_of(layer)))
-            if wanted is None or wanted == tuple(layer.contrast_limits):
+            role = str(role_of(layer))
+            if role not in self._limits:
+                continue
+            wanted = self._wanted(role)
+            if wanted == tuple(layer.contrast_limits):
                 continue
             if tuple(layer.contrast_limits) in self._given:
                 self._given.add(wanted)
@@ -83,10 +88,16 @@ class StackRequest:
         for _, keywords, kind in self.described:
             role = str(role_of(keywords))
             if kind == "image" and role in earlier._limits:
-                limits = _widened(self._limits[role], np.array(earlier._limits[role]))
-                self._limits[role] = limits
+                self._earlier[role] = earlier._wanted(role)
+                limits = self._wanted(role)
                 self._given.add(limits)
                 keywords["contrast_limits"] = now.get(role, limits)
+
+    def _wanted(self, role: str) -> tuple[float, float]:
+        """Limits that hold all shots of this run, and of earlier ones into the same store."""
+        limits = self._limits[role]
+        earlier = self._earlier.get(role)
+        return limits if earlier is None else _widened(limits, np.array(earlier))
 
     def _look(self, index: int | None) -> None:
         """Describe the layers once a shot is done, and look how strong each one is."""

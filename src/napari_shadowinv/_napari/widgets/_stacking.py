@@ -123,10 +123,11 @@ class StackJob:
         def tell(news: RunProgress) -> None:
             if news.outcome is None:
                 self._recall()
-            self.books.take(news)
+            # The window looks into the books at any time: what they tell of must be seen to.
             if news.done:
                 ended = news.outcome
                 on_done(None if ended is None or ended.reason else ended.index)
+            self.books.take(news)
             step = news.done + news.failed
             on_progress(Progress("shots", step, news.total, self.books.text))
 
@@ -134,7 +135,7 @@ class StackJob:
         run_stack(
             self.shots,
             self.out,
-            source=self._source(),
+            source=self._source(should_stop),
             mask=self.mask,
             options=self.options,
             setup=self.setup,
@@ -158,15 +159,15 @@ class StackJob:
             reason = str(store.report(int(index)).get("reason", "unknown"))
             self.books.failures.append((store.names[index], reason))
 
-    def _source(self) -> Any:
+    def _source(self, should_stop: ShouldStop) -> Any:
         if isinstance(self.source, UniformEstimate):
             return None
         if isinstance(self.source, Estimate):
-            return _estimates(self.shots, self.source, self.mask)
+            return _estimates(self.shots, self.source, self.mask, _Here(should_stop))
         return self.source
 
 
-def _estimates(shots: Any, estimate: Estimate, mask: Mask | None) -> Any:
+def _estimates(shots: Any, estimate: Estimate, mask: Mask | None, should_stop: ShouldStop) -> Any:
     """Source of each shot, guessed when the shot's turn comes; an xarray.DataArray."""
     import xarray as xr
 
@@ -174,12 +175,12 @@ def _estimates(shots: Any, estimate: Estimate, mask: Mask | None) -> Any:
     from napari_shadowinv.stack._shots import find_shots
 
     found = find_shots(shots)
+    estimating = _Estimating(estimate, mask, should_stop)
     if found.array is None:
-        reading = _Estimating(estimate, mask)
-        sources = lazy_stack(reading.of_shot, found.items, found.shape)
+        sources = lazy_stack(estimating.of_shot, found.items, found.shape)
     else:
         sources = found.array.map_blocks(
-            _Estimating(estimate, mask).of_block, dtype=np.float64, meta=np.empty((0, 0, 0))
+            estimating.of_block, dtype=np.float64, meta=np.empty((0, 0, 0))
         )
     # The store tells by these names whether it goes on with the same estimate.
     values = ", ".join(f"{name} {value}" for name, value in estimate.model_dump().items())
@@ -188,12 +189,30 @@ def _estimates(shots: Any, estimate: Estimate, mask: Mask | None) -> Any:
     return xr.DataArray(sources, dims=("shot", "y", "x"), coords={"shot": names})
 
 
+class _Here:
+    """Asks whether to stop in this process; a worker elsewhere gets a copy that never does."""
+
+    def __init__(self, should_stop: ShouldStop) -> None:
+        self._should_stop = should_stop
+
+    def __call__(self) -> bool:
+        return self._should_stop()
+
+    def __reduce__(self) -> tuple[type[_Here], tuple[ShouldStop]]:
+        return _Here, (_never,)
+
+
+def _never() -> bool:
+    return False
+
+
 @dataclass(frozen=True, eq=False)
 class _Estimating:
     """Guesses sources on a worker, which has neither napari nor Qt."""
 
     estimate: Estimate
     mask: Mask | None
+    should_stop: ShouldStop
 
     def of_block(self, block: NDArray[Any]) -> Image:
         return np.stack([self._of_image(image) for image in block])
@@ -204,4 +223,5 @@ class _Estimating:
     def _of_image(self, image: NDArray[Any]) -> Image:
         usable = image if self.mask is None else np.where(self.mask, image, 0)
         # What an inversion would clip must not spoil the estimate.
-        return self.estimate.source(np.maximum(usable, 0).astype(np.float64), self.mask)
+        clipped = np.maximum(usable, 0).astype(np.float64)
+        return self.estimate.source(clipped, self.mask, self.should_stop)

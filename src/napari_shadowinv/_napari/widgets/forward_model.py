@@ -84,6 +84,7 @@ class ForwardModel(ToolPanel):
             self.warning,
         ):
             self.column.addWidget(row)
+        self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
         self.object.changed.connect(self._on_change)
         self.setup.changed.connect(self.keep)
         for side in (self.height_px, self.width_px):
@@ -106,9 +107,7 @@ class ForwardModel(ToolPanel):
         if "setup" in kept:
             self.setup.picker.restore(kept["setup"])
         else:
-            from napari_shadowinv.physics.phantoms import paper_setup
-
-            self.setup.show_setup(paper_setup().model_dump())
+            self.setup.show_setup(_usual_setup("proton").model_dump())
         self.object.restore(kept.get("object", {}))
         size = kept.get("size", [200, 200])
         self.height_px.setValue(int(size[0]))
@@ -145,6 +144,16 @@ class ForwardModel(ToolPanel):
         self.warning.setVisible(False)
         self.panel.run(request.job.run, request)
 
+    def _on_object(self) -> None:
+        """Choose the beam that an object needs; one that is filled in already stays."""
+        recipe = PHANTOMS.get(self.object.kind)
+        if recipe is None or not recipe.probe or not self._ready:
+            return
+        self.setup.picker.set_kind(recipe.probe)
+        form = self.setup.picker.form
+        if form is not None and form.is_empty:
+            self.setup.show_setup(_usual_setup(recipe.probe).model_dump())
+
     def _on_change(self) -> None:
         a_layer = self.object.kind == _LAYER
         self._potential_row.setVisible(a_layer)
@@ -156,15 +165,24 @@ class ForwardModel(ToolPanel):
             return
         forecast, request = outcome.value, outcome.tag
         unit = "" if request.job.source is None else unit_of(self.source.layer or {})
+        # Whoever inverts the image finds its source.
+        came_with = {} if forecast.source is None else {"source": forecast.source}
         keywords = {
             "name": request.name,
-            "metadata": mark("image", unit, request.job.setup),
+            "metadata": mark("image", unit, request.job.setup, **came_with),
             **request.frame.keywords(),
         }
         ResultLayers(self.viewer, self).show([(forecast.image, keywords, "image")])
         self.viewer.reset_view()
         self.warning.setText(forecast.warning)
         self.warning.setVisible(bool(forecast.warning))
+
+
+def _usual_setup(kind: str) -> Any:
+    """The paper's beam of protons or of light."""
+    from napari_shadowinv.physics.phantoms import paper_setup, wakefield_setup
+
+    return paper_setup() if kind == "proton" else wakefield_setup()
 
 
 def _to_px2(layer: Any, setup: Any) -> float:

@@ -5,28 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from qtpy.QtWidgets import QCheckBox
-
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.marks import role_of
-from napari_shadowinv._napari.widgets._base import with_button
-from napari_shadowinv._napari.widgets._drawing import new_mask, new_shapes
+from napari_shadowinv._napari.marks import Result, role_of
+from napari_shadowinv._napari.widgets._base import Part, with_button
+from napari_shadowinv._napari.widgets._drawing import new_shapes
 from napari_shadowinv._napari.widgets._estimating import SourceCache
-from napari_shadowinv._napari.widgets._forms import ModelForm, ModelPicker, kinds_of, labelled
+from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
 from napari_shadowinv._napari.widgets._live import LivePanel
+from napari_shadowinv._napari.widgets._masks import MaskPicker
 from napari_shadowinv._napari.widgets._messages import reporting, tell_warning
+from napari_shadowinv._napari.widgets._options import OptionsForm
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, report_rows, section
 from napari_shadowinv._napari.widgets._picking import LayerPicker, LayerWatch
-from napari_shadowinv._napari.widgets._reading import crop_of, image_of, mask_of
+from napari_shadowinv._napari.widgets._reading import crop_of, image_of
 from napari_shadowinv._napari.widgets._recipes import FILTERS
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together, result_frame
 from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._sources import SourcePicker
-from napari_shadowinv._napari.widgets._toml import TomlButtons
-from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import OnProgress, ShouldStop
-from napari_shadowinv.validation import validated
 
 if TYPE_CHECKING:
     import napari
@@ -58,16 +55,10 @@ class _Request:
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> _Answer:
         """Invert the shot and describe its layers, all of it beside the window."""
         inversion = self.job.run(on_progress, should_stop)
-        from napari_shadowinv._napari.layers import inversion_layers
+        from napari_shadowinv._napari.layers import result_layers
 
-        described = inversion_layers(
-            inversion,
-            self.setup,
-            name=f"{self.image.name} preview" if self.preview else self.image.name,
-            scale=self.frame.scale,
-            translate=self.frame.translate,
-            units=self.frame.units,
-        )
+        name = f"{self.image.name} preview" if self.preview else self.image.name
+        described = result_layers(Result(inversion, self.setup), self.frame, name)
         if self.preview:
             described = [layer for layer in described if role_of(layer[1]) in _PREVIEW_ROLES]
         return _Answer(inversion, described)
@@ -92,7 +83,7 @@ class InvertShot(LivePanel):
         self.previewed = ResultLayers(viewer, self)
         self._build()
         self._connect()
-        self.restore(self._keeper.load())
+        self.restore_last()
         self._on_image()
         self._ready = True
 
@@ -101,13 +92,11 @@ class InvertShot(LivePanel):
         self.image = LayerPicker(viewer, ("image",))
         self.image.setToolTip("The shot: a grey image layer.")
         self.source = SourcePicker(viewer)
-        self.masks = LayerPicker(viewer, ("labels", "shapes"), none="none")
-        self.masks.setToolTip("<qt>Labels or shapes that mark pixels of the detector.</qt>")
-        self.painted_is_unusable = QCheckBox("painted = unusable")
-        self.painted_is_unusable.setChecked(True)
-        self.painted_is_unusable.setToolTip(
-            "<qt>Checked: what is painted is left out (writing, dead pixels). Unchecked: only "
-            "what is painted is used. What stands in the beam belongs into the source.</qt>"
+        self.masks = MaskPicker(
+            viewer,
+            lambda: self.image.layer,
+            ("labels", "shapes"),
+            "Labels or shapes that mark pixels of the detector.",
         )
         self.crop = LayerPicker(viewer, ("shapes",), none="none")
         self.crop.setToolTip("<qt>A rectangle in a shapes layer: only that part is inverted.</qt>")
@@ -116,8 +105,7 @@ class InvertShot(LivePanel):
             "Filter",
             {"none": ("nothing", None), **kinds_of(FILTERS)},
         )
-        self.options = ModelForm(InversionOptions, first={"n_sites": PREVIEW_SITES})
-        self.option_files = TomlButtons("options", self._options_to_save, self._take_options)
+        self.options = OptionsForm()
         self.live.setToolTip(
             f"<qt>The field follows every change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
@@ -126,15 +114,14 @@ class InvertShot(LivePanel):
         for row in (
             labelled("Image", self.image),
             self.source,
-            labelled("Mask", with_button(self.masks, "✎", "Paint a mask.", self._paint_mask)),
-            labelled("", self.painted_is_unusable),
+            self.masks,
             labelled("Crop", with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)),
             self.setup,
         ):
             self.column.addWidget(row)
         self._cleaning_section = section("", self.cleaning)
         self.column.addWidget(self._cleaning_section)
-        self.column.addWidget(section("Options", self.options, self.option_files))
+        self.column.addWidget(section("Options", self.options))
         for widget in (self.live, self.panel, self.report):
             self.column.addWidget(widget)
 
@@ -144,34 +131,25 @@ class InvertShot(LivePanel):
         self._edits.setParent(self)
         for signal in (
             self.source.changed,
-            self.masks.picked,
+            self.masks.changed,
             self.crop.picked,
             self._edits.edited,
             self.setup.changed,
             self.cleaning.changed,
             self.options.changed,
-            self.painted_is_unusable.toggled,
         ):
             signal.connect(self.on_change)
 
     # What is kept, and what is asked for
 
-    def state(self) -> dict[str, Any]:
+    def parts(self) -> dict[str, Part]:
         return {
-            "source": self.source.state(),
-            "setup": self.setup.picker.state(),
-            "cleaning": self.cleaning.state(),
-            "options": self.options.values(),
-            "painted_is_unusable": self.painted_is_unusable.isChecked(),
+            "source": self.source,
+            "setup": self.setup,
+            "cleaning": self.cleaning,
+            "options": self.options,
+            "painted_is_unusable": self.masks,
         }
-
-    def restore(self, kept: Any) -> None:
-        """Show what `state` has returned."""
-        self.source.restore(kept.get("source", {}))
-        self.setup.picker.restore(kept.get("setup", {}))
-        self.cleaning.restore(kept.get("cleaning", {}))
-        self.options.set_values(kept.get("options", {}))
-        self.painted_is_unusable.setChecked(bool(kept.get("painted_is_unusable", True)))
 
     def request(self, preview: bool = False) -> _Request:
         layer = self.image.layer
@@ -179,7 +157,7 @@ class InvertShot(LivePanel):
         job = ShotJob(
             image=image,
             source=self.source.source(layer),
-            mask=mask_of(self.masks.layer, layer, self.painted_is_unusable.isChecked()),
+            mask=self.masks.usable(layer),
             crop=crop_of(self.crop.layer, layer),
             cleaning=self.cleaning.model(),  # type: ignore[arg-type]
             options=self.options.model(),  # type: ignore[arg-type]
@@ -233,20 +211,6 @@ class InvertShot(LivePanel):
         self.on_change()
 
     @reporting
-    def _paint_mask(self) -> None:
-        self.masks.layer = new_mask(self.viewer, self.image.layer)
-
-    @reporting
     def _draw_crop(self) -> None:
         image_of(self.image.layer)
         self.crop.layer = new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")
-
-    # Files
-
-    def _options_to_save(self) -> dict[str, object]:
-        self.options.model()
-        return self.options.values()
-
-    def _take_options(self, loaded: dict[str, object], path: str) -> None:
-        validated(InversionOptions, loaded, path)
-        self.options.set_values(loaded)

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 from qtpy.QtCore import QTimer
 from qtpy.QtWidgets import QCheckBox, QLabel
 
-from napari_shadowinv._napari.widgets._base import ToolPanel, with_button
-from napari_shadowinv._napari.widgets._drawing import new_mask
-from napari_shadowinv._napari.widgets._forms import ModelForm, labelled
-from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES
+from napari_shadowinv._napari.leafing import follow_shots
+from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.widgets._base import Part, ToolPanel
+from napari_shadowinv._napari.widgets._forms import labelled
+from napari_shadowinv._napari.widgets._masks import MaskPicker
 from napari_shadowinv._napari.widgets._messages import reporting
+from napari_shadowinv._napari.widgets._options import OptionsForm
 from napari_shadowinv._napari.widgets._panels import RunPanel, section
-from napari_shadowinv._napari.widgets._picking import LayerPicker
 from napari_shadowinv._napari.widgets._reading import stack_of
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._runner import Outcome
@@ -25,10 +26,7 @@ from napari_shadowinv._napari.widgets._sources import SourcePicker
 from napari_shadowinv._napari.widgets._stack_inputs import EnginePicker, ShotsPicker, StoreEdit
 from napari_shadowinv._napari.widgets._stack_results import FailureTable, StackRequest, place_on
 from napari_shadowinv._napari.widgets._stacking import StackJob
-from napari_shadowinv._napari.widgets._toml import TomlButtons
-from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Progress
-from napari_shadowinv.validation import validated
 
 if TYPE_CHECKING:
     import napari
@@ -60,30 +58,29 @@ class InvertStack(ToolPanel):
         self._running: StackRequest | None = None
         self._heard = 0
         self._look_at = False
+        self._arrows: Any = None
+        self._read_arrows: Callable[[], None] | None = None
         self._soon = QTimer(self)
         self._soon.setSingleShot(True)
         self._soon.setInterval(_REFRESH_AFTER)
         self._soon.timeout.connect(self._refresh)
         self._build()
         self._connect()
-        self.restore(self._keeper.load())
+        self.restore_last()
         self._on_layer()
         self._ready = True
 
     def _build(self) -> None:
         self.shots = ShotsPicker(self.viewer)
         self.source = SourcePicker(self.viewer)
-        self.masks = LayerPicker(self.viewer, ("labels",), none="none")
-        self.masks.setToolTip("<qt>Labels that mark pixels of the detector, in all shots.</qt>")
-        self.painted_is_unusable = QCheckBox("painted = unusable")
-        self.painted_is_unusable.setChecked(True)
-        self.painted_is_unusable.setToolTip(
-            "<qt>Checked: what is painted is left out (writing, dead pixels). Unchecked: only "
-            "what is painted is used.</qt>"
+        self.masks = MaskPicker(
+            self.viewer,
+            lambda: self.shots.layer,
+            ("labels",),
+            "Labels that mark pixels of the detector, in all shots.",
         )
         self.setup = SetupPicker()
-        self.options = ModelForm(InversionOptions, first={"n_sites": PREVIEW_SITES})
-        self.option_files = TomlButtons("options", self._options_to_save, self._take_options)
+        self.options = OptionsForm()
         self.store = StoreEdit()
         self.overwrite = QCheckBox("overwrite what the store holds")
         self.overwrite.setToolTip("<qt>Begin anew. Else the run goes on where it stopped.</qt>")
@@ -93,14 +90,12 @@ class InvertStack(ToolPanel):
         self.failures_title = QLabel("Failed shots")
         self.failures_title.setVisible(False)
         self.failures = FailureTable()
-        paint = with_button(self.masks, "✎", "Paint a mask.", self._paint_mask)
         for row in (
             self.shots,
             self.source,
-            labelled("Mask", paint),
-            labelled("", self.painted_is_unusable),
+            self.masks,
             self.setup,
-            section("Options", self.options, self.option_files),
+            section("Options", self.options),
             labelled("Store", self.store),
             labelled("", self.overwrite),
             labelled("", self.redo_failed),
@@ -118,7 +113,7 @@ class InvertStack(ToolPanel):
             self.setup.changed,
             self.options.changed,
             self.engine.changed,
-            self.painted_is_unusable.toggled,
+            self.masks.changed,
         ):
             signal.connect(self.keep)
         self.panel.button.clicked.connect(lambda: self._run_or_cancel())
@@ -127,22 +122,14 @@ class InvertStack(ToolPanel):
 
     # What is kept, and what is asked for
 
-    def state(self) -> dict[str, Any]:
+    def parts(self) -> dict[str, Part]:
         return {
-            "source": self.source.state(),
-            "setup": self.setup.picker.state(),
-            "options": self.options.values(),
-            "engine": self.engine.state(),
-            "painted_is_unusable": self.painted_is_unusable.isChecked(),
+            "source": self.source,
+            "setup": self.setup,
+            "options": self.options,
+            "engine": self.engine,
+            "painted_is_unusable": self.masks,
         }
-
-    def restore(self, kept: Any) -> None:
-        """Show what `state` has returned."""
-        self.source.restore(kept.get("source", {}))
-        self.setup.picker.restore(kept.get("setup", {}))
-        self.options.set_values(kept.get("options", {}))
-        self.engine.restore(kept.get("engine", {}))
-        self.painted_is_unusable.setChecked(bool(kept.get("painted_is_unusable", True)))
 
     def request(self) -> StackRequest:
         """What the controls ask for.
@@ -159,7 +146,7 @@ class InvertStack(ToolPanel):
             shots=self.shots.shots(),
             out=self.store.store,
             source=self._source(layer),
-            mask=self._mask(),
+            mask=self.masks.usable(layer),
             options=self.options.model(),  # type: ignore[arg-type]
             setup=setup,
             scheduler=scheduler,
@@ -181,14 +168,6 @@ class InvertStack(ToolPanel):
         if self.source.picker.kind == "layer" and chosen is not None and chosen.ndim == 3:
             return stack_of(chosen)
         return self.source.source(layer)  # type: ignore[return-value]
-
-    def _mask(self) -> Any:
-        if self.masks.layer is None:
-            return None
-        painted = np.asarray(self.masks.layer.data) != 0
-        if not painted.any():
-            return None
-        return ~painted if self.painted_is_unusable.isChecked() else painted
 
     # A run
 
@@ -237,6 +216,10 @@ class InvertStack(ToolPanel):
         if self._look_at:
             self._look_at = False
             self.viewer.reset_view()
+        arrows = next((one for one in self.results.layers if role_of(one) == "arrows"), None)
+        if arrows is not self._arrows:
+            self._arrows = arrows
+            self._read_arrows = None if arrows is None else follow_shots(self.viewer, arrows)
         self._soon.start()
 
     def _refresh(self) -> None:
@@ -244,6 +227,8 @@ class InvertStack(ToolPanel):
             self._shown.follow(self.results.layers)
         for layer in self.results.layers:
             layer.refresh()
+        if self._read_arrows is not None:
+            self._read_arrows()
 
     def _show_failures(self, failures: list[tuple[str, str]]) -> None:
         self.failures.show_failures(failures)
@@ -263,7 +248,7 @@ class InvertStack(ToolPanel):
             self.panel.say(f"{books.text}, in {request.job.out.name}")
         self.panel.status.setToolTip(str(request.job.out.absolute()))
 
-    # Layers and files
+    # Layers
 
     def _on_layer(self) -> None:
         layer = self.shots.layer
@@ -271,15 +256,3 @@ class InvertStack(ToolPanel):
             self.source.follow(layer)
             self.setup.follow(layer)
         self.keep()
-
-    @reporting
-    def _paint_mask(self) -> None:
-        self.masks.layer = new_mask(self.viewer, self.shots.layer)
-
-    def _options_to_save(self) -> dict[str, object]:
-        self.options.model()
-        return self.options.values()
-
-    def _take_options(self, loaded: dict[str, object], path: str) -> None:
-        validated(InversionOptions, loaded, path)
-        self.options.set_values(loaded)
