@@ -65,12 +65,14 @@ class Filter(_Recipe):
     def filtered(
         self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
     ) -> Image:
-        """Apply it, so that what is masked does not touch the rest."""
+        """Apply it, so that what is masked, even NaN, does not touch the rest."""
         import numpy as np
 
-        # Masked pixels may hold NaN.
+        from napari_shadowinv.sources import interpolated_source
+
         if mask is not None and mask.any() and not mask.all():
-            image = np.where(mask, image, image[mask].mean())
+            around = interpolated_source(image, mask, should_stop=should_stop)
+            image = np.where(mask, image, around)
         return self._applied(image, mask, should_stop)
 
     def _applied(self, image: Image, mask: Mask | None, should_stop: ShouldStop | None) -> Image:
