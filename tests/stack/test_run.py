@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ from napari_shadowinv import (
     run_stack,
 )
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
+from napari_shadowinv.stack import read_shot
+from napari_shadowinv.stack._shot import described_reader
 
 OPTIONS = InversionOptions(n_sites=100)
 
@@ -304,3 +307,10 @@ def test_a_damaged_store_is_told_in_one_sentence(night, out):
     (out / "status" / "c" / "2").write_bytes(b"")
     with pytest.raises(FileFormatError, match="stack of shots but is damaged"):
         read(out)
+
+
+def test_a_reader_is_known_by_where_it_comes_from_and_its_choices():
+    assert described_reader(read_shot) == "napari_shadowinv.read_shot"
+    chosen = partial(read_shot, factor=2, channel="red")
+    assert described_reader(chosen) == "napari_shadowinv.read_shot(channel='red', factor=2)"
+    assert described_reader(np.load) == "numpy.load"

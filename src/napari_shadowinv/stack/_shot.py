@@ -195,4 +195,7 @@ def described_reader(reader: Reader) -> str:
     if isinstance(reader, functools.partial):
         named = ", ".join(f"{name}={value!r}" for name, value in sorted(reader.keywords.items()))
         return f"{described_reader(reader.func)}({named})"
-    return f"{reader.__module__}.{getattr(reader, '__qualname__', type(reader).__qualname__)}"
+    module, name = reader.__module__, getattr(reader, "__qualname__", type(reader).__qualname__)
+    own = __name__.partition(".")[0]
+    # Where ours lie may change; the stores that were begun with them go on.
+    return f"{own}.{name}" if module.startswith(f"{own}.") else f"{module}.{name}"
