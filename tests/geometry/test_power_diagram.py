@@ -66,6 +66,22 @@ def test_masses_equal_half_plane_clipping_whatever_sites_and_weights(kind, seed)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * image.sum() / len(sites))
 
 
+def test_a_border_that_ends_far_away_is_as_exact_as_any():
+    """Only two of eleven sites within 1e-3 px have cells, whose border ends between ghosts."""
+    rng = np.random.default_rng(491635)
+    scale = (10.0 ** rng.uniform(-8, 2, 4))[0]
+    image = rng.random((4, 5))
+    sites = awkward_sites("clustered", rng, image.shape)
+    weights = scale * rng.normal(size=len(sites))
+    expected = [
+        over_pixels(power_cell(sites, weights, i, *low_and_high(image.shape)), image)[0]
+        for i in range(len(sites))
+    ]
+    diagram = power_diagram(sites, Density.from_image(image), weights)
+    assert np.flatnonzero(diagram.masses).tolist() == [2, 3]
+    np.testing.assert_allclose(diagram.masses, expected, rtol=0, atol=1e-12)
+
+
 def test_cells_tile_the_image():
     rng = np.random.default_rng(3)
     image = rng.random((50, 70)) * 1000

@@ -37,11 +37,16 @@ Indices = NDArray[np.int32]
 
 @njit(nogil=True, cache=True)
 def _power_centres(
-    start: int, stop: int, points: Array, weights: Array, vertices: Indices, centres: Array
+    start: int, stop: int, points: Array, weights: Array, n: int, vertices: Indices, centres: Array
 ) -> None:
     """Find the point of equal power distance to the three sites of each triangle."""
     for t in range(start, stop):
         a, b, c = vertices[t]
+        # Seen from a ghost far away, two sites that are close together differ in few digits.
+        if a >= n:
+            a, b, c = b, c, a
+        if a >= n:
+            a, b, c = b, c, a
         by = points[b, 0] - points[a, 0]
         bx = points[b, 1] - points[a, 1]
         cy = points[c, 0] - points[a, 0]
@@ -224,6 +229,7 @@ class PowerDiagram:
             self._threads,
             triangulation.points,
             triangulation.weights,
+            self.n_sites,
             triangulation.vertices,
             centres,
         )
