@@ -23,15 +23,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import dask
 import numpy as np
 import psutil  # dask needs it, too
-from distributed import Client, LocalCluster
+from distributed import Client
 
 from napari_shadowinv import InversionOptions, run_stack, synthetic_image
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.stack import ShotOutcome, read_shot
+from napari_shadowinv.stack._local import local_client
 from napari_shadowinv.stack._work import Beam, invert_shot
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
@@ -93,17 +93,7 @@ def warm_up(shots: int, folder: Path, scheduler: Any) -> None:
 
 def on_workers(count: int, run: Callable[[Client], float], folder: Path) -> float:
     """Time a run on workers with one thread each that have done a few shots before."""
-    with (
-        # As `run_stack` has it: the profiler's records grow with time.
-        dask.config.set({"distributed.worker.profile.enabled": False}),
-        LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
+    with local_client(count) as client:
         warm_up(6 * count, folder, client)
         return run(client)
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -272,6 +274,16 @@ def test_threads_do_not_change_a_bit(image):
     )
     for name in ("potential", "displacement", "weights", "site_displacement", "reprojection"):
         np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+
+
+def test_one_thread_takes_one_core(image):
+    options = InversionOptions(n_sites=20000, threads=1)
+    plan = plan_sites(np.ones(SHAPE), options)
+    invert(image, plan=plan, options=options)
+    began, worked = time.perf_counter(), time.process_time()
+    invert(image, plan=plan, options=options)
+    passed, worked = time.perf_counter() - began, time.process_time() - worked
+    assert worked < 1.05 * passed
 
 
 def test_the_report_tells_how_it_went(image):

@@ -5,22 +5,19 @@
 
 from __future__ import annotations
 
-import logging
-import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from importlib import import_module
-from multiprocessing import resource_tracker
 from typing import Any, Protocol
 
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry._threads import available_threads
-from napari_shadowinv.interrupts import interrupts_put_off
 from napari_shadowinv.progress import ShouldStop
+from napari_shadowinv.stack._local import local_client
 from napari_shadowinv.stack._shot import BlockShot, Shot
 
 __all__ = ["Engine", "EngineError", "WorkerDied", "engine_for"]
@@ -263,44 +260,9 @@ def _threads(count: int) -> Iterator[Engine]:
 
 
 def _processes(count: int) -> Iterator[Engine]:
-    distributed: Any = import_module("distributed")
-    dask: Any = import_module("dask")
-    with ExitStack() as opened:
-        # Its records grow by megabytes a minute, and nobody would look at them.
-        opened.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
-        # A cluster that is half made cannot be closed.
-        with interrupts_put_off(), _hidden_from_workers():
-            cluster = distributed.LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                # Workers that die are told of by the shots that they were at.
-                silence_logs=logging.CRITICAL,
-                preload=["napari_shadowinv.stack._preload"],
-            )
-            opened.enter_context(cluster)
-            client = opened.enter_context(distributed.Client(cluster, set_as_default=False))
+    with local_client(count) as client:
         name = f"{count} process{'es' if count > 1 else ''}"
         yield _Cluster(client, name, count)
-
-
-@contextmanager
-def _hidden_from_workers() -> Iterator[None]:
-    """Keep Ctrl-C, which a terminal sends to all processes, from those that the block starts.
-
-    They inherit the mask of signals from threads that the block starts; see also `_preload`.
-    """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    # Whatever starts the first process of all lifts the mask: let it be now.
-    resource_tracker.ensure_running()
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _given(scheduler: Any, should_stop: ShouldStop | None) -> Iterator[Engine]:

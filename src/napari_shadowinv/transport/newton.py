@@ -103,7 +103,7 @@ def _damped_step(
     alive: Callable[[], None],
 ) -> tuple[Array, PowerDiagram] | None:
     """Halve the step until all cells keep some flux and the error falls."""
-    error = np.linalg.norm(gap)
+    error = _length(gap)
     share = 1.0
     while share > shortest:
         diagram = None  # one at a time: they are large
@@ -111,11 +111,16 @@ def _damped_step(
         trial = weights + share * step
         diagram = objective.diagram_if_full(trial)
         if diagram is not None and diagram.masses.min() > least:
-            now = np.linalg.norm(objective.mass - diagram.masses)
+            now = _length(objective.mass - diagram.masses)
             if now < (1 - 0.1 * share) * error:
                 return trial, diagram
         share /= 2
     return None
+
+
+def _length(vector: Array) -> float:
+    """Return the length without BLAS, whose idle threads spin and whose sums depend on them."""
+    return float(np.sqrt(np.sum(vector * vector)))
 
 
 def with_full_cells(objective: TransportObjective, weights: Array) -> Array:

@@ -147,7 +147,7 @@ class TransportObjective:
         """
         diagram = self.diagram(weights, with_moments=True)
         gradient = diagram.masses - self.mass
-        value = float(weights @ gradient - diagram.inertia.sum())
+        value = float(np.sum(weights * gradient - diagram.inertia))
         return value, gradient
 
     def residual(self, diagram: PowerDiagram) -> float:

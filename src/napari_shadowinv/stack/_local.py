@@ -1,0 +1,83 @@
+"""Worker processes on this machine, as runs of shots need them.
+
+- start some, connected: `local_client`
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from importlib import import_module
+from multiprocessing import resource_tracker
+from typing import Any
+
+from napari_shadowinv.interrupts import interrupts_put_off
+
+__all__ = ["local_client"]
+
+_ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
+_TRIMMING = "MALLOC_TRIM_THRESHOLD_"
+
+
+@contextmanager
+def local_client(count: int) -> Iterator[Any]:
+    """Start worker processes of one thread each, which end with the block.
+
+    Parameters
+    ----------
+    count : int
+        Processes.
+
+    Yields
+    ------
+    distributed.Client
+    """
+    distributed: Any = import_module("distributed")
+    dask: Any = import_module("dask")
+    with ExitStack() as opened:
+        opened.enter_context(dask.config.set(_settings(dask.config.get(_ENVIRONMENT))))
+        # A cluster that is half made cannot be closed.
+        with interrupts_put_off(), _hidden_from_workers():
+            cluster = distributed.LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:0",
+                # Workers that die are told of by the shots that they were at.
+                silence_logs=logging.CRITICAL,
+                preload=["napari_shadowinv.stack._preload"],
+            )
+            opened.enter_context(cluster)
+            client = opened.enter_context(distributed.Client(cluster, set_as_default=False))
+        yield client
+
+
+def _settings(environment: dict[str, Any]) -> dict[str, Any]:
+    """Return what differs from dask's own settings."""
+    return {
+        # Its records grow by megabytes a minute, and nobody would look at them.
+        "distributed.worker.profile.enabled": False,
+        # Dask has every array given back to the system at once. One of the same size is wanted
+        # in the next moment: that takes a seventh of the time of a shot.
+        _ENVIRONMENT: {name: value for name, value in environment.items() if name != _TRIMMING},
+    }
+
+
+@contextmanager
+def _hidden_from_workers() -> Iterator[None]:
+    """Keep Ctrl-C, which a terminal sends to all processes, from those that the block starts.
+
+    They inherit the mask of signals from threads that the block starts; see also `_preload`.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    # Whatever starts the first process of all lifts the mask: let it be now.
+    resource_tracker.ensure_running()
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
