@@ -18,8 +18,8 @@ gallery: $(VENV)/installed
 
 test: lint
 	@sh .ci/need-display
-	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore tests/napari --ignore tests/stack
-	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest tests/stack tests/napari
+	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore tests/napari
+	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest tests/napari
 	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest -q \
 		tests/napari/widgets/test_tools.py tests/napari/widgets/test_forms.py
 
