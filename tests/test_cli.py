@@ -20,8 +20,8 @@ from typer.testing import CliRunner, Result
 
 from napari_shadowinv import filters, sources
 from napari_shadowinv.cli import app
+from napari_shadowinv.cli._choices import Choices
 from napari_shadowinv.cli._inputs import Experiment, experiment_from
-from napari_shadowinv.cli._preparation import Preparation
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.io import inversion_from_dataset, read, setup_from_dataset, write
@@ -537,12 +537,12 @@ def test_reference_in_a_text_image_is_the_source(folder: Path) -> None:
     (folder / "both.txt").write_text("\n".join(["# flux2D (24, 32)", *rows]))
     assert shadowinv("invert", "both.txt").exit_code == 0
     np.testing.assert_allclose(dataset("both.shadowinv")["source"], source, rtol=1e-9)
-    chosen = Preparation(source_from="uniform")
-    estimate = read_experiment("both.txt", preparation=chosen).source
+    chosen = Choices(source_from="uniform")
+    estimate = read_experiment("both.txt", choices=chosen).source
     assert estimate is not None
     assert np.ptp(estimate.image) == 0
     with pytest.raises(InputError, match="holds its own source, and the image is to be flattened"):
-        read_experiment("both.txt", preparation=Preparation(high_pass=3))
+        read_experiment("both.txt", choices=Choices(high_pass=3))
 
 
 def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
@@ -585,12 +585,12 @@ def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
         ),
     )
     for choice, files, expected in choices:
-        chosen = Preparation.model_validate(choice)
-        estimate = read_experiment("shot.npy", preparation=chosen, **files).source
+        chosen = Choices.model_validate(choice)
+        estimate = read_experiment("shot.npy", choices=chosen, **files).source
         assert estimate is not None
         np.testing.assert_array_equal(estimate.image, expected)
     result = shadowinv("invert", "shot.npy", "--source-from", "total-variation")
-    assert "estimated from the image: total-variation" in " ".join(result.stdout.split())
+    assert "estimated from the image: total variation" in " ".join(result.stdout.split())
     saved = dataset("shot.shadowinv")
     np.testing.assert_array_equal(saved["source"], sources.total_variation_source(image))
     assert json.loads(saved.attrs["source_preparation"]) == {"source_from": "total-variation"}
@@ -631,8 +631,8 @@ def test_filters_are_those_of_the_library(folder: Path) -> None:
     np.testing.assert_array_equal(again["image"], saved["image"])
     assert inversion_from_dataset(again).options.n_sites == 300
     # A measured source is blurred as its shot is.
-    chosen = Preparation(low_pass=2)
-    beam = read_experiment("shot.npy", source=Path("beam.npy"), preparation=chosen).source
+    chosen = Choices(low_pass=2)
+    beam = read_experiment("shot.npy", source=Path("beam.npy"), choices=chosen).source
     assert beam is not None
     np.testing.assert_array_equal(beam.image, filters.low_pass(ramp, 2.0))
 
@@ -641,13 +641,13 @@ def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
     usable = np.ones((24, 32), np.uint8)
     usable[:5, :6] = 0
     iio.imwrite("usable.png", usable)
-    chosen = Preparation(low_pass=2, hot_pixels=6, background_degree=1)
+    chosen = Choices(low_pass=2, hot_pixels=6, background_degree=1)
     images = []
     for junk in (0.0, 1e5, np.nan):
         image = np.load(shot)
         image[:5, :6] = junk
         np.save(shot, image)
-        prepared = read_experiment(shot.name, mask=Path("usable.png"), preparation=chosen).shot
+        prepared = read_experiment(shot.name, mask=Path("usable.png"), choices=chosen).shot
         images.append(prepared.image)
     np.testing.assert_array_equal(images[0], images[1])
     np.testing.assert_array_equal(images[0], images[2])

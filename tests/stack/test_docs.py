@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 import tifffile
 from typer.testing import CliRunner
@@ -36,7 +38,7 @@ def test_the_python_blocks_make_what_they_promise(folder, night):
     assert list(names["later"].status) == [1] * 6  # type: ignore[attr-defined]
 
 
-def test_the_commands_work_as_shown(folder):
+def test_the_commands_work_as_shown(folder, night):
     pytest.importorskip("imageio_ffmpeg")
     batch = ["batch", "shots/*.tif", "--source", "reference.tif", "--out", "night.shadowinv.zarr"]
     assert batch == COMMANDS[0].replace("'", "").split()[1:]
@@ -47,6 +49,12 @@ def test_the_commands_work_as_shown(folder):
     )
     fast = ["--scheduler", "threads", "--n-sites", "100", "--setup", "setup.toml"]
     assert runner.invoke(app, [*batch, *fast]).exit_code == 0
+    bare = np.ones(night.source.shape, np.uint8)
+    bare[4:17, 6:22] = 0
+    iio.imwrite("bare.png", bare)
+    (guessing,) = [command for command in COMMANDS if "--source-from" in command]
+    command = [*guessing.replace("'", "").split()[1:], *fast]
+    assert runner.invoke(app, command).exit_code == 0
     others = [command for command in COMMANDS if "batch" not in command]
     assert len(others) == 5
     for command in others:

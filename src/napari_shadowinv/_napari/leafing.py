@@ -102,8 +102,8 @@ def follow_once_added(described: Sequence[FullLayerData]) -> None:
     from napari import current_viewer
 
     viewer = current_viewer()
-    stores = {mark_of(layer[1]).get("store") for layer in described}
-    if viewer is None:
+    stores = {mark_of(one[1]).get("store") for one in described if role_of(one[1]) == "arrows"}
+    if viewer is None or not stores:
         return
 
     def begin(event: Any) -> None:

@@ -56,8 +56,7 @@ def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
     list of (data, keywords, layer type)
         Layers over dask arrays of shape (shots, H, W), the lowest first: those of a single
         result as far as the store has them, without sites. The arrows are those of the first
-        finished shot; see
-        `napari_shadowinv._napari.leafing`.
+        finished shot; see `napari_shadowinv._napari.leafing`.
 
     Raises
     ------

@@ -22,6 +22,7 @@ from napari_shadowinv.errors import InputError, InversionCancelled
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from napari_shadowinv.cli._choices import Choices
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.stack import RunProgress
 
@@ -79,6 +80,8 @@ def run_batch(
     mask: Path | None,
     setup: Path | None,
     options: InversionOptions,
+    choices: Choices,
+    source_mask: Path | None,
     factor: int,
     channel: str | None,
     variables: str | None,
@@ -98,13 +101,18 @@ def run_batch(
     ledger = _Ledger()
     geometry = None if setup is None else binned_setup(setup_from(setup), factor)
     reader = functools.partial(read_shot, channel=channel, factor=factor)
+    if choices.hot_pixels is not None:
+        reader = functools.partial(reader, hot_pixels=choices.hot_pixels)
+    estimate = choices.estimate()
     try:
         with _display(ledger, quiet) as show:
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
-                source=source,
+                source=source if estimate is None else estimate,
                 mask=None if mask is None else _mask(mask, factor),
+                filters=choices.filters(),
+                source_mask=None if source_mask is None else _mask(source_mask, factor),
                 options=options,
                 setup=geometry,
                 variables=STORED if variables is None else _names(variables),
@@ -314,6 +322,7 @@ def store_rows(path: Path, *, trouble: bool = True) -> Rows:
         ("shots", _counts_text(done, failed, pending)),
         ("image", str(attributes["image_size"])),
         ("source", str(attributes.get("source_file", attributes["source_image"]))),
+        *([("filters", str(attributes["filters"]))] if attributes.get("filters") else []),
         ("stored", str(attributes["stored"])),
         ("options", options_text(json.loads(attributes["options"]))),
     ]

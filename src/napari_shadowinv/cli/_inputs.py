@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from napari_shadowinv.cli._preparation import Preparation
+    from napari_shadowinv.cli._choices import Choices
     from napari_shadowinv.io import Radiograph
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.physics.setup import Setup
@@ -64,7 +64,7 @@ def experiment_from(
     *,
     variable: str | None = None,
     source_variable: str | None = None,
-    preparation: Preparation | None = None,
+    choices: Choices | None = None,
     source_mask: Path | None = None,
 ) -> Experiment:
     """Read what is to be inverted, binned alike and prepared as asked for."""
@@ -83,17 +83,17 @@ def experiment_from(
     if source is not None or source_variable is not None:
         beam = read_radiograph(source or image, channel=channel, variable=source_variable)
     else:
-        beam = _own_source(image, shot, preparation)
+        beam = _own_source(image, shot, choices)
     bare = None if source_mask is None else _picture_mask(source_mask, shot, "source mask")
-    shot, beam = _prepared(shot, beam, factor, preparation, bare)
+    shot, beam = _prepared(shot, beam, factor, choices, bare)
     return Experiment(shot, beam, geometry)
 
 
-def _own_source(path: Path, shot: Radiograph, preparation: Preparation | None) -> Radiograph | None:
+def _own_source(path: Path, shot: Radiograph, choices: Choices | None) -> Radiograph | None:
     """Source from the shot's own file: some hold the image with and without the object."""
-    if shot.source is None or (preparation is not None and preparation.source_from is not None):
+    if shot.source is None or (choices is not None and choices.source_from is not None):
         return None
-    if preparation is not None and preparation.flattens:
+    if choices is not None and choices.flattens:
         raise InputError(
             f"{path} holds its own source, and the image is to be flattened: leave the filter "
             "out, or put --source-from uniform in place of that source"
@@ -105,21 +105,21 @@ def _prepared(
     shot: Radiograph,
     beam: Radiograph | None,
     factor: int,
-    preparation: Preparation | None,
+    choices: Choices | None,
     bare: NDArray[np.bool_] | None,
 ) -> tuple[Radiograph, Radiograph | None]:
     """Filter a shot and its source, broken pixels before they are summed and the rest after."""
-    if preparation is None:
+    if choices is None:
         return shot.binned(factor), None if beam is None else beam.binned(factor)
-    from napari_shadowinv.cli._preparing import estimated, filtered, repaired
+    from napari_shadowinv.cli._preparing import estimated, filtered, filtered_source, repaired
 
     whole = bare
     if bare is not None:
         whole = replace(shot, mask=bare).binned(factor).mask
-    shot = filtered(repaired(shot, preparation).binned(factor), preparation)
+    shot = filtered(repaired(shot, choices).binned(factor), choices)
     if beam is None:
-        return shot, estimated(shot, preparation, whole)
-    return shot, filtered(repaired(beam, preparation).binned(factor), preparation, is_source=True)
+        return shot, estimated(shot, choices, whole)
+    return shot, filtered_source(repaired(beam, choices).binned(factor), choices)
 
 
 def _picture_mask(path: Path, shot: Radiograph, name: str) -> NDArray[np.bool_]:

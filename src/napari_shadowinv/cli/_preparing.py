@@ -1,114 +1,101 @@
 """Prepare an image as was chosen: filter it, and estimate its source.
 
 - before pixels are summed: `repaired`
-- after it: `filtered`, `estimated`
+- after it: `filtered`, `filtered_source`, `estimated`
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv import filters, sources
-from napari_shadowinv.cli._preparation import KEYWORDS, Estimate, Preparation
+from napari_shadowinv.cli._choices import Choices
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.filters import remove_hot_pixels
 from napari_shadowinv.io import Radiograph
+from napari_shadowinv.preparation import Preparation
+from napari_shadowinv.recipes import without_masked
 
-__all__ = ["estimated", "filtered", "repaired"]
+__all__ = ["estimated", "filtered", "filtered_source", "repaired"]
 
 Plane = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_FUNCTIONS: dict[Estimate, Callable[..., Plane]] = {
-    "uniform": sources.uniform_source,
-    "gaussian": sources.gaussian_source,
-    "polynomial": sources.polynomial_source,
-    "low-pass": sources.low_pass_source,
-    "total-variation": sources.total_variation_source,
-    "interpolated": sources.interpolated_source,
-}
 
-
-def repaired(shot: Radiograph, chosen: Preparation) -> Radiograph:
+def repaired(shot: Radiograph, chosen: Choices) -> Radiograph:
     """Replace hot and dead pixels, while pixels are still those of the detector."""
     if chosen.hot_pixels is None:
         return shot
-    found: list[Mask] = []
-
-    def repair(image: Plane) -> Plane:
-        clean, hot, dead = filters.remove_hot_pixels(image, threshold=chosen.hot_pixels or 0)
-        found.extend((hot, dead))
-        return clean
-
-    image = _apply(shot, repair)
+    with _named(shot):
+        image = without_masked(shot.image, shot.mask)
+        clean, hot, dead = remove_hot_pixels(image, threshold=chosen.hot_pixels)
     usable = np.ones(image.shape, bool) if shot.mask is None else shot.mask
-    hot, dead = (int((pixels & usable).sum()) for pixels in found)
-    note = f"{hot} hot and {dead} dead pixels replaced (beyond {chosen.hot_pixels:g} deviations)"
-    return _with(shot, image, note, {"hot_pixels": chosen.hot_pixels})
+    counts = (int((pixels & usable).sum()) for pixels in (hot, dead))
+    note = "{} hot and {} dead pixels replaced (beyond {:g} deviations)".format(
+        *counts, chosen.hot_pixels
+    )
+    return _with(shot, clean, [note], {"hot_pixels": chosen.hot_pixels})
 
 
-def filtered(shot: Radiograph, chosen: Preparation, *, is_source: bool = False) -> Radiograph:
-    """Flatten and blur a shot; a measured source is only blurred, as much as its shot."""
-    if chosen.background_degree is not None and not is_source:
-        degree, usable = chosen.background_degree, shot.mask
-        image = _apply(shot, lambda image: filters.remove_background(image, degree, mask=usable))
-        note = f"divided by a polynomial of degree {degree}"
-        shot = _with(shot, image, note, {"background_degree": degree})
-    if chosen.high_pass is not None and not is_source:
-        width = chosen.high_pass
-        image = _apply(shot, lambda image: filters.high_pass(image, width))
-        shot = _with(shot, image, f"high pass of {width:g} px", {"high_pass": width})
-    if chosen.low_pass is not None:
-        blur = chosen.low_pass
-        image = _apply(shot, lambda image: filters.low_pass(image, blur))
-        shot = _with(shot, image, f"low pass of {blur:g} px", {"low_pass": blur})
-    return shot
+def filtered(shot: Radiograph, chosen: Choices) -> Radiograph:
+    """Flatten and blur a shot."""
+    preparation = Preparation(chosen.filters())
+    with _named(shot):
+        image = preparation.image(shot.image, shot.mask)
+    names = ("background_degree", "high_pass", "low_pass")
+    return _with(shot, image, _notes(preparation), _chosen(chosen, names))
 
 
-def estimated(shot: Radiograph, chosen: Preparation, bare: Mask | None) -> Radiograph | None:
+def filtered_source(beam: Radiograph, chosen: Choices) -> Radiograph:
+    """Blur a measured source as much as its shot."""
+    preparation = Preparation(tuple(one for one in chosen.filters() if not one.flattens))
+    with _named(beam):
+        image = preparation.measured(beam.image, beam.mask)
+    return _with(beam, image, _notes(preparation), _chosen(chosen, ("low_pass",)))
+
+
+def estimated(shot: Radiograph, chosen: Choices, bare: Mask | None) -> Radiograph | None:
     """Guess the source from a shot; `bare` is True where the object is not."""
-    if chosen.source_from is None:
+    estimate = chosen.estimate()
+    if estimate is None:
         return None
-    parameters = {
-        name: getattr(chosen, name) for name in KEYWORDS if getattr(chosen, name) is not None
-    }
-    usable = _both(shot.mask, bare)
-    keywords = {KEYWORDS[name][0]: value for name, value in parameters.items()}
+    with _named(shot):
+        beam = Preparation((), estimate, bare).estimated(shot.image, shot.mask)
+    recorded = {"source_from": chosen.source_from, **chosen.parameters()}
+    return _with(Radiograph(beam), beam, [estimate.described], recorded)
+
+
+def _notes(preparation: Preparation) -> list[str]:
+    return [one.described for one in preparation.filters]
+
+
+def _chosen(chosen: Choices, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(chosen, name) for name in names if getattr(chosen, name) is not None}
+
+
+@contextmanager
+def _named(shot: Radiograph) -> Iterator[None]:
+    """Tell of which file it is that something cannot be done."""
     try:
-        beam = _FUNCTIONS[chosen.source_from](shot.image, mask=usable, **keywords)
-    except InputError as error:
-        raise InputError(f"{shot.path}: {error}") from error
-    details = "".join(f", {KEYWORDS[name][0]} {value:g}" for name, value in parameters.items())
-    recorded = {"source_from": chosen.source_from, **parameters}
-    return _with(Radiograph(beam), beam, f"{chosen.source_from}{details}", recorded)
-
-
-def _both(first: Mask | None, second: Mask | None) -> Mask | None:
-    if first is None or second is None:
-        return second if first is None else first
-    return first & second
-
-
-def _apply(shot: Radiograph, change: Callable[[Plane], Plane]) -> Plane:
-    """Filter an image whose masked pixels, which may hold anything, must not leak out."""
-    image = shot.image
-    try:
-        if shot.mask is not None and not shot.mask.all():
-            image = np.where(shot.mask, image, sources.interpolated_source(image, shot.mask))
-        return change(image)
+        yield
     except InputError as error:
         raise InputError(f"{shot.path}: {error}") from error
 
 
-def _with(shot: Radiograph, image: Plane, note: str, recorded: Mapping[str, Any]) -> Radiograph:
+def _with(
+    shot: Radiograph, image: Plane, notes: list[str], recorded: Mapping[str, Any]
+) -> Radiograph:
     """The same shot with another image, and word of what was done to it."""
+    if not recorded:
+        return shot
     metadata = {
         **shot.metadata,
-        "notes": (*shot.metadata.get("notes", ()), note),
+        "notes": (*shot.metadata.get("notes", ()), *notes),
         "preparation": {**shot.metadata.get("preparation", {}), **recorded},
     }
     return replace(shot, image=image, metadata=metadata)

@@ -133,7 +133,7 @@ def invert(
     Writes potential, displacement, re-projection and residual, with all options,
     to one file, and a figure beside it.
     """
-    from napari_shadowinv.cli._preparation import TABLE, preparation_from
+    from napari_shadowinv.cli._choices import TABLE, choices_from
     from napari_shadowinv.io.writing import RESULT_SUFFIXES
 
     result, figure = result_and_figure(image, out, report)
@@ -143,13 +143,11 @@ def invert(
     edge = given(boundary=boundary, margin=margin, flux=flux)
     chosen = options_from(options, transport | edge, clip_negative, other_tables=(TABLE,))
     check_margin(margin, chosen)
-    filters = given(
+    preparing = given(
         hot_pixels=hot_pixels,
         background_degree=background_degree,
         high_pass=high_pass,
         low_pass=low_pass,
-    )
-    estimate = given(
         source_from=source_from,
         source_degree=source_degree,
         source_weight=source_weight,
@@ -164,9 +162,9 @@ def invert(
         mask,
         variable=variable,
         source_variable=source_variable,
-        preparation=preparation_from(
+        choices=choices_from(
             options,
-            filters | estimate,
+            preparing,
             has_source=source is not None or source_variable is not None,
             has_source_mask=source_mask is not None,
         ),

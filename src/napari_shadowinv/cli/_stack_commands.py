@@ -8,15 +8,24 @@ from typing import Annotated
 import typer
 
 from napari_shadowinv.cli._flags import (
+    BackgroundDegree,
     Bin,
     Channel,
     ChosenShots,
     ClipNegative,
+    HighPass,
+    HotPixels,
+    LowPass,
     OptionsFile,
     Overwrite,
     Quiet,
     SetupFile,
     SiteCount,
+    SourceDegree,
+    SourceFrom,
+    SourceMask,
+    SourceWeight,
+    SourceWidth,
     StoreFolder,
     given,
 )
@@ -28,6 +37,7 @@ BATCH_EPILOG = """
 [bold]Examples[/bold]
 shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr
 shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr --resume
+shadowinv batch 'shots/*.tif' --source-from polynomial --low-pass 1 --out night.shadowinv.zarr
 shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
 
 [bold]Exit codes[/bold]
@@ -90,17 +100,44 @@ def batch(
         bool, typer.Option("--redo-failed", help="As --resume, and try failed shots again.")
     ] = False,
     quiet: Quiet = False,
+    source_from: SourceFrom = None,
+    source_degree: SourceDegree = None,
+    source_weight: SourceWeight = None,
+    source_width: SourceWidth = None,
+    source_mask: SourceMask = None,
+    hot_pixels: HotPixels = None,
+    background_degree: BackgroundDegree = None,
+    high_pass: HighPass = None,
+    low_pass: LowPass = None,
 ) -> None:
     """Invert many shots into one store that survives a crash."""
     from napari_shadowinv.cli._batch import run_batch
+    from napari_shadowinv.cli._choices import TABLE, choices_from
 
+    chosen = given(
+        hot_pixels=hot_pixels,
+        background_degree=background_degree,
+        high_pass=high_pass,
+        low_pass=low_pass,
+        source_from=source_from,
+        source_degree=source_degree,
+        source_weight=source_weight,
+        source_width=source_width,
+    )
     run_batch(
         shots,
         out,
         source=source,
         mask=mask,
         setup=setup,
-        options=options_from(options, given(n_sites=n_sites), clip_negative),
+        options=options_from(options, given(n_sites=n_sites), clip_negative, other_tables=(TABLE,)),
+        choices=choices_from(
+            options,
+            chosen,
+            has_source=source is not None,
+            has_source_mask=source_mask is not None,
+        ),
+        source_mask=source_mask,
         factor=bin_,
         channel=channel,
         variables=variables,

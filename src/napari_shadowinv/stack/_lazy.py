@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -23,12 +23,13 @@ from napari_shadowinv.stack._stack import (
     dtype_of,
     values_of_beam,
 )
-from napari_shadowinv.stack._work import Beam, arrays_of, invert_shot, threads_here
+from napari_shadowinv.stack._work import Beam, Work
 
 if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.recipes import Filter
 
 __all__ = ["invert_stack"]
 
@@ -43,6 +44,8 @@ def invert_stack(
     mask: ArrayLike | None = None,
     options: InversionOptions | None = None,
     setup: ProtonSetup | OpticalSetup | None = None,
+    filters: Sequence[Filter] = (),
+    source_mask: ArrayLike | None = None,
     variables: Collection[str] | None = None,
     reader: Reader = read_shot,
     warm_start: int = 1,
@@ -55,15 +58,21 @@ def invert_stack(
         A dask or numpy array; an xarray object with one such variable; paths of one image each;
         a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; or a TIFF with a
         page for each shot. Files are read by the tasks that invert them.
-    source : array (y, x), path, or as `shots`, optional
-        The undisturbed beam, one for all shots or one for each. Default: uniform, and then
-        intensities in the result are relative to each shot's mean.
+    source : array (y, x), path, Estimate, or as `shots`, optional
+        The undisturbed beam, one for all shots or one for each, or a recipe of
+        `napari_shadowinv.recipes` by which it is guessed from each shot. Default: uniform, and
+        then intensities in the result are relative to each shot's mean.
     mask : array_like of bool, shape (H, W), optional
         The pixels that can be used, the same in all shots; see `napari_shadowinv.invert`.
     options : InversionOptions, optional
         Choices. If `threads` is None, all shots that are inverted at once share the cores.
     setup : ProtonSetup or OpticalSetup, optional
         Adds fields in SI units.
+    filters : sequence of Filter, optional
+        Recipes of `napari_shadowinv.recipes` for each shot, in their order. A measured source is
+        cleaned and blurred alike; what flattens the image needs a source that is not measured.
+    source_mask : array_like of bool, shape (H, W), optional
+        Pixels where the object never is; an estimate of the source looks at no others.
     variables : collection of str, optional
         Make only these of a result's variables. Default: all.
     reader : callable, optional
@@ -71,8 +80,9 @@ def invert_stack(
         `functools.partial(read_shot, factor=2)` sums blocks of 2 × 2 pixels.
     warm_start : int, optional
         The solver starts from the answer to the shot before, in runs of so many shots: for
-        series in which shots are alike. The answers are the same within the tolerance. Shots of
-        one run are inverted one after the other. Default: each shot on its own.
+        series in which shots are alike and share their source. The answers are the same within
+        the tolerance. Shots of one run are inverted one after the other. Default: each shot on
+        its own.
 
     Returns
     -------
@@ -105,33 +115,32 @@ def invert_stack(
     >>> float(abs(stack.displacement.isel(shot=1)).max())
     0.0
     """
-    stack = describe_stack(shots, source, mask, options, setup, variables, reader, warm_start)
+    stack = describe_stack(
+        shots, source, mask, options, setup, variables, reader, warm_start, filters, source_mask
+    )
     return _Graph(stack).dataset()
 
 
 def _invert(
     label: str,
     shot: Any,
-    beam: Beam | Shot,
-    mask: NDArray[np.bool_] | None,
-    settings: tuple[InversionOptions, Any, tuple[str, ...]],
+    beam: Beam | Shot | None,
+    work: Work,
     previous: dict[str, Any] | None = None,
     keep: bool = False,
 ) -> dict[str, Any]:
     """Task of one shot: its variables by name."""
-    options, setup, names = settings
-    if options.threads is None:
-        options = options.model_copy(update={"threads": threads_here()})
+    start = None if previous is None else previous["inversion"]
     try:
         image = shot[0] if isinstance(shot, np.ndarray) else shot.load()[0]
-        if not isinstance(beam, Beam):
-            beam = Beam.of(image.shape, beam.load()[0], mask)
-        start = None if previous is None else previous["inversion"]
-        inversion = invert_shot(image, beam, options, start=start)
+        if beam is None or isinstance(beam, Beam):
+            inversion = work.invert(image, beam, start=start)
+        else:
+            inversion = work.invert(image, None, beam.load()[0], start=start)
     except InputError as error:
         raise InputError(f"{label}: {error}") from error
     return {
-        **arrays_of(inversion, dict.fromkeys(names), setup),
+        **work.arrays(inversion),
         **_numbers_of(inversion),
         **({"inversion": inversion} if keep else {}),
     }
@@ -160,11 +169,15 @@ class _Graph:
         from dask.highlevelgraph import HighLevelGraph
 
         self._stack = stack
+        preparation = stack.preparation
         token = tokenize(
             stack.shots.items if stack.shots.array is None else stack.shots.array.name,
             None if stack.sources is None else stack.sources.items,
             None if stack.beam is None else stack.beam.key,
             stack.mask,
+            preparation.described,
+            None if preparation.estimate is None else preparation.estimate.described,
+            preparation.bare,
             stack.options.model_dump_json(),
             None if stack.setup is None else stack.setup.model_dump_json(),
             stack.variables,
@@ -178,19 +191,16 @@ class _Graph:
             # One node, so that a worker gets the source once and not with each shot.
             self._beam = delayed(stack.beam, name=f"beam-{stack.beam.key}", traverse=False)
             dependencies.append(self._beam)
-        settings = delayed(
-            (stack.options, stack.setup, stack.variables), name=f"settings-{token}", traverse=False
-        )
-        mask = delayed(stack.mask, name=f"mask-{token}", traverse=False)
+        work = delayed(stack.work(stack.variables), name=f"work-{token}", traverse=False)
         tasks: dict[Any, Any] = {
-            (self._inverted, index): self._task(index, mask.key, settings.key)
+            (self._inverted, index): self._task(index, work.key)
             for index in range(len(stack.shots))
         }
         self._shots = HighLevelGraph.from_collections(
-            self._inverted, tasks, dependencies=[*dependencies, settings, mask]
+            self._inverted, tasks, dependencies=[*dependencies, work]
         )
 
-    def _task(self, index: int, mask: Any, settings: Any) -> tuple[Any, ...]:
+    def _task(self, index: int, work: Any) -> tuple[Any, ...]:
         stack = self._stack
         array = stack.shots.array
         shot = stack.shots.items[index] if array is None else (array.name, index, 0, 0)
@@ -198,7 +208,7 @@ class _Graph:
         run = stack.warm_start
         previous = (self._inverted, index - 1) if index % run else None
         keep = run > 1 and (index + 1) % run != 0
-        return (_invert, stack.shots.label(index), shot, beam, mask, settings, previous, keep)
+        return (_invert, stack.shots.label(index), shot, beam, work, previous, keep)
 
     def dataset(self) -> xarray.Dataset:
         """Return the lazy dataset."""

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -37,7 +38,9 @@ def local_client(count: int) -> Iterator[Any]:
     distributed: Any = import_module("distributed")
     dask: Any = import_module("dask")
     with ExitStack() as opened:
-        opened.enter_context(dask.config.set(_settings(dask.config.get(_ENVIRONMENT))))
+        environment = dask.config.get(_ENVIRONMENT)
+        opened.enter_context(dask.config.set(_settings(environment)))
+        opened.enter_context(_forgotten(_TRIMMING, environment.get(_TRIMMING)))
         # A cluster that is half made cannot be closed.
         with interrupts_put_off(), _hidden_from_workers():
             cluster = distributed.LocalCluster(
@@ -63,6 +66,19 @@ def _settings(environment: dict[str, Any]) -> dict[str, Any]:
         # in the next moment: that takes a seventh of the time of a shot.
         _ENVIRONMENT: {name: value for name, value in environment.items() if name != _TRIMMING},
     }
+
+
+@contextmanager
+def _forgotten(name: str, value: Any) -> Iterator[None]:
+    """Take a variable out of the environment if an earlier cluster has left it there."""
+    if os.environ.get(name) != str(value):
+        yield
+        return
+    kept = os.environ.pop(name)
+    try:
+        yield
+    finally:
+        os.environ.setdefault(name, kept)
 
 
 @contextmanager

@@ -103,20 +103,29 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
     """What must be the same for a store to be continued; of so many of its shots."""
     height, width = stack.shape
     source = "uniform"
+    preparation = stack.preparation
     if stack.sources is not None:
         source = f"one for each shot: {', '.join(stack.sources.names[:shots])}"
+    elif preparation.estimate is not None:
+        source = f"guessed from each shot: {preparation.estimate.described}"
     elif stack.beam is not None and stack.beam.source is not None:
         source = f"sha256 {checksum(stack.beam.source)}"
     return {
         "options": stack.options.model_dump_json(exclude={"threads"}),
         "setup": "" if stack.setup is None else stack.setup.model_dump_json(),
         "source_image": source,
-        "mask_image": "none" if stack.mask is None else f"sha256 {checksum(stack.mask)}",
+        "mask_image": _sum_of(stack.mask) or "none",
+        "filters": preparation.described,
+        "source_mask_image": _sum_of(preparation.bare),
         "image_size": f"{width} × {height} px",
         "stored": f"{', '.join(stack.variables)} as {dtype}",
         "reader": stack.reader,
         "warm_start": str(stack.warm_start),
     }
+
+
+def _sum_of(mask: NDArray[np.bool_] | None) -> str:
+    return "" if mask is None else f"sha256 {checksum(mask)}"
 
 
 def continued(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:

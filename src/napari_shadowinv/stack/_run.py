@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.recipes import Filter
 
 __all__ = ["STORED", "RunProgress", "ShotOutcome", "run_stack"]
 
@@ -79,6 +80,8 @@ def run_stack(
     mask: ArrayLike | None = None,
     options: InversionOptions | None = None,
     setup: ProtonSetup | OpticalSetup | None = None,
+    filters: Sequence[Filter] = (),
+    source_mask: ArrayLike | None = None,
     variables: Collection[str] = STORED,
     dtype: str = "float32",
     reader: Reader = read_shot,
@@ -98,9 +101,9 @@ def run_stack(
 
     Parameters
     ----------
-    shots, source, mask, options, setup, reader, warm_start
-        See `invert_stack`. Options, setup, source, mask and earlier shots must be those of the
-        store where it is resumed.
+    shots, source, mask, options, setup, filters, source_mask, reader, warm_start
+        See `invert_stack`. All of them, and earlier shots, must be those of the store where it is
+        resumed.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
     variables : collection of str, optional
@@ -143,7 +146,9 @@ def run_stack(
     if dtype not in ("float32", "float64"):
         raise InputError(f"dtype is {dtype!r}: expected 'float32' or 'float64'")
     kept = np.dtype(dtype)
-    stack = describe_stack(shots, source, mask, options, setup, variables, reader, warm_start)
+    stack = describe_stack(
+        shots, source, mask, options, setup, variables, reader, warm_start, filters, source_mask
+    )
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
     with locked(path) as live:
         store = StackStore(path) if path.exists() and not overwrite else None
@@ -236,14 +241,8 @@ class _Run:
     def _shared(self, engine: Engine) -> tuple[Any, Any]:
         """Bring what all shots need to where they are inverted."""
         stack = self._stack
-        settings = Settings(
-            self._store.writer,
-            stack.options,
-            stack.setup,
-            tuple(name for name in stack.variables if not stack.is_shared(name)),
-            stack.mask,
-            engine.workers,
-        )
+        own = tuple(name for name in stack.variables if not stack.is_shared(name))
+        settings = Settings(self._store.writer, stack.work(own), engine.workers)
         # A name that no earlier run has used: what dask has under a name it does not take again.
         name = f"settings-{self._store.attributes['store_id']}-{time.time_ns()}"
         beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -46,7 +46,12 @@ class Shot(Protocol):
 
 
 def read_shot(
-    path: Path, *, page: int | None = None, channel: str | int | None = None, factor: int = 1
+    path: Path,
+    *,
+    page: int | None = None,
+    channel: str | int | None = None,
+    factor: int = 1,
+    hot_pixels: float | None = None,
 ) -> NDArray[np.float64]:
     """Read the image of a shot; this is the reader where none is given.
 
@@ -60,6 +65,9 @@ def read_shot(
         What to take of a colour image.
     factor : int, optional
         Sum blocks of so many pixels squared.
+    hot_pixels : float, optional
+        Before that, replace pixels that differ from the median of their neighbours by more
+        standard deviations of the noise.
 
     Returns
     -------
@@ -75,8 +83,14 @@ def read_shot(
     from napari_shadowinv.io.reading import read_radiograph
 
     if page is None:
-        return read_radiograph(path, channel=channel).binned(factor).image
-    return Radiograph(read_tiff_page(path, page, channel=channel)).binned(factor).image
+        shot = read_radiograph(path, channel=channel)
+    else:
+        shot = Radiograph(read_tiff_page(path, page, channel=channel))
+    if hot_pixels is not None:
+        from napari_shadowinv.filters import remove_hot_pixels
+
+        shot = replace(shot, image=remove_hot_pixels(shot.image, threshold=hot_pixels)[0])
+    return shot.binned(factor).image
 
 
 @dataclass(frozen=True)

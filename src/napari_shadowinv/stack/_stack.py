@@ -22,10 +22,12 @@ from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preparation import Preparation
 from napari_shadowinv.preprocess import checked_mask, checked_source
+from napari_shadowinv.recipes import Estimate, Filter, UniformEstimate
 from napari_shadowinv.stack._shot import Reader, Shot, described_reader
 from napari_shadowinv.stack._shots import Shots, find_shots, find_source
-from napari_shadowinv.stack._work import Beam, shared_plan, threads_here
+from napari_shadowinv.stack._work import Beam, Work, shared_plan, threads_here
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
@@ -51,9 +53,9 @@ class Stack:
     shots : Shots
         The shots.
     beam : Beam or None
-        Source and mask of all shots; None if each has a source of its own.
+        Source, filtered, and mask of all shots; None if each has a source of its own.
     sources : Shots or None
-        Source of each shot, if each has its own.
+        Source of each shot, if each has a measured one.
     mask : ndarray of bool, shape (H, W), or None
         The pixels that can be used.
     options : InversionOptions
@@ -62,6 +64,8 @@ class Stack:
         For fields in SI units.
     variables : tuple of str
         The variables that are wanted.
+    preparation : Preparation
+        Filters of the shots, and how their sources are guessed.
     warm_start : int
         So many shots in a row start from the answer to the one before; 1 for none.
     source_file : str
@@ -77,6 +81,7 @@ class Stack:
     options: InversionOptions
     setup: ProtonSetup | OpticalSetup | None
     variables: tuple[str, ...]
+    preparation: Preparation
     warm_start: int = 1
     source_file: str = ""
     reader: str = ""
@@ -104,13 +109,17 @@ class Stack:
         )
 
     def source_of(self, index: int) -> Shot | None:
-        """Reference to the source of one shot; None if all share one."""
+        """Reference to the measured source of one shot; None if it is shared, or guessed."""
         return None if self.sources is None else self.sources.items[index]
 
     def chosen(self, order: Sequence[int]) -> Stack:
         """Return the stack with its shots, and their sources, in another order."""
         sources = None if self.sources is None else self.sources.chosen(order)
         return replace(self, shots=self.shots.chosen(order), sources=sources)
+
+    def work(self, variables: tuple[str, ...]) -> Work:
+        """Return what the task of each shot needs to know to make some variables."""
+        return Work(self.shape, self.options, self.setup, variables, self.mask, self.preparation)
 
     def changed(self, index: int, origin: dict[str, Any]) -> str:
         """Say what of a shot is not what it was when this was said of it; empty if nothing."""
@@ -130,12 +139,14 @@ def describe_stack(
     variables: Collection[str] | None,
     reader: Reader,
     warm_start: int,
+    filters: Sequence[Filter] = (),
+    source_mask: ArrayLike | None = None,
 ) -> Stack:
     """Check everything that can be checked before a shot is read.
 
     Parameters
     ----------
-    shots, source, mask, options, setup, variables, reader, warm_start
+    shots, source, mask, options, setup, variables, reader, warm_start, filters, source_mask
         See `invert_stack`.
 
     Returns
@@ -150,7 +161,10 @@ def describe_stack(
     options = options or InversionOptions()
     if warm_start < 1:
         raise InputError(f"warm_start is {warm_start}: expected a number of shots, 1 for no start")
-    sources = find_source(source, reader=reader)
+    estimate = source if isinstance(source, Estimate) else None
+    if isinstance(estimate, UniformEstimate):
+        estimate = None
+    sources = None if isinstance(source, Estimate) else find_source(source, reader=reader)
     # Where the source tells it, no shot needs to be read for its shape.
     shape: tuple[int, ...] = () if mask is None else np.shape(mask)
     if sources is not None:
@@ -161,14 +175,25 @@ def describe_stack(
     if sources is not None and sources.shape != found.shape:
         raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
     usable = None if mask is None else checked_mask(mask, found.shape)
+    bare = None if source_mask is None else checked_mask(source_mask, found.shape)
+    preparation = Preparation(tuple(filters), estimate, bare)
+    preparation.check(has_source=sources is not None)
     beam = None
     if not isinstance(sources, Shots):
         if sources is not None:
+            sources = preparation.measured(sources, usable)
             checked_source(sources, usable)
-        beam, sources = Beam.of(found.shape, sources, usable), None
+        if estimate is None:
+            beam = Beam.of(found.shape, sources, usable)
+        sources = None
     elif len(sources) != len(found):
         raise InputError(
             f"got {len(sources)} sources for {len(found)} shots: expected one, or one for each shot"
+        )
+    if beam is None and warm_start > 1:
+        raise InputError(
+            f"warm_start is {warm_start} and each shot has a source of its own: the answer to the "
+            "shot before belongs to other sites; leave warm_start out, or give one source for all"
         )
     return Stack(
         found,
@@ -177,7 +202,8 @@ def describe_stack(
         usable,
         options,
         setup,
-        _checked_variables(variables, options, setup, sources is not None),
+        _checked_variables(variables, options, setup, own_sources=beam is None),
+        preparation,
         warm_start,
         source_file=text_of(Path(source).name) if isinstance(source, (str, Path)) else "",
         reader=described_reader(reader),
@@ -188,6 +214,7 @@ def _checked_variables(
     wanted: Collection[str] | None,
     options: InversionOptions,
     setup: ProtonSetup | OpticalSetup | None,
+    *,
     own_sources: bool,
 ) -> tuple[str, ...]:
     """Names of the variables that a stack shall have."""
@@ -223,6 +250,8 @@ def attributes_of(stack: Stack) -> dict[str, str]:
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.setup).attrs
     if stack.source_file:
         attributes["source_file"] = stack.source_file
+    if stack.preparation.filters:
+        attributes["filters"] = stack.preparation.described
     return {"format": FORMAT, **attributes, "options": stack.options.model_dump_json()}
 
 

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
-from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._shot import Shot, checksum
-from napari_shadowinv.stack._work import Beam, arrays_of, invert_shot, threads_here
+from napari_shadowinv.stack._work import Beam, Work
 
 __all__ = ["Settings", "ShotOutcome", "run_shots"]
 
@@ -54,10 +53,7 @@ class Settings:
     """What the task of every shot needs to know."""
 
     writer: ShotWriter
-    options: InversionOptions
-    setup: Any
-    variables: tuple[str, ...]
-    mask: NDArray[np.bool_] | None
+    work: Work
     workers: int | None
 
 
@@ -69,7 +65,7 @@ def run_shots(
     stop: Any = None,
 ) -> list[ShotOutcome]:
     """Task: invert some shots one after the other and write each."""
-    options = _with_threads(settings)
+    stopping = None if stop is None else stop.is_set
     previous: Inversion | None = None
     outcomes = []
     for shot, (index, wanted, source) in zip(shots, labels, strict=True):
@@ -77,13 +73,17 @@ def run_shots(
         failure = ""
         try:
             image, origin = _loaded(shot)
-            here = beam
-            if here is None:
-                assert source is not None
+            own = None
+            if source is not None:
                 own, origin["source"] = source.load()
-                here = Beam.of(np.shape(image), own, settings.mask)
-            stopping = None if stop is None else stop.is_set
-            previous = invert_shot(image, here, options, start=previous, should_stop=stopping)
+            previous = settings.work.invert(
+                image,
+                beam,
+                own,
+                start=previous,
+                workers=settings.workers,
+                should_stop=stopping,
+            )
         except InversionCancelled:
             raise
         except Exception as error:
@@ -119,13 +119,6 @@ def _loaded(shot: Any) -> tuple[NDArray[Any], dict[str, Any]]:
     return image, origin
 
 
-def _with_threads(settings: Settings) -> InversionOptions:
-    if settings.options.threads is not None:
-        return settings.options
-    threads = threads_here(settings.workers)
-    return settings.options.model_copy(update={"threads": threads})
-
-
 def _write(
     settings: Settings,
     index: int,
@@ -133,11 +126,10 @@ def _write(
     origin: dict[str, Any],
     seconds: float,
 ) -> None:
-    names = dict.fromkeys(settings.variables)
     report = {
         **dataclasses.asdict(inversion.report),
         "stages": inversion.report.seconds,
         "seconds": seconds,
         **origin,
     }
-    settings.writer.write(index, arrays_of(inversion, names, settings.setup), report)
+    settings.writer.write(index, settings.work.arrays(inversion), report)

@@ -2,7 +2,8 @@
 
 - an undisturbed beam that can be sent around: `Beam`
 - sites that threads share: `shared_plan`
-- one shot to an inversion: `invert_shot`; to arrays for a dataset: `arrays_of`
+- a shot as it was recorded to an inversion: `Work`; with all filters and its beam: `invert_shot`
+- an inversion to arrays for a dataset: `arrays_of`
 - how many threads a shot may use: `threads_here`
 """
 
@@ -27,6 +28,7 @@ from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preparation import Preparation
 from napari_shadowinv.progress import OnProgress, ShouldStop
 from napari_shadowinv.stack._shot import checksum
 from napari_shadowinv.transport.sites import SitePlan
@@ -34,7 +36,7 @@ from napari_shadowinv.transport.sites import SitePlan
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
-__all__ = ["Beam", "arrays_of", "invert_shot", "shared_plan", "threads_here"]
+__all__ = ["Beam", "Work", "arrays_of", "invert_shot", "shared_plan", "threads_here"]
 
 _ASKED_AGAIN_AFTER = 10.0  # seconds: workers come and go, but asking takes milliseconds
 _PLANS_KEPT = 2  # a worker that changes between two sources makes each once
@@ -165,9 +167,6 @@ def invert_shot(
     InputError
         If the shot cannot be inverted.
     """
-    if np.shape(image) != beam.shape:
-        others = "the others" if beam.source is None else "the source"
-        raise InputError(f"image has shape {np.shape(image)}, expected {beam.shape} as {others}")
     began = time.perf_counter()
     plan = shared_plan(beam, options, on_progress=on_progress, should_stop=should_stop)
     on_sites = time.perf_counter() - began
@@ -183,6 +182,94 @@ def invert_shot(
     )
     seconds = {**inversion.report.seconds, "sites": on_sites}
     return replace(inversion, report=replace(inversion.report, seconds=seconds))
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What is done with every shot of a stack, wherever it is.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Shape (H, W) that shots must have.
+    options : InversionOptions
+        Choices. If `threads` is None, shots that are inverted at once share the cores.
+    setup : ProtonSetup or OpticalSetup or None
+        For fields in SI units.
+    variables : tuple of str
+        Names of the arrays to make.
+    mask : ndarray of bool, shape (H, W), or None
+        The pixels that can be used.
+    preparation : Preparation
+        Filters, and how sources are guessed.
+    """
+
+    shape: tuple[int, int]
+    options: InversionOptions
+    setup: ProtonSetup | OpticalSetup | None
+    variables: tuple[str, ...]
+    mask: NDArray[np.bool_] | None
+    preparation: Preparation
+
+    def invert(
+        self,
+        image: NDArray[Any],
+        beam: Beam | None,
+        source: NDArray[Any] | None = None,
+        *,
+        start: Inversion | None = None,
+        workers: int | None = None,
+        should_stop: ShouldStop | None = None,
+    ) -> Inversion:
+        """Filter and invert one shot.
+
+        Parameters
+        ----------
+        image : ndarray, shape (H, W)
+            The shot as it was recorded.
+        beam : Beam or None
+            What all shots share, filtered; None if this has a source of its own.
+        source : ndarray, shape (H, W), optional
+            That source as it was recorded. Default: it is guessed from the shot.
+        start, should_stop
+            See `invert_shot`.
+        workers : int, optional
+            See `threads_here`.
+
+        Returns
+        -------
+        Inversion
+
+        Raises
+        ------
+        InputError
+            If the shot cannot be inverted.
+        """
+        if np.shape(image) != self.shape:
+            others = "the others" if beam is None or beam.source is None else "the source"
+            raise InputError(
+                f"image has shape {np.shape(image)}, expected {self.shape} as {others}"
+            )
+        image = self.preparation.image(image, self.mask, should_stop)
+        if beam is None:
+            beam = Beam.of(self.shape, self._source(image, source, should_stop), self.mask)
+        options = self.options
+        if options.threads is None:
+            options = options.model_copy(update={"threads": threads_here(workers)})
+        return invert_shot(image, beam, options, start=start, should_stop=should_stop)
+
+    def _source(
+        self, image: NDArray[Any], source: NDArray[Any] | None, should_stop: ShouldStop | None
+    ) -> NDArray[Any]:
+        if source is None:
+            return self.preparation.estimated(image, self.mask, should_stop)
+        if np.shape(source) != self.shape:
+            raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
+        return self.preparation.measured(source, self.mask, should_stop)
+
+    def arrays(self, inversion: Inversion) -> dict[str, NDArray[Any]]:
+        """Return the variables by name."""
+        return arrays_of(inversion, dict.fromkeys(self.variables), self.setup)
 
 
 def _relative(image: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[Any]:

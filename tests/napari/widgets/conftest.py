@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._napari.widgets._jobs import ShotJob
-from napari_shadowinv._napari.widgets._recipes import UniformEstimate
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.recipes import UniformEstimate
 
 
 @pytest.fixture(autouse=True)
@@ -58,6 +58,20 @@ def open_widget(window: Any) -> Callable[[str], Any]:
         return widget
 
     return opened
+
+
+@pytest.fixture
+def assert_it_fits(window: Any, qtbot: Any) -> Callable[[Any], None]:
+    """Check that a widget needs no sideways scrolling in a small and in a large window."""
+
+    def check(tool: Any) -> None:
+        for size in ((1280, 800), (2560, 1440)):
+            window.window._qt_window.resize(*size)
+            qtbot.wait(50)
+            assert tool.area.horizontalScrollBar().maximum() == 0
+            assert tool.area.widget().minimumSizeHint().width() <= tool.area.viewport().width()
+
+    return check
 
 
 def running_threads() -> list[Any]:

@@ -11,11 +11,11 @@ from qtpy.QtWidgets import QFileDialog
 
 from napari_shadowinv import InputError, InversionOptions, OpticalSetup, ProtonSetup
 from napari_shadowinv._napari.widgets._forms import ModelForm, ModelPicker, kinds_of
-from napari_shadowinv._napari.widgets._recipes import ESTIMATES
 from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._state import StateKeeper
 from napari_shadowinv._napari.widgets._toml import dump_toml, load_toml
 from napari_shadowinv.cli._inputs import options_from, setup_from
+from napari_shadowinv.recipes import ESTIMATES
 
 CHANGED = {
     "n_sites": 1234,

@@ -292,21 +292,34 @@ MISTAKES = {
 }
 
 
+@pytest.fixture
+def expecting(told: list[str], qtbot: Any) -> Any:
+    """Press Run, and check that one notification with some words comes of it."""
+
+    def of_tool(tool: Any) -> Any:
+        def expect(words: str) -> None:
+            told.clear()
+            tool.panel.button.click()
+            qtbot.waitUntil(lambda: bool(told) and not tool.panel.runner.running, timeout=PATIENCE)
+            qtbot.wait(30)
+            assert len(told) == 1, told
+            assert words in told[0]
+            assert "\n" not in told[0]
+            assert tool.panel.button.text() == "Run"
+            assert tool.panel.button.isEnabled()
+
+        return expect
+
+    return of_tool
+
+
 def test_a_mistake_is_told_once_and_the_viewer_lives(
-    window: Any, open_widget: Any, told: list[str], qtbot: Any, monkeypatch: pytest.MonkeyPatch
+    window: Any, open_widget: Any, expecting: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tool = open_widget("Invert shot")
     tool.options.set_values(FEW)
 
-    def expect(words: str) -> None:
-        told.clear()
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda: bool(told) and not tool.panel.runner.running, timeout=PATIENCE)
-        qtbot.wait(30)
-        assert len(told) == 1, told
-        assert words in told[0]
-        assert tool.panel.button.text() == "Run"
-        assert tool.panel.button.isEnabled()
+    expect = expecting(tool)
 
     for words, data in MISTAKES.items():
         window.layers.clear()
@@ -341,17 +354,9 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
 
 
 def test_a_mistake_in_a_layer_of_another_kind_is_told_once(
-    window: Any, tool: Any, shot: Array, told: list[str], qtbot: Any
+    window: Any, tool: Any, shot: Array, expecting: Any
 ) -> None:
-    def expect(words: str) -> None:
-        told.clear()
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda: bool(told) and not tool.panel.runner.running, timeout=PATIENCE)
-        qtbot.wait(30)
-        assert len(told) == 1, told
-        assert words in told[0]
-        assert "\n" not in told[0]
-
+    expect = expecting(tool)
     some = shot.copy()
     some[3, 5] = np.nan
     tool.image.layer = window.add_image(some, name="nan", contrast_limits=(0, 500))
@@ -434,8 +439,8 @@ def test_the_preview_follows_in_its_own_layers(
         return time.perf_counter() - start
 
     tool.masks.paint()
-    follows(lambda: tool.cleaning.set_kind("low_pass"))
-    follows(lambda: tool.cleaning.form.editors["width"].set_value(2.0))
+    follows(lambda: tool.cleaning.picker.set_kind("low_pass"))
+    follows(lambda: tool.cleaning.picker.form.editors["width"].set_value(2.0))
     follows(lambda: tool.options.editors["floor"].set_value(0.5))
     follows(lambda: tool.masks.layer.paint((30, 10), 1))
     assert not result_of(potential).content.mask.all()
@@ -474,21 +479,17 @@ def test_the_preview_follows_in_its_own_layers(
     assert told == []
 
 
-def test_it_fits_and_remembers(window: Any, open_widget: Any, tool: Any, qtbot: Any) -> None:
+def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fits: Any) -> None:
     tool.options.set_values({"seed": 5})
     tool.source.picker.set_kind("interpolated")
     tool.setup.show_setup(paper_setup().model_dump())
-    tool.cleaning.set_kind("background")
-    tool._cleaning_section.expand()
-    for size in ((1280, 800), (2560, 1440)):
-        window.window._qt_window.resize(*size)
-        qtbot.wait(50)
-        assert tool.area.horizontalScrollBar().maximum() == 0
-        assert tool.area.widget().minimumSizeHint().width() <= tool.area.viewport().width()
+    tool.cleaning.picker.set_kind("background")
+    tool.cleaning.folded.expand()
+    assert_it_fits(tool)
     tool._keeper.write()
     again = InvertShot(window)
     qtbot.addWidget(again)
     assert again.options.model() == InversionOptions(seed=5)
     assert again.setup.setup() == paper_setup()
     assert again.source.picker.model() == tool.source.picker.model()
-    assert "flatten" in again._cleaning_section.text()
+    assert "flatten" in again.cleaning.folded.text()

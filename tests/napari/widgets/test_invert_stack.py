@@ -14,12 +14,12 @@ import pytest
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert
 from napari_shadowinv._napari.marks import role_of
-from napari_shadowinv._napari.widgets._recipes import LowPassEstimate
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.stack import _engines, _tasks
+from napari_shadowinv.recipes import LowPassEstimate, LowPassFilter
+from napari_shadowinv.stack import _engines, _work
 
 Array = np.ndarray[Any, Any]
 FEW = {"n_sites": 100}
@@ -71,7 +71,7 @@ def at_rest(tool: Any) -> bool:
 def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Hold each run at its third shot, as a large image would, until it is stopped or let go."""
     let_go = threading.Event()
-    original = _tasks.invert_shot
+    original = _work.invert_shot
     count = iter(range(1000))
 
     def holding(*args: Any, should_stop: Any = None, **kwargs: Any) -> Any:
@@ -80,7 +80,7 @@ def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
                 time.sleep(0.01)
         return original(*args, should_stop=should_stop, **kwargs)
 
-    monkeypatch.setattr(_tasks, "invert_shot", holding)
+    monkeypatch.setattr(_work, "invert_shot", holding)
     return let_go
 
 
@@ -314,7 +314,7 @@ def test_overwriting_takes_a_box_that_counts_once(tool: Any, run: Any, out: Path
     assert not tool.overwrite.isChecked()
 
 
-def test_the_source_is_guessed_for_each_shot(
+def test_shots_are_filtered_and_their_sources_guessed(
     window: Any, tool: Any, run: Any, stack: Array, out: Path
 ) -> None:
     mask = np.ones(SHAPE, bool)
@@ -323,9 +323,11 @@ def test_the_source_is_guessed_for_each_shot(
     tool.masks.layer.data[:3, :4] = 1
     tool.source.picker.set_kind("low_pass")
     tool.source.picker.form.editors["width"].set_value(6.0)
+    tool.cleaning.picker.set_kind("low_pass")
     run(tool)
-    source = LowPassEstimate(width=6.0).source(np.where(mask, stack[1], 0), mask)
-    expected = invert(stack[1], source=source, mask=mask, options=InversionOptions(**FEW))
+    clean = LowPassFilter(width=1.0).filtered(stack[1], mask)
+    source = LowPassEstimate(width=6.0).source(np.where(mask, clean, 0), mask)
+    expected = invert(clean, source=source, mask=mask, options=InversionOptions(**FEW))
     shown = np.asarray(layer_of(window, "potential").data[1])
     np.testing.assert_allclose(
         shown[mask], expected.potential[mask], atol=1e-4 * np.ptp(expected.potential)
@@ -333,16 +335,12 @@ def test_the_source_is_guessed_for_each_shot(
 
 
 def test_it_fits_and_remembers_what_is_harmless(
-    window: Any, tool: Any, qtbot: Any, out: Path
+    window: Any, tool: Any, qtbot: Any, assert_it_fits: Any
 ) -> None:
     tool.engine.workers.setValue(3)
     tool.overwrite.setChecked(True)
     tool._show_failures([("a_very_long_name_of_a_file_of_a_shot_0001.tif", "it is damaged " * 5)])
-    for size in ((1280, 800), (2560, 1440)):
-        window.window._qt_window.resize(*size)
-        qtbot.wait(50)
-        assert tool.area.horizontalScrollBar().maximum() == 0
-        assert tool.area.widget().minimumSizeHint().width() <= tool.area.viewport().width()
+    assert_it_fits(tool)
     tool._keeper.write()
     again = InvertStack(window)
     qtbot.addWidget(again)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import threading
 import time
@@ -14,8 +13,13 @@ import numpy as np
 import pytest
 from napari.layers import Image, Labels, Shapes
 
-from napari_shadowinv import InputError, InversionCancelled, InversionOptions, filters, sources
-from napari_shadowinv._napari.widgets import _recipes as recipes
+from napari_shadowinv import (
+    InputError,
+    InversionCancelled,
+    InversionOptions,
+    filters,
+    recipes,
+)
 from napari_shadowinv._napari.widgets._estimating import quick_source
 from napari_shadowinv._napari.widgets._forecast import ForwardJob
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob, SourceJob
@@ -24,9 +28,9 @@ from napari_shadowinv._napari.widgets._quantities import parsed, shown
 from napari_shadowinv._napari.widgets._reading import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._sampling import Profile, along, sampled, table_text
 from napari_shadowinv._napari.widgets._stacking import StackJob
-from napari_shadowinv.cli._preparation import Preparation
-from napari_shadowinv.cli._preparing import filtered
-from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.cli._choices import Choices
+from napari_shadowinv.cli._preparing import filtered, filtered_source
+from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.io.radiograph import Radiograph
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -60,23 +64,6 @@ def test_a_quantity_is_read_exactly_and_shown_so_that_it_reads_back(
 def test_what_is_no_quantity_is_refused(text: str, unit: str) -> None:
     with pytest.raises(InputError):
         parsed(text, unit)
-
-
-@pytest.mark.parametrize(
-    ("recipe", "function"),
-    [
-        (recipes.PolynomialEstimate, sources.polynomial_source),
-        (recipes.TotalVariationEstimate, sources.total_variation_source),
-        (recipes.InterpolatedEstimate, sources.interpolated_source),
-        (recipes.BackgroundFilter, filters.remove_background),
-        (recipes.HotPixelFilter, filters.remove_hot_pixels),
-    ],
-)
-def test_defaults_of_a_form_are_those_of_the_function(recipe: Any, function: Any) -> None:
-    parameters = inspect.signature(function).parameters
-    for name, field in recipe.model_fields.items():
-        if parameters[name].default is not inspect.Parameter.empty:
-            assert field.default == parameters[name].default, name
 
 
 def test_a_crop_gives_the_field_of_the_cropped_image(shot: Array) -> None:
@@ -152,11 +139,29 @@ def test_a_filter_does_the_same_as_that_of_the_command_line(shot: Array) -> None
     usable = np.ones(shot.shape, bool)
     usable[5:9, 7:12] = False
     image = np.where(usable, shot, np.nan)
-    chosen = Preparation(low_pass=1.5)
+    beam = 1 + np.random.default_rng(0).random(shot.shape)
+    cleaning = recipes.LowPassFilter(width=1.5)
+    mine = ShotJob(image, beam, usable, cleaning=cleaning, options=FEW).run()
+    chosen = Choices(low_pass=1.5)
     told = filtered(Radiograph(image, mask=usable), chosen).image
-    mine = recipes.LowPassFilter(width=1.5).filtered(image, usable)
-    np.testing.assert_array_equal(mine, told)
-    assert np.isfinite(mine).all()
+    source = filtered_source(Radiograph(beam, mask=usable), chosen).image
+    alone = invert(told, source=source, mask=usable, options=FEW)
+    np.testing.assert_array_equal(mine.displacement, alone.displacement)
+    assert np.isfinite(told).all()
+
+
+@pytest.mark.parametrize("cleaning", [recipes.HighPassFilter(), recipes.BackgroundFilter()])
+def test_what_flattens_the_image_fits_no_measured_source(
+    shot: Array, tmp_path: Path, cleaning: recipes.Filter
+) -> None:
+    beam, out = np.ones(shot.shape), tmp_path / "a.shadowinv.zarr"
+    jobs = (
+        ShotJob(shot, beam, cleaning=cleaning),
+        StackJob(shot[None], out, beam, cleaning=cleaning),
+    )
+    for job in jobs:
+        with pytest.raises(InputError, match="takes the beam out of the image"):
+            job.run(lambda _: None, lambda: False)
 
 
 def test_a_uniform_source_is_the_same_after_a_filter(shot: Array) -> None:

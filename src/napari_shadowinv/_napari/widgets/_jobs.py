@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._napari.widgets._estimating import SourceCache, quick_source, same_array
-from napari_shadowinv._napari.widgets._recipes import Estimate, Filter
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preparation import Preparation, as_beam
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv.recipes import Estimate, Filter
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
@@ -162,14 +163,15 @@ class ShotJob:
         clock = time.perf_counter()
         report("prepare", 0, None, "image and source")
         image, mask = self._image_and_mask()
-        if self.cleaning is not None:
-            image = self.cleaning.filtered(image, mask, should_stop)
+        preparation = Preparation(() if self.cleaning is None else (self.cleaning,))
+        preparation.check(has_source=not isinstance(self.source, Estimate))
+        image = preparation.image(image, mask, should_stop)
         # Before the sites are spread: a mistake is told at once.
         report("prepare", 0, None)
         prepare(image, None, self.options, mask)
         if isinstance(self.source, Estimate):
             report("source", 0, None, self.source.title)
-        source = self._source(image, mask, should_stop)
+        source = self._source(image, mask, preparation, should_stop)
         report("prepare", 0, None)
         seconds["source"] = time.perf_counter() - clock
         ensure_compiled(on_progress, should_stop)
@@ -202,14 +204,20 @@ class ShotJob:
             return image, mask
         return _cropped(image, self.crop), None if mask is None else mask[self.crop]
 
-    def _source(self, image: Image, mask: Mask | None, should_stop: ShouldStop | None) -> Image:
+    def _source(
+        self,
+        image: Image,
+        mask: Mask | None,
+        preparation: Preparation,
+        should_stop: ShouldStop | None,
+    ) -> Image:
         from napari_shadowinv.preprocess import checked_source
 
         if isinstance(self.source, Estimate):
-            # What an inversion would clip must not spoil the estimate.
-            clipped = np.maximum(np.where(mask, image, 0) if mask is not None else image, 0)
             most_pixels = PREVIEW_PIXELS if self.preview else None
-            return self.estimates.source(self.source, clipped, mask, most_pixels, should_stop)
+            return self.estimates.source(
+                self.source, as_beam(image, mask), mask, most_pixels, should_stop
+            )
         given = self.source
         if isinstance(given, Path):
             from napari_shadowinv.io import read_radiograph
@@ -221,6 +229,7 @@ class ShotJob:
             raise InputError(f"source has shape {source.shape}, image {whole}: they must match")
         if self.crop is not None:
             source = source[self.crop]
+        source = preparation.measured(source, mask, should_stop)
         return checked_source(source, np.ones(image.shape, bool) if mask is None else mask)
 
 

@@ -13,8 +13,8 @@ from napari_shadowinv._napari.widgets._base import PathEdit
 from napari_shadowinv._napari.widgets._forms import RowPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._picking import LayerPicker
 from napari_shadowinv._napari.widgets._reading import image_of
-from napari_shadowinv._napari.widgets._recipes import ESTIMATES, Estimate
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.recipes import ESTIMATES, Estimate
 
 __all__ = ["SourcePicker"]
 

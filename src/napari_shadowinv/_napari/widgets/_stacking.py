@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_shadowinv._napari.widgets._recipes import Estimate, UniformEstimate
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import OnProgress, Progress, ShouldStop
+from napari_shadowinv.recipes import Estimate, Filter, UniformEstimate
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
@@ -75,6 +75,8 @@ class StackJob:
         The store.
     source : array_like, Path or Estimate
         The undisturbed beam, of all shots or of each, or how to guess it for each.
+    cleaning : Filter, optional
+        What is done to the images first.
     mask : ndarray of bool, shape (H, W), optional
         True where a pixel is usable.
     options, setup, scheduler, workers, overwrite, redo_failed
@@ -87,6 +89,7 @@ class StackJob:
     out: Path
     source: ArrayLike | Path | Estimate = field(default_factory=UniformEstimate)
     mask: Mask | None = None
+    cleaning: Filter | None = None
     options: InversionOptions = field(default_factory=InversionOptions)
     setup: ProtonSetup | OpticalSetup | None = None
     scheduler: str = "threads"
@@ -135,8 +138,9 @@ class StackJob:
         run_stack(
             self.shots,
             self.out,
-            source=self._source(should_stop),
+            source=self.source,
             mask=self.mask,
+            filters=() if self.cleaning is None else (self.cleaning,),
             options=self.options,
             setup=self.setup,
             scheduler=self.scheduler,
@@ -158,70 +162,3 @@ class StackJob:
         for index in np.flatnonzero(store.statuses() == FAILED):
             reason = str(store.report(int(index)).get("reason", "unknown"))
             self.books.failures.append((store.names[index], reason))
-
-    def _source(self, should_stop: ShouldStop) -> Any:
-        if isinstance(self.source, UniformEstimate):
-            return None
-        if isinstance(self.source, Estimate):
-            return _estimates(self.shots, self.source, self.mask, _Here(should_stop))
-        return self.source
-
-
-def _estimates(shots: Any, estimate: Estimate, mask: Mask | None, should_stop: ShouldStop) -> Any:
-    """Source of each shot, guessed when the shot's turn comes; an xarray.DataArray."""
-    import xarray as xr
-
-    from napari_shadowinv._napari.lazy import lazy_stack
-    from napari_shadowinv.stack._shots import find_shots
-
-    found = find_shots(shots)
-    estimating = _Estimating(estimate, mask, should_stop)
-    if found.array is None:
-        sources = lazy_stack(estimating.of_shot, found.items, found.shape)
-    else:
-        sources = found.array.map_blocks(
-            estimating.of_block, dtype=np.float64, meta=np.empty((0, 0, 0))
-        )
-    # The store tells by these names whether it goes on with the same estimate.
-    values = ", ".join(f"{name} {value}" for name, value in estimate.model_dump().items())
-    how = f"{estimate.title} ({values})" if values else estimate.title
-    names = [f"{how} of {name}" for name in found.names]
-    return xr.DataArray(sources, dims=("shot", "y", "x"), coords={"shot": names})
-
-
-class _Here:
-    """Asks whether to stop in this process; a worker elsewhere gets a copy that never does."""
-
-    def __init__(self, should_stop: ShouldStop) -> None:
-        self._should_stop = should_stop
-
-    def __call__(self) -> bool:
-        return self._should_stop()
-
-    def __reduce__(self) -> tuple[type[_Here], tuple[ShouldStop]]:
-        return _Here, (_never,)
-
-
-def _never() -> bool:
-    return False
-
-
-@dataclass(frozen=True, eq=False)
-class _Estimating:
-    """Guesses sources on a worker, which has neither napari nor Qt."""
-
-    estimate: Estimate
-    mask: Mask | None
-    should_stop: ShouldStop
-
-    def of_block(self, block: NDArray[Any]) -> Image:
-        return np.stack([self._of_image(image) for image in block])
-
-    def of_shot(self, shot: Any) -> Image:
-        return self._of_image(np.asarray(shot.load()[0]))
-
-    def _of_image(self, image: NDArray[Any]) -> Image:
-        usable = image if self.mask is None else np.where(self.mask, image, 0)
-        # What an inversion would clip must not spoil the estimate.
-        clipped = np.maximum(usable, 0).astype(np.float64)
-        return self.estimate.source(clipped, self.mask, self.should_stop)

@@ -15,9 +15,9 @@ from napari_shadowinv._napari.widgets._masks import MaskPicker
 from napari_shadowinv._napari.widgets._panels import RunPanel
 from napari_shadowinv._napari.widgets._picking import LayerPicker, LayerWatch
 from napari_shadowinv._napari.widgets._reading import image_of
-from napari_shadowinv._napari.widgets._recipes import ESTIMATES
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv.progress import OnProgress, ShouldStop
+from napari_shadowinv.recipes import ESTIMATES
 
 if TYPE_CHECKING:
     import napari

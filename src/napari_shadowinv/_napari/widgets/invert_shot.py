@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.marks import Result, role_of
 from napari_shadowinv._napari.widgets._base import Part, with_button
+from napari_shadowinv._napari.widgets._cleaning import CleaningSection
 from napari_shadowinv._napari.widgets._drawing import new_shapes
 from napari_shadowinv._napari.widgets._estimating import SourceCache
-from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
+from napari_shadowinv._napari.widgets._forms import labelled
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
 from napari_shadowinv._napari.widgets._live import LivePanel
 from napari_shadowinv._napari.widgets._masks import MaskPicker
@@ -19,7 +20,6 @@ from napari_shadowinv._napari.widgets._options import OptionsForm
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, report_rows, section
 from napari_shadowinv._napari.widgets._picking import LayerPicker, LayerWatch
 from napari_shadowinv._napari.widgets._reading import crop_of, image_of
-from napari_shadowinv._napari.widgets._recipes import FILTERS
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together, result_frame
 from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._sources import SourcePicker
@@ -101,10 +101,7 @@ class InvertShot(LivePanel):
         self.crop = LayerPicker(viewer, ("shapes",), none="none")
         self.crop.setToolTip("<qt>A rectangle in a shapes layer: only that part is inverted.</qt>")
         self.setup = SetupPicker()
-        self.cleaning = ModelPicker(
-            "Filter",
-            {"none": ("nothing", None), **kinds_of(FILTERS)},
-        )
+        self.cleaning = CleaningSection()
         self.options = OptionsForm()
         self.live.setToolTip(
             f"<qt>The field follows every change, with at most {PREVIEW_SITES:,} sites.</qt>"
@@ -117,10 +114,9 @@ class InvertShot(LivePanel):
             self.masks,
             labelled("Crop", with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)),
             self.setup,
+            self.cleaning,
         ):
             self.column.addWidget(row)
-        self._cleaning_section = section("", self.cleaning)
-        self.column.addWidget(self._cleaning_section)
         self.column.addWidget(section("Options", self.options))
         for widget in (self.live, self.panel, self.report):
             self.column.addWidget(widget)
@@ -159,7 +155,7 @@ class InvertShot(LivePanel):
             source=self.source.source(layer),
             mask=self.masks.usable(layer),
             crop=crop_of(self.crop.layer, layer),
-            cleaning=self.cleaning.model(),  # type: ignore[arg-type]
+            cleaning=self.cleaning.model(),
             options=self.options.model(),  # type: ignore[arg-type]
             cache=self._cache,
             estimates=self._estimates,
@@ -174,13 +170,6 @@ class InvertShot(LivePanel):
             result_frame(layer, setup, job.crop),
             preview,
         )
-
-    def on_change(self) -> None:
-        # A filter must not work unseen in a folded section.
-        title = f"Filter first: {self.cleaning.choice.currentText()}"
-        if self._cleaning_section.text() != title:
-            self._cleaning_section.setText(title)
-        super().on_change()
 
     def show_result(self, value: _Answer, request: _Request) -> None:
         image = request.image

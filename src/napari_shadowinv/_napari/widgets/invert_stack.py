@@ -13,6 +13,7 @@ from qtpy.QtWidgets import QCheckBox, QLabel
 from napari_shadowinv._napari.leafing import follow_shots
 from napari_shadowinv._napari.marks import role_of
 from napari_shadowinv._napari.widgets._base import Part, ToolPanel
+from napari_shadowinv._napari.widgets._cleaning import CleaningSection
 from napari_shadowinv._napari.widgets._forms import labelled
 from napari_shadowinv._napari.widgets._masks import MaskPicker
 from napari_shadowinv._napari.widgets._messages import reporting
@@ -80,6 +81,7 @@ class InvertStack(ToolPanel):
             "Labels that mark pixels of the detector, in all shots.",
         )
         self.setup = SetupPicker()
+        self.cleaning = CleaningSection()
         self.options = OptionsForm()
         self.store = StoreEdit()
         self.overwrite = QCheckBox("overwrite what the store holds")
@@ -95,6 +97,7 @@ class InvertStack(ToolPanel):
             self.source,
             self.masks,
             self.setup,
+            self.cleaning,
             section("Options", self.options),
             labelled("Store", self.store),
             labelled("", self.overwrite),
@@ -111,6 +114,7 @@ class InvertStack(ToolPanel):
         for signal in (
             self.source.changed,
             self.setup.changed,
+            self.cleaning.changed,
             self.options.changed,
             self.engine.changed,
             self.masks.changed,
@@ -126,6 +130,7 @@ class InvertStack(ToolPanel):
         return {
             "source": self.source,
             "setup": self.setup,
+            "cleaning": self.cleaning,
             "options": self.options,
             "engine": self.engine,
             "painted_is_unusable": self.masks,
@@ -147,6 +152,7 @@ class InvertStack(ToolPanel):
             out=self.store.store,
             source=self._source(layer),
             mask=self.masks.usable(layer),
+            cleaning=self.cleaning.model(),
             options=self.options.model(),  # type: ignore[arg-type]
             setup=setup,
             scheduler=scheduler,

@@ -1,6 +1,6 @@
 """What is to be done to an image before it is inverted: filters, and an estimate of its source.
 
-- the choices, from flags and the table ``[prepare]`` of an options file: `preparation_from`
+- the choices, from flags and the table ``[prepare]`` of an options file: `choices_from`
 - apply them: `napari_shadowinv.cli._preparing`
 """
 
@@ -14,19 +14,27 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import read_toml
+from napari_shadowinv.recipes import (
+    ESTIMATES,
+    BackgroundFilter,
+    Estimate,
+    Filter,
+    HighPassFilter,
+    LowPassFilter,
+)
 from napari_shadowinv.validation import validated
 
-__all__ = ["KEYWORDS", "TABLE", "Estimate", "Preparation", "preparation_from"]
+__all__ = ["TABLE", "Choices", "choices_from"]
 
 TABLE = "prepare"
 """Name of the table in an options file."""
 
-Estimate = Literal[
+_EstimateName = Literal[
     "uniform", "gaussian", "polynomial", "low-pass", "total-variation", "interpolated"
 ]
 
 
-class Preparation(BaseModel):
+class Choices(BaseModel):
     """Choices before an inversion; what is None is not done, or left to the function's default."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -59,7 +67,7 @@ class Preparation(BaseModel):
         title="Width of the low pass (px)",
         description="Image and source are blurred by a Gaussian of this standard deviation.",
     )
-    source_from: Estimate | None = Field(
+    source_from: _EstimateName | None = Field(
         default=None, title="Source from", description="How the source is guessed from the image."
     )
     source_degree: int | None = Field(
@@ -89,33 +97,55 @@ class Preparation(BaseModel):
         """Whether the beam is taken out of the image."""
         return self.background_degree is not None or self.high_pass is not None
 
+    def filters(self) -> tuple[Filter, ...]:
+        """Filters after pixels were summed, in their order."""
+        chosen: list[Filter] = []
+        if self.background_degree is not None:
+            chosen.append(BackgroundFilter(degree=self.background_degree))
+        if self.high_pass is not None:
+            chosen.append(HighPassFilter(width=self.high_pass))
+        if self.low_pass is not None:
+            chosen.append(LowPassFilter(width=self.low_pass))
+        return tuple(chosen)
 
-KEYWORDS: dict[str, tuple[str, tuple[Estimate, ...]]] = {
+    def estimate(self) -> Estimate | None:
+        """How the source is guessed."""
+        if self.source_from is None:
+            return None
+        parameters = {_KEYWORDS[name][0]: value for name, value in self.parameters().items()}
+        return ESTIMATES[self.source_from.replace("-", "_")](**parameters)
+
+    def parameters(self) -> dict[str, Any]:
+        """What was chosen for the estimate, by name."""
+        return {name: getattr(self, name) for name in _KEYWORDS if getattr(self, name) is not None}
+
+
+_KEYWORDS: dict[str, tuple[str, tuple[_EstimateName, ...]]] = {
     "source_degree": ("degree", ("polynomial",)),
     "source_weight": ("weight", ("total-variation",)),
     "source_width": ("width", ("low-pass", "interpolated")),
 }
-"""The keyword of an estimate's function for each parameter, and which estimates take it."""
+"""The keyword of an estimate for each parameter, and which estimates take it."""
 
 
-def preparation_from(
+def choices_from(
     path: Path | None, flags: Mapping[str, Any], *, has_source: bool, has_source_mask: bool
-) -> Preparation:
+) -> Choices:
     """Choices from an options file's table, with flags on top, that make sense together."""
     where = "options" if path is None else f"{path}, table [{TABLE}]"
     chosen = {} if path is None else read_toml(path).get(TABLE, {})
     if isinstance(chosen, Mapping):
         chosen = {**chosen, **flags}
-    preparation = validated(Preparation, chosen, where)
-    _check(preparation, has_source, has_source_mask)
-    return preparation
+    choices = validated(Choices, chosen, where)
+    _check(choices, has_source, has_source_mask)
+    return choices
 
 
 def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def _check(chosen: Preparation, has_source: bool, has_source_mask: bool) -> None:
+def _check(chosen: Choices, has_source: bool, has_source_mask: bool) -> None:
     """Refuse choices that contradict each other, before any work."""
     if has_source and chosen.source_from is not None:
         raise InputError(
@@ -127,7 +157,7 @@ def _check(chosen: Preparation, has_source: bool, has_source_mask: bool) -> None
             f"received --source and {_flag(name)}: what flattens the image takes the beam out of "
             "it, which the source still has; leave one of them out"
         )
-    for name, (_, estimates) in KEYWORDS.items():
+    for name, (_, estimates) in _KEYWORDS.items():
         if getattr(chosen, name) is not None and chosen.source_from not in estimates:
             wanted = " or ".join(f"--source-from {estimate}" for estimate in estimates)
             raise InputError(f"received {_flag(name)}: it needs {wanted}")

@@ -1,30 +1,52 @@
-"""Source estimates and filters with their parameters: what a form can show.
+"""Source estimates and filters together with their parameters, to keep, show and hand on.
 
-- how to guess the source: `ESTIMATES`
-- how to clean the image beforehand: `FILTERS`
+- guess the source: `UniformEstimate`, `GaussianEstimate`, `PolynomialEstimate`,
+  `LowPassEstimate`, `TotalVariationEstimate`, `InterpolatedEstimate`; by name: `ESTIMATES`
+- clean the image beforehand: `LowPassFilter`, `HighPassFilter`, `BackgroundFilter`,
+  `HotPixelFilter`; by name: `FILTERS`
 
-Each is a pydantic model, named after the function that does it and with fields that are its
-keywords. Defaults are those of the function, wherever it has one.
+Each is a pydantic model whose fields are keywords of a function in `napari_shadowinv.sources` or
+`napari_shadowinv.filters`. Defaults are those of the function, wherever it has one.
+
+Examples
+--------
+>>> LowPassEstimate(width=20).described
+'blurred shot, width 20.0'
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from napari_shadowinv.progress import ShouldStop
 
-    Image = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
+__all__ = [
+    "ESTIMATES",
+    "FILTERS",
+    "BackgroundFilter",
+    "Estimate",
+    "Filter",
+    "GaussianEstimate",
+    "HighPassFilter",
+    "HotPixelFilter",
+    "InterpolatedEstimate",
+    "LowPassEstimate",
+    "LowPassFilter",
+    "PolynomialEstimate",
+    "TotalVariationEstimate",
+    "UniformEstimate",
+    "without_masked",
+]
 
-__all__ = ["ESTIMATES", "FILTERS", "Estimate", "Filter"]
+Image = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 class _Recipe(BaseModel):
@@ -34,6 +56,11 @@ class _Recipe(BaseModel):
     title: ClassVar[str]
     function: ClassVar[str]
 
+    @property
+    def described(self) -> str:
+        """Title and parameters, the same for the same choices."""
+        return ", ".join([self.title, *(f"{name} {value}" for name, value in self)])
+
 
 class Estimate(_Recipe):
     """A way to guess the undisturbed beam from the shot."""
@@ -41,7 +68,28 @@ class Estimate(_Recipe):
     def source(
         self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
     ) -> Image:
-        """Estimate the source by a function of `napari_shadowinv.sources`."""
+        """Estimate the source by a function of `napari_shadowinv.sources`.
+
+        Parameters
+        ----------
+        image : ndarray, shape (H, W)
+            The shot.
+        mask : ndarray of bool, shape (H, W), or None
+            The pixels to look at.
+        should_stop : callable, optional
+            Asked now and then by estimates that take long.
+
+        Returns
+        -------
+        ndarray, shape (H, W)
+
+        Raises
+        ------
+        InputError
+            If the image cannot be used.
+        InversionCancelled
+            If `should_stop` returned true.
+        """
         from napari_shadowinv import sources
 
         estimated: Image = getattr(sources, self.function)(
@@ -50,7 +98,7 @@ class Estimate(_Recipe):
         return estimated
 
     def coarser(self, factor: int) -> Estimate:
-        """The same for an image with pixels `factor` times as large."""
+        """Return the same for an image with pixels `factor` times as large."""
         lengths = {
             name: getattr(self, name) / factor
             for name, field in type(self).model_fields.items()
@@ -60,20 +108,42 @@ class Estimate(_Recipe):
 
 
 class Filter(_Recipe):
-    """Something done to the image before its inversion."""
+    """Something done to the image before its inversion.
+
+    Attributes
+    ----------
+    flattens : bool
+        Whether it takes the beam out of the image, so that a measured source fits no more.
+    """
+
+    flattens: ClassVar[bool] = False
 
     def filtered(
         self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
     ) -> Image:
-        """Apply it, so that what is masked, even NaN, does not touch the rest."""
-        import numpy as np
+        """Apply it, so that what is masked, even NaN, does not touch the rest.
 
-        from napari_shadowinv.sources import interpolated_source
+        Parameters
+        ----------
+        image : ndarray, shape (H, W)
+            The shot.
+        mask : ndarray of bool, shape (H, W), or None
+            The pixels that can be used.
+        should_stop : callable, optional
+            Asked now and then by filters that take long.
 
-        if mask is not None and mask.any() and not mask.all():
-            around = interpolated_source(image, mask, should_stop=should_stop)
-            image = np.where(mask, image, around)
-        return self._applied(image, mask, should_stop)
+        Returns
+        -------
+        ndarray, shape (H, W)
+
+        Raises
+        ------
+        InputError
+            If the image cannot be used.
+        InversionCancelled
+            If `should_stop` returned true.
+        """
+        return self._applied(without_masked(image, mask, should_stop), mask, should_stop)
 
     def _applied(self, image: Image, mask: Mask | None, should_stop: ShouldStop | None) -> Image:
         """Apply a function of `napari_shadowinv.filters`."""
@@ -81,6 +151,25 @@ class Filter(_Recipe):
 
         result: Image = getattr(filters, self.function)(image, **self.model_dump())
         return result
+
+
+def without_masked(image: Image, mask: Mask | None, should_stop: ShouldStop | None = None) -> Image:
+    """Fill in masked pixels from around them, so that nothing of them leaks out.
+
+    Parameters
+    ----------
+    image, mask, should_stop
+        See `Filter.filtered`.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+    """
+    if mask is None or mask.all() or not mask.any():
+        return image
+    from napari_shadowinv.sources import interpolated_source
+
+    return np.where(mask, image, interpolated_source(image, mask, should_stop=should_stop))
 
 
 def _degree(description: str) -> Any:
@@ -193,8 +282,7 @@ class InterpolatedEstimate(Estimate):
     ) -> Image:
         if mask is None:
             raise InputError(
-                "this estimate fills in what the mask marks: choose a mask layer that covers "
-                "the object"
+                "this estimate fills in what the mask marks: choose a mask that covers the object"
             )
         return super().source(image, mask, should_stop)
 
@@ -210,6 +298,7 @@ class LowPassFilter(Filter):
 class HighPassFilter(Filter):
     """Take away large structures."""
 
+    flattens = True
     title = "high-pass"
     function = "high_pass"
     width: float = _width(
@@ -220,6 +309,7 @@ class HighPassFilter(Filter):
 class BackgroundFilter(Filter):
     """Flatten by a polynomial."""
 
+    flattens = True
     title = "flatten (polynomial)"
     function = "remove_background"
     degree: int = _degree(" that is taken out of the image.")

@@ -1,0 +1,181 @@
+"""Filters of shots, and sources that are guessed from them."""
+
+from __future__ import annotations
+
+import functools
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from conftest import OPTIONS
+from napari_shadowinv import InputError, invert, invert_stack, read, run_stack
+from napari_shadowinv.cli import app
+from napari_shadowinv.filters import high_pass, low_pass, remove_hot_pixels
+from napari_shadowinv.io.store import DONE
+from napari_shadowinv.recipes import (
+    HighPassFilter,
+    HotPixelFilter,
+    LowPassEstimate,
+    LowPassFilter,
+    PolynomialEstimate,
+    UniformEstimate,
+)
+from napari_shadowinv.sources import polynomial_source
+from napari_shadowinv.stack import read_shot
+
+FILTERS = (HotPixelFilter(), LowPassFilter(width=0.8))
+
+
+@pytest.fixture
+def bare(night) -> np.ndarray:
+    """Where the blobs of a night never are."""
+    y, x = np.mgrid[:24, :28]
+    return np.hypot(y - 10, x - 14) > 8
+
+
+@pytest.fixture
+def usable() -> np.ndarray:
+    mask = np.ones((24, 28), bool)
+    mask[:3, :4] = False
+    return mask
+
+
+def alone(image, usable, bare):
+    """One shot as a stack does it, by the functions themselves."""
+    # Far from the object the masked corner hides nothing that counts.
+    clean = LowPassFilter(width=0.8).filtered(HotPixelFilter().filtered(image, usable), usable)
+    source = polynomial_source(clean, degree=1, mask=usable & bare)
+    return invert(clean, source=source, mask=usable, options=OPTIONS)
+
+
+def test_sources_are_guessed_from_filtered_shots(night, out, bare, usable):
+    shots = night.images.copy()
+    shots[:, 12, 20] = 900
+    shots[:, ~usable] = np.nan
+    arguments = {
+        "source": PolynomialEstimate(degree=1),
+        "source_mask": bare,
+        "mask": usable,
+        "filters": FILTERS,
+        "options": OPTIONS,
+        "variables": ("potential", "source", "weights"),
+    }
+    written = run_stack(shots, out, **arguments, dtype="float64")
+    lazy = invert_stack(shots, **arguments)
+    assert (written.status == DONE).all()
+    for index in (0, 3):
+        expected = alone(shots[index], usable, bare)
+        for name in ("potential", "source", "weights"):
+            values = getattr(expected, name)
+            np.testing.assert_array_equal(written[name][index], values)
+            np.testing.assert_array_equal(lazy[name][index].compute(), values)
+    assert written.attrs["source_image"] == ("guessed from each shot: fitted polynomial, degree 1")
+    told = "remove hot pixels, threshold 6.0; low-pass (smooth), width 0.8"
+    assert written.attrs["filters"] == lazy.attrs["filters"] == told
+
+
+def test_a_measured_source_is_blurred_as_its_shots(night, out):
+    blur = (LowPassFilter(width=1.0),)
+    expected = invert(
+        low_pass(night.images[1], 1.0), source=low_pass(night.source, 1.0), options=OPTIONS
+    )
+    sources = np.stack([night.source] * 6)
+    for source in (night.source, sources):
+        stack = invert_stack(night.images, source=source, filters=blur, options=OPTIONS)
+        np.testing.assert_array_equal(stack.potential[1].compute(), expected.potential)
+        np.testing.assert_array_equal(stack.source.values.reshape(-1, 24, 28)[0], expected.source)
+
+
+def test_a_uniform_beam_is_shared_and_may_be_flattened(night):
+    flatten = (HighPassFilter(width=9.0),)
+    stack = invert_stack(night.images, source=UniformEstimate(), filters=flatten, options=OPTIONS)
+    assert stack.sites.dims == ("site", "component")
+    expected = invert(high_pass(night.images[2], 9.0), options=OPTIONS)
+    np.testing.assert_allclose(stack.potential[2].compute(), expected.potential, rtol=0, atol=1e-9)
+
+
+def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare):
+    begun = {
+        "source": LowPassEstimate(width=6),
+        "source_mask": bare,
+        "filters": (LowPassFilter(width=1),),
+    }
+    night.run(out, **begun)
+    assert (night.run(out, **begun).status == DONE).all()
+    for change, named in (
+        ({"filters": (LowPassFilter(width=1.5),)}, "another filters .low-pass .smooth., width 1.0"),
+        ({"filters": ()}, "another filters"),
+        ({"source": LowPassEstimate(width=7)}, "another source image"),
+        ({"source": None, "source_mask": None}, "another source image"),
+        ({"source_mask": ~bare}, "another source mask image"),
+    ):
+        with pytest.raises(InputError, match=named):
+            night.run(out, **{**begun, **change})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"filters": (HighPassFilter(),)}, "takes the beam out of the image"),
+        ({"source_mask": np.eye(24, 28) > 0}, "got a source mask"),
+        ({"source": LowPassEstimate(width=6), "warm_start": 2}, "a source of its own"),
+        ({"source": np.ones((6, 24, 28)), "warm_start": 2}, "a source of its own"),
+        (
+            {"source": LowPassEstimate(width=6), "source_mask": np.ones((3, 3), bool)},
+            r"mask has shape \(3, 3\)",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_anything_is_made(night, out, arguments, named):
+    with pytest.raises(InputError, match=named):
+        night.run(out, **arguments)
+    assert not out.exists()
+
+
+def test_an_estimate_that_cannot_be_made_fails_its_shot_alone(night, out):
+    spoilt = night.images.copy()
+    spoilt[2] = 0
+    written = run_stack(spoilt, out, source=LowPassEstimate(width=6), options=OPTIONS)
+    assert list(written.status) == [1, 1, 2, 1, 1, 1]
+
+
+def test_hot_pixels_are_replaced_before_pixels_are_summed(tmp_path):
+    image = 100 + np.random.default_rng(0).normal(size=(40, 40))
+    image[7, 9] = 4000
+    np.save(tmp_path / "shot.npy", image)
+    clean = remove_hot_pixels(image, threshold=6.0)[0]
+    reader = functools.partial(read_shot, factor=2, hot_pixels=6.0)
+    expected = clean.reshape(20, 2, 20, 2).sum(axis=(1, 3))
+    np.testing.assert_allclose(reader(tmp_path / "shot.npy"), expected, rtol=1e-12)
+
+
+def test_a_batch_prepares_its_shots_as_an_inversion_of_one(
+    night, tmp_path, monkeypatch, bare, usable
+):
+    monkeypatch.chdir(tmp_path)
+    iio.imwrite("bare.png", bare.astype(np.uint8))
+    iio.imwrite("usable.png", usable.astype(np.uint8))
+    (tmp_path / "options.toml").write_text(
+        'n_sites = 100\n[prepare]\nsource_from = "polynomial"\nsource_degree = 1\n'
+    )
+    same = [
+        "--options", "options.toml", "--mask", "usable.png", "--source-mask", "bare.png",
+        "--low-pass", "0.8", "--hot-pixels", "6", "--bin", "2", "--quiet",
+    ]  # fmt: skip
+    out = ["--out", "n.shadowinv.zarr", "--scheduler", "threads"]
+    shot = str(night.path(1))
+    for command in (["batch", night.glob, *out], ["invert", shot, "--out", "one.shadowinv"]):
+        result = CliRunner().invoke(app, [*command, *same])
+        assert result.exit_code == 0, result.output
+    stack, one = read("n.shadowinv.zarr"), read("one.shadowinv")
+    np.testing.assert_array_equal(stack.potential[1], one.potential.astype(np.float32))
+    told = " ".join(CliRunner().invoke(app, ["status", "n.shadowinv.zarr"]).output.split())
+    assert "guessed from each shot: fitted polynomial, degree 1" in told
+    assert "low-pass (smooth), width 0.8" in told
+    refused = CliRunner().invoke(
+        app, ["batch", night.glob, "--source", shot, "--source-from", "gaussian", *out]
+    )
+    assert refused.exit_code == 2
+    assert "choose one of them" in " ".join(refused.output.split())
