@@ -7,10 +7,11 @@ import functools
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from scipy.io import savemat
 from typer.testing import CliRunner
 
 from conftest import OPTIONS
-from napari_shadowinv import InputError, invert, invert_stack, read, run_stack
+from napari_shadowinv import InputError, InversionOptions, invert, invert_stack, read, run_stack
 from napari_shadowinv.cli import app
 from napari_shadowinv.filters import high_pass, low_pass, remove_hot_pixels
 from napari_shadowinv.io.store import DONE
@@ -149,6 +150,25 @@ def test_hot_pixels_are_replaced_before_pixels_are_summed(tmp_path):
     reader = functools.partial(read_shot, factor=2, hot_pixels=6.0)
     expected = clean.reshape(20, 2, 20, 2).sum(axis=(1, 3))
     np.testing.assert_allclose(reader(tmp_path / "shot.npy"), expected, rtol=1e-12)
+
+
+def test_arrays_of_matlab_files_and_a_free_boundary(night, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for index, image in enumerate(night.images[:2]):
+        savemat(f"shot_{index}.mat", {"shot": image, "dark": 0 * image, "beam": night.source})
+    flags = ["--n-sites", "100", "--boundary", "free", "--margin", "5", "--flux", "known"]
+    batch = ["batch", "shot_*.mat", "--scheduler", "threads", "--quiet", *flags]
+    result = CliRunner().invoke(app, [*batch, "--variable", "shot", "--out", "n.shadowinv.zarr"])
+    assert result.exit_code == 0, result.output
+    options = InversionOptions(n_sites=100, boundary="free", margin=5, flux="known")
+    image = night.images[1] / night.images[1].mean()
+    expected = invert(image, source=np.ones_like(image), options=options)
+    np.testing.assert_allclose(
+        read("n.shadowinv.zarr").potential[1], expected.potential, rtol=1e-6, atol=1e-6
+    )
+    refused = CliRunner().invoke(app, [*batch[:5], "--margin", "5", "--out", "m.shadowinv.zarr"])
+    assert refused.exit_code == 2
+    assert "--margin: it needs --boundary free" in " ".join(refused.output.split())
 
 
 def test_a_batch_prepares_its_shots_as_an_inversion_of_one(

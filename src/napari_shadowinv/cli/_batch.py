@@ -84,6 +84,7 @@ def run_batch(
     source_mask: Path | None,
     factor: int,
     channel: str | None,
+    variable: str | None,
     variables: str | None,
     warm_start: int,
     scheduler: str | None,
@@ -101,6 +102,8 @@ def run_batch(
     ledger = _Ledger()
     geometry = None if setup is None else binned_setup(setup_from(setup), factor)
     reader = functools.partial(read_shot, channel=channel, factor=factor)
+    if variable is not None:
+        reader = functools.partial(reader, variable=variable)
     if choices.hot_pixels is not None:
         reader = functools.partial(reader, hot_pixels=choices.hot_pixels)
     estimate = choices.estimate()

@@ -10,12 +10,15 @@ import typer
 from napari_shadowinv.cli._flags import (
     BackgroundDegree,
     Bin,
+    Boundary,
     Channel,
     ChosenShots,
     ClipNegative,
+    Flux,
     HighPass,
     HotPixels,
     LowPass,
+    Margin,
     OptionsFile,
     Overwrite,
     Quiet,
@@ -27,10 +30,11 @@ from napari_shadowinv.cli._flags import (
     SourceWeight,
     SourceWidth,
     StoreFolder,
+    Variable,
     given,
 )
 from napari_shadowinv.cli._guard import guarded
-from napari_shadowinv.cli._inputs import options_from
+from napari_shadowinv.cli._inputs import check_margin, options_from
 from napari_shadowinv.cli._tables import say
 
 BATCH_EPILOG = """
@@ -72,6 +76,7 @@ def batch(
     n_sites: SiteCount = None,
     bin_: Bin = 1,
     channel: Channel = None,
+    variable: Variable = None,
     clip_negative: ClipNegative = False,
     variables: Annotated[
         str | None,
@@ -100,6 +105,9 @@ def batch(
         bool, typer.Option("--redo-failed", help="As --resume, and try failed shots again.")
     ] = False,
     quiet: Quiet = False,
+    boundary: Boundary = None,
+    margin: Margin = None,
+    flux: Flux = None,
     source_from: SourceFrom = None,
     source_degree: SourceDegree = None,
     source_weight: SourceWeight = None,
@@ -114,7 +122,10 @@ def batch(
     from napari_shadowinv.cli._batch import run_batch
     from napari_shadowinv.cli._choices import TABLE, choices_from
 
-    chosen = given(
+    transport = given(n_sites=n_sites, boundary=boundary, margin=margin, flux=flux)
+    chosen = options_from(options, transport, clip_negative, other_tables=(TABLE,))
+    check_margin(margin, chosen)
+    preparing = given(
         hot_pixels=hot_pixels,
         background_degree=background_degree,
         high_pass=high_pass,
@@ -130,16 +141,17 @@ def batch(
         source=source,
         mask=mask,
         setup=setup,
-        options=options_from(options, given(n_sites=n_sites), clip_negative, other_tables=(TABLE,)),
+        options=chosen,
         choices=choices_from(
             options,
-            chosen,
+            preparing,
             has_source=source is not None,
             has_source_mask=source_mask is not None,
         ),
         source_mask=source_mask,
         factor=bin_,
         channel=channel,
+        variable=variable,
         variables=variables,
         warm_start=warm_start,
         scheduler=scheduler,

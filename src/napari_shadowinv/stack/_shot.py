@@ -50,6 +50,7 @@ def read_shot(
     *,
     page: int | None = None,
     channel: str | int | None = None,
+    variable: str | None = None,
     factor: int = 1,
     hot_pixels: float | None = None,
 ) -> NDArray[np.float64]:
@@ -63,6 +64,8 @@ def read_shot(
         Of a TIFF with many pages.
     channel : {"red", "green", "blue", "mean"} or int, optional
         What to take of a colour image.
+    variable : str, optional
+        Name of the array in a MATLAB or HDF5 file.
     factor : int, optional
         Sum blocks of so many pixels squared.
     hot_pixels : float, optional
@@ -83,7 +86,7 @@ def read_shot(
     from napari_shadowinv.io.reading import read_radiograph
 
     if page is None:
-        shot = read_radiograph(path, channel=channel)
+        shot = read_radiograph(path, channel=channel, variable=variable)
     else:
         shot = Radiograph(read_tiff_page(path, page, channel=channel))
     if hot_pixels is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import subprocess
 import sys
 import threading
@@ -18,7 +19,7 @@ import pytest
 from napari.utils import progress
 from qtpy.QtCore import QTimer
 
-from napari_shadowinv import InversionOptions, ProtonSetup, invert
+from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.marks import mark, result_of, role_of, unit_of
 from napari_shadowinv._napari.widgets import _runner
@@ -248,6 +249,29 @@ def test_crop_mask_and_source_are_used(
     tool.source.picker.set_kind("low_pass")
     estimated = computed(tool).source
     assert 0 < estimated.std() < 0.2 * estimated.mean()
+
+
+def test_a_saved_result_tells_how_it_was_made(
+    window: Any, tool: Any, shot: Array, run: Any, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "flame.npy", shot)
+    window.open(str(tmp_path / "flame.npy"), plugin="napari")
+    tool.image.layer = window.layers["flame"]
+    tool.cleaning.picker.set_kind("low_pass")
+    tool.source.picker.set_kind("polynomial")
+    tool.crop.layer = window.add_shapes(np.array([[4, 8], [4, 50], [40, 50], [40, 8]]))
+    run(tool)
+    window.layers.save(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
+    told = read(tmp_path / "a.shadowinv").attrs
+    assert told["input_file"] == "flame.npy"
+    assert json.loads(told["input_preparation"]) == {
+        "crop": {"y": [4, 41], "x": [8, 51]},
+        "low_pass": {"width": 1.0},
+    }
+    assert json.loads(told["source_preparation"]) == {
+        "source_from": "polynomial_source",
+        "degree": 2,
+    }
 
 
 def test_cancel_takes_effect_within_a_second(

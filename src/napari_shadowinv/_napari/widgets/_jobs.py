@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._napari.widgets._estimating import SourceCache, quick_source, same_array
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.files import text_of
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preparation import Preparation, as_beam
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
@@ -194,6 +196,24 @@ class ShotJob:
         spent = inversion.report.seconds
         seconds |= {stage: spent[stage] + seconds.get(stage, 0.0) for stage in spent}
         return replace(inversion, report=replace(inversion.report, seconds=seconds))
+
+    def attributes(self) -> dict[str, str]:
+        """What is done before the inversion, as `napari_shadowinv.io.dataset.provenance` tells."""
+        told: dict[str, str] = {}
+        done: dict[str, Any] = {}
+        if self.crop is not None:
+            rows, columns = self.crop
+            done["crop"] = {"y": [rows.start, rows.stop], "x": [columns.start, columns.stop]}
+        if self.cleaning is not None:
+            done[self.cleaning.function] = self.cleaning.model_dump()
+        if done:
+            told["input_preparation"] = json.dumps(done)
+        if isinstance(self.source, Estimate):
+            guess = {"source_from": self.source.function, **self.source.model_dump()}
+            told["source_preparation"] = json.dumps(guess)
+        elif isinstance(self.source, Path):
+            told["source_file"] = text_of(self.source.name)
+        return told
 
     def _image_and_mask(self) -> tuple[Image, Mask | None]:
         image = plane_of(self.image, "the image")

@@ -20,9 +20,9 @@ from napari_shadowinv._napari.widgets._picking import kind_of
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
 
-_VISIBLE = 0.02
-
 __all__ = ["ResultLayers", "place_together", "result_frame"]
+
+_VISIBLE = 0.02  # of what limits span
 
 
 def result_frame(image: Any, setup: Any | None, crop: tuple[slice, slice] | None) -> Frame:

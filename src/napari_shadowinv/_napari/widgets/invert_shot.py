@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.frame import Frame
@@ -23,6 +24,7 @@ from napari_shadowinv._napari.widgets._reading import crop_of, image_of
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together, result_frame
 from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._sources import SourcePicker
+from napari_shadowinv.io.files import text_of
 from napari_shadowinv.progress import OnProgress, ShouldStop
 
 if TYPE_CHECKING:
@@ -58,7 +60,10 @@ class _Request:
         from napari_shadowinv._napari.layers import result_layers
 
         name = f"{self.image.name} preview" if self.preview else self.image.name
-        described = result_layers(Result(inversion, self.setup), self.frame, name)
+        file = self.image.source.path
+        told = {} if file is None else {"input_file": text_of(Path(file).name)}
+        result = Result(inversion, self.setup, {**told, **self.job.attributes()})
+        described = result_layers(result, self.frame, name)
         if self.preview:
             described = [layer for layer in described if role_of(layer[1]) in _PREVIEW_ROLES]
         return _Answer(inversion, described)
