@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.recipes import Estimate, Filter
+from napari_shadowinv.recipes import Estimate, Filter, InterpolatedEstimate
 
 if TYPE_CHECKING:
     from napari_shadowinv.progress import ShouldStop
@@ -47,24 +47,31 @@ class Preparation:
         """Titles and parameters of the filters; empty if there are none."""
         return "; ".join(one.described for one in self.filters)
 
-    def check(self, *, has_source: bool) -> None:
+    def check(self, *, has_source: bool, has_mask: bool) -> None:
         """Refuse what contradicts itself, before any work.
 
         Parameters
         ----------
         has_source : bool
             Whether there is a measured source.
+        has_mask : bool
+            Whether there is a mask of usable pixels.
 
         Raises
         ------
         InputError
-            If there is one though the image is flattened, or no mask for what needs one.
+            If there is a source though the image is flattened, or no mask for what needs one.
         """
         flattening = [one.described for one in self.filters if one.flattens]
         if has_source and flattening:
             raise InputError(
                 f"got a source and the filter {flattening[0]}, which takes the beam out of the "
                 "image while the source still has it: leave one of them out"
+            )
+        if isinstance(self.estimate, InterpolatedEstimate) and self.bare is None and not has_mask:
+            raise InputError(
+                f"got the estimate {self.estimate.described} without a mask: it fills in what a "
+                "mask hides; give a source mask that is false where the object is"
             )
         if self.bare is not None and self.estimate is None:
             raise InputError(

@@ -307,6 +307,19 @@ def test_the_colour_scale_of_a_film_is_fixed(store):
         np.testing.assert_array_equal(frame[60:, bar], scaled[brightest][60:, bar])
 
 
+def test_a_gif_keeps_the_colours_of_its_scale(store):
+    from matplotlib import colormaps
+
+    from napari_shadowinv.plotting import in_few_colours, stack_frames
+
+    scale = colormaps["viridis"](np.linspace(0, 1, 1000), bytes=True)[None, :, :3]
+    # Half of the way to the next of 200 colours.
+    assert np.abs(in_few_colours(scale).astype(int) - scale).max() <= 3
+    assert shadowinv("movie", store, "-o", "film.gif").exit_code == 0
+    frames = [in_few_colours(frame) for frame in stack_frames(read(store))]
+    np.testing.assert_array_equal(iio.imread("film.gif"), frames)
+
+
 def test_without_its_package_mp4_is_refused_in_one_sentence(store, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     result = shadowinv("movie", store, "-o", "plume.mp4")

@@ -18,6 +18,7 @@ from napari_shadowinv.io.store import DONE
 from napari_shadowinv.recipes import (
     HighPassFilter,
     HotPixelFilter,
+    InterpolatedEstimate,
     LowPassEstimate,
     LowPassFilter,
     PolynomialEstimate,
@@ -121,6 +122,7 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
     [
         ({"filters": (HighPassFilter(),)}, "takes the beam out of the image"),
         ({"source_mask": np.eye(24, 28) > 0}, "got a source mask"),
+        ({"source": InterpolatedEstimate()}, "without a mask: it fills in"),
         ({"source": LowPassEstimate(width=6), "warm_start": 2}, "a source of its own"),
         ({"source": np.ones((6, 24, 28)), "warm_start": 2}, "a source of its own"),
         (

@@ -194,7 +194,7 @@ def write_movie(
         Number of frames.
     """
     from napari_shadowinv.io import check_output, replacing
-    from napari_shadowinv.plotting import stack_frames
+    from napari_shadowinv.plotting import in_few_colours, stack_frames
 
     check_output(out, overwrite, suffixes=(".mp4", ".gif"))
     protect_store(store, out)
@@ -204,6 +204,8 @@ def write_movie(
         raise InputError(f"rate is {rate:g}: expected more than 0 and at most 120 frames a second")
     dataset = opened(store, shots)
     frames = stack_frames(dataset, variable, limits=limits)
+    if out.suffix.lower() == ".gif":
+        frames = map(in_few_colours, frames)
     with replacing(out, overwrite) as temporary:
         return _write_frames(temporary, frames, rate)
 

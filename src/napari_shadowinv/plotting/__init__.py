@@ -2,7 +2,7 @@
 
 - all of one shot on a page: `report_figure`
 - fields side by side on one scale: `comparison_figure`
-- frames of a film of many shots: `stack_frames`
+- frames of a film of many shots: `stack_frames`, for a GIF also `in_few_colours`
 - write a figure, whole or not at all: `save_figure`
 - the field that an experimenter asks for, in a handy unit: `shown_fields`; the potential:
   `shown_potential`
@@ -12,12 +12,13 @@ disturb the figures of a notebook.
 """
 
 from napari_shadowinv.plotting._figures import comparison_figure, report_figure, save_figure
-from napari_shadowinv.plotting._movie import stack_frames
+from napari_shadowinv.plotting._movie import in_few_colours, stack_frames
 from napari_shadowinv.plotting._units import ShownField, shown_fields, shown_potential
 
 __all__ = [
     "ShownField",
     "comparison_figure",
+    "in_few_colours",
     "report_figure",
     "save_figure",
     "shown_fields",

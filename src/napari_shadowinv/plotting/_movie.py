@@ -1,8 +1,15 @@
-"""Frames of a film: one variable of a stack, shot after shot, on one colour scale."""
+"""Frames of a film: one variable of a stack, shot after shot, on one colour scale.
+
+- the frames: `stack_frames`
+- the same in the 256 colours that a GIF has: `in_few_colours`
+"""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,11 +23,14 @@ from napari_shadowinv.plotting._units import _prefix, image_scale
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["stack_frames"]
+__all__ = ["in_few_colours", "stack_frames"]
 
 _DOTS_PER_INCH = 120
 _OUTLIERS = 0.02  # share of the shots whose extremes may lie beyond the colour scale
 _UNITS_WITH_PREFIX = {"m", "rad", "T m", "V"}
+_COLOURS = "viridis"
+_GREYS = 56  # of the colours of a GIF, for what is written
+_LETTER, _LINE = 0.075, 0.15  # inches
 
 
 def stack_frames(
@@ -102,9 +112,11 @@ class _Frame:
 
         with rc_context(STYLE):
             grid = choose_grid(shape, 1, title=False)
+            lines = textwrap.wrap(label, max(12, int(grid.height / _LETTER)))
+            grid = replace(grid, right=grid.right + _LINE * (len(lines) - 1))
             self._figure, (panel,) = new_page(grid, image_scale(shape, setup), None)
             # Without values: the colour bar must not depend on the first shot.
-            panel.show(np.full(shape, limits[0]), "", label, "viridis", limits)
+            panel.show(np.full(shape, limits[0]), "", "\n".join(lines), _COLOURS, limits)
         self._axes = panel.axes
         self._picture = panel.axes.images[0]
 
@@ -120,3 +132,39 @@ class _Frame:
         pixels = np.asarray(canvas.buffer_rgba())[..., :3]
         rows, columns = (length - length % 2 for length in pixels.shape[:2])
         return np.ascontiguousarray(pixels[:rows, :columns])
+
+
+def in_few_colours(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Keep to colours of which a GIF has enough for all.
+
+    A program that chooses 256 colours by how often they occur leaves few for the bright parts.
+
+    Parameters
+    ----------
+    frame : ndarray of uint8, shape (rows, columns, 3)
+        From `stack_frames`.
+
+    Returns
+    -------
+    ndarray of uint8, shape (rows, columns, 3)
+        The nearest colours of the colour scale, and greys.
+    """
+    tree, palette = _palette()
+    rows = frame.reshape(-1, 3)
+    # A frame has few thousand different colours, and most pixels share some.
+    packed = rows @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+    _, first, which = np.unique(packed, return_index=True, return_inverse=True)
+    nearest: NDArray[np.uint8] = palette[tree.query(rows[first])[1]]
+    return nearest[which].reshape(frame.shape)
+
+
+@lru_cache(maxsize=1)
+def _palette() -> tuple[Any, NDArray[np.uint8]]:
+    """The colours of a GIF, and what finds the nearest."""
+    from matplotlib import colormaps
+    from scipy.spatial import cKDTree
+
+    scale = 255 * colormaps[_COLOURS](np.linspace(0, 1, 256 - _GREYS))[:, :3]
+    greys = np.repeat(np.linspace(0, 255, _GREYS), 3).reshape(-1, 3)
+    colours = np.concatenate([scale, greys]).round().astype(np.uint8)
+    return cKDTree(colours), colours

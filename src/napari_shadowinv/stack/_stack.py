@@ -177,7 +177,7 @@ def describe_stack(
     usable = None if mask is None else checked_mask(mask, found.shape)
     bare = None if source_mask is None else checked_mask(source_mask, found.shape)
     preparation = Preparation(tuple(filters), estimate, bare)
-    preparation.check(has_source=sources is not None)
+    preparation.check(has_source=sources is not None, has_mask=usable is not None)
     beam = None
     if not isinstance(sources, Shots):
         if sources is not None:

@@ -166,7 +166,9 @@ class ShotJob:
         report("prepare", 0, None, "image and source")
         image, mask = self._image_and_mask()
         preparation = Preparation(() if self.cleaning is None else (self.cleaning,))
-        preparation.check(has_source=not isinstance(self.source, Estimate))
+        preparation.check(
+            has_source=not isinstance(self.source, Estimate), has_mask=mask is not None
+        )
         image = preparation.image(image, mask, should_stop)
         # Before the sites are spread: a mistake is told at once.
         report("prepare", 0, None)
