@@ -62,6 +62,11 @@ def _settings(environment: dict[str, Any]) -> dict[str, Any]:
     return {
         # Its records grow by megabytes a minute, and nobody would look at them.
         "distributed.worker.profile.enabled": False,
+        # Dask looks at itself fifty times a second in each process, and writes down what it sees:
+        # a twentieth of two cores.
+        "distributed.admin.tick.interval": "500ms",
+        "distributed.admin.system-monitor.interval": "5s",
+        "distributed.worker.memory.monitor-interval": "500ms",
         # Dask has every array given back to the system at once. One of the same size is wanted
         # in the next moment: that takes a seventh of the time of a shot.
         _ENVIRONMENT: {name: value for name, value in environment.items() if name != _TRIMMING},
