@@ -17,6 +17,7 @@ from napari_shadowinv import (
     InputError,
     InversionCancelled,
     InversionOptions,
+    compilation,
     invert_stack,
     read,
     run_stack,
@@ -282,6 +283,19 @@ class TestRefusals:
         with pytest.raises(InputError, match=words):
             night.run(tmp_path / "new.shadowinv.zarr", **changes)
         assert not (tmp_path / "new.shadowinv.zarr").exists()
+
+
+def test_the_first_run_ever_compiles_before_its_shots(night, out, monkeypatch):
+    told = []
+    monkeypatch.setattr(compilation, "is_compiled", lambda: False)
+    night.run(out, scheduler="synchronous", on_progress=told.append)
+    assert "minute" in told[0].compiling
+    assert told[0].engine == ""
+    assert not any(news.compiling for news in told[1:])
+    assert told[-1].done == 6
+    with pytest.raises(InversionCancelled):
+        night.run(out, overwrite=True, should_stop=lambda: True)
+    assert (read(out).status == DONE).all()
 
 
 def test_overwriting_begins_anew(night, out):

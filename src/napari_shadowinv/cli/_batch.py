@@ -191,6 +191,9 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
         task = bars.add_task("starting", total=None, rate="", left="", failed="", last="")
 
         def show(progress: RunProgress) -> None:
+            if progress.compiling:
+                bars.update(task, description=f"compiling, {progress.compiling}")
+                return
             ledger.note(progress)
             outcome = progress.outcome
             last = "" if outcome is None else f"{progress.name}, {outcome.seconds:.1f} s"

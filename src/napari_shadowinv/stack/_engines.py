@@ -1,6 +1,6 @@
 """Where shots are inverted: in this process, in others, on a cluster.
 
-- an engine for what the user names: `engine_for`
+- an engine for what the user names: `engine_for`; whether it is on this machine: `is_here`
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from napari_shadowinv.progress import ShouldStop
 from napari_shadowinv.stack._local import local_client
 from napari_shadowinv.stack._shot import BlockShot, Shot
 
-__all__ = ["Engine", "EngineError", "WorkerDied", "engine_for"]
+__all__ = ["Engine", "EngineError", "WorkerDied", "engine_for", "is_here"]
 
 _CONNECT_SECONDS = 10.0
 _POLL = 0.1  # seconds between two looks at `should_stop` while connecting
 _ASKED_AGAIN_AFTER = 2.0  # seconds: clusters grow and shrink
 _AHEAD = 2  # tasks for each slot: one that runs, one that waits for it to end
+_HERE = ("threads", "synchronous", "processes")
 _AHEAD_OF_FILES = 64  # references to files are small; a cluster that grows wants to see work
 
 
@@ -219,8 +220,7 @@ def engine_for(
     """
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}: expected 1 or more")
-    if scheduler is None:
-        scheduler = _current_client() or "threads"
+    scheduler = _chosen(scheduler)
     count = workers or available_threads(None)
     if scheduler in ("threads", "synchronous"):
         yield from _threads(1 if scheduler == "synchronous" else count)
@@ -233,6 +233,16 @@ def engine_for(
         )
     else:
         yield from _given(scheduler, should_stop)
+
+
+def is_here(scheduler: Any) -> bool:
+    """Whether `engine_for` makes an engine on this machine of this."""
+    chosen = _chosen(scheduler)
+    return isinstance(chosen, str) and chosen in _HERE
+
+
+def _chosen(scheduler: Any) -> Any:
+    return (_current_client() or "threads") if scheduler is None else scheduler
 
 
 def _current_client() -> Any:

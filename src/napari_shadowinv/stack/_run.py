@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv.compilation import ensure_compiled
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.io.locking import locked
 from napari_shadowinv.io.store import (
@@ -25,8 +26,8 @@ from napari_shadowinv.io.store import (
 )
 from napari_shadowinv.io.store_layout import create_store
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.progress import ShouldStop
-from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for
+from napari_shadowinv.progress import Progress, ShouldStop
+from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
 from napari_shadowinv.stack._resuming import contents_of, continued, lengthened
 from napari_shadowinv.stack._shot import Reader, read_shot
 from napari_shadowinv.stack._stack import Stack, describe_stack
@@ -59,6 +60,8 @@ class RunProgress:
         The shot that has just ended; empty at the start and while nothing has ended.
     outcome : ShotOutcome or None
         What became of it.
+    compiling : str
+        Before all shots, after an installation: that the compiler is at work.
     """
 
     total: int
@@ -67,6 +70,7 @@ class RunProgress:
     engine: str
     name: str = ""
     outcome: ShotOutcome | None = None
+    compiling: str = ""
 
 
 OnRunProgress = Callable[[RunProgress], None]
@@ -150,6 +154,8 @@ def run_stack(
         shots, source, mask, options, setup, variables, reader, warm_start, filters, source_mask
     )
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
+    if is_here(scheduler):
+        _compile(len(stack.shots), on_progress, should_stop)
     with locked(path) as live:
         store = StackStore(path) if path.exists() and not overwrite else None
         arrived = False
@@ -167,6 +173,16 @@ def run_stack(
                 store = lengthened(store, stack, kept)
             _Run(stack, store, again, on_progress, should_stop, live).on(engine)
     return read_stack(path)
+
+
+def _compile(shots: int, on_progress: OnRunProgress | None, should_stop: ShouldStop | None) -> None:
+    """Once for all workers, which would each be at it during their first shot."""
+
+    def tell(news: Progress) -> None:
+        if on_progress is not None:
+            on_progress(RunProgress(shots, 0, 0, "", compiling=news.message))
+
+    ensure_compiled(tell, should_stop)
 
 
 class _Run:

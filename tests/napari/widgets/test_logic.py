@@ -17,6 +17,7 @@ from napari_shadowinv import (
     InputError,
     InversionCancelled,
     InversionOptions,
+    compilation,
     filters,
     recipes,
 )
@@ -162,6 +163,17 @@ def test_what_flattens_the_image_fits_no_measured_source(
     for job in jobs:
         with pytest.raises(InputError, match="takes the beam out of the image"):
             job.run(lambda _: None, lambda: False)
+
+
+def test_a_stack_tells_that_it_compiles(
+    shot: Array, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compilation, "is_compiled", lambda: False)
+    stages: list[str] = []
+    job = StackJob(shot[None], tmp_path / "a.shadowinv.zarr", options=FEW)
+    books = job.run(lambda news: stages.append(news.stage), lambda: False)
+    assert list(dict.fromkeys(stages)) == ["prepare", "compile", "shots"]
+    assert books.text == "1 of 1 done"
 
 
 def test_a_uniform_source_is_the_same_after_a_filter(shot: Array) -> None:

@@ -124,6 +124,9 @@ class StackJob:
         from napari_shadowinv.stack import run_stack
 
         def tell(news: RunProgress) -> None:
+            if news.compiling:
+                on_progress(Progress("compile", 0, None, news.compiling))
+                return
             if news.outcome is None:
                 self._recall()
             # The window looks into the books at any time: what they tell of must be seen to.
