@@ -651,7 +651,17 @@ def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
         images.append(prepared.image)
     np.testing.assert_array_equal(images[0], images[1])
     np.testing.assert_array_equal(images[0], images[2])
-    assert shadowinv("invert", shot, "--mask", "usable.png", "--low-pass", 2).exit_code == 0
+    flags = ["--mask", "usable.png", "--low-pass", 2, "--hot-pixels", 6]
+    assert shadowinv("invert", shot, *flags).exit_code == 0
+    # Nor in a source that was recorded with the same detector.
+    beam = np.full((24, 32), 100.0)
+    for junk, name in ((1e5, "one.shadowinv"), (np.nan, "two.shadowinv")):
+        beam[:5, :6] = junk
+        np.save("beam.npy", beam)
+        result = shadowinv("invert", shot, "--source", "beam.npy", *flags, "--out", name)
+        assert result.exit_code == 0, result.output
+    one, two = dataset("one.shadowinv"), dataset("two.shadowinv")
+    np.testing.assert_array_equal(one["displacement"], two["displacement"])
 
 
 @pytest.mark.parametrize(

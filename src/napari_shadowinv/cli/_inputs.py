@@ -116,6 +116,9 @@ def _prepared(
     whole = bare
     if bare is not None:
         whole = replace(shot, mask=bare).binned(factor).mask
+    if beam is not None and beam.mask is None and beam.image.shape == shot.image.shape:
+        # A broken pixel is broken in both.
+        beam = replace(beam, mask=shot.mask)
     shot = filtered(repaired(shot, choices).binned(factor), choices)
     if beam is None:
         return shot, estimated(shot, choices, whole)
