@@ -68,7 +68,7 @@ def _settings(environment: dict[str, Any]) -> dict[str, Any]:
         "distributed.admin.system-monitor.interval": "5s",
         "distributed.worker.memory.monitor-interval": "500ms",
         # Dask has every array given back to the system at once. One of the same size is wanted
-        # in the next moment: that takes a seventh of the time of a shot.
+        # in the next moment: that takes an eighth of the time of a shot.
         _ENVIRONMENT: {name: value for name, value in environment.items() if name != _TRIMMING},
     }
 
