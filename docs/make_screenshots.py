@@ -1,4 +1,4 @@
-"""Make the pictures of napari's window that the README shows.
+"""Make the pictures of napari's window that the README and docs/batch.md show.
 
     xvfb-run -a -s "-screen 0 2560x1440x24" python docs/make_screenshots.py [--data ../shared/data]
 
@@ -9,7 +9,9 @@ README's credits) are looked for in the data folder and left out where they are 
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +19,13 @@ from PIL import Image
 from qtpy.QtWidgets import QApplication
 
 import napari
-from napari_shadowinv import InversionOptions, add_inversion, invert, read
+from napari_shadowinv import InversionOptions, add_inversion, invert
 from napari_shadowinv._napari.marks import setup_of
-from napari_shadowinv._napari.shots import radiograph_layers
+from napari_shadowinv.stack import read_shot
 
 HERE = Path(__file__).parent / "pictures"
 PLUGIN = "napari-shadowinv"
-SHOT = "Image_20241017221829851.bmp"
-REFERENCE = "Image_00000.bmp"
+FRAMES, SHOWN = 6, 2
 
 
 def new_window(title: str) -> napari.Viewer:
@@ -65,19 +66,26 @@ def toroid_window() -> None:
     photograph(viewer, "napari-toroid.png")
 
 
-def burner_window(folder: Path) -> None:
-    """A real shadowgram, its reference beam, and the deflection found."""
+def stack_window(folder: Path) -> None:
+    """A run over real shadowgrams without a reference: the widget, and a shot's field."""
     viewer = new_window("alcohol burner")
-    shot = read(folder / SHOT).binned(2)
-    reference = read(folder / REFERENCE).binned(2)
-    inversion = invert(shot.image, source=reference.image)
-    for data, keywords, _ in radiograph_layers(shot, "burner 03"):
-        viewer.add_image(data, **keywords)
-    layers = add_inversion(viewer, inversion, name="burner 03")
-    field = next(layer for layer in layers if layer.name.endswith("|d| (px)"))
-    # A few pixels at the nozzle are far above the plume.
-    field.contrast_limits = (0, float(np.percentile(field.data, 99.5)))
-    photograph(viewer, "napari-burner.png")
+    shots = [read_shot(path, channel="mean", factor=4) for path in frames(folder)]
+    viewer.add_image(np.stack(shots), name="burner")
+    _, widget = viewer.window.add_plugin_dock_widget(PLUGIN, "Invert stack")
+    widget.source.picker.set_kind("polynomial")
+    widget.cleaning.picker.set_kind("hot_pixels")
+    widget.cleaning.folded.expand()
+    with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
+        widget.store.edit.setText("burner.shadowinv.zarr")
+        widget.panel.button.click()
+        while widget.panel.runner.running or widget.results.busy:
+            settle(0.2)
+        viewer.dims.set_current_step(0, SHOWN)
+        photograph(viewer, "napari-stack.png")
+
+
+def frames(folder: Path) -> list[Path]:
+    return sorted(folder.glob("Image_2*.bmp"))[:FRAMES]
 
 
 def main() -> None:
@@ -86,8 +94,8 @@ def main() -> None:
     folder = parser.parse_args().data / "burner" / "data"
     HERE.mkdir(exist_ok=True)
     toroid_window()
-    if (folder / SHOT).exists():
-        burner_window(folder)
+    if frames(folder):
+        stack_window(folder)
     else:
         print(f"no burner shadowgrams in {folder}: their picture is left out")
 
