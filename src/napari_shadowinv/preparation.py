@@ -71,7 +71,7 @@ class Preparation:
         if isinstance(self.estimate, InterpolatedEstimate) and self.bare is None and not has_mask:
             raise InputError(
                 f"got the estimate {self.estimate.described} without a mask: it fills in what a "
-                "mask hides; give a source mask that is false where the object is"
+                "mask hides; give a mask or a source mask that leaves out the object"
             )
         if self.bare is not None and self.estimate is None:
             raise InputError(
