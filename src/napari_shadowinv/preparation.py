@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.recipes import Estimate, Filter, InterpolatedEstimate
+from napari_shadowinv.recipes import Estimate, Filter
 
 if TYPE_CHECKING:
     from napari_shadowinv.progress import ShouldStop
@@ -68,26 +68,23 @@ class Preparation:
                 f"got a source and the filter {flattening[0]}, which takes the beam out of the "
                 "image while the source still has it: leave one of them out"
             )
-        if isinstance(self.estimate, InterpolatedEstimate) and self.bare is None and not has_mask:
-            raise InputError(
-                f"got the estimate {self.estimate.described} without a mask: it fills in what a "
-                "mask hides; give a mask or a source mask that leaves out the object"
-            )
-        if self.bare is not None and self.estimate is None:
+        if self.estimate is not None:
+            self.estimate.check(has_mask=has_mask or self.bare is not None)
+        elif self.bare is not None:
             raise InputError(
                 "got a source mask, which an estimate of the source looks at, but no estimate: "
                 "leave the mask out, or choose an estimate"
             )
 
-    def image(
+    def filtered(
         self, image: NDArray[Any], mask: Mask | None = None, should_stop: ShouldStop | None = None
     ) -> NDArray[Any]:
-        """Filter a shot.
+        """Filter a shot, or a measured source as much as its shot.
 
         Parameters
         ----------
         image : ndarray, shape (H, W)
-            The shot.
+            The shot or the source.
         mask : ndarray of bool, shape (H, W), optional
             The pixels that can be used.
         should_stop : callable, optional
@@ -96,7 +93,7 @@ class Preparation:
         Returns
         -------
         ndarray, shape (H, W)
-            The shot itself where there are no filters.
+            The image itself where there are no filters.
 
         Raises
         ------
@@ -105,24 +102,16 @@ class Preparation:
         InversionCancelled
             If `should_stop` returned true.
         """
-        return _filtered(image, self.filters, mask, should_stop)
-
-    def measured(
-        self, source: NDArray[Any], mask: Mask | None = None, should_stop: ShouldStop | None = None
-    ) -> NDArray[Any]:
-        """Clean and blur a measured source as much as its shot.
-
-        Parameters, returned value and errors are those of `image`.
-        """
-        kept = tuple(one for one in self.filters if not one.flattens)
-        return _filtered(source, kept, mask, should_stop)
+        for one in self.filters:
+            image = one.filtered(np.asarray(image, dtype=np.float64), mask, should_stop)
+        return image
 
     def estimated(
         self, image: NDArray[Any], mask: Mask | None = None, should_stop: ShouldStop | None = None
     ) -> Image:
-        """Guess the source of a shot that `image` has filtered.
+        """Guess the source of a shot that is filtered.
 
-        Parameters and errors are those of `image`.
+        Parameters and errors are those of `filtered`.
 
         Returns
         -------
@@ -149,17 +138,6 @@ def as_beam(image: NDArray[Any], mask: Mask | None) -> Image:
     """
     values = np.asarray(image, dtype=np.float64)
     return np.maximum(values if mask is None else np.where(mask, values, 0), 0)
-
-
-def _filtered(
-    image: NDArray[Any],
-    filters: tuple[Filter, ...],
-    mask: Mask | None,
-    should_stop: ShouldStop | None,
-) -> NDArray[Any]:
-    for one in filters:
-        image = one.filtered(np.asarray(image, dtype=np.float64), mask, should_stop)
-    return image
 
 
 def _both(first: Mask | None, second: Mask | None) -> Mask | None:

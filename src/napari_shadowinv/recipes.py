@@ -63,7 +63,34 @@ class _Recipe(BaseModel):
 
 
 class Estimate(_Recipe):
-    """A way to guess the undisturbed beam from the shot."""
+    """A way to guess the undisturbed beam from the shot.
+
+    Attributes
+    ----------
+    needs_mask : bool
+        Whether it does nothing without a mask.
+    """
+
+    needs_mask: ClassVar[bool] = False
+
+    def check(self, *, has_mask: bool) -> None:
+        """Refuse to work without a mask where one is needed.
+
+        Parameters
+        ----------
+        has_mask : bool
+            Whether there is one.
+
+        Raises
+        ------
+        InputError
+            If there is none, and one is needed.
+        """
+        if self.needs_mask and not has_mask:
+            raise InputError(
+                f"got the estimate '{self.title}' without a mask: it fills in what the mask "
+                "hides; choose a mask that covers the object"
+            )
 
     def source(
         self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
@@ -92,6 +119,7 @@ class Estimate(_Recipe):
         """
         from napari_shadowinv import sources
 
+        self.check(has_mask=mask is not None)
         estimated: Image = getattr(sources, self.function)(
             image, mask=mask, should_stop=should_stop, **self.model_dump()
         )
@@ -263,6 +291,7 @@ class TotalVariationEstimate(Estimate):
 class InterpolatedEstimate(Estimate):
     """The shot, with the masked part filled in from around it."""
 
+    needs_mask = True
     title = "filled in under the mask"
     function = "interpolated_source"
     width: float = _width(
@@ -276,15 +305,6 @@ class InterpolatedEstimate(Estimate):
             "'laplace' never leaves the range of the surroundings: for gaps at its edge."
         ),
     )
-
-    def source(
-        self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
-    ) -> Image:
-        if mask is None:
-            raise InputError(
-                "this estimate fills in what the mask marks: choose a mask that covers the object"
-            )
-        return super().source(image, mask, should_stop)
 
 
 class LowPassFilter(Filter):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interrupted
-from napari_shadowinv.cli._inputs import setup_from
+from napari_shadowinv.cli._inputs import picture_mask, setup_from
 from napari_shadowinv.cli._tables import Rows, options_text, say, two_columns
 from napari_shadowinv.errors import InputError, InversionCancelled
 
@@ -152,9 +152,9 @@ def _check(out: Path, resume: bool, overwrite: bool) -> None:
 def _mask(path: Path, factor: int) -> Any:
     import numpy as np
 
-    from napari_shadowinv.io import Radiograph, read_radiograph
+    from napari_shadowinv.io import Radiograph
 
-    usable = read_radiograph(path, channel="mean").image != 0
+    usable = picture_mask(path)
     return Radiograph(np.ones(usable.shape), mask=usable).binned(factor).mask
 
 

@@ -24,7 +24,7 @@ from napari_shadowinv.recipes import (
 )
 from napari_shadowinv.validation import validated
 
-__all__ = ["TABLE", "Choices", "choices_from"]
+__all__ = ["KEYWORDS", "TABLE", "Choices", "choices_from"]
 
 TABLE = "prepare"
 """Name of the table in an options file."""
@@ -95,7 +95,7 @@ class Choices(BaseModel):
     @property
     def flattens(self) -> bool:
         """Whether the beam is taken out of the image."""
-        return self.background_degree is not None or self.high_pass is not None
+        return any(one.flattens for one in self.filters())
 
     def filters(self) -> tuple[Filter, ...]:
         """Filters after pixels were summed, in their order."""
@@ -112,15 +112,15 @@ class Choices(BaseModel):
         """How the source is guessed."""
         if self.source_from is None:
             return None
-        parameters = {_KEYWORDS[name][0]: value for name, value in self.parameters().items()}
+        parameters = {KEYWORDS[name][0]: value for name, value in self.given(*KEYWORDS).items()}
         return ESTIMATES[self.source_from.replace("-", "_")](**parameters)
 
-    def parameters(self) -> dict[str, Any]:
-        """What was chosen for the estimate, by name."""
-        return {name: getattr(self, name) for name in _KEYWORDS if getattr(self, name) is not None}
+    def given(self, *names: str) -> dict[str, Any]:
+        """Those of some choices that were made, by name."""
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
-_KEYWORDS: dict[str, tuple[str, tuple[_EstimateName, ...]]] = {
+KEYWORDS: dict[str, tuple[str, tuple[_EstimateName, ...]]] = {
     "source_degree": ("degree", ("polynomial",)),
     "source_weight": ("weight", ("total-variation",)),
     "source_width": ("width", ("low-pass", "interpolated")),
@@ -157,7 +157,7 @@ def _check(chosen: Choices, has_source: bool, has_source_mask: bool) -> None:
             f"received --source and {_flag(name)}: what flattens the image takes the beam out of "
             "it, which the source still has; leave one of them out"
         )
-    for name, (_, estimates) in _KEYWORDS.items():
+    for name, (_, estimates) in KEYWORDS.items():
         if getattr(chosen, name) is not None and chosen.source_from not in estimates:
             wanted = " or ".join(f"--source-from {estimate}" for estimate in estimates)
             raise InputError(f"received {_flag(name)}: it needs {wanted}")

@@ -73,7 +73,7 @@ def experiment_from(
     entries = None if setup is None else read_toml(setup)
     shot = read_radiograph(image, channel=channel, variable=variable)
     if mask is not None:
-        shot = replace(shot, mask=_picture_mask(mask, shot, "mask"))
+        shot = replace(shot, mask=_mask_of(mask, shot, "mask"))
     geometry = shot.setup
     if entries is not None:
         geometry = _setup(entries, shot.metadata.get("geometry", {}), str(setup))
@@ -84,7 +84,7 @@ def experiment_from(
         beam = read_radiograph(source or image, channel=channel, variable=source_variable)
     else:
         beam = _own_source(image, shot, choices)
-    bare = None if source_mask is None else _picture_mask(source_mask, shot, "source mask")
+    bare = None if source_mask is None else _mask_of(source_mask, shot, "source mask")
     shot, beam = _prepared(shot, beam, factor, choices, bare)
     return Experiment(shot, beam, geometry)
 
@@ -111,7 +111,7 @@ def _prepared(
     """Filter a shot and its source, broken pixels before they are summed and the rest after."""
     if choices is None:
         return shot.binned(factor), None if beam is None else beam.binned(factor)
-    from napari_shadowinv.cli._preparing import estimated, filtered, filtered_source, repaired
+    from napari_shadowinv.cli._preparing import estimated, filtered, repaired
 
     whole = bare
     if bare is not None:
@@ -122,14 +122,20 @@ def _prepared(
     shot = filtered(repaired(shot, choices).binned(factor), choices)
     if beam is None:
         return shot, estimated(shot, choices, whole)
-    return shot, filtered_source(repaired(beam, choices).binned(factor), choices)
+    return shot, filtered(repaired(beam, choices).binned(factor), choices)
 
 
-def _picture_mask(path: Path, shot: Radiograph, name: str) -> NDArray[np.bool_]:
-    """Mask from a picture of the shot's size, in which what must not be looked at is 0."""
+def picture_mask(path: Path) -> NDArray[np.bool_]:
+    """Mask from a picture, in which what must not be looked at is 0."""
     from napari_shadowinv.io import read_radiograph
 
-    usable: NDArray[np.bool_] = read_radiograph(path, channel="mean").image != 0
+    mask: NDArray[np.bool_] = read_radiograph(path, channel="mean").image != 0
+    return mask
+
+
+def _mask_of(path: Path, shot: Radiograph, name: str) -> NDArray[np.bool_]:
+    """Mask from a picture that must be of the shot's size."""
+    usable = picture_mask(path)
     if usable.shape != shot.image.shape:
         raise InputError(
             f"{path}: {name} has shape {usable.shape}, image {shot.image.shape}: they must match"

@@ -1,7 +1,7 @@
 """Prepare an image as was chosen: filter it, and estimate its source.
 
 - before pixels are summed: `repaired`
-- after it: `filtered`, `filtered_source`, `estimated`
+- after it: `filtered`, `estimated`
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.cli._choices import Choices
+from napari_shadowinv.cli._choices import KEYWORDS, Choices
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.filters import remove_hot_pixels
 from napari_shadowinv.io import Radiograph
 from napari_shadowinv.preparation import Preparation
 from napari_shadowinv.recipes import without_masked
 
-__all__ = ["estimated", "filtered", "filtered_source", "repaired"]
+__all__ = ["estimated", "filtered", "repaired"]
 
 Plane = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,20 +43,12 @@ def repaired(shot: Radiograph, chosen: Choices) -> Radiograph:
 
 
 def filtered(shot: Radiograph, chosen: Choices) -> Radiograph:
-    """Flatten and blur a shot."""
+    """Flatten and blur a shot, or blur its measured source, which nothing may flatten."""
     preparation = Preparation(chosen.filters())
     with _named(shot):
-        image = preparation.image(shot.image, shot.mask)
-    names = ("background_degree", "high_pass", "low_pass")
-    return _with(shot, image, _notes(preparation), _chosen(chosen, names))
-
-
-def filtered_source(beam: Radiograph, chosen: Choices) -> Radiograph:
-    """Blur a measured source as much as its shot."""
-    preparation = Preparation(tuple(one for one in chosen.filters() if not one.flattens))
-    with _named(beam):
-        image = preparation.measured(beam.image, beam.mask)
-    return _with(beam, image, _notes(preparation), _chosen(chosen, ("low_pass",)))
+        image = preparation.filtered(shot.image, shot.mask)
+    notes = [one.described for one in preparation.filters]
+    return _with(shot, image, notes, chosen.given("background_degree", "high_pass", "low_pass"))
 
 
 def estimated(shot: Radiograph, chosen: Choices, bare: Mask | None) -> Radiograph | None:
@@ -66,16 +58,8 @@ def estimated(shot: Radiograph, chosen: Choices, bare: Mask | None) -> Radiograp
         return None
     with _named(shot):
         beam = Preparation((), estimate, bare).estimated(shot.image, shot.mask)
-    recorded = {"source_from": chosen.source_from, **chosen.parameters()}
+    recorded = {"source_from": chosen.source_from, **chosen.given(*KEYWORDS)}
     return _with(Radiograph(beam), beam, [estimate.described], recorded)
-
-
-def _notes(preparation: Preparation) -> list[str]:
-    return [one.described for one in preparation.filters]
-
-
-def _chosen(chosen: Choices, names: tuple[str, ...]) -> dict[str, Any]:
-    return {name: getattr(chosen, name) for name in names if getattr(chosen, name) is not None}
 
 
 @contextmanager

@@ -116,7 +116,16 @@ def invert_stack(
     0.0
     """
     stack = describe_stack(
-        shots, source, mask, options, setup, variables, reader, warm_start, filters, source_mask
+        shots,
+        source=source,
+        mask=mask,
+        options=options,
+        setup=setup,
+        variables=variables,
+        reader=reader,
+        warm_start=warm_start,
+        filters=filters,
+        source_mask=source_mask,
     )
     return _Graph(stack).dataset()
 

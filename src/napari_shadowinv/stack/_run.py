@@ -151,7 +151,16 @@ def run_stack(
         raise InputError(f"dtype is {dtype!r}: expected 'float32' or 'float64'")
     kept = np.dtype(dtype)
     stack = describe_stack(
-        shots, source, mask, options, setup, variables, reader, warm_start, filters, source_mask
+        shots,
+        source=source,
+        mask=mask,
+        options=options,
+        setup=setup,
+        variables=variables,
+        reader=reader,
+        warm_start=warm_start,
+        filters=filters,
+        source_mask=source_mask,
     )
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
     if is_here(scheduler):

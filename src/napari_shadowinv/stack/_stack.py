@@ -132,6 +132,7 @@ class Stack:
 
 def describe_stack(
     shots: Any,
+    *,
     source: Any,
     mask: ArrayLike | None,
     options: InversionOptions | None,
@@ -139,8 +140,8 @@ def describe_stack(
     variables: Collection[str] | None,
     reader: Reader,
     warm_start: int,
-    filters: Sequence[Filter] = (),
-    source_mask: ArrayLike | None = None,
+    filters: Sequence[Filter],
+    source_mask: ArrayLike | None,
 ) -> Stack:
     """Check everything that can be checked before a shot is read.
 
@@ -181,7 +182,7 @@ def describe_stack(
     beam = None
     if not isinstance(sources, Shots):
         if sources is not None:
-            sources = preparation.measured(sources, usable)
+            sources = preparation.filtered(sources, usable)
             checked_source(sources, usable)
         if estimate is None:
             beam = Beam.of(found.shape, sources, usable)

@@ -250,7 +250,7 @@ class Work:
             raise InputError(
                 f"image has shape {np.shape(image)}, expected {self.shape} as {others}"
             )
-        image = self.preparation.image(image, self.mask, should_stop)
+        image = self.preparation.filtered(image, self.mask, should_stop)
         if beam is None:
             beam = Beam.of(self.shape, self._source(image, source, should_stop), self.mask)
         options = self.options
@@ -265,7 +265,7 @@ class Work:
             return self.preparation.estimated(image, self.mask, should_stop)
         if np.shape(source) != self.shape:
             raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
-        return self.preparation.measured(source, self.mask, should_stop)
+        return self.preparation.filtered(source, self.mask, should_stop)
 
     def arrays(self, inversion: Inversion) -> dict[str, NDArray[Any]]:
         """Return the variables by name."""

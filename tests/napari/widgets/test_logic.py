@@ -30,7 +30,7 @@ from napari_shadowinv._napari.widgets._reading import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._sampling import Profile, along, sampled, table_text
 from napari_shadowinv._napari.widgets._stacking import StackJob
 from napari_shadowinv.cli._choices import Choices
-from napari_shadowinv.cli._preparing import filtered, filtered_source
+from napari_shadowinv.cli._preparing import filtered
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.io.radiograph import Radiograph
 from napari_shadowinv.physics.forward import synthetic_image
@@ -145,7 +145,7 @@ def test_a_filter_does_the_same_as_that_of_the_command_line(shot: Array) -> None
     mine = ShotJob(image, beam, usable, cleaning=cleaning, options=FEW).run()
     chosen = Choices(low_pass=1.5)
     told = filtered(Radiograph(image, mask=usable), chosen).image
-    source = filtered_source(Radiograph(beam, mask=usable), chosen).image
+    source = filtered(Radiograph(beam, mask=usable), chosen).image
     alone = invert(told, source=source, mask=usable, options=FEW)
     np.testing.assert_array_equal(mine.displacement, alone.displacement)
     assert np.isfinite(told).all()

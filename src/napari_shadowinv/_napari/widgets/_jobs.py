@@ -165,16 +165,15 @@ class ShotJob:
         clock = time.perf_counter()
         report("prepare", 0, None, "image and source")
         image, mask = self._image_and_mask()
-        preparation = Preparation(() if self.cleaning is None else (self.cleaning,))
-        preparation.check(
-            has_source=not isinstance(self.source, Estimate), has_mask=mask is not None
-        )
-        image = preparation.image(image, mask, should_stop)
+        estimate = self.source if isinstance(self.source, Estimate) else None
+        preparation = Preparation(() if self.cleaning is None else (self.cleaning,), estimate)
+        preparation.check(has_source=estimate is None, has_mask=mask is not None)
+        image = preparation.filtered(image, mask, should_stop)
         # Before the sites are spread: a mistake is told at once.
         report("prepare", 0, None)
         prepare(image, None, self.options, mask)
-        if isinstance(self.source, Estimate):
-            report("source", 0, None, self.source.title)
+        if estimate is not None:
+            report("source", 0, None, estimate.title)
         source = self._source(image, mask, preparation, should_stop)
         report("prepare", 0, None)
         seconds["source"] = time.perf_counter() - clock
@@ -251,7 +250,7 @@ class ShotJob:
             raise InputError(f"source has shape {source.shape}, image {whole}: they must match")
         if self.crop is not None:
             source = source[self.crop]
-        source = preparation.measured(source, mask, should_stop)
+        source = preparation.filtered(source, mask, should_stop)
         return checked_source(source, np.ones(image.shape, bool) if mask is None else mask)
 
 
