@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from napari_shadowinv import filters, invert, read, sources, synthetic_image
-from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 
 SHOT = "Image_20241017221829851.bmp"
 SHAPE = (160, 200)
@@ -150,6 +150,14 @@ def source_pictures() -> None:
     y, x = grid()
     flat = scene(np.ones(SHAPE), big_object())
     source_picture("uniform", "uniform_source", flat, sources.uniform_source(flat.shot))
+    setup = paper_setup().model_copy(update={"pixel_size": 4e-6})
+    point = scene(sources.isotropic_source(np.ones(SHAPE), setup), 0.5 * big_object())
+    source_picture(
+        "isotropic",
+        f"isotropic_source, {sources.point_distance(setup):.0f} px from the detector",
+        point,
+        sources.isotropic_source(point.shot, setup),
+    )
     spot = scene(gaussian_beam(), big_object())
     source_picture("gaussian", "gaussian_source", spot, sources.gaussian_source(spot.shot))
     tilted = scene(tilted_beam(), big_object())

@@ -46,7 +46,7 @@ def settle(seconds: float = 1.0) -> None:
 def photograph(viewer: napari.Viewer, name: str) -> None:
     """Save the window as it is seen, and close it."""
     viewer.reset_view()
-    settle()
+    settle(3.0)
     pixels = viewer.window.screenshot(canvas_only=False, flash=False)
     path = HERE / name
     Image.fromarray(pixels[..., :3]).save(path, optimize=True)

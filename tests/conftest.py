@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.trust import image_residual
 
 # The same examples in each run: a change is to blame for what fails, not the day.
 settings.register_profile("same each time", derandomize=True)
@@ -44,6 +48,7 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         "levels": ((4, 10, 0.1), (17, 21, 1 / 3000)),
         "seconds": {"prepare": 0.1, "sites": 0.2, "transport": 1.0, "read-out": 0.1},
         "warnings": ("1 negative pixel was set to zero",),
+        "image_residual": image_residual(image, reprojection, np.ones(shape, dtype=bool)),
     }
     return Inversion(
         image=image,
@@ -94,3 +99,21 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"no shared data at {SHARED_DATA}")
     return SHARED_DATA
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[tuple[Path, Callable[[str], bool]]]:
+    """A folder on a disk of 400 kB, and what gives the disk another size."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def mount(option: str) -> bool:
+        command = ["mount", "-t", "tmpfs", "-o", option, "tmpfs", str(folder)]
+        return subprocess.run(command, capture_output=True).returncode == 0
+
+    if os.name != "posix" or not shutil.which("mount") or not mount("size=400k"):
+        pytest.skip("no file system can be mounted here")
+    try:
+        yield folder, lambda size: mount(f"remount,size={size}")
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)

@@ -46,6 +46,10 @@ def shadowinv(*arguments: object) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
+def flat(text: str) -> str:
+    return " ".join(text.split())
+
+
 def content(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
@@ -175,14 +179,16 @@ def test_a_mask_keeps_unusable_pixels_out(
 def test_bin_sums_and_widens_pixels(folder: Path) -> None:
     image = 100 * synthetic_image(gaussian_blob((50, 63), 20.0, 8.0).displacement)
     np.save("fine.npy", image)
+    beam = np.random.default_rng(0).uniform(90, 110, image.shape)
+    np.save("beam.npy", beam)
     (folder / "light.toml").write_text(
         'kind = "optical"\nwavelength = 5e-7\nobject_image_distance = 0.1\npixel_size = 1e-5\n'
     )
-    arguments = ["--bin", 2, "--setup", "light.toml", "--source", "fine.npy"]
+    arguments = ["--bin", 2, "--setup", "light.toml", "--source", "beam.npy"]
     result = shadowinv("invert", "fine.npy", *arguments)
     assert result.exit_code == 0, result.output
     saved = dataset("fine.shadowinv")
-    blocks = image[:50, :62].reshape(25, 2, 31, 2).sum(axis=(1, 3))
+    blocks = beam[:50, :62].reshape(25, 2, 31, 2).sum(axis=(1, 3))
     np.testing.assert_allclose(saved["source"], blocks)
     setup = setup_from_dataset(saved)
     assert isinstance(setup, OpticalSetup)
@@ -221,8 +227,41 @@ def test_colour_film_by_channel(folder: Path) -> None:
     tifffile.imwrite("film.tif", np.stack([red, red // 2, red // 3], axis=-1), photometric="rgb")
     result = shadowinv("invert", "film.tif", "--channel", "red")
     assert result.exit_code == 0, result.output
-    image = dataset("film.shadowinv")["image"].values
+    assert "wrong sign" in flat(result.stdout)
+    content = dataset("film.shadowinv")
+    image = content["image"].values
     np.testing.assert_allclose(image / image.sum(), red / red.sum())
+    warnings = json.loads(content.attrs["report"])["warnings"]
+    assert warnings[-1].startswith("channel 'red' of a colour image was taken as the fluence")
+
+
+def test_grey_film_is_told_but_a_linear_image_is_not(folder: Path) -> None:
+    counts = 1000 * synthetic_image(BLOB.displacement)
+    film = np.full(counts.shape, 60_000.0)
+    film[3:-3, 3:-3] *= 10 ** (-counts[3:-3, 3:-3] / 3000)
+    for name, image, said in (("film.tif", film, True), ("shot.tif", counts, False)):
+        tifffile.imwrite(name, image.astype(np.uint16))
+        for command in ("info", "invert"):
+            result = shadowinv(command, name)
+            assert ("the rim is as bright as anything" in flat(result.stdout)) == said
+    assert "--channel" not in flat(shadowinv("invert", "--help").stdout.split("Examples")[1])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="such names are not allowed there")
+@pytest.mark.parametrize("name", ["a[/b].tif", "a[red]b.tif", "a\x1b[31mb\u202e.tif", "a\nb.tif"])
+def test_names_reach_the_terminal_as_they_are(folder: Path, name: str) -> None:
+    path = Path(name)
+    path.parent.mkdir(exist_ok=True)
+    tifffile.imwrite(path, np.rint(100 * synthetic_image(BLOB.displacement)).astype(np.uint16))
+    shown = name.replace("\x1b", r"\x1b").replace("\u202e", r"\u202e").replace("\n", r"\n")
+    for arguments in (("info", name), ("invert", name, "--n-sites", 100, "--out", "a.shadowinv")):
+        result = shadowinv(*arguments)
+        assert result.exit_code == 0, result.output
+        assert shown in result.stdout.replace("\n", "")
+        assert not set("\x1b\u202e") & set(result.stdout)
+    line = shadowinv("info", f"{name}.gone").stderr
+    assert shown.replace(r"\n", " ") in line
+    assert not set("\x1b\u202e") & set(line)
 
 
 def test_negative_pixels_are_clipped_counted_and_reported(folder: Path) -> None:
@@ -534,7 +573,9 @@ def test_reference_in_a_text_image_is_the_source(folder: Path) -> None:
     source = np.tile(np.linspace(90, 110, 32), (24, 1))
     image = synthetic_image(BLOB.displacement, source)
     rows = [" ".join(f"{v:.9f}" for v in row) for row in np.concatenate([image, source])]
-    (folder / "both.txt").write_text("\n".join(["# flux2D (24, 32)", *rows]))
+    (folder / "both.txt").write_text(
+        "\n".join(["# flux2D (24, 32)", "# flux2D_ref (24, 32)", *rows])
+    )
     assert shadowinv("invert", "both.txt").exit_code == 0
     np.testing.assert_allclose(dataset("both.shadowinv")["source"], source, rtol=1e-9)
     chosen = Choices(source_from="uniform")
@@ -637,6 +678,28 @@ def test_filters_are_those_of_the_library(folder: Path) -> None:
     np.testing.assert_array_equal(beam.image, filters.low_pass(ramp, 2.0))
 
 
+def test_the_butterworth_filter_is_that_of_the_library(folder: Path, shot: Path) -> None:
+    image = np.load(shot)
+    flags = ["--butterworth", 12, "--butterworth-order", 3]
+    result = shadowinv("invert", shot, "--n-sites", 300, *flags)
+    assert result.exit_code == 0, result.output
+    saved = dataset("shot.shadowinv")
+    expected = filters.butterworth(image, 12.0, 3)
+    np.testing.assert_allclose(
+        saved["image"], expected * saved["source"].mean().item() / expected.mean()
+    )
+    assert json.loads(saved.attrs["input_preparation"]) == {
+        "butterworth": 12.0,
+        "butterworth_order": 3,
+    }
+    # What keeps the large structures keeps the beam: a measured source is filtered alike.
+    np.save("beam.npy", image)
+    chosen = Choices(butterworth=9, butterworth_kind="low")
+    beam = read_experiment("shot.npy", source=Path("beam.npy"), choices=chosen).source
+    assert beam is not None
+    np.testing.assert_array_equal(beam.image, filters.butterworth(image, 9.0, kind="low"))
+
+
 def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
     usable = np.ones((24, 32), np.uint8)
     usable[:5, :6] = 0
@@ -670,12 +733,18 @@ def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
         (["--source-from", "gausian"], ("'source_from' is 'gausian'", "'gaussian'")),
         (["--source-from", "low-pass"], "needs --source-width"),
         (["--source-from", "interpolated"], "needs --source-mask"),
+        (["--source-from", "isotropic"], "'isotropic' without a setup"),
+        (["--source-centre-y", 3], ("--source-centre-y", "--source-from isotropic")),
+        (["--source", "shot.npy"], ("shot.npy", "the source is the image itself")),
         (["--source-from", "gaussian", "--source", "shot.npy"], "choose one of them"),
         (["--source-from", "gaussian", "--source-degree", 3], ("--source-degree", "polynomial")),
         (["--source-weight", 2], ("--source-weight", "total-variation")),
         (["--source-mask", "shot.npy"], ("--source-mask", "--source-from")),
         (["--source", "shot.npy", "--background-degree", 0], ("--source", "--background-degree")),
         (["--source", "shot.npy", "--high-pass", 3], ("--source", "--high-pass")),
+        (["--source", "shot.npy", "--butterworth", 9], ("--source", "--butterworth")),
+        (["--butterworth-order", 3], ("--butterworth-order", "it needs --butterworth")),
+        (["--butterworth", 9, "--butterworth-kind", "band"], ("'butterworth_kind'", "'high'")),
         (["--hot-pixels", 0], ("'hot_pixels' is 0", "greater than 0")),
         (["--low-pass", -1], ("'low_pass' is -1", "greater than 0")),
         (["--background-degree", 11], ("'background_degree' is 11", "at most 10")),
@@ -686,6 +755,37 @@ def test_choices_that_make_no_sense_are_refused(
     shot: Path, refused: Callable[..., None], flags: list[object], names: str | tuple[str, ...]
 ) -> None:
     refused("invert", shot, *flags, names=names)
+
+
+def test_one_mask_for_bad_pixels_and_for_the_object_is_refused(
+    folder: Path, shot: Path, refused: Callable[..., None]
+) -> None:
+    y, x = np.mgrid[:24, :32]
+    iio.imwrite("bare.png", (np.hypot(y - 10, x - 18) > 7).astype(np.uint8))
+    for estimate in ("polynomial", "interpolated"):
+        flags = ["--source-from", estimate, "--mask", "bare.png", "--source-mask", "bare.png"]
+        refused("invert", shot, *flags, names=("shot.npy", "left out of the inversion"))
+
+
+def test_a_point_source_is_taken_for_one_or_told_of(folder: Path, shot: Path) -> None:
+    near = ProtonSetup(
+        energy=14.7, source_object_distance=1e-3, object_image_distance=0.28, pixel_size=1e-5
+    )
+    text = "".join(f"{name} = {value!r}\n" for name, value in near.model_dump().items())
+    (folder / "setup.toml").write_text(text)
+    flags = ["--setup", "setup.toml", "--out", "result.shadowinv", "--overwrite"]
+    for chosen, warned in (
+        ([], True),
+        (["--source-from", "uniform"], True),
+        (["--source-from", "isotropic", "--source-centre-y", 2], False),
+    ):
+        result = shadowinv("invert", shot, *flags, *chosen)
+        assert result.exit_code == 0, result.output
+        assert ("choose the source 'isotropic'" in " ".join(result.stdout.split())) == warned
+        report = inversion_from_dataset(dataset("result.shadowinv")).report
+        assert any("'isotropic'" in text for text in report.warnings) == warned
+    expected = sources.isotropic_source(np.load(shot), near, centre_y=2)
+    np.testing.assert_array_equal(dataset("result.shadowinv")["source"], expected)
 
 
 def test_mistakes_in_the_prepare_table_are_named(
@@ -862,3 +962,45 @@ def test_ctrl_c_while_writing_keeps_the_old_result(folder: Path, shot: Path) -> 
     code, errors = interrupted(folder, slow_disk, ["invert", "shot.npy", "--overwrite"])
     assert (code, errors.strip()) == (130, "Cancelled")
     assert content(folder) == before
+
+
+def test_neither_result_nor_figure_is_left_on_a_full_disk(
+    small_disk: tuple[Path, Callable[[str], bool]], shot: Path
+) -> None:
+    disk, resize = small_disk
+    assert resize("64k")
+    for out, figure in (("shot.shadowinv", disk / "a.png"), (disk / "a.shadowinv", "a.png")):
+        (disk / "other").write_bytes(bytes(40_000))
+        result = shadowinv("invert", shot, "--n-sites", 300, "--out", out, "--report", figure)
+        assert result.exit_code == 2
+        (line,) = result.stderr.splitlines()
+        assert f"{disk}/a." in line
+        assert "cannot be written (No space left on device): make room" in line
+        assert [path.name for path in disk.iterdir()] == ["other"]
+        assert sorted(content(shot.parent)) == ["shot.npy"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
+def test_a_second_ctrl_c_does_not_interrupt_the_clearing_up(folder: Path, shot: Path) -> None:
+    impatient = """
+        import signal, time
+        from napari_shadowinv.io import files, writing
+
+        class Room:
+            def __enter__(self):
+                # What is left between the interrupt and the block that puts it off.
+                signal.raise_signal(signal.SIGINT)
+            def __exit__(self, *error):
+                pass
+
+        def write_slowly(path, dataset):
+            path.write_text("half")
+            files.interrupts_put_off = Room
+            print("now")
+            time.sleep(60)
+
+        writing.write_result = write_slowly
+    """
+    code, errors = interrupted(folder, impatient, ["invert", "shot.npy"])
+    assert (code, errors.strip()) == (130, "Cancelled")
+    assert sorted(content(folder)) == ["shot.npy"]

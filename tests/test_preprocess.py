@@ -13,7 +13,7 @@ def test_image_source_and_floored_image_have_one_flux():
     image, source = 1 + 1000 * rng.random((20, 30)), rng.random((20, 30))
     image[:3] = 0
     prepared = prepare(image, source, InversionOptions())
-    for values in (prepared.image, prepared.floored_image):
+    for values in (prepared.image, prepared.floored_image * prepared.unit):
         assert values.sum() == pytest.approx(source.sum(), rel=1e-12)
     assert prepared.floored_pixels == (image < 1e-3 * image.mean()).sum() == 90
     floor = prepared.floored_image.min() / prepared.floored_image.mean()
@@ -49,3 +49,22 @@ def test_sites_default_to_the_pixels_up_to_a_limit():
     assert number_of_sites((20, 30), InversionOptions(n_sites=77)) == 77
     with pytest.raises(InputError, match="use at most"):
         number_of_sites((20, 30), InversionOptions(n_sites=10**13))
+
+
+def test_fewer_sites_than_pixels_are_told_of():
+    image = np.ones((1000, 1001))
+    (warning,) = prepare(image, None, InversionOptions()).warnings
+    assert "1,000,000 sites for 1,001,000 pixels" in warning
+    assert "n_sites = 1,001,000" in warning
+    assert prepare(image, None, InversionOptions(n_sites=5000)).warnings == ()
+    assert prepare(image[:, 1:], None, InversionOptions()).warnings == ()
+
+
+@pytest.mark.parametrize(("rows", "said"), [(3, False), (5, True)])
+def test_a_mask_over_much_of_the_image_is_told(rows, said):
+    mask = np.ones((20, 30), bool)
+    mask[:rows] = False
+    warnings = prepare(np.ones((20, 30)), None, InversionOptions(), mask).warnings
+    assert [text.startswith("the mask leaves out 25.0% of the pixels") for text in warnings] == (
+        [True] if said else []
+    )

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import shlex
+import shutil
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +14,10 @@ import tifffile
 import xarray
 from typer.testing import CliRunner
 
-from napari_shadowinv import synthetic_image
+from napari_shadowinv import read, synthetic_image
 from napari_shadowinv.cli import app
 from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.setup import SPECIES, setup_from_dict
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -43,15 +47,55 @@ def test_the_python_example_makes_the_file_it_promises(shot_folder):
     assert peak == pytest.approx(20 / 6 * np.exp(-0.5), rel=0.05)
 
 
-def test_the_command_and_its_setup_file_work_as_shown(shot_folder):
+STEP = re.compile(
+    r"```python\n(?P<python>.*?)```|^    shadowinv (?P<line>[^\n]*)$"
+    r"|`shadowinv (?P<inline>[^`\n]*)`",
+    re.DOTALL | re.MULTILINE,
+)
+LEFT_TO_THE_READER = {"info FILE": "info shot.shadowinv", "status": "status night.shadowinv.zarr"}
+
+
+def steps() -> list[tuple[str, str]]:
+    """The commands and the Python of the README, from the top to the bottom."""
+    found = []
+    for match in STEP.finditer(README):
+        kind = "python" if match["python"] else "command"
+        text = match["python"] or match["line"] or match["inline"]
+        found.append((kind, LEFT_TO_THE_READER.get(text, text)))
+    return found
+
+
+def test_commands_and_python_work_one_after_the_other_in_one_folder(shot_folder):
     (setup,) = blocks("toml")
     (shot_folder / "setup.toml").write_text(setup, encoding="utf-8")
-    command = re.search(r"^    (shadowinv invert .*)$", README, re.MULTILINE)
-    assert command is not None
-    result = CliRunner().invoke(app, command[1].split()[1:])
-    assert result.exit_code == 0, result.output
-    assert (shot_folder / "shot.shadowinv").exists()
+    other = setup.replace("14.7", "3.0")  # "at another energy"
+    (shot_folder / "other.toml").write_text(other, encoding="utf-8")
+    (shot_folder / "shots").mkdir()
+    for number in (1, 2):
+        shutil.copy("shot.tif", f"shots/shot{number}.tif")
+    done = []
+    for kind, text in steps():
+        if kind == "python":
+            exec(compile(text, "README.md", "exec"), {})
+        else:
+            # One process is enough, and starts at once.
+            result = CliRunner().invoke(app, shlex.split(text))
+            assert result.exit_code == 0, f"{text}: {result.output}"
+            done.append(shlex.split(text)[0])
+    assert done == ["invert", "info", "forward", "batch", "status"]
     assert (shot_folder / "shot.png").read_bytes().startswith(b"\x89PNG")
+    assert read("shot.shadowinv").potential.attrs["units"] == "px²"
+    image = tifffile.imread("shot_image.tif")
+    assert image.shape == (40, 50)
+    assert xarray.open_zarr("night.shadowinv.zarr", consolidated=False).sizes["shot"] == 2
+
+
+def test_a_setup_for_electrons_is_as_the_readme_says(tmp_path):
+    (setup,) = blocks("toml")
+    said = re.search(r"`(kind = .*?)`.*`(species = .*?)`", README)
+    assert said is not None
+    written = re.sub("^kind.*$", f"{said[1]}\n{said[2]}", setup, flags=re.MULTILINE)
+    assert setup_from_dict(tomllib.loads(written)).particle == SPECIES["electron"]
 
 
 def test_every_picture_and_page_that_it_links_to_exists():

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from napari_shadowinv.geometry.interpolation import BLOCK
 from napari_shadowinv.readout import read_centroids, read_dual
 from napari_shadowinv.transport.sites import plan_levels
 
@@ -61,3 +62,14 @@ def test_the_mean_integration_lies_between_the_two_orders(level):
     }
     assert np.ptp(by_order["y"] - by_order["x"]) > 0.1
     np.testing.assert_allclose(by_order["mean"], (by_order["y"] + by_order["x"]) / 2, atol=1e-12)
+
+
+def test_reading_in_parts_changes_no_bit(level, monkeypatch):
+    shape = (120, 90)
+    given = (level, 2 * standing_wave(level.sites), -gradient(level.sites), shape)
+    at_once, shares = read_dual(*given), []
+    monkeypatch.setattr("napari_shadowinv.readout._PART", 2 * BLOCK)
+    in_parts = read_dual(*given, on_share=shares.append)
+    assert shares == [2 * BLOCK / 10800, 4 * BLOCK / 10800, 1.0]
+    for one, other in zip(at_once, in_parts, strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.progress import Reporter
 
 __all__ = ["least_variation"]

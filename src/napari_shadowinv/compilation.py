@@ -38,9 +38,15 @@ def ensure_compiled(
     """
     if is_compiled():
         return
+    from napari_shadowinv.geometry._kernel import is_kept
     from napari_shadowinv.inversion import invert
 
-    Reporter(on_progress, should_stop)("compile", 0, None, "once, for a minute or so")
+    how_often = (
+        "once, for a minute or so"
+        if is_kept()
+        else "each time: set NUMBA_CACHE_DIR to a folder that can be written"
+    )
+    Reporter(on_progress, should_stop)("compile", 0, None, how_often)
     y, x = np.indices((_SIDE, _SIDE)) / _SIDE
     uneven = np.exp(-4 * (y + x))
     invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)
@@ -52,10 +58,13 @@ def is_compiled() -> bool:
     Returns
     -------
     bool
-        False after an installation, and where the cache (``NUMBA_CACHE_DIR``, or a folder
-        beside the package) is empty.
+        False after an installation, where the cache (``NUMBA_CACHE_DIR``, or a folder
+        beside the package) is empty, and where nothing can be kept.
     """
     from napari_shadowinv.geometry._flips import build
+    from napari_shadowinv.geometry._kernel import is_kept
 
+    if not is_kept():
+        return False
     kept = Path(build.stats.cache_path)  # type: ignore[attr-defined]
     return any(kept.glob("_flips.build-*.nbi"))

@@ -7,8 +7,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -27,6 +28,7 @@ from napari_shadowinv.preprocess import (
     margin_around,
     masked_source,
     number_of_sites,
+    power_of_two,
     prepare,
 )
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
@@ -34,6 +36,7 @@ from napari_shadowinv.readout import read_out
 from napari_shadowinv.transport.outside import Outside, crossings
 from napari_shadowinv.transport.sites import SitePlan, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fitted_flux, solve
+from napari_shadowinv.trust import doubts, image_residual
 
 if TYPE_CHECKING:
     import xarray
@@ -43,6 +46,9 @@ if TYPE_CHECKING:
 __all__ = ["Inversion", "Report", "count_sites", "invert", "plan_sites"]
 
 Array = NDArray[np.float64]
+
+# Steps of the read-out: up to the first number the potential, then the re-projection.
+_READ, _STEPS = 30, 100
 
 
 @dataclass(frozen=True)
@@ -78,6 +84,9 @@ class Report:
     flux_left, flux_entered : dict of str to float
         With a free boundary the flux that crossed each side of the image (top, bottom, left,
         right), as a share of the source's flux in the image; else empty.
+    image_residual : float
+        How far the re-projection is from the image: r.m.s. difference over the used pixels,
+        as a share of the image's mean there. NaN in reports of older versions.
     """
 
     converged: bool
@@ -94,6 +103,7 @@ class Report:
     flux_scale: float = 1.0
     flux_left: dict[str, float] = field(default_factory=dict)
     flux_entered: dict[str, float] = field(default_factory=dict)
+    image_residual: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -154,6 +164,21 @@ class Inversion:
     mask: NDArray[np.bool_]
     report: Report
     options: InversionOptions
+
+    def with_warnings(self, texts: Iterable[str]) -> Inversion:
+        """Return the same with more to know before trusting it, such as doubts of its source.
+
+        Parameters
+        ----------
+        texts : iterable of str
+            Sentences that are added to those of the report.
+
+        Returns
+        -------
+        Inversion
+        """
+        warnings = (*self.report.warnings, *texts)
+        return replace(self, report=replace(self.report, warnings=warnings))
 
     def to_dataset(self, setup: ProtonSetup | OpticalSetup | None = None) -> xarray.Dataset:
         """Everything as one labelled dataset, with units; see `napari_shadowinv.io.dataset`.
@@ -234,7 +259,13 @@ def plan_sites(
         threads=options.threads,
         report=Reporter(on_progress, should_stop),
     )
-    return replace(plan, source=ground.beam, mask=ground.mask, outside=ground.outside)
+    return replace(
+        plan,
+        source=ground.beam * ground.unit,
+        mask=ground.mask,
+        outside=ground.outside,
+        unit=ground.unit,
+    )
 
 
 def count_sites(
@@ -264,9 +295,10 @@ def count_sites(
 
 
 class _Ground(NamedTuple):
-    """What sites are to be spread over, and how many."""
+    """What sites are to be spread over, in units of a power of two, and how many."""
 
     beam: Array
+    unit: float
     mask: NDArray[np.bool_] | None
     outside: Outside | None
     n_sites: int
@@ -278,10 +310,12 @@ def _ground(source: ArrayLike, options: InversionOptions, mask: ArrayLike | None
     if usable is not None:
         beam = masked_source(beam, usable, options)
     n_sites = number_of_sites(beam.shape, options)
+    unit = power_of_two(beam)
+    beam = beam / unit
     if options.boundary != "free":
-        return _Ground(beam, usable, None, n_sites)
+        return _Ground(beam, unit, usable, None, n_sites)
     outside = Outside.around(beam, margin_around(beam.shape, options), usable)
-    return _Ground(beam, usable, outside, round(n_sites * outside.beam.sum() / beam.sum()))
+    return _Ground(beam, unit, usable, outside, round(n_sites * outside.beam.sum() / beam.sum()))
 
 
 def invert(
@@ -333,7 +367,8 @@ def invert(
     Raises
     ------
     InputError
-        If image or source cannot be inverted, or `start` has other sites.
+        If image or source cannot be inverted, the source is the image itself, or `start` has
+        other sites.
     InversionCancelled
         If `should_stop` returned true.
 
@@ -394,7 +429,7 @@ def invert(
     with stopwatch("read-out"):
         fields = _read_fields(plan, prepared, solutions[-1], options, report)
     level = plan.levels[-1]
-    caustic = jacobian_determinant(fields.displacement) < options.caustic_jacobian
+    jacobian = jacobian_determinant(fields.displacement)
     return Inversion(
         image=prepared.image,
         source=prepared.source,
@@ -402,14 +437,14 @@ def invert(
         displacement=fields.displacement,
         sites=level.sites - plan.margin,
         weights=solutions[-1].weights,
-        site_mass=level.mass,
-        site_flux=solutions[-1].flux,
+        site_mass=level.mass * plan.unit,
+        site_flux=solutions[-1].flux * plan.unit,
         site_displacement=solutions[-1].displacement,
         reprojection=fields.reprojection,
         residual=np.where(prepared.mask, prepared.image - fields.reprojection, 0.0),
-        caustic=caustic & prepared.mask,
+        caustic=(jacobian < options.caustic_jacobian) & prepared.mask,
         mask=prepared.mask,
-        report=_report(prepared, plan, solutions, fields, stopwatch.seconds, options),
+        report=_report(prepared, plan, solutions, fields, jacobian, stopwatch.seconds, options),
         options=options,
     )
 
@@ -445,28 +480,49 @@ def _read_fields(
     options: InversionOptions,
     report: Reporter,
 ) -> _Fields:
-    report("read-out", 0, 2)
-    potential, displacement = read_out(plan, solution, options)
-    report("read-out", 1, 2)
+    report("read-out", 0, _STEPS)
+    potential, displacement = read_out(plan, solution, options, _reading(report, 0, _READ))
+    source = prepared.source / prepared.unit
     left: dict[str, float] = {}
     entered: dict[str, float] = {}
     if plan.outside is None:
-        reprojection = synthetic_image(displacement, prepared.source, threads=options.threads)
+        reprojection = _reprojection(displacement, source, options, report, _READ, _STEPS)
     else:
-        from_image, from_margin = (
-            synthetic_image(displacement, part, threads=options.threads)
-            for part in plan.outside.parts(prepared.source)
-        )
+        halfway = (_READ + _STEPS) // 2
+        of_image, of_margin = plan.outside.parts(source)
+        from_image = _reprojection(displacement, of_image, options, report, _READ, halfway)
+        from_margin = _reprojection(displacement, of_margin, options, report, halfway, _STEPS)
         reprojection = plan.within(from_image + from_margin)
         left, entered = crossings(from_image, from_margin, plan.outside)
-    report("read-out", 2, 2)
     inner = plan.within(potential)
     return _Fields(
         np.ascontiguousarray(inner - border_mean(inner)),
         np.ascontiguousarray(plan.within(displacement)),
-        np.ascontiguousarray(reprojection),
+        np.ascontiguousarray(reprojection) * prepared.unit,
         left,
         entered,
+    )
+
+
+def _reading(report: Reporter, first: int, last: int) -> Callable[[float], None]:
+    """Report a share of some work as steps of the read-out."""
+    return lambda share: report("read-out", round(first + share * (last - first)), _STEPS)
+
+
+def _reprojection(
+    displacement: Array,
+    source: Array,
+    options: InversionOptions,
+    report: Reporter,
+    first: int,
+    last: int,
+) -> Array:
+    tell = _reading(report, first, last)
+    return synthetic_image(
+        displacement,
+        source,
+        threads=options.threads,
+        on_progress=lambda news: tell(news.step / (news.total or 1)),
     )
 
 
@@ -487,17 +543,30 @@ def _report(
     plan: SitePlan,
     solutions: list[LevelSolution],
     fields: _Fields,
+    jacobian: Array,
     seconds: dict[str, float],
     options: InversionOptions,
 ) -> Report:
     finest = solutions[-1]
     warnings = prepared.warnings
+    image, source = prepared.image / prepared.unit, prepared.source / prepared.unit
+    reprojection = fields.reprojection / prepared.unit
     if not finest.converged:
         warnings = (
             f"not converged: flux residual {finest.residual:.2g} per cell, asked for "
             f"{options.tolerance:.2g}; {finest.reason}",
             *warnings,
         )
+    else:
+        found = doubts(
+            replace(prepared, image=image, source=source),
+            fields.displacement,
+            reprojection,
+            jacobian,
+            len(finest.weights),
+            options,
+        )
+        warnings = (*found, *warnings)
     return Report(
         converged=finest.converged,
         iterations=sum(solution.iterations for solution in solutions),
@@ -516,4 +585,5 @@ def _report(
         flux_scale=prepared.flux_scale,
         flux_left=fields.flux_left,
         flux_entered=fields.flux_entered,
+        image_residual=image_residual(image, reprojection, prepared.mask),
     )

@@ -1,11 +1,13 @@
 """What is done to a shot before its inversion: filters, then a guess of its undisturbed beam.
 
 - all of it, in order: `Preparation`
-- a shot as an estimate of its source shall see it: `as_beam`
+- masks that contradict each other: `check_masks`
 """
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +18,16 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.recipes import Estimate, Filter
 
 if TYPE_CHECKING:
-    from napari_shadowinv.progress import ShouldStop
+    from napari_shadowinv.progress import OnWarning, ShouldStop
 
-__all__ = ["Preparation", "as_beam"]
+__all__ = ["Preparation", "check_masks"]
 
 Image = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+_LEAST_VISIBLE = 0.1  # of what the source mask hides in one place, for the inversion to see it
+_LEAST_OBJECT = 10  # pixels
+_MOST_FALL = 10.0  # times below the dimmest pixel seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,20 +53,21 @@ class Preparation:
         """Titles and parameters of the filters; empty if there are none."""
         return "; ".join(one.described for one in self.filters)
 
-    def check(self, *, has_source: bool, has_mask: bool) -> None:
+    def check(self, *, has_source: bool, mask: Mask | None) -> None:
         """Refuse what contradicts itself, before any work.
 
         Parameters
         ----------
         has_source : bool
             Whether there is a measured source.
-        has_mask : bool
-            Whether there is a mask of usable pixels.
+        mask : ndarray of bool, shape (H, W), or None
+            The pixels that can be used.
 
         Raises
         ------
         InputError
-            If there is a source though the image is flattened, or no mask for what needs one.
+            If there is a source though the image is flattened, no source mask for an estimate
+            that needs one, or the mask hides the object, too.
         """
         flattening = [one.described for one in self.filters if one.flattens]
         if has_source and flattening:
@@ -69,7 +76,12 @@ class Preparation:
                 "image while the source still has it: leave one of them out"
             )
         if self.estimate is not None:
-            self.estimate.check(has_mask=has_mask or self.bare is not None)
+            if self.estimate.needs_mask and self.bare is None:
+                raise InputError(
+                    f"got the estimate '{self.estimate.title}' without a source mask, which hides "
+                    "the object from it and not from the inversion: give one"
+                )
+            check_masks(mask, self.bare)
         elif self.bare is not None:
             raise InputError(
                 "got a source mask, which an estimate of the source looks at, but no estimate: "
@@ -107,11 +119,19 @@ class Preparation:
         return image
 
     def estimated(
-        self, image: NDArray[Any], mask: Mask | None = None, should_stop: ShouldStop | None = None
+        self,
+        image: NDArray[Any],
+        mask: Mask | None = None,
+        should_stop: ShouldStop | None = None,
+        on_warning: OnWarning | None = None,
+        *,
+        by: Callable[..., Image] | None = None,
     ) -> Image:
         """Guess the source of a shot that is filtered.
 
-        Parameters and errors are those of `filtered`.
+        Parameters and errors are those of `filtered`, but for `on_warning`: it receives a
+        sentence where the estimate has to be doubted (default: `warnings.warn`); and `by`, what
+        is called as `Estimate.source` is, and in its place.
 
         Returns
         -------
@@ -119,25 +139,65 @@ class Preparation:
         """
         assert self.estimate is not None
         usable = _both(mask, self.bare)
-        return self.estimate.source(as_beam(image, usable), usable, should_stop)
+        beam = _as_beam(image, usable)
+        guess = self.estimate.source if by is None else by
+        source = guess(beam, usable, should_stop=should_stop, on_warning=on_warning)
+        _check_fall(source, beam, mask, self.bare, on_warning)
+        return source
 
 
-def as_beam(image: NDArray[Any], mask: Mask | None) -> Image:
-    """Take away what an inversion would clip or not look at, which must not spoil an estimate.
+def _as_beam(image: NDArray[Any], mask: Mask | None) -> Image:
+    """Return a shot as an estimate of its source shall see it: not negative, 0 where masked."""
+    values = np.asarray(image, dtype=np.float64)
+    return np.maximum(values if mask is None else np.where(mask, values, 0), 0)
+
+
+def check_masks(mask: Mask | None, bare: Mask | None) -> None:
+    """Refuse a mask that takes the object, which the source mask tells of, out of the inversion.
 
     Parameters
     ----------
-    image : ndarray, shape (H, W)
-        The shot.
-    mask : ndarray of bool, shape (H, W), or None
-        The pixels to look at.
+    mask, bare : ndarray of bool, shape (H, W), or None
+        The pixels that can be used, and those where the object is not.
 
-    Returns
-    -------
-    ndarray, shape (H, W)
+    Raises
+    ------
+    InputError
+        If next to nothing of the object is left.
     """
-    values = np.asarray(image, dtype=np.float64)
-    return np.maximum(values if mask is None else np.where(mask, values, 0), 0)
+    if mask is None or bare is None or bare.all():
+        return
+    from scipy.ndimage import label
+
+    # Place by place: a source mask may hide a wide border of unusable pixels, too.
+    places, count = label(~bare, np.ones((3, 3)))
+    hidden = np.bincount(places.ravel(), minlength=count + 1)[1:]
+    visible = np.bincount(places[mask], minlength=count + 1)[1:]
+    # Stray pixels are no object, unless there is nothing else.
+    objects = hidden >= min(_LEAST_OBJECT, hidden.max())
+    hidden, visible = hidden[objects], visible[objects]
+    if (visible < _LEAST_VISIBLE * hidden).all():
+        raise InputError(
+            f"the mask hides {1 - visible.sum() / hidden.sum():.0%} of what the source mask hides, "
+            "so the object would be left out of the inversion: let the mask hide unusable pixels "
+            "only, and the source mask the object; if it is the object that is unusable, leave "
+            "the source mask out, as no estimate looks at what the mask hides"
+        )
+
+
+def _check_fall(
+    source: Image, image: Image, mask: Mask | None, bare: Mask | None, warn: OnWarning | None
+) -> None:
+    """Tell of a source that is much darker behind the source mask than anywhere around it."""
+    if bare is None:
+        return
+    seen, object_ = (bare, ~bare) if mask is None else (bare & mask, ~bare & mask)
+    if object_.any() and source[object_].min() < image[seen].min() / _MOST_FALL:
+        (warnings.warn if warn is None else warn)(
+            f"the estimated source falls to {source[object_].min():.3g} behind the source mask, "
+            f"the image is {image[seen].min():.3g} at least elsewhere: compare it with another "
+            "estimate"
+        )
 
 
 def _both(first: Mask | None, second: Mask | None) -> Mask | None:

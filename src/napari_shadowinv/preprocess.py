@@ -23,6 +23,7 @@ __all__ = [
     "margin_around",
     "masked_source",
     "number_of_sites",
+    "power_of_two",
     "prepare",
 ]
 
@@ -34,6 +35,9 @@ _LEAST_MARGIN = 4
 _MARGIN_SHARE = 0.05  # of the image's shorter side
 _BYTES_PER_SITE = 2000  # measured peak of a whole inversion, rounded up
 _NOTABLE_FLUX_CHANGE = 0.05
+_NOTABLE_MASK = 0.2  # of the pixels
+_DIMMEST, _BRIGHTEST = 1e-301, 1e301  # sums of a whole image stay within double precision
+_ALIKE = 1e-6  # of the mean: what rounding to 32 bits leaves of a difference
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,10 @@ class Prepared:
     image, source : ndarray, shape (H, W)
         Clipped where asked for, the image scaled to the flux of the source; 0 where masked.
     floored_image, floored_source : ndarray, shape (H, W)
-        The same as the transport sees them: dark pixels of the image raised to the floor,
-        masked pixels of both at the floor.
+        The same as the transport sees them, in units of `unit`: dark pixels of the image raised
+        to the floor, masked pixels of both at the floor.
+    unit : float
+        The source's `power_of_two`.
     mask : ndarray of bool, shape (H, W)
         The pixels that are used.
     clipped_pixels, floored_pixels : int
@@ -61,6 +67,7 @@ class Prepared:
     source: Array
     floored_image: Array
     floored_source: Array
+    unit: float
     mask: Mask
     clipped_pixels: int
     floored_pixels: int
@@ -100,7 +107,9 @@ def prepare(
     Raises
     ------
     InputError
-        If an array cannot be an image of a beam: wrong shape, not a number, negative, zero.
+        If an array cannot be an image of a beam: wrong shape, not a number, negative, zero,
+        or so bright or dim that its sums are beyond double precision; or if the source is the
+        image itself.
     """
     shape = _plane(image, "image").shape
     usable = np.ones(shape, bool) if mask is None else checked_mask(mask, shape)
@@ -117,11 +126,19 @@ def prepare(
         raise InputError(
             "image has no positive pixel, expected a beam: check the file and its background"
         )
+    _check_range(values, "image")
     if source is None:
         beam = np.where(usable, values.sum() / usable.sum(), 0.0)
     else:
         beam = checked_source(source, usable)
-    ratio = float(values.sum() / beam.sum())
+        _refuse_the_image_itself(beam, values, usable)
+    with np.errstate(over="ignore", under="ignore"):
+        ratio = float(values.sum() / beam.sum())
+    if not _DIMMEST < ratio < _BRIGHTEST:
+        raise InputError(
+            f"image has {values.sum():.3g} units of flux and source {beam.sum():.3g}: expected a "
+            "ratio that double precision can hold; divide each by its mean"
+        )
     conserved = flux_scale is None and options.flux != "known"
     if flux_scale is None:
         flux_scale = ratio if conserved else 1.0
@@ -133,22 +150,54 @@ def prepare(
         # The floor has added to both, not alike.
         floored *= floored_source.sum() / floored.sum()
     below = int((values[usable] < least).sum())
+    unit = power_of_two(beam)
     return Prepared(
         image=values,
         source=beam,
-        floored_image=floored,
-        floored_source=floored_source,
+        floored_image=floored / unit,
+        floored_source=floored_source / unit,
+        unit=unit,
         mask=usable,
         clipped_pixels=negative,
         floored_pixels=below,
         flux_scale=flux_scale,
-        warnings=_warnings(ratio if conserved else 1.0, negative, below, int(usable.sum())),
+        warnings=(
+            *_warnings(ratio if conserved else 1.0, negative, below, int(usable.sum())),
+            *_large_mask(usable),
+            *_few_sites(values.size, options),
+        ),
     )
+
+
+def power_of_two(source: Array) -> float:
+    """Return the power of two next below the brightest pixel: dividing by it rounds nothing."""
+    return float(2.0 ** np.floor(np.log2(source.max())))
+
+
+def _refuse_the_image_itself(beam: Array, image: Array, mask: Mask) -> None:
+    """Refuse a source that is proportional to the image, unless both are uniform."""
+    ones, others = (values[mask] / values[mask].mean() for values in (beam, image))
+    if np.abs(ones - others).max() <= _ALIKE and np.ptp(ones) > 2 * _ALIKE:
+        raise InputError(
+            "the source is the image itself, so nothing would be deflected: give an image of the "
+            "beam without the object, or an estimate of it"
+        )
 
 
 def masked_source(source: Array, mask: Mask, options: InversionOptions) -> Array:
     """Return a source with its masked pixels at the floor, so that cells fill the image."""
     return np.where(mask, source, options.floor * source[mask].mean())
+
+
+def _large_mask(usable: Mask) -> tuple[str, ...]:
+    share = 1 - float(usable.mean())
+    if share < _NOTABLE_MASK:
+        return ()
+    return (
+        f"the mask leaves out {share:.1%} of the pixels: the field there is only a smooth "
+        "continuation. A mask that hides the object from an estimate of the source is a source "
+        "mask, not this one",
+    )
 
 
 def _warnings(ratio: float, clipped: int, floored: int, size: int) -> tuple[str, ...]:
@@ -166,6 +215,15 @@ def _warnings(ratio: float, clipped: int, floored: int, size: int) -> tuple[str,
             "the field inside dark areas is not reliable"
         )
     return tuple(warnings)
+
+
+def _few_sites(pixels: int, options: InversionOptions) -> tuple[str, ...]:
+    if options.n_sites is not None or pixels <= MAX_DEFAULT_SITES:
+        return ()
+    return (
+        f"{MAX_DEFAULT_SITES:,} sites for {pixels:,} pixels, the most that are taken by default: "
+        f"n_sites = {pixels:,} resolves single pixels, and takes longer and more memory",
+    )
 
 
 def checked_source(source: ArrayLike, mask: Mask | None = None) -> Array:
@@ -198,7 +256,17 @@ def checked_source(source: ArrayLike, mask: Mask | None = None) -> Array:
         )
     if not beam.any():
         raise InputError("source is zero everywhere, expected the undisturbed beam")
+    _check_range(beam, "source")
     return beam
+
+
+def _check_range(values: Array, name: str) -> None:
+    peak = float(values.max())
+    if not _DIMMEST < peak < _BRIGHTEST:
+        raise InputError(
+            f"{name} has a brightest pixel of {peak:.3g}, expected one between {_DIMMEST:g} and "
+            f"{_BRIGHTEST:g}: divide it by its mean"
+        )
 
 
 def checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Mask:
@@ -245,9 +313,21 @@ def _finite_image(values: ArrayLike, name: str, mask: Mask) -> Array:
 
 
 def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
-    """Return the pixels beyond each edge that sites cover where the boundary is free."""
-    default = max(_LEAST_MARGIN, round(_MARGIN_SHARE * min(shape)))
-    return default if options.margin is None else options.margin
+    """Return the pixels beyond each edge that sites cover where the boundary is free.
+
+    Raises
+    ------
+    InputError
+        If it is wider than the image.
+    """
+    if options.margin is None:
+        return max(_LEAST_MARGIN, round(_MARGIN_SHARE * min(shape)))
+    if options.margin > max(shape):
+        raise InputError(
+            f"margin is {options.margin:,} px beside an image of {shape[0]} × {shape[1]} px, "
+            f"expected at most {max(shape)} px: choose it about as wide as the object"
+        )
+    return options.margin
 
 
 def number_of_sites(shape: tuple[int, int], options: InversionOptions) -> int:

@@ -1,4 +1,4 @@
-"""How long work tells its progress and is asked to stop.
+"""How long work tells its progress and its doubts, and is asked to stop.
 
 The core calls `on_progress` with a `Progress` and asks `should_stop` between
 steps; progress bars of the command line, of napari and of a notebook are
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from napari_shadowinv.errors import InversionCancelled
 
-__all__ = ["OnProgress", "Progress", "Reporter", "ShouldStop"]
+__all__ = ["OnProgress", "OnWarning", "Progress", "Reporter", "ShouldStop"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
+OnWarning = Callable[[str], None]
 ShouldStop = Callable[[], bool]
 
 

@@ -7,12 +7,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
+from napari_shadowinv.geometry.interpolation import BLOCK
 from napari_shadowinv.geometry.natural_neighbor import natural_neighbor
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
@@ -24,10 +26,16 @@ from napari_shadowinv.transport.solvers import LevelSolution
 __all__ = ["read_centroids", "read_dual", "read_out"]
 
 Array = NDArray[np.float64]
+OnShare = Callable[[float], None]
+
+_PART = 64 * BLOCK  # pixels
 
 
 def read_out(
-    plan: SitePlan, solution: LevelSolution, options: InversionOptions
+    plan: SitePlan,
+    solution: LevelSolution,
+    options: InversionOptions,
+    on_share: OnShare | None = None,
 ) -> tuple[Array, Array]:
     """Potential and displacement at the pixels, by the read-out that the options name.
 
@@ -39,6 +47,8 @@ def read_out(
         Of the plan's finest level.
     options : InversionOptions
         Its `readout`, `integration` and `threads` are used.
+    on_share : callable, optional
+        Receives the share of the pixels that are read, from 0 to 1; what it raises ends the work.
 
     Returns
     -------
@@ -54,7 +64,7 @@ def read_out(
         return read_centroids(
             level, displacement, level.shape, threads, integration=options.integration
         )
-    return read_dual(level, weights, displacement, level.shape, threads)
+    return read_dual(level, weights, displacement, level.shape, threads, on_share)
 
 
 def read_dual(
@@ -63,6 +73,7 @@ def read_dual(
     site_displacement: Array,
     shape: tuple[int, int],
     threads: int | None = None,
+    on_share: OnShare | None = None,
 ) -> tuple[Array, Array]:
     """Read the potential off the weights: at a site it is half the weight.
 
@@ -78,6 +89,8 @@ def read_dual(
         Shape (H, W) of the image.
     threads : int, optional
         Default: all cores.
+    on_share : callable, optional
+        See `read_out`.
 
     Returns
     -------
@@ -88,7 +101,15 @@ def read_dual(
         crosses, the potential is taken as its mirror image.
     """
     surface = potential_surface(level, weights, site_displacement, threads=threads)
-    potential = surface(_pixels(shape))[0].reshape(shape)
+    potential = np.empty(shape)
+    count = potential.size
+    # Whole blocks of the surface's queries, so that the parts change nothing.
+    for first in range(0, count, _PART):
+        part = np.arange(first, min(first + _PART, count))
+        rows, columns = np.divmod(part.astype(np.float64), shape[1])
+        potential.ravel()[part[0] : part[-1] + 1] = surface(np.column_stack([rows, columns]))[0]
+        if on_share is not None:
+            on_share((first + len(part)) / count)
     potential -= border_mean(potential)
     gradient = np.array(np.gradient(np.pad(potential, 1, mode="symmetric")))
     return potential, np.ascontiguousarray(-gradient[:, 1:-1, 1:-1])

@@ -1,9 +1,10 @@
 """Source estimates and filters together with their parameters, to keep, show and hand on.
 
-- guess the source: `UniformEstimate`, `GaussianEstimate`, `PolynomialEstimate`,
-  `LowPassEstimate`, `TotalVariationEstimate`, `InterpolatedEstimate`; by name: `ESTIMATES`
-- clean the image beforehand: `LowPassFilter`, `HighPassFilter`, `BackgroundFilter`,
-  `HotPixelFilter`; by name: `FILTERS`
+- guess the source: `UniformEstimate`, `IsotropicEstimate`, `GaussianEstimate`,
+  `PolynomialEstimate`, `LowPassEstimate`, `TotalVariationEstimate`, `InterpolatedEstimate`; by
+  name: `ESTIMATES`
+- clean the image beforehand: `LowPassFilter`, `HighPassFilter`, `ButterworthFilter`,
+  `BackgroundFilter`, `HotPixelFilter`; by name: `FILTERS`
 
 Each is a pydantic model whose fields are keywords of a function in `napari_shadowinv.sources` or
 `napari_shadowinv.filters`. Defaults are those of the function, wherever it has one.
@@ -16,27 +17,30 @@ Examples
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
-    from napari_shadowinv.progress import ShouldStop
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.progress import OnWarning, ShouldStop
 
 __all__ = [
     "ESTIMATES",
     "FILTERS",
     "BackgroundFilter",
+    "ButterworthFilter",
     "Estimate",
     "Filter",
     "GaussianEstimate",
     "HighPassFilter",
     "HotPixelFilter",
     "InterpolatedEstimate",
+    "IsotropicEstimate",
     "LowPassEstimate",
     "LowPassFilter",
     "PolynomialEstimate",
@@ -69,9 +73,12 @@ class Estimate(_Recipe):
     ----------
     needs_mask : bool
         Whether it does nothing without a mask.
+    warns : bool
+        Whether its function takes `on_warning`.
     """
 
     needs_mask: ClassVar[bool] = False
+    warns: ClassVar[bool] = False
 
     def check(self, *, has_mask: bool) -> None:
         """Refuse to work without a mask where one is needed.
@@ -92,8 +99,36 @@ class Estimate(_Recipe):
                 "hides; choose a mask that covers the object"
             )
 
+    def placed(
+        self,
+        setup: ProtonSetup | OpticalSetup | None,
+        shape: tuple[int, ...],
+        corner: tuple[int, int] = (0, 0),
+    ) -> Estimate:
+        """Return the same for the images of an experiment; most estimates do not depend on it.
+
+        Parameters
+        ----------
+        setup : ProtonSetup or OpticalSetup or None
+            The experiment, None if it is not known.
+        shape : tuple of int
+            Shape (H, W) of the whole image.
+        corner : tuple of int, optional
+            First row and column of the part of it whose source is to be estimated.
+
+        Raises
+        ------
+        InputError
+            If the estimate needs another setup.
+        """
+        return self
+
     def source(
-        self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
+        self,
+        image: Image,
+        mask: Mask | None,
+        should_stop: ShouldStop | None = None,
+        on_warning: OnWarning | None = None,
     ) -> Image:
         """Estimate the source by a function of `napari_shadowinv.sources`.
 
@@ -105,6 +140,8 @@ class Estimate(_Recipe):
             The pixels to look at.
         should_stop : callable, optional
             Asked now and then by estimates that take long.
+        on_warning : callable, optional
+            Receives a sentence where the estimate has to be doubted. Default: `warnings.warn`.
 
         Returns
         -------
@@ -120,8 +157,9 @@ class Estimate(_Recipe):
         from napari_shadowinv import sources
 
         self.check(has_mask=mask is not None)
+        told = {"on_warning": on_warning} if self.warns else {}
         estimated: Image = getattr(sources, self.function)(
-            image, mask=mask, should_stop=should_stop, **self.model_dump()
+            image, mask=mask, should_stop=should_stop, **told, **self.model_dump()
         )
         return estimated
 
@@ -136,15 +174,12 @@ class Estimate(_Recipe):
 
 
 class Filter(_Recipe):
-    """Something done to the image before its inversion.
+    """Something done to the image before its inversion."""
 
-    Attributes
-    ----------
-    flattens : bool
-        Whether it takes the beam out of the image, so that a measured source fits no more.
-    """
-
-    flattens: ClassVar[bool] = False
+    @property
+    def flattens(self) -> bool:
+        """Whether it takes the beam out of the image, so that a measured source fits no more."""
+        return False
 
     def filtered(
         self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
@@ -228,16 +263,91 @@ class UniformEstimate(Estimate):
     function = "uniform_source"
 
     def source(
-        self, image: Image, mask: Mask | None, should_stop: ShouldStop | None = None
+        self,
+        image: Image,
+        mask: Mask | None,
+        should_stop: ShouldStop | None = None,
+        on_warning: OnWarning | None = None,
     ) -> Image:
         from napari_shadowinv.sources import uniform_source
 
         return uniform_source(image, mask=mask)
 
 
+class IsotropicEstimate(Estimate):
+    """A point that shines evenly in all directions, on a flat detector."""
+
+    title = "isotropic point source"
+    function = "isotropic_source"
+    centre_y: float | None = Field(
+        default=None,
+        allow_inf_nan=False,
+        title="Centre y (px)",
+        description="Row in which the detector faces the source. Default: the image's middle.",
+    )
+    centre_x: float | None = Field(
+        default=None,
+        allow_inf_nan=False,
+        title="Centre x (px)",
+        description="Column in which the detector faces the source. Default: the image's middle.",
+    )
+    # Not a parameter: every face of the package asks for the setup elsewhere.
+    _setup: Any = PrivateAttr(default=None)
+
+    def placed(
+        self,
+        setup: ProtonSetup | OpticalSetup | None,
+        shape: tuple[int, ...],
+        corner: tuple[int, int] = (0, 0),
+    ) -> Estimate:
+        if setup is None:
+            raise _without_setup()
+        from napari_shadowinv.sources import point_distance
+
+        point_distance(setup)  # refuses a collimated beam before any work
+        height, width = shape
+        y = (height - 1) / 2 if self.centre_y is None else self.centre_y
+        x = (width - 1) / 2 if self.centre_x is None else self.centre_x
+        return self._at(y - corner[0], x - corner[1], setup)
+
+    def source(
+        self,
+        image: Image,
+        mask: Mask | None,
+        should_stop: ShouldStop | None = None,
+        on_warning: OnWarning | None = None,
+    ) -> Image:
+        from napari_shadowinv.sources import isotropic_source
+
+        if self._setup is None:
+            raise _without_setup()
+        return isotropic_source(image, self._setup, mask=mask, **self.model_dump())
+
+    def coarser(self, factor: int) -> Estimate:
+        if self._setup is None or self.centre_y is None or self.centre_x is None:
+            return self
+        from napari_shadowinv.physics.setup import binned_setup
+
+        y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
+        return self._at(y, x, binned_setup(self._setup, factor))
+
+    def _at(self, y: float, x: float, setup: ProtonSetup | OpticalSetup) -> Self:
+        placed = self.model_copy(update={"centre_y": y, "centre_x": x})
+        placed._setup = setup
+        return placed
+
+
+def _without_setup() -> InputError:
+    return InputError(
+        "got the source 'isotropic' without a setup, which tells how far away the point is and how "
+        "large the pixels are: give one, or choose the source 'uniform'"
+    )
+
+
 class GaussianEstimate(Estimate):
     """A fitted elliptical spot."""
 
+    warns = True
     title = "fitted Gaussian"
     function = "gaussian_source"
 
@@ -318,18 +428,51 @@ class LowPassFilter(Filter):
 class HighPassFilter(Filter):
     """Take away large structures."""
 
-    flattens = True
     title = "high-pass"
     function = "high_pass"
     width: float = _width(
         50.0, "Structures much larger than this standard deviation, in px, vanish.", 1.0, 200.0
     )
 
+    @property
+    def flattens(self) -> bool:
+        return True
+
+
+class ButterworthFilter(Filter):
+    """Take away large or small structures, with a chosen steepness."""
+
+    title = "Butterworth"
+    function = "butterworth"
+    cutoff: float = Field(
+        default=100.0,
+        gt=0,
+        title="Cutoff (px)",
+        description="Wavelength in px at which the amplitude falls by 1/√2.",
+        json_schema_extra={"slider": [2.0, 500.0]},
+    )
+    order: int = Field(
+        default=2,
+        ge=1,
+        le=20,
+        title="Order",
+        description="The amplitude falls as this power of the wavelength; high orders ring.",
+        json_schema_extra={"slider": [1, 20]},
+    )
+    kind: Literal["high", "low"] = Field(
+        default="high",
+        title="Keeps",
+        description="'high' takes away structures larger than the cutoff, 'low' smaller ones.",
+    )
+
+    @property
+    def flattens(self) -> bool:
+        return self.kind == "high"
+
 
 class BackgroundFilter(Filter):
     """Flatten by a polynomial."""
 
-    flattens = True
     title = "flatten (polynomial)"
     function = "remove_background"
     degree: int = _degree(" that is taken out of the image.")
@@ -338,6 +481,10 @@ class BackgroundFilter(Filter):
         title="How",
         description="'divide' by it, for an uneven beam, or 'subtract' it, for stray light.",
     )
+
+    @property
+    def flattens(self) -> bool:
+        return True
 
     def _applied(self, image: Image, mask: Mask | None, should_stop: ShouldStop | None) -> Image:
         from napari_shadowinv.filters import remove_background
@@ -371,6 +518,7 @@ class HotPixelFilter(Filter):
 
 ESTIMATES: dict[str, type[Estimate]] = {
     "uniform": UniformEstimate,
+    "isotropic": IsotropicEstimate,
     "gaussian": GaussianEstimate,
     "polynomial": PolynomialEstimate,
     "low_pass": LowPassEstimate,
@@ -380,6 +528,7 @@ ESTIMATES: dict[str, type[Estimate]] = {
 FILTERS: dict[str, type[Filter]] = {
     "low_pass": LowPassFilter,
     "high_pass": HighPassFilter,
+    "butterworth": ButterworthFilter,
     "background": BackgroundFilter,
     "hot_pixels": HotPixelFilter,
 }

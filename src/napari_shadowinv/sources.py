@@ -3,7 +3,8 @@
 An inversion needs the source: the image that the beam would make without the object. Where
 none was recorded, or the beam changes from shot to shot, it has to be guessed from the shot.
 
-- the beam is flat, or nothing is known: `uniform_source`
+- the beam is flat, or nothing is known: `uniform_source`; whether it can be: `uniform_warnings`
+- a point shines evenly in all directions: `isotropic_source`; how far away: `point_distance`
 - the beam is a Gaussian spot: `gaussian_source`
 - the beam varies slowly, in no known way: `polynomial_source`, `low_pass_source`
 - the beam has edges that matter: `total_variation_source`
@@ -12,6 +13,7 @@ none was recorded, or the beam changes from shot to shot, it has to be guessed f
 Each takes an image ``[y, x]`` and returns one of the same shape that is positive everywhere
 and has the same flux over the usable pixels. A `mask` is True where a pixel is usable; the
 others (dead areas, handwriting, a shadow) may hold anything, NaN too, and are filled in.
+An estimate that rises there to ten times the brightest pixel it saw is refused.
 Those that take long ask `should_stop` at each of their steps.
 
 What an estimate takes for the beam is lost from the object, and the other way round. The
@@ -20,7 +22,9 @@ choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179
 
 from __future__ import annotations
 
-from typing import Literal
+import math
+import warnings
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,15 +42,21 @@ from napari_shadowinv.filters import (
     fit_polynomial,
     low_pass,
 )
-from napari_shadowinv.progress import Reporter, ShouldStop
+from napari_shadowinv.progress import OnWarning, Reporter, ShouldStop
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 __all__ = [
     "gaussian_source",
     "interpolated_source",
+    "isotropic_source",
     "low_pass_source",
+    "point_distance",
     "polynomial_source",
     "total_variation_source",
     "uniform_source",
+    "uniform_warnings",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -62,6 +72,11 @@ _COARSEST_SIDE = 32
 _FILL_WIDTH = 5.0
 _NARROWEST_WAVES = 2.0  # px; a Gaussian that is narrower has waves too short for the pixels
 _FILL_TOLERANCE = 1e-6
+_MOST_EXTRAPOLATION = 10.0  # times the brightest pixel seen
+_NOTABLE_EXTRAPOLATION = 1.5  # likewise
+# Of a fitted Gaussian: height over the image's mean, and sides from the image's middle.
+_HIGHEST, _FARTHEST = 1e3, 3.0
+_NOTABLE_FALL = 0.01  # of the fluence, from the brightest pixel to the dimmest
 
 
 def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatArray:
@@ -93,8 +108,133 @@ def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatA
     return np.full(values.shape, values[usable].mean())
 
 
+def uniform_warnings(
+    shape: tuple[int, int],
+    setup: ProtonSetup | OpticalSetup | None,
+    *,
+    centre: tuple[float, float] | None = None,
+) -> tuple[str, ...]:
+    """Say whether a point source would light an image too unevenly to be taken as uniform.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Height and width of the image.
+    setup : ProtonSetup or OpticalSetup, optional
+        The experiment. Default: not known, and nothing is said.
+    centre : tuple of float, optional
+        See `isotropic_source`, there `centre_y` and `centre_x`.
+
+    Returns
+    -------
+    tuple of str
+        Empty where the fluence of an isotropic point source varies by 1 % at most.
+
+    Examples
+    --------
+    >>> from napari_shadowinv.physics.phantoms import paper_setup
+    >>> uniform_warnings((60, 60), paper_setup())
+    ()
+    >>> len(uniform_warnings((400, 400), paper_setup()))
+    1
+    """
+    if setup is None or setup.collimated:
+        return ()
+    distance = point_distance(setup)
+    axis = [(side - 1) / 2 for side in shape] if centre is None else centre
+    near = [max(0.0, place - (side - 1), -place) for place, side in zip(axis, shape, strict=True)]
+    far = [max(place, side - 1 - place) for place, side in zip(axis, shape, strict=True)]
+    highest, lowest = ((1 + (math.hypot(*r) / distance) ** 2) ** -1.5 for r in (near, far))
+    fall = 1 - lowest / highest
+    if fall <= _NOTABLE_FALL:
+        return ()
+    return (
+        f"the source is taken as uniform, but a point source {setup.source_object_distance:.3g} m "
+        f"from the object lights this image unevenly, by {fall:.1%} between brightest and dimmest "
+        "pixel: if yours shines evenly in all directions, choose the source 'isotropic'",
+    )
+
+
+def isotropic_source(
+    image: ArrayLike,
+    setup: ProtonSetup | OpticalSetup,
+    *,
+    centre_y: float | None = None,
+    centre_x: float | None = None,
+    mask: ArrayLike | None = None,
+) -> FloatArray:
+    """Beam of a point that shines evenly in all directions, on a flat detector.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; only its flux is used.
+    setup : ProtonSetup or OpticalSetup
+        The experiment: distance of the point, and side of a pixel.
+    centre_y, centre_x : float, optional
+        Pixel in which the detector faces the point. Default: the middle of the image.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel is usable. Default: everywhere.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The beam, in the unit of `image`.
+
+    Raises
+    ------
+    InputError
+        If image and mask cannot be used, the image has no flux, the beam of the setup is
+        collimated, or the centre is not finite.
+
+    Notes
+    -----
+    A pixel receives its share of the solid angle; for small pixels that is proportional to
+    cos³θ, with θ the angle between its line of sight to the point and the detector's normal.
+
+    Examples
+    --------
+    >>> from napari_shadowinv.physics.phantoms import paper_setup
+    >>> beam = isotropic_source(np.ones((201, 201)), paper_setup())
+    >>> float(round(beam[0, 0] / beam[100, 100], 3))  # the corner, 9.3 degrees from the axis
+    0.961
+    """
+    values, usable = _beam_pixels(image, mask)
+    distance = point_distance(setup)
+    y, x = (
+        _edges(side, "centre_" + axis, centre) / distance
+        for side, axis, centre in zip(values.shape, "yx", (centre_y, centre_x), strict=True)
+    )
+    y = y[:, None]
+    # Solid angle of the rectangle between the axis and each corner of the pixels.
+    angles = np.arctan2(y * x, np.sqrt(1 + y**2 + x**2))
+    beam = np.diff(np.diff(angles, axis=0), axis=1)
+    return np.asarray(beam * (values[usable].mean() / beam[usable].mean()))
+
+
+def point_distance(setup: ProtonSetup | OpticalSetup) -> float:
+    """Return how far the point source is from the detector, in px of the detector.
+
+    Raises
+    ------
+    InputError
+        If the beam is collimated.
+    """
+    if setup.collimated:
+        raise InputError(
+            "got the source 'isotropic' and a setup with a collimated beam (source_object_distance "
+            "is inf): give the distance of the point, or choose the source 'uniform'"
+        )
+    # The magnification enlarges distance and pixel alike.
+    return setup.source_object_distance / setup.object_pixel_size
+
+
 def gaussian_source(
-    image: ArrayLike, *, mask: ArrayLike | None = None, should_stop: ShouldStop | None = None
+    image: ArrayLike,
+    *,
+    mask: ArrayLike | None = None,
+    should_stop: ShouldStop | None = None,
+    on_warning: OnWarning | None = None,
 ) -> FloatArray:
     """Elliptical Gaussian plus a constant, fitted to the image.
 
@@ -106,11 +246,14 @@ def gaussian_source(
         True where a pixel is usable. Default: everywhere.
     should_stop : callable, optional
         Asked at each step; when it returns true the estimate ends.
+    on_warning : callable, optional
+        Receives a sentence where the fit has to be doubted. Default: `warnings.warn`.
 
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The fitted beam, in the unit of `image`.
+        The fitted beam, in the unit of `image`; the same everywhere if the fit rises, where
+        nothing is seen, to ten times what is seen.
 
     Raises
     ------
@@ -124,7 +267,9 @@ def gaussian_source(
     Least squares with the soft L1 loss, whose unit is the median absolute deviation of the
     residuals, found by fitting again until it stays: modulation stronger than that counts
     in proportion, not squared. Centre, both widths, tilt, height and constant are free; the
-    last two are not negative. Large images are averaged in blocks for the fit.
+    last two are not negative. Large images are averaged in blocks for the fit. A Gaussian
+    narrower than 1/256 of the image, higher than 1000 times the mean, or more than three sides
+    away from the middle of what is seen is not considered.
 
     Examples
     --------
@@ -140,8 +285,21 @@ def gaussian_source(
     report = Reporter(None, should_stop)
     parameters = _fitted_gaussian(y / side, x / side, sample, report)
     rows, columns = (np.arange(n) / side for n in values.shape)
-    beam = mean * _gaussian(parameters, rows[:, None], columns)
-    return _with_flux_of(beam, values, usable)
+    beam = _gaussian(parameters, rows[:, None], columns)
+    rise = float(beam.max() / sample.max())
+    tell = _python_warning if on_warning is None else on_warning
+    if rise > _MOST_EXTRAPOLATION:
+        tell(
+            "no Gaussian beam can be told from the pixels that are not masked: the source is "
+            "taken as uniform; mask less, or choose another estimate"
+        )
+        return uniform_source(image, mask=mask)
+    if rise > _NOTABLE_EXTRAPOLATION:
+        tell(
+            f"the Gaussian beam rises to {rise:.2g} times what the fit has seen, where the mask "
+            "hides the image: compare it with another estimate, or mask less"
+        )
+    return _with_flux_of(mean * beam, values, usable)
 
 
 def polynomial_source(
@@ -392,11 +550,29 @@ def _beam_pixels(image: ArrayLike, mask: ArrayLike | None) -> tuple[FloatArray, 
     return values, usable
 
 
+def _edges(side: int, name: str, centre: float | None) -> FloatArray:
+    """Edges of so many pixels, relative to the centre of one, or to the middle of all."""
+    if centre is not None and not math.isfinite(centre):
+        raise InputError(f"{name} is {centre!r}, expected a finite number of px")
+    return np.arange(-0.5, side) - ((side - 1) / 2 if centre is None else centre)
+
+
 def _with_flux_of(beam: FloatArray, values: FloatArray, usable: BoolArray) -> FloatArray:
     """A beam made positive and given the flux of an image over its usable pixels."""
     mean = values[usable].mean()
     positive = np.maximum(beam, _FLOOR * mean)
-    return np.asarray(positive * (mean / positive[usable].mean()))
+    source = np.asarray(positive * (mean / positive[usable].mean()))
+    seen = float(values[usable].max())
+    if not source.max() <= _MOST_EXTRAPOLATION * seen:
+        raise InputError(
+            f"the estimated source rises to {source.max():.3g} where the mask hides the image, "
+            f"which is {seen:.3g} at most elsewhere: mask less, or choose another estimate"
+        )
+    return source
+
+
+def _python_warning(text: str) -> None:
+    warnings.warn(text, stacklevel=3)
 
 
 def _samples(values: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -425,17 +601,33 @@ def _fitted_gaussian(
     y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter
 ) -> FloatArray:
     """Parameters of `_gaussian` that fit samples, by repeated robust least squares."""
-    parameters = _first_gaussian(y, x, sample)
+    bounds = _bounds(y, x)
+    parameters = np.clip(_first_gaussian(y, x, sample), *bounds)
     # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
-    parameters = _refitted(parameters, y, x, sample, report, loss="linear", scale=1.0)
+    parameters = _refitted(parameters, y, x, sample, report, bounds, loss="linear", scale=1.0)
     scale = 0.0
     for _ in range(_MOST_FITS):
         residual = _gaussian(parameters, y, x) - sample
         previous, scale = scale, max(_NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
         if abs(scale - previous) < 1e-2 * scale:
             break
-        parameters = _refitted(parameters, y, x, sample, report, loss="soft_l1", scale=scale)
+        parameters = _refitted(
+            parameters, y, x, sample, report, bounds, loss="soft_l1", scale=scale
+        )
     return parameters
+
+
+def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least and greatest parameters of `_gaussian`: without them it may hide behind a mask."""
+    steepest = math.sqrt(_MOST_FITTED_PIXELS)  # one over the width of a block of pixels
+    ranges = [
+        (0, _HIGHEST),
+        (0, _HIGHEST),
+        *((axis.mean() - _FARTHEST, axis.mean() + _FARTHEST) for axis in (y, x)),
+        *[(-steepest, steepest)] * 3,
+    ]
+    least, most = np.transpose(ranges)
+    return least, most
 
 
 def _refitted(
@@ -444,13 +636,12 @@ def _refitted(
     x: FloatArray,
     sample: FloatArray,
     report: Reporter,
+    bounds: tuple[FloatArray, FloatArray],
     *,
     loss: Literal["linear", "soft_l1"],
     scale: float,
 ) -> FloatArray:
     """Parameters of `_gaussian` nearest to samples, in the sense of a loss of some scale."""
-    least = np.full(len(parameters), -np.inf)
-    least[:2] = 0  # height and constant
 
     def excess(p: FloatArray) -> FloatArray:
         report("source", 0)
@@ -460,7 +651,7 @@ def _refitted(
         excess,
         parameters,
         jac=lambda p: _gaussian_slopes(p, y, x),
-        bounds=(least, np.inf),
+        bounds=bounds,
         loss=loss,
         f_scale=scale,
         x_scale="jac",

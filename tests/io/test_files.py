@@ -1,3 +1,6 @@
+import errno
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -94,3 +97,44 @@ def test_temporary_file_lies_beside_with_the_same_ending(tmp_path: Path) -> None
         assert not path.exists()
         np.save(temporary, np.arange(3))
     assert np.load(path).tolist() == [0, 1, 2]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals to oneself")
+def test_ctrl_c_during_the_clean_up_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    remove = Path.unlink
+
+    def interrupted(path: Path, missing_ok: bool = False) -> None:
+        signal.raise_signal(signal.SIGINT)
+        remove(path, missing_ok)
+
+    def work() -> None:
+        with replacing(tmp_path / "a.txt") as temporary:
+            temporary.write_text("half")
+            monkeypatch.setattr(Path, "unlink", interrupted)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    monkeypatch.undo()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_takes_its_name_when_the_disk_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = []
+
+    def fsync(descriptor: int) -> None:
+        names.append([path.name for path in tmp_path.iterdir()])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with (
+        pytest.raises(FileFormatError, match=r"a\.txt cannot be written \(No space left"),
+        replacing(tmp_path / "a.txt") as temporary,
+    ):
+        temporary.write_text("whole")
+    assert names == [[temporary.name]]
+    assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,7 @@ from PIL import Image
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read, read_dataset, read_radiograph, read_toml
 from napari_shadowinv.io.files import sha256
-from napari_shadowinv.io.radiograph import Radiograph
+from napari_shadowinv.io.radiograph import Radiograph, film_warnings
 
 RAMP = np.arange(6 * 9).reshape(6, 9)
 
@@ -94,7 +94,7 @@ def test_planar_colour_tiff(tmp_path: Path) -> None:
 def test_colour_needs_a_choice_that_exists(tmp_path: Path) -> None:
     path = tmp_path / "film.png"
     iio.imwrite(path, colours())
-    with pytest.raises(InputError, match=r'3 channels: choose .* "red", "green", "blue"'):
+    with pytest.raises(InputError, match=r'3 channels: convert .* dose .* "red", "green", "blue"'):
         read(path)
     for channel in ("purple", 3, "-1"):
         with pytest.raises(InputError, match="no channel"):
@@ -295,6 +295,21 @@ def test_real_film_scan(shared_data: Path) -> None:
     assert red.image.shape == (548, 1022)
     assert red.metadata["bits"] == 16
     np.testing.assert_array_equal(red.image, tifffile.imread(path)[..., 0])
+    assert "wrong sign unless it is converted to dose first" in red.warnings[0]
+
+
+def test_every_real_film_is_told_and_no_linear_image(shared_data: Path) -> None:
+    for path in (shared_data / "rcf").glob("*.tif"):
+        scan = tifffile.imread(path)
+        for grey in (scan[..., 0], scan[..., 2], (scan[..., 1] // 257).astype(np.uint8)):
+            assert film_warnings(grey, None), path
+    for path in [*shared_data.glob("toroid/dm*.npy"), shared_data / "donut" / "intensity.npy"]:
+        image = np.load(path)
+        if image.ndim == 2:  # dm194 and the donut are nearly empty in the middle
+            scaled = np.clip(image / image.max() * 65535, 0, None).astype(np.uint16)
+            assert not film_warnings(scaled, None), path
+    for path in (shared_data / "burner" / "data").glob("*.bmp"):
+        assert not read_radiograph(path).warnings, path
 
 
 def test_real_shadowgram(shared_data: Path) -> None:

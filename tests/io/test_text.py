@@ -88,6 +88,69 @@ def test_pradreader_stacks_image_and_reference(tmp_path: Path) -> None:
     np.testing.assert_array_equal(radiograph.source, VALUES + 1)
 
 
+def pradreader(path: Path, *header: str, blocks: int = 3) -> Path:
+    """Write shot, reference and a mask that leaves the last two columns out."""
+    mask = np.zeros(VALUES.shape)
+    mask[:, -2:] = 1
+    with path.open("w") as file:
+        file.write("".join(f"# {line}\n" for line in header))
+        for block in (VALUES, VALUES + 1, mask, mask)[:blocks]:
+            np.savetxt(file, block, delimiter=",", fmt="%.17g")
+    return path
+
+
+ALL = ("flux2D (5, 7)", "flux2D_ref (5, 7)", "mask (5, 7)")
+SELECTED = ("x-mask 0.0 % - 100.0 %", "y-mask 0.0 % - 100.0 %")
+
+
+@pytest.mark.parametrize(
+    "header", [ALL, (*ALL[:2], *SELECTED), ("flux2D (5, 7)", "flux2D_ref", "mask")]
+)
+def test_pradreader_stacks_a_mask_too(tmp_path: Path, header: tuple[str, ...]) -> None:
+    radiograph = read_radiograph(pradreader(tmp_path / "input.txt", *header))
+    np.testing.assert_array_equal(radiograph.image, VALUES)
+    assert radiograph.source is not None
+    np.testing.assert_array_equal(radiograph.source, VALUES + 1)
+    assert radiograph.mask is not None
+    np.testing.assert_array_equal(radiograph.mask, np.arange(7) < np.full((5, 1), 5))
+
+
+def test_pradreader_selects_rows_and_columns_by_their_share(tmp_path: Path) -> None:
+    header = (*ALL[:2], "x-mask 20 % - 80 %", "y-mask 0.0 % - 100.0 %")
+    mask = read_radiograph(pradreader(tmp_path / "input.txt", *header, blocks=2)).mask
+    assert mask is not None
+    np.testing.assert_array_equal(mask.all(axis=1), [False, True, True, True, False])
+    assert read_radiograph(pradreader(tmp_path / "all.txt", *ALL[:2], blocks=2)).mask is None
+
+
+@pytest.mark.parametrize(
+    ("header", "blocks"),
+    [
+        (ALL, 2),
+        (ALL, 4),
+        (ALL[:2], 3),
+        (ALL[:1], 2),
+        (("flux2D (4, 7)", "flux2D_ref (4, 7)"), 2),
+        (("flux2D (5, 8)", "flux2D_ref (5, 8)"), 2),
+        (("flux2D (5, 7)", "flux2D_ref (6, 7)"), 2),
+    ],
+)
+def test_other_blocks_than_the_header_tells_are_refused(
+    tmp_path: Path, header: tuple[str, ...], blocks: int
+) -> None:
+    with pytest.raises(FileFormatError, match=r"rows of 7 numbers, but its header tells flux2D"):
+        read_radiograph(pradreader(tmp_path / "input.txt", *header, blocks=blocks))
+
+
+def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "input.txt"
+    with path.open("w") as file:
+        file.write("# flux2D (5, 7)\n# mask (5, 7)\n")
+        np.savetxt(file, np.vstack([VALUES, VALUES]))
+    with pytest.raises(FileFormatError, match="other numbers than 0"):
+        read_radiograph(path)
+
+
 @pytest.mark.parametrize(
     ("rows", "message"),
     [

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +11,8 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read_radiograph, write
 from napari_shadowinv.physics.setup import ProtonSetup
+
+Disk = tuple[Path, Callable[[str], bool]]
 
 IMAGE = np.linspace(0, 7, 30).reshape(5, 6)
 
@@ -76,3 +81,56 @@ def test_error_while_writing_leaves_the_old_result(
         write(path, inversion, overwrite=True)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["a.shadowinv", "a.h5", "a.csv", "a.tif", "a.npy", "a.png"])
+def test_a_full_disk_is_told_and_keeps_the_old_file(
+    name: str, small_disk: Disk, inversion: Inversion, proton_setup: ProtonSetup
+) -> None:
+    folder, _ = small_disk
+    result = inversion if name.endswith((".shadowinv", ".h5", ".csv")) else IMAGE
+    old = write(folder / name, result, setup=proton_setup).read_bytes()
+    (folder / "other").write_bytes(bytes(_left(folder)))
+    with pytest.raises(FileFormatError, match=rf"{name} cannot be written \(No space left on dev"):
+        write(folder / name, result, setup=proton_setup, overwrite=True)
+    assert (folder / name).read_bytes() == old
+    assert sorted(path.name for path in folder.iterdir()) == [name, "other"]
+
+
+def _left(folder: Path) -> int:
+    import shutil
+
+    return shutil.disk_usage(folder).free
+
+
+# A process of its own: HDF5 would take this one with it.
+_LONGEST = """
+import resource, sys
+from pathlib import Path
+from napari_shadowinv.io import read, write
+
+dataset = read(sys.argv[1])
+_, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, most))
+for name in ("b.shadowinv", "b.h5"):
+    try:
+        write(Path(sys.argv[1]).with_name(name), dataset)
+    except OSError as error:
+        print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no limit there")
+def test_hdf5_that_finds_no_room_does_not_end_the_process(
+    tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup
+) -> None:
+    whole = write(tmp_path / "a.shadowinv", inversion, setup=proton_setup)
+    printed = subprocess.run(
+        [sys.executable, "-c", _LONGEST, str(whole)], capture_output=True, text=True
+    )
+    assert (printed.returncode, printed.stderr) == (0, "")
+    lines = printed.stdout.splitlines()
+    assert [line.split(" (")[0] for line in lines] == [
+        f"{tmp_path / name} cannot be written" for name in ("b.shadowinv", "b.h5")
+    ]
+    assert list(tmp_path.iterdir()) == [whole]

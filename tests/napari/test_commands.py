@@ -111,7 +111,7 @@ def test_from_the_menu_an_inversion_brings_its_layers_and_the_scale_bar(
     window = make_napari_viewer()
     add_shot(window, shot, proton_setup)
     in_loop(registered("invert_uniform"))
-    qtbot.waitUntil(lambda: len(window.layers) == 11, timeout=120_000)
+    qtbot.waitUntil(lambda: len(window.layers) == 12, timeout=120_000)
     assert window.layers.selection.active.name == "shot |∫B×dz| (µT·m)"
     assert window.canvas.overlays.scale_bar.visible
 

@@ -29,7 +29,7 @@ def test_all_of_a_result_is_there_and_the_field_and_arrows_are_visible(
     layers = by_role(add_inversion(viewer, solved, proton_setup, name="shot 7"))
     assert list(layers) == [
         "image", "reprojection", "residual", "potential", "field y", "field x", "field",
-        "caustic", "arrows", "sites",
+        "caustic", "field arrows", "arrows", "sites",
     ]  # fmt: skip
     assert {role for role, layer in layers.items() if layer.visible} == {"field", "arrows"}
     assert all(layer.name.startswith("shot 7 ") for layer in viewer.layers)
@@ -51,7 +51,7 @@ def test_values_are_those_of_the_result_in_the_unit_that_the_layer_names(
         layers["potential"].data, metres * proton_setup.potential(solved.potential)
     )
     assert unit_of(layers["potential"]) in layers["potential"].name
-    percent = 100 * solved.residual / solved.source.mean()
+    percent = 100 * solved.residual / solved.image.mean()
     np.testing.assert_allclose(layers["residual"].data, percent)
     np.testing.assert_array_equal(layers["reprojection"].data, solved.reprojection)
     np.testing.assert_array_equal(layers["caustic"].data > 0, solved.caustic)
@@ -330,7 +330,7 @@ def test_the_field_of_a_megapixel_is_seen_first_and_within_a_second(
     for _ in range(2):
         inserted.clear()
         drawn, complete, _ = shown_in(window, qtbot, described)
-        assert inserted[:2] == ["|d| (px)", "arrows"]
+        assert inserted[:2] == ["|d| (px)", "displacement arrows"]
         assert [layer.name for layer in window.layers] == names
         assert window.layers.selection.active is window.layers["|d| (px)"]
         window.layers.clear()

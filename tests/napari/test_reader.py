@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 from napari.components import ViewerModel
+from napari.utils.notifications import notification_manager
 from scipy.io import savemat
 
 from napari_shadowinv import FileFormatError, ProtonSetup, write
@@ -18,6 +20,7 @@ from napari_shadowinv._napari.layers import thinned_arrows
 from napari_shadowinv._napari.leafing import follow_shots
 from napari_shadowinv._napari.marks import mark_of, result_of, role_of, setup_of, source_of
 from napari_shadowinv._napari.reader import get_reader, read_paths
+from napari_shadowinv._napari.widgets._reading import warnings_of
 from napari_shadowinv.inversion import Inversion
 
 PLUGIN = "napari-shadowinv"
@@ -95,10 +98,10 @@ def test_formats_that_napari_does_not_know_need_no_choice(
 def test_text_with_a_header_brings_scale_and_source(viewer: ViewerModel, tmp_path: Path) -> None:
     image, reference = np.full((4, 5), 7.0), np.full((4, 5), 8.0)
     path = tmp_path / "praline.txt"
-    header = "s2r_cm 1.0\ns2d_cm 11.0\nEp_MeV 14.7\nbin_um 110.0\nflux2D (4, 5)"
+    header = "s2r_cm 1.0\ns2d_cm 11.0\nEp_MeV 14.7\nbin_um 110.0\nflux2D (4, 5)\nflux2D_ref (4, 5)"
     np.savetxt(path, np.vstack([image, reference]), header=header)
     source, layer = viewer.open(path, plugin=PLUGIN)
-    assert (role_of(source), role_of(layer)) == ("source", "image")
+    assert (role_of(source), role_of(layer)) == ("source", "shot")
     assert not source.visible
     np.testing.assert_array_equal(source_of(layer), reference)
     np.testing.assert_array_equal(source.data, reference)
@@ -204,7 +207,7 @@ def test_a_pradformat_inversion_shows_its_field(
 ) -> None:
     write(tmp_path / "field.h5", solved, setup=proton_setup)
     layers = {role_of(layer): layer for layer in viewer.open(tmp_path / "field.h5", plugin=PLUGIN)}
-    assert list(layers) == ["potential", "field y", "field x", "field", "arrows"]
+    assert list(layers) == ["potential", "field y", "field x", "field", "field arrows", "arrows"]
     field = proton_setup.path_integrated_b(solved.displacement)
     np.testing.assert_allclose(layers["field"].data, 1e3 * np.hypot(*field), rtol=1e-9)
     np.testing.assert_allclose(layers["field"].scale, 1.5)
@@ -366,7 +369,53 @@ def test_shots_that_are_marked_as_pending_are_not_looked_at(store: Path, solved:
 def test_a_damaged_store_is_one_sentence(store: Path) -> None:
     shutil.rmtree(store / "displacement")
     (store / "zarr.json").unlink()
-    with pytest.raises(FileFormatError, match=r"no store of results or is damaged|without the"):
+    with pytest.raises(FileFormatError, match=r"is damaged or cut short|without the"):
         read_paths(str(store))
     with pytest.raises(FileFormatError, match="does not exist"):
         read_paths(str(store.with_name("gone.shadowinv.zarr")))
+
+
+def test_a_scan_of_film_is_told_and_so_is_its_result(viewer: ViewerModel, tmp_path: Path) -> None:
+    film = np.full((24, 32), 60_000, np.uint16)
+    film[6:-6, 8:-8] = 20_000
+    tifffile.imwrite(tmp_path / "film.tif", film)
+    tifffile.imwrite(tmp_path / "film2.tif", film)
+    ((_, own, _),) = read_paths([str(tmp_path / "film.tif"), str(tmp_path / "film2.tif")])
+    (told,) = [record for record in notification_manager.records if "film.tif" in record.message]
+    (warning,) = mark_of(own)["warnings"]
+    assert "wrong sign" in warning
+    assert warning in told.message
+    (read_by_napari,) = viewer.open(tmp_path / "film.tif", plugin="napari")
+    assert warnings_of(read_by_napari) == (warning,)
+    assert warnings_of(viewer.add_image(film)) == ()
+
+
+def test_pradreader_brings_its_source_and_its_mask(
+    viewer: ViewerModel, shot: np.ndarray, tmp_path: Path
+) -> None:
+    mask = np.zeros(shot.shape)
+    mask[:, :3] = 1
+    told = "\n".join(f"{name} {shot.shape}" for name in ("flux2D", "flux2D_ref", "mask"))
+    np.savetxt(tmp_path / "input.txt", np.vstack([shot, shot + 1, mask]), header=told)
+    layers = viewer.open(tmp_path / "input.txt", plugin=PLUGIN)
+    assert [role_of(layer) for layer in layers] == ["source", "mask", "shot"]
+    np.testing.assert_array_equal(layers[1].data, mask)  # painted is unusable
+    np.testing.assert_array_equal(layers[2].data, shot)
+
+
+def test_a_pipe_is_refused_and_does_not_block(tmp_path: Path) -> None:
+    for name in ("shot.h5", "shot.tif", "shot.shadowinv"):
+        os.mkfifo(tmp_path / name)
+        reader = get_reader(str(tmp_path / name))
+        if reader is not None:
+            with pytest.raises(FileFormatError, match="is a pipe"):
+                reader(str(tmp_path / name))
+
+
+def test_damage_within_a_result_is_one_sentence(tmp_path: Path, inversion: Inversion) -> None:
+    path = write(tmp_path / "shot.shadowinv", inversion)
+    with h5py.File(path, "r+") as file:
+        file.attrs["report"] = '{"converged": '
+    with pytest.raises(FileFormatError, match="is damaged or cut short") as error:
+        read_paths(str(path))
+    assert error.value.__cause__ is not None

@@ -33,11 +33,11 @@ def test_each_opens_within_two_seconds(viewer: ViewerModel, name: str) -> None:
 def test_the_source_is_a_layer_where_it_is_not_uniform(viewer: ViewerModel, name: str) -> None:
     layers = {role_of(layer): layer for layer in viewer.open_sample("napari-shadowinv", name)}
     assert ("source" in layers) == (name != "toroid_with_caustics")
-    beam: Any = source_of(layers["image"])
+    beam: Any = source_of(layers["shot"])
     if beam is not None:
         np.testing.assert_array_equal(layers["source"].data, beam)
         # Only what is thrown out of the image is missing.
-        share = layers["image"].data.sum() / beam.sum()
+        share = layers["shot"].data.sum() / beam.sum()
         assert 0.95 < share < 1.005
 
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair, paper_setup, toroid
 
@@ -229,6 +229,23 @@ def test_number_of_threads_changes_no_bit() -> None:
     for threads in (2, 5, None):
         again = synthetic_image(field, random_source((90, 70)), threads=threads)
         np.testing.assert_array_equal(one, again)
+
+
+def test_each_band_is_told_and_stopping_needs_no_further_one() -> None:
+    field, steps = folding_field((90, 70)), []
+    whole = synthetic_image(field, on_progress=lambda news: steps.append(news.step / news.total))
+    np.testing.assert_array_equal(whole, synthetic_image(field))
+    assert len(steps) > 20
+    assert steps == sorted(steps)
+    assert (steps[0], steps[-1]) == (0, 1)
+    heard: list[int] = []
+    with pytest.raises(InversionCancelled):
+        synthetic_image(
+            field,
+            on_progress=lambda news: heard.append(news.step),
+            should_stop=lambda: len(heard) == 3,
+        )
+    assert heard == [0, 1, 2]
 
 
 def test_rays_are_rounded_up_to_a_square() -> None:

@@ -263,8 +263,15 @@ def test_every_field_tells_its_meaning() -> None:
         ({"species": "proten"}, "'species' is 'proten': species must be 'proton'"),
         ({"energy": "high"}, "'energy' is 'high': .* must be a valid number"),
         ({"kind": "protons"}, "'kind' is 'protons', .* did you mean 'proton'"),
-        ({"kind": ["proton"]}, "'kind' is .* must be 'proton' or 'optical'"),
-        ({"kind": None}, "'kind' is missing"),
+        ({"kind": ["proton"]}, "'kind' is .* must be 'proton' .* or 'optical'"),
+        ({"kind": "electron"}, 'give kind = "proton" and species = "electron"'),
+        ({"kind": "Electrons"}, 'give kind = "proton" and species = "electron"'),
+        ({"kind": "protons"}, "species.*: proton, deuteron,.*electron.*did you mean 'proton'"),
+        (
+            {"kind": "proton", "species": "positron"},
+            "'species' is 'positron': .*'proton', 'deuteron',.*'electron'",
+        ),
+        ({"kind": None}, "'kind' is missing, .*species.*electron.*or 'optical'"),
     ],
 )
 def test_a_wrong_value_is_told_in_one_sentence(change: dict[str, object], message: str) -> None:

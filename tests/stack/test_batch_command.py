@@ -202,7 +202,7 @@ def test_a_store_whose_reports_are_lost_or_damaged_is_told(store):
     result = shadowinv("status", store)
     assert result.exit_code == 2
     (line,) = result.stderr.splitlines()
-    assert "is a stack of shots but is damaged" in line
+    assert "is damaged or cut short" in line
 
 
 def test_a_tiff_with_pages_a_mask_and_bins(night, folder):
@@ -268,7 +268,11 @@ def test_a_table_of_all_shots_is_exported_as_csv(night, folder):
     assert [row["name"] for row in rows] == [f"shot_{i}.npy" for i in range(6)]
     assert rows[2]["status"] == "failed"
     assert "no positive pixel" in rows[2]["reason"]
-    largest = np.hypot(*read("n.shadowinv.zarr").displacement.values[3]).max()
+    store = read("n.shadowinv.zarr")
+    assert float(rows[3]["image_residual"]) == float(store.image_residual[3])
+    status = shadowinv("status", "n.shadowinv.zarr", "--all").output
+    assert f"{float(store.image_residual[3]):.2%}" in flat(status)
+    largest = np.hypot(*store.displacement.values[3]).max()
     assert float(rows[3]["displacement_peak (px)"]) == pytest.approx(largest, rel=1e-6)
 
 
@@ -290,6 +294,48 @@ def test_a_film_has_a_frame_for_each_shot(store, name):
     assert all(length % 2 == 0 for length in frames.shape[1:3])
     assert not np.array_equal(frames[0], frames[2])
     assert shadowinv("movie", store, "-o", name).exit_code == 2  # it exists
+
+
+@pytest.mark.parametrize("name", ["plume.gif", "plume.mp4"])
+def test_a_film_on_a_full_disk_is_refused_and_the_old_one_kept(store, small_disk, name):
+    if name.endswith("mp4"):
+        pytest.importorskip("imageio_ffmpeg")
+    disk, resize = small_disk
+    film = disk / name
+    film.write_bytes(bytes(8000))
+    assert resize("16k")
+    result = shadowinv("movie", store, "-o", film, "--overwrite")
+    assert result.exit_code == 2, result.output
+    assert f"{film} cannot be written" in flat(result.output)
+    assert "No space left on device" in flat(result.output)
+    assert "Wrote" not in result.output
+    assert film.read_bytes() == bytes(8000)
+    assert list(disk.iterdir()) == [film]
+
+
+def test_a_film_that_cannot_be_read_back_is_none(store, monkeypatch):
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", lambda path: (5, 0.5))
+    result = shadowinv("movie", store, "-o", "plume.mp4")
+    assert result.exit_code == 2
+    assert "ffmpeg: 5 of 6 frames can be read back" in flat(result.output)
+    assert not list(Path().glob("*plume*"))
+
+
+def test_shots_that_find_no_room_are_not_exported_by_half(store, small_disk):
+    from napari_shadowinv.io import read_dataset
+
+    (store.parent / "setup.toml").write_text(PROTON)
+    assert batch("--setup", "setup.toml", "--overwrite").exit_code == 0
+    disk, resize = small_disk
+    assert resize("40k")
+    result = shadowinv("export", store, "--format", "pradformat", "--out", disk / "shots")
+    assert result.exit_code == 2, result.output
+    assert "cannot be written (No space left on device)" in flat(result.output)
+    written = sorted((disk / "shots").iterdir())
+    assert 0 < len(written) < 6
+    for path in written:
+        assert "potential" in read_dataset(path)
 
 
 def test_the_colour_scale_of_a_film_is_fixed(store):

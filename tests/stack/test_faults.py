@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -12,6 +13,8 @@ import textwrap
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +32,7 @@ from napari_shadowinv import (
     read,
 )
 from napari_shadowinv.geometry._threads import available_threads
+from napari_shadowinv.io import locking
 from napari_shadowinv.io.locking import locked
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import _engines
@@ -347,26 +351,9 @@ def test_the_wait_for_a_scheduler_that_is_not_there_can_be_ended(night, out):
     assert not out.exists()
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path):
-    folder = tmp_path / "disk"
-    folder.mkdir()
-
-    def size(option: str) -> bool:
-        command = ["mount", "-t", "tmpfs", "-o", option, "tmpfs", str(folder)]
-        return subprocess.run(command, capture_output=True).returncode == 0
-
-    if os.name != "posix" or not shutil.which("mount") or not size("size=400k"):
-        pytest.skip("no file system can be mounted here")
-    try:
-        yield folder, lambda: size("remount,size=16m")
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True)
-
-
 def test_the_disk_full_while_writing(make_night, small_disk):
     night = make_night(40)
-    folder, enlarge = small_disk
+    folder, resize = small_disk
     out = folder / "night.shadowinv.zarr"
     with pytest.raises(OSError, match=r"No space left on device\): make room"):
         night.run(out)
@@ -376,7 +363,7 @@ def test_the_disk_full_while_writing(make_night, small_disk):
     assert not (before.status == FAILED).any()
     assert np.isfinite(before.potential.values[done]).all()
     kept = {name: text for name, text in content(out).items() if done[shot_of(name)]}
-    assert enlarge()
+    assert resize("16m")
     after = night.run(out)
     assert (after.status == DONE).all()
     assert np.isfinite(after.potential.values).all()
@@ -387,6 +374,33 @@ def shot_of(name: str) -> int:
     return int(Path(name).parts[2])
 
 
+@pytest.fixture
+def quick(monkeypatch) -> None:
+    """Make signs of life come, and their absence count, within a moment."""
+    for name, seconds in (("_BEAT", 0.02), ("_WATCH", 1.0), ("_SETTLE", 0.05)):
+        monkeypatch.setattr(locking, name, seconds)
+
+
+@contextmanager
+def alive(lock: Path, behind: float = 0) -> Iterator[None]:
+    """Give signs of life for another host, whose clock may be behind."""
+    ended = threading.Event()
+
+    def beat() -> None:
+        while not ended.wait(0.02):
+            now = time.time() - behind
+            os.utime(lock, (now, now))
+
+    thread = threading.Thread(target=beat)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="locks of another kind there")
 class TestLocks:
     def test_the_lock_of_a_process_that_was_killed_is_none(self, tmp_path):
         path = tmp_path / "store"
@@ -415,23 +429,90 @@ class TestLocks:
             pass
         assert list(tmp_path.iterdir()) == []
 
-    def test_another_host_holds_its_lock_while_it_gives_signs_of_life(self, tmp_path):
+    def test_another_host_holds_its_lock_while_it_gives_signs_of_life(self, tmp_path, quick):
         lock = tmp_path / ".store.lock"
         lock.write_text('{"host": "elsewhere", "pid": 7}')
-        path = tmp_path / "store"
-        with pytest.raises(FileFormatError, match="process 7 on elsewhere"), locked(path):
-            pass
-        past = time.time() - 1000
-        os.utime(lock, (past, past))
-        with locked(path):
+        with alive(lock):
+            refused = pytest.raises(FileFormatError, match="process 7 on elsewhere")
+            with refused, locked(tmp_path / "store"):
+                pass
+        # Silent from now on; that its clock is ahead by an hour does not matter.
+        later = time.time() + 3600
+        os.utime(lock, (later, later))
+        with locked(tmp_path / "store"):
+            assert json.loads(lock.read_text())["pid"] == os.getpid()
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_slow_clock_is_no_sign_of_death(self, tmp_path, quick):
+        lock = tmp_path / ".store.lock"
+        lock.write_text('{"host": "elsewhere", "pid": 7}')
+        refused = pytest.raises(FileFormatError, match="process 7 on elsewhere")
+        with alive(lock, behind=7200), refused, locked(tmp_path / "store"):
             pass
 
-    def test_signs_of_life_are_given(self, tmp_path):
-        with locked(tmp_path / "store") as live:
-            past = time.time() - 1000
-            os.utime(tmp_path / ".store.lock", (past, past))
-            live()
-            assert time.time() - (tmp_path / ".store.lock").stat().st_mtime < 100
+    def test_signs_of_life_are_given_whatever_the_block_does(self, tmp_path, quick):
+        with locked(tmp_path / "store"):
+            lock = tmp_path / ".store.lock"
+            before = lock.stat().st_mtime_ns
+            wait_for(lambda: lock.stat().st_mtime_ns != before, "a sign of life")
+
+    @pytest.mark.parametrize("error", [errno.ENOLCK, errno.EOPNOTSUPP])
+    def test_where_a_file_system_has_no_locks(self, tmp_path, quick, monkeypatch, error):
+        def flock(*arguments: object) -> None:
+            raise OSError(error, os.strerror(error))
+
+        monkeypatch.setattr("fcntl.flock", flock)
+        with locked(tmp_path / "store"):
+            refused = pytest.raises(FileFormatError, match=f"process {os.getpid()} on")
+            with refused, locked(tmp_path / "store"):
+                pass
+        # The lock of a process that was killed: it says nothing any more.
+        (tmp_path / ".store.lock").write_text(
+            json.dumps({"host": socket.gethostname(), "pid": os.getpid()})
+        )
+        with locked(tmp_path / "store"):
+            pass
+        assert list(tmp_path.iterdir()) == []
+
+    def test_of_two_that_take_a_stale_lock_one_gets_it(self, tmp_path, quick, monkeypatch):
+        lock = tmp_path / ".store.lock"
+        lock.write_text('{"host": "elsewhere", "pid": 7}')
+        monkeypatch.setattr(locking, "_SETTLE", 0.3)
+
+        def sign() -> None:
+            wait_for(lambda: "elsewhere" not in lock.read_text(), "the first to sign")
+            lock.write_text('{"host": "third", "pid": 8}')
+
+        other = threading.Thread(target=sign)
+        other.start()
+        refused = pytest.raises(FileFormatError, match="process 8 on third")
+        with refused, locked(tmp_path / "store"):
+            pass
+        other.join()
+        assert "third" in lock.read_text()
+
+    def test_links_are_not_followed(self, tmp_path):
+        lock, other = tmp_path / ".store.lock", tmp_path / "other"
+        other.write_text("mine")
+        for link in (lock.symlink_to, lock.hardlink_to):
+            link(other)
+            refused = pytest.raises(FileFormatError, match="is a link or no file at all")
+            with refused, locked(tmp_path / "store"):
+                pass
+            assert other.read_text() == "mine"
+            lock.unlink()
+        lock.symlink_to(tmp_path / "nowhere")
+        with pytest.raises(FileFormatError, match="is a link"), locked(tmp_path / "store"):
+            pass
+        assert not (tmp_path / "nowhere").exists()
+
+    def test_no_room_for_it(self, small_disk):
+        folder, resize = small_disk
+        assert resize("4k")
+        (folder / "full").write_bytes(bytes(4096))
+        with pytest.raises(FileFormatError, match="No space left"), locked(folder / "store"):
+            pass
+        assert [path.name for path in folder.iterdir()] == ["full"]
 
     def test_one_process_cannot_take_it_twice(self, tmp_path):
         with locked(tmp_path / "store"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 
@@ -59,6 +60,21 @@ def test_later_shots_are_appended_and_the_bytes_are_those_of_one_run(night, out,
     # So do those who go by the arrays' own metadata.
     plain = zarr.open_group(out, mode="r", use_consolidated=False)
     assert {array.shape[0] for name, array in plain.arrays() if name not in "yx"} - {2} == {6}
+
+
+def test_a_store_of_an_older_version_without_image_residuals_still_grows(night, out, hidden):
+    hidden(5)
+    night.run(out)
+    shutil.rmtree(out / "image_residual")
+    file = out / "zarr.json"
+    metadata = json.loads(file.read_text(encoding="utf-8"))
+    del metadata["consolidated_metadata"]["metadata"]["image_residual"]
+    file.write_text(json.dumps(metadata), encoding="utf-8")
+    hidden()
+    grown = night.run(out)
+    assert list(grown.status) == [DONE] * 6
+    assert (grown.iterations > 0).all()
+    assert "image_residual" not in grown
 
 
 def test_a_shot_that_sorts_in_between_goes_to_the_end_and_no_number_changes(night, out, hidden):

@@ -285,7 +285,8 @@ def test_a_bad_shot_is_named_when_it_is_computed(night):
 def test_only_what_is_asked_for_is_made(night):
     setup = OpticalSetup(wavelength=5e-7, object_image_distance=0.3, pixel_size=1e-5)
     stack = invert_stack(night.images, setup=setup, variables=["potential_si"], options=OPTIONS)
-    assert set(stack.data_vars) == {"potential_si", "converged", "flux_residual", "iterations"}
+    quality = {"converged", "flux_residual", "image_residual", "iterations"}
+    assert set(stack.data_vars) == {"potential_si", *quality}
     alone = invert(night.images[0], options=OPTIONS)
     np.testing.assert_allclose(stack.potential_si[0], setup.potential(alone.potential), rtol=1e-9)
 

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import platform
+import ssl
+import threading
+import time
+import urllib.error
+import urllib.request
 
 import dask
-import distributed  # noqa: F401 - its settings
 import numpy as np
+import psutil  # dask needs it, too
 import pytest
+from distributed import Client, Security
+from distributed.comm import connect
 
+from napari_shadowinv.stack._engines import EngineError, engine_for
 from napari_shadowinv.stack._local import local_client
 
 ROUNDS = 200
@@ -36,3 +45,76 @@ def test_workers_use_memory_again_that_they_had(monkeypatch):
     # 4 MB are 977 pages; given back each time, all of them are taken again.
     assert pages < 50
     assert dask.config.get("distributed.nanny.pre-spawn-environ") == before
+
+
+def answers(address: str, **security: object) -> bool:
+    """Tell whether a scheduler or worker goes on talking after hello."""
+
+    async def greet() -> None:
+        comm = await connect(address, timeout=2, **security)
+        await comm.write({"op": "identity", "reply": True})
+        await comm.read()
+        await comm.close()
+
+    try:
+        asyncio.run(greet())
+    except OSError:
+        return False
+    return True
+
+
+def test_only_who_has_the_key_of_a_run_can_talk_to_it():
+    stranger = ssl.create_default_context()
+    stranger.check_hostname, stranger.verify_mode = False, ssl.CERT_NONE
+    other = Security.temporary().get_connection_args("client")
+    with local_client(1) as client:
+        (worker,) = client.scheduler_info()["workers"]
+        for address in (client.scheduler.address, worker):
+            assert not answers(address.replace("tls:", "tcp:"))
+            assert not answers(address, ssl_context=stranger)
+            assert not answers(address, **other)
+            assert answers(address, **client.security.get_connection_args("client"))
+        with Client(client.scheduler.address, security=client.security) as friend:
+            assert friend.submit(sum, (1, 2)).result(timeout=30) == 3
+
+
+def test_no_page_tells_what_is_at_work():
+    with local_client(1) as client:
+        mine = psutil.Process()
+        ports = [
+            socket.laddr
+            for process in (mine, *mine.children(recursive=True))
+            for socket in process.net_connections("inet")
+            if socket.status == psutil.CONN_LISTEN
+        ]
+        assert {ip for ip, _ in ports} == {"127.0.0.1"}
+        pages = [
+            client.dashboard_link,
+            client.dashboard_link.replace("status", "json/identity.json"),
+        ]
+        for page in pages:
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                urllib.request.urlopen(page, timeout=5)
+
+
+def test_a_worker_killed_while_it_starts_is_told_in_one_sentence():
+    def kill() -> None:
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            for process in psutil.Process().children(recursive=True):
+                if "spawn_main" in " ".join(process.cmdline()):
+                    process.kill()
+                    return
+            time.sleep(0.01)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    told = "1 process for the shots could not be started .* then run again to resume"
+    with pytest.raises(EngineError, match=told), engine_for("processes", 1):
+        pass
+    killer.join()
+    assert not [
+        process
+        for process in psutil.Process().children(recursive=True)
+        if "spawn_main" in " ".join(process.cmdline())
+    ]

@@ -11,20 +11,30 @@ from scipy.io import savemat
 from typer.testing import CliRunner
 
 from conftest import OPTIONS
-from napari_shadowinv import InputError, InversionOptions, invert, invert_stack, read, run_stack
+from napari_shadowinv import (
+    InputError,
+    InversionOptions,
+    ProtonSetup,
+    invert,
+    invert_stack,
+    read,
+    run_stack,
+)
 from napari_shadowinv.cli import app
 from napari_shadowinv.filters import high_pass, low_pass, remove_hot_pixels
-from napari_shadowinv.io.store import DONE
+from napari_shadowinv.io.store import DONE, StackStore, read_stack
 from napari_shadowinv.recipes import (
+    GaussianEstimate,
     HighPassFilter,
     HotPixelFilter,
     InterpolatedEstimate,
+    IsotropicEstimate,
     LowPassEstimate,
     LowPassFilter,
     PolynomialEstimate,
     UniformEstimate,
 )
-from napari_shadowinv.sources import polynomial_source
+from napari_shadowinv.sources import isotropic_source, polynomial_source
 from napari_shadowinv.stack import read_shot
 
 FILTERS = (HotPixelFilter(), LowPassFilter(width=0.8))
@@ -122,7 +132,16 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
     [
         ({"filters": (HighPassFilter(),)}, "takes the beam out of the image"),
         ({"source_mask": np.eye(24, 28) > 0}, "got a source mask"),
-        ({"source": InterpolatedEstimate()}, "without a mask: it fills in"),
+        ({"source": InterpolatedEstimate()}, "without a source mask"),
+        (
+            {
+                "source": PolynomialEstimate(),
+                "source_mask": np.arange(28) > np.zeros((24, 1)) + 9,
+                "mask": np.arange(28) > np.zeros((24, 1)) + 9,
+            },
+            "left out of the inversion",
+        ),
+        ({"source": IsotropicEstimate()}, "'isotropic' without a setup"),
         ({"source": LowPassEstimate(width=6), "warm_start": 2}, "a source of its own"),
         ({"source": np.ones((6, 24, 28)), "warm_start": 2}, "a source of its own"),
         (
@@ -201,3 +220,36 @@ def test_a_batch_prepares_its_shots_as_an_inversion_of_one(
     )
     assert refused.exit_code == 2
     assert "choose one of them" in " ".join(refused.output.split())
+
+
+def test_doubts_of_a_source_are_in_the_report_of_each_shot(night, out):
+    near = ProtonSetup(
+        energy=14.7, source_object_distance=1e-3, object_image_distance=0.28, pixel_size=1e-5
+    )
+    y, x = np.mgrid[:24, :28]
+    spot = 1e4 * np.exp(-((y - 12) ** 2 + (x - 14) ** 2) / 2 / 5**2) + 100
+    shots = np.random.default_rng(0).poisson([spot, spot])
+    hidden = np.hypot(y - 12, x - 14) > 7
+    for source, source_mask, words in (
+        (None, None, "choose the source 'isotropic'"),
+        (UniformEstimate(), None, "choose the source 'isotropic'"),
+        (GaussianEstimate(), hidden, "the Gaussian beam rises to"),
+        (IsotropicEstimate(), None, ""),
+    ):
+        run_stack(
+            shots,
+            out,
+            source=source,
+            source_mask=source_mask,
+            setup=near,
+            options=OPTIONS,
+            variables=("potential", "source"),
+            overwrite=True,
+            scheduler="synchronous",
+        )
+        for index in (0, 1):
+            told = "; ".join(StackStore(out).report(index)["warnings"])
+            assert words in told
+            assert ("'isotropic'" in told) == ("'isotropic'" in words)
+    written = read_stack(out)["source"][1]
+    np.testing.assert_allclose(written, isotropic_source(shots[1], near), rtol=1e-6)

@@ -50,6 +50,8 @@ def test_the_store_holds_what_the_lazy_stack_computes(night, out, optical_setup)
         np.testing.assert_allclose(written[name], lazy[name], rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(written.iterations, lazy.iterations)
     np.testing.assert_array_equal(written.flux_residual, lazy.flux_residual)
+    np.testing.assert_array_equal(written.image_residual, lazy.image_residual)
+    assert (written.image_residual > 0).all()
     # Fields in SI units follow from what is stored, when they are asked for.
     for name in ("deflection_angle", "line_integrated_density"):
         assert written[name].attrs == lazy[name].attrs
@@ -319,7 +321,7 @@ def test_a_writer_of_a_store_that_was_replaced_writes_nothing(night, out):
 def test_a_damaged_store_is_told_in_one_sentence(night, out):
     night.run(out, shots=night.images)
     (out / "status" / "c" / "2").write_bytes(b"")
-    with pytest.raises(FileFormatError, match="stack of shots but is damaged"):
+    with pytest.raises(FileFormatError, match="is damaged or cut short"):
         read(out)
 
 

@@ -9,11 +9,12 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Reporter
+from napari_shadowinv.transport.continuation import blurred
 from napari_shadowinv.transport.descent import quasi_newton
 from napari_shadowinv.transport.newton import newton
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import plan_levels
-from napari_shadowinv.transport.solvers import _blurred, solve
+from napari_shadowinv.transport.solvers import solve
 
 
 def bright_spot(shape=(40, 50)):
@@ -164,9 +165,9 @@ def test_threads_do_not_change_the_weights():
 def test_blurring_keeps_the_flux_and_adds_variances():
     image = np.zeros((81, 101))
     image[40, 50] = 7.0
-    blurred = _blurred(image, 5.0)
+    spread = blurred(image, 5.0)
     y, x = np.indices(image.shape)
-    assert blurred.sum() == pytest.approx(7.0, rel=1e-12)
-    assert ((y - 40) ** 2 * blurred).sum() / 7 == pytest.approx(25.0, rel=1e-6)
-    assert ((x - 50) ** 2 * blurred).sum() / 7 == pytest.approx(25.0, rel=1e-6)
-    assert _blurred(image, 40.0).sum() == pytest.approx(7.0, rel=1e-12)
+    assert spread.sum() == pytest.approx(7.0, rel=1e-12)
+    assert ((y - 40) ** 2 * spread).sum() / 7 == pytest.approx(25.0, rel=1e-6)
+    assert ((x - 50) ** 2 * spread).sum() / 7 == pytest.approx(25.0, rel=1e-6)
+    assert blurred(image, 40.0).sum() == pytest.approx(7.0, rel=1e-12)

@@ -11,14 +11,21 @@ cross to cancel it in napari's activity dock; from a script it is done at once.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.marks import setup_of
+from napari_shadowinv._napari.marks import (
+    SOURCE,
+    may_be_shot,
+    may_be_source,
+    role_of,
+    setup_of,
+    setup_origin_of,
+)
 from napari_shadowinv._napari.notices import MISTAKES, in_event_loop, show_mistake, told
 from napari_shadowinv.errors import InputError, InversionCancelled
 
@@ -45,6 +52,8 @@ class _Picked:
     name: str
     frame: Frame
     setup: ProtonSetup | OpticalSetup | None
+    setup_origin: str
+    role: str | None
 
 
 def _nothing() -> list[Any]:
@@ -72,7 +81,7 @@ def invert_uniform(
     Raises
     ------
     InputError
-        If no grey image is selected or it cannot be inverted; from a menu, the user is told.
+        If no shot is selected or it cannot be inverted; from a menu, the user is told.
     """
     return _begin(_picked(layer, viewer), _inverted, "Inverting", viewer)
 
@@ -93,7 +102,9 @@ def remove_hot_pixels(
     list of (data, keywords, layer type)
         The repaired image, with the number of such pixels in its name.
     """
-    return _begin(_picked(layer, viewer), _repaired, "Removing hot pixels from", viewer)
+    return _begin(
+        _picked(layer, viewer, may_be_source), _repaired, "Removing hot pixels from", viewer
+    )
 
 
 @told(otherwise=_nothing)
@@ -112,7 +123,7 @@ def high_pass(
     list of (data, keywords, layer type)
         The filtered image.
     """
-    return _begin(_picked(layer, viewer), _high_passed, "Filtering", viewer)
+    return _begin(_picked(layer, viewer, may_be_source), _high_passed, "Filtering", viewer)
 
 
 @told(otherwise=_nothing)
@@ -134,7 +145,7 @@ def estimate_source(
     return _begin(_picked(layer, viewer), _beam, "Estimating the source of", viewer)
 
 
-def _picked(layer: Any, viewer: Any) -> _Picked:
+def _picked(layer: Any, viewer: Any, usable: Callable[[Any], bool] = may_be_shot) -> _Picked:
     """Take the plane that is shown of an image layer."""
     from napari.layers import Image
 
@@ -144,12 +155,22 @@ def _picked(layer: Any, viewer: Any) -> _Picked:
         is_colour = isinstance(layer, Image)
         kind = "a colour image" if is_colour else f"of type {layer.__class__.__name__}"
         raise InputError(f"layer '{layer.name}' is {kind}: select a grey image")
+    if not usable(layer):
+        kind = "a source" if role_of(layer) == SOURCE else "part of a result"
+        raise InputError(f"layer '{layer.name}' is {kind}: select the shot")
     data = layer.data[0] if layer.multiscale else layer.data
     name = layer.name
     if data.ndim > 2:
         at = _shown(viewer, data.ndim)
         data, name = data[at], f"{name} {','.join(map(str, at))}"
-    return _Picked(np.asarray(data), name, frame_of(layer), setup_of(layer))
+    return _Picked(
+        np.asarray(data),
+        name,
+        frame_of(layer),
+        setup_of(layer),
+        setup_origin_of(layer),
+        role_of(layer),
+    )
 
 
 def _shown(viewer: Any, ndim: int) -> tuple[int, ...]:
@@ -207,7 +228,10 @@ def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     from napari_shadowinv.inversion import invert
 
     inversion = invert(picked.image, should_stop=should_stop)
-    return result_layers(Result(inversion, picked.setup), picked.frame, picked.name)
+    told = {"source_origin": "uniform"}
+    if picked.setup_origin:
+        told["setup_origin"] = picked.setup_origin
+    return result_layers(Result(inversion, picked.setup, told), picked.frame, picked.name)
 
 
 def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
@@ -228,16 +252,22 @@ def _beam(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     from napari_shadowinv.sources import total_variation_source
 
     source = total_variation_source(picked.image, should_stop=should_stop)
-    return [_filtered(picked, source, "source by total variation", role="source")]
+    return [_filtered(replace(picked, role=SOURCE), source, "source by total variation")]
 
 
-def _filtered(
-    picked: _Picked, image: NDArray[np.float64], title: str, role: str = "image"
-) -> FullLayerData:
+def _filtered(picked: _Picked, image: NDArray[np.float64], title: str) -> FullLayerData:
     from napari_shadowinv._napari.layers import intensity_limits
     from napari_shadowinv._napari.shots import shot_layer
 
     # The same limits show what a filter did.
     limits = intensity_limits(picked.image)
     name = f"{picked.name} {title}"
-    return shot_layer(image, name, picked.setup, limits, role, frame=picked.frame)
+    return shot_layer(
+        image,
+        name,
+        picked.setup,
+        limits,
+        picked.role,
+        frame=picked.frame,
+        setup_origin=picked.setup_origin or None,
+    )

@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_for
+from napari_shadowinv._napari.legend import follow_top_image
 from napari_shadowinv._napari.marks import Result, mark, role_of
+from napari_shadowinv._napari.placing import place_newcomers
 from napari_shadowinv.plotting import ShownField, shown_fields, shown_potential
 
 if TYPE_CHECKING:
@@ -51,6 +53,7 @@ _SIGNED_MAP = "RdBu_r"
 # Both stand out of every colour of the field's map.
 _CAUSTIC_COLOUR = "#5dff5d"
 _ARROW_COLOUR = "#00c8ff"
+_FIELD_ARROW_COLOUR = "#ffffff"
 
 _ARROWS_ALONG = 28
 _SHORTEST_ARROW = 0.05
@@ -146,7 +149,7 @@ def add_inversion(
     >>> viewer = ViewerModel()
     >>> layers = add_inversion(viewer, invert(np.ones((20, 20))), name="blank")
     >>> [layer.name for layer in layers if layer.visible]
-    ['blank |d| (px)', 'blank arrows']
+    ['blank |d| (px)', 'blank displacement arrows']
     """
     return add_layers(viewer, inversion_layers(inversion, setup, name=name, **keywords))
 
@@ -154,7 +157,7 @@ def add_inversion(
 def add_layers(
     viewer: Any, described: Sequence[FullLayerData], *, below: Any | None = None
 ) -> list[Any]:
-    """Add described layers to a viewer, select the field and switch on the scale bar.
+    """Add described layers to a viewer, select the field, switch on scale bar and colour bar.
 
     Parameters
     ----------
@@ -180,9 +183,9 @@ def add_layers(
         if role_of(layer) == "field":
             # The status line then tells the field below the mouse.
             viewer.layers.selection.active = layer
-            if hasattr(layer, "colorbar"):
-                layer.colorbar.visible = True
     show_scale_bar(viewer)
+    follow_top_image(viewer)
+    place_newcomers(viewer)
     return added
 
 
@@ -203,7 +206,8 @@ class _Maker:
     def layer(
         self, data: Any, kind: str, role: str, title: str, unit: str = "", **keywords: Any
     ) -> FullLayerData:
-        metadata = mark(role, unit, self.result.setup, result=self.result)
+        made_from = dict(self.result.attributes)
+        metadata = mark(role, unit, self.result.setup, result=self.result, made_from=made_from)
         return (
             data,
             {
@@ -257,14 +261,14 @@ def result_layers(
                 else []
             ),
             *_field(make, displacement),
-            _arrows(make, displacement),
+            *_arrows(make, displacement),
         ]
     return [
         *_intensities(make, content),
         _potential(make, content.potential),
         *_field(make, content.displacement),
         _caustics(make, content),
-        _arrows(make, content.displacement),
+        *_arrows(make, content.displacement),
         _sites(make, content),
         *([_cells(make, content)] if cells else []),
     ]
@@ -274,7 +278,7 @@ def _intensities(make: _Maker, inversion: Inversion) -> list[FullLayerData]:
     """What was inverted, what the answer makes of it, and what is left over."""
     unit = "flux/px²"
     limits = intensity_limits(inversion.image)
-    percent = 100 * inversion.residual / inversion.source.mean()
+    percent = 100 * inversion.residual / inversion.image[inversion.mask].mean()
     layers = [make.image(inversion.image, "image", "image", unit, limits, _INTENSITY_MAP)]
     if np.ptp(inversion.source):
         layers.append(
@@ -352,42 +356,57 @@ def caustic_keywords() -> dict[str, Any]:
     return {"colormap": CyclicLabelColormap(colours), "opacity": 0.5, "visible": False}
 
 
-def _arrows(make: _Maker, displacement: Array) -> FullLayerData:
-    """Displacements of few enough rays that each arrow can be seen."""
+def _arrows(make: _Maker, displacement: Array) -> list[FullLayerData]:
+    """Displacements of few enough rays that each arrow can be seen.
+
+    A magnetic field is at right angles to them: it has arrows of its own, hidden to begin with.
+    """
     data, spacing = thinned_arrows(displacement)
-    return make.layer(data, "vectors", "arrows", "arrows", "px", **arrow_keywords(data, spacing))
+    title = "displacement arrows"
+    arrows = [make.layer(data, "vectors", "arrows", title, "px", **arrow_keywords(data, spacing))]
+    setup = make.result.setup
+    if setup is None or setup.kind != "proton":
+        return arrows
+    (field,) = shown_fields([displacement], setup)
+    data, spacing = thinned_arrows(field.vectors)
+    look = arrow_keywords(data, spacing, "field")
+    name = "∫B dz arrows"
+    hidden = make.layer(
+        data, "vectors", "field arrows", name, field.unit, **{**look, "visible": False}
+    )
+    return [hidden, *arrows]
 
 
-def arrow_keywords(data: Array, spacing: float) -> dict[str, Any]:
+def arrow_keywords(data: Array, spacing: float, shown: str = "displacement") -> dict[str, Any]:
     """Return how arrows look, from those of one result; see `thinned_arrows`."""
     lengths = np.hypot(*data[:, 1].T)
     # Most arrows keep to their own place; the strongest reach to the next but one at most.
     usual = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
     return {
-        "features": {"displacement": lengths},
+        "features": {shown: lengths},
         "vector_style": "arrow",
-        "edge_color": _ARROW_COLOUR,
+        "edge_color": _FIELD_ARROW_COLOUR if shown == "field" else _ARROW_COLOUR,
         "edge_width": spacing / 9,
-        # The data are displacements in px; only the drawing is stretched.
+        # The data keep their unit; only the drawing is stretched.
         "length": float(0.95 * spacing / usual) if usual else 1.0,
         "opacity": 0.75,
     }
 
 
 def thinned_arrows(displacement: Array, along: int = _ARROWS_ALONG) -> tuple[Array, float]:
-    """Pick the displacement of rays on a coarse grid.
+    """Pick the displacement of rays, or another field of vectors, on a coarse grid.
 
     Parameters
     ----------
     displacement : ndarray, shape (2, H, W)
-        Displacement in px.
+        Displacement in px, or a field in its unit.
     along : int
         Number of rays along the longer side.
 
     Returns
     -------
     data : ndarray, shape (n, 2, 2)
-        Start and displacement of each ray, both (y, x) in px. Rays that go nearly nowhere are
+        Start of each ray in px and its vector, both (y, x). Rays that go nearly nowhere are
         left out.
     spacing : float
         Distance of the rays in px.

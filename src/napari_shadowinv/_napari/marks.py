@@ -1,11 +1,14 @@
 """What a layer of this plugin knows about itself, kept in its metadata.
 
-- write it: `mark`
-- read it from a layer: `role_of`, `unit_of`, `setup_of`, `result_of`, `source_of`
+- write it: `mark`; give a layer another setup: `keep_setup`
+- read it from a layer: `role_of`, `unit_of`, `setup_of`, `setup_origin_of`, `result_of`,
+  `source_of`
+- what a layer can be used as: `may_be_shot`, `may_be_source`, `may_be_mask`
 - everything behind the layers of one result: `Result`
 
-Layers carry only the units of their axes; the unit of their values, the setup and the result
-that they show are in ``layer.metadata["napari-shadowinv"]``, a plain dict.
+Layers carry only the units of their axes; the role, the unit of their values, the setup and the
+result that they show are in ``layer.metadata["napari-shadowinv"]``, a plain dict. A layer of
+other origin has none of it: it may be a shot, a source or a mask.
 """
 
 from __future__ import annotations
@@ -24,18 +27,34 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 __all__ = [
+    "CAME_WITH",
     "KEY",
+    "MASK",
+    "SHOT",
+    "SOURCE",
     "Result",
+    "keep_setup",
     "mark",
     "mark_of",
+    "may_be_mask",
+    "may_be_shot",
+    "may_be_source",
     "result_of",
     "role_of",
     "setup_of",
+    "setup_origin_of",
     "source_of",
     "unit_of",
 ]
 
 KEY = "napari-shadowinv"
+
+SHOT, SOURCE, MASK = "shot", "source", "mask"
+"""Roles of what goes into an inversion. The layers of a result have roles of their own, and
+either the result or its store in their metadata."""
+
+CAME_WITH = "came with"
+"""How the origin of a setup begins that a file or a sample brought; all others are the user's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +77,7 @@ class Result:
 
 
 def mark(
-    role: str,
+    role: str | None,
     unit: str,
     setup: ProtonSetup | OpticalSetup | None = None,
     **more: Any,
@@ -67,14 +86,16 @@ def mark(
 
     Parameters
     ----------
-    role : str
-        What it shows: ``"image"``, ``"source"``, ``"potential"``, ``"field"``, ``"sites"``, …
+    role : str or None
+        What it shows: ``"shot"``, ``"source"``, ``"potential"``, ``"field"``, ``"sites"``, …;
+        None if that is not known.
     unit : str
         Unit of its values; empty if they have none.
     setup : ProtonSetup or OpticalSetup, optional
         The experiment.
     **more
-        Other facts, such as ``result`` (a `Result`) or ``source`` (an array).
+        Other facts, such as ``result`` (a `Result`), ``source`` (an array) or ``setup_origin``
+        (see `setup_origin_of`).
 
     Returns
     -------
@@ -119,6 +140,48 @@ def setup_of(layer: Any) -> ProtonSetup | OpticalSetup | None:
 
     found = mark_of(layer).get("setup")
     return None if found is None else setup_from_dict(found, "the layer's setup")
+
+
+def setup_origin_of(layer: Any) -> str:
+    """Return where a layer's setup comes from, such as ``"came with shot.h5"``; empty if none."""
+    return str(mark_of(layer).get("setup_origin", ""))
+
+
+def keep_setup(layer: Any, setup: ProtonSetup | OpticalSetup | None, origin: str) -> None:
+    """Make a setup the one of a layer.
+
+    Parameters
+    ----------
+    layer : napari.layers.Layer
+        An image.
+    setup : ProtonSetup or OpticalSetup or None
+        The experiment; None takes away what the layer has.
+    origin : str
+        Where it comes from.
+    """
+    others = {
+        name: value
+        for name, value in mark_of(layer).items()
+        if name not in ("setup", "setup_origin")
+    }
+    given = {} if setup is None else {"setup": setup.model_dump(), "setup_origin": origin}
+    # A new dict: a duplicate of the layer may share the old one.
+    layer.metadata[KEY] = others | given
+
+
+def may_be_shot(layer: Any) -> bool:
+    """Whether a layer is a shot, or may be one: neither a source nor part of a result."""
+    return role_of(layer) in (None, SHOT)
+
+
+def may_be_source(layer: Any) -> bool:
+    """Whether a layer may be an undisturbed beam: also a shot, of which the object was taken."""
+    return role_of(layer) in (None, SHOT, SOURCE)
+
+
+def may_be_mask(layer: Any) -> bool:
+    """Whether somebody may have painted a layer to mark pixels; a result has labels, too."""
+    return role_of(layer) in (None, MASK)
 
 
 def result_of(layer: Any) -> Result | None:

@@ -2,6 +2,7 @@
 
 - whether somebody is looking: `in_event_loop`
 - a function whose user's mistakes become notifications: `told`; one such: `show_mistake`
+- what to know before trusting a file: `show_caution`
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any, TypeVar
 
 from napari_shadowinv.errors import InputError
 
-__all__ = ["MISTAKES", "in_event_loop", "show_mistake", "told"]
+__all__ = ["MISTAKES", "in_event_loop", "show_caution", "show_mistake", "told"]
 
 MISTAKES = (InputError, OSError, MemoryError)
 """What a user can mend; all else is a fault of the program, whose traceback is needed."""
@@ -70,3 +71,10 @@ def show_mistake(error: BaseException) -> None:
 
     text = str(error) or "there is not enough memory for this"
     show_error(text[:1].upper() + text[1:])
+
+
+def show_caution(text: str) -> None:
+    """Show what the user should know before trusting a file."""
+    from napari.utils.notifications import show_warning
+
+    show_warning(text)

@@ -12,8 +12,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv._napari.notices import told
+from napari_shadowinv._napari.notices import show_caution, told
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.safety import refusing_damage
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
@@ -67,13 +68,11 @@ def _is_image_name(path: Path) -> bool:
 
 def _is_ours(path: Path) -> bool:
     """Whether HDF5 is pradformat or a result; much else has that ending."""
-    import h5py
+    from napari_shadowinv.io.pradformat import is_ours
 
     try:
-        with h5py.File(path, "r") as file:
-            kind = file.attrs.get("object_type", b"")
-            return "format" in file.attrs or kind in ("radiograph", "inversion")
-    except (OSError, RuntimeError, KeyError):
+        return is_ours(path)
+    except FileFormatError:
         return False
 
 
@@ -119,11 +118,12 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
 
 
 def _matches(pattern: str) -> list[Path]:
-    from napari_shadowinv._napari.shots import in_counting_order
+    from napari_shadowinv.io.files import in_counting_order
 
     return in_counting_order(Path(name) for name in glob.glob(pattern))
 
 
+@refusing_damage
 def _read_file(path: Path) -> list[FullLayerData]:
     from napari_shadowinv._napari.saved import layers_of_dataset
     from napari_shadowinv._napari.shots import radiograph_layers
@@ -131,5 +131,7 @@ def _read_file(path: Path) -> list[FullLayerData]:
 
     content = read(path)
     if isinstance(content, Radiograph):
+        for text in content.warnings:
+            show_caution(f"{path.name}: {text}")
         return radiograph_layers(content)
     return layers_of_dataset(content, path.stem)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._napari.lazy import lazy_stack
+from napari_shadowinv._napari.marks import CAME_WITH
 from napari_shadowinv._napari.shots import radiograph_layers, shot_layer
 
 if TYPE_CHECKING:
@@ -77,7 +78,10 @@ def wakefield_run() -> list[FullLayerData]:
 
     stack = lazy_stack(_wakefield_shot, range(_RUN_LENGTH), _RUN_SHAPE)
     limits = intensity_limits(_wakefield_shot(_RUN_LENGTH // 2))
-    return [shot_layer(stack, "wakefield run", wakefield_setup(), limits)]
+    origin = f"{CAME_WITH} the sample 'wakefield run'"
+    return [
+        shot_layer(stack, "wakefield run", wakefield_setup(), limits, setup_origin=origin),
+    ]
 
 
 def _toroid_of(peak: float) -> Phantom:

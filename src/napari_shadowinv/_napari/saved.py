@@ -31,6 +31,7 @@ _OWN_ATTRIBUTES = {
     "format",
     "options",
     "report",
+    "image_residual",
     "setup",
     "package_version",
     "created",

@@ -3,15 +3,14 @@
 - one image, with what its file tells: `radiograph_layers`
 - any image or stack of images: `shot_layer`
 - many files along an axis of shots, each read when it is shown: `stack_layers`
-- the images in a folder: `images_in`; shot 2 before shot 10: `in_counting_order`
+- the images in a folder, shot 2 before shot 10: `images_in`
 """
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,8 +21,10 @@ from numpy.typing import NDArray
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
 from napari_shadowinv._napari.lazy import lazy_stack
-from napari_shadowinv._napari.marks import mark
+from napari_shadowinv._napari.marks import CAME_WITH, MASK, SHOT, SOURCE, mark
+from napari_shadowinv._napari.notices import show_caution
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.files import in_counting_order
 
 if TYPE_CHECKING:
     from napari_shadowinv.io import Radiograph
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 __all__ = [
     "IMAGE_SUFFIXES",
     "images_in",
-    "in_counting_order",
     "radiograph_layers",
     "shot_layer",
     "stack_layers",
@@ -47,7 +47,7 @@ IMAGE_SUFFIXES = frozenset(_PICTURES | _NUMBERS | _CAMERAS)
 
 
 def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
-    """Describe an image, and its undisturbed beam where the file holds one.
+    """Describe an image, and its undisturbed beam and mask where the file holds them.
 
     Parameters
     ----------
@@ -59,20 +59,31 @@ def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
     Returns
     -------
     list of (data, keywords, layer type)
-        The source, if any, and the image above it.
+        The source and the mask, if any, and the image above them. Painted pixels of the mask
+        cannot be used.
     """
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
     frame = _frame(shot)
+    facts = _facts(shot, f"the sample '{name}'" if shot.path is None else shot.path.name)
     image = shot_layer(
-        shot.image, name, shot.setup, limits, frame=frame, source=shot.source, **_facts(shot)
+        shot.image, name, shot.setup, limits, frame=frame, source=shot.source, **facts
     )
-    if shot.source is None:
-        return [image]
-    data, keywords, kind = shot_layer(
-        shot.source, f"{name} source", shot.setup, limits, "source", frame=frame, **_facts(shot)
-    )
-    return [(data, {**keywords, "visible": False}, kind), image]
+    layers: list[FullLayerData] = []
+    if shot.source is not None:
+        data, keywords, kind = shot_layer(
+            shot.source, f"{name} source", shot.setup, limits, SOURCE, frame=frame, **facts
+        )
+        layers.append((data, {**keywords, "visible": False}, kind))
+    if shot.mask is not None:
+        keywords = {
+            "name": f"{name} mask",
+            "visible": False,
+            "metadata": mark(MASK, "", shot.setup, **facts),
+            **frame.keywords(stacked=False),
+        }
+        layers.append(((~shot.mask).astype(np.uint8), keywords, "labels"))
+    return [*layers, image]
 
 
 def shot_layer(
@@ -80,7 +91,7 @@ def shot_layer(
     name: str,
     setup: Setup | None,
     limits: tuple[float, float],
-    role: str = "image",
+    role: str | None = SHOT,
     *,
     frame: Frame | None = None,
     **more: Any,
@@ -97,8 +108,8 @@ def shot_layer(
         The experiment.
     limits : tuple of float
         Contrast limits; napari would read two shots of a stack to find some.
-    role : {"image", "source"}
-        What it is.
+    role : {"shot", "source"} or None
+        What it is, None if that is not known.
     frame : Frame, optional
         Where it lies. Default: as the setup tells.
     **more
@@ -121,10 +132,12 @@ def shot_layer(
     return data, keywords, "image"
 
 
-def _facts(shot: Radiograph) -> dict[str, Any]:
+def _facts(shot: Radiograph, origin: str) -> dict[str, Any]:
     """What is known of a file; a layer keeps no more than this of it."""
     return {
+        "setup_origin": None if shot.setup is None else f"{CAME_WITH} {origin}",
         "file": dict(shot.metadata) or None,
+        "warnings": list(shot.warnings) or None,
         "path": None if shot.path is None else str(shot.path),
     }
 
@@ -163,17 +176,6 @@ def images_in(folder: Path) -> list[Path]:
     return in_counting_order(path for path in files if path.suffix.lower() == chosen)
 
 
-def in_counting_order(paths: Iterable[Path]) -> list[Path]:
-    """Sort files by name, numbers within by their value."""
-    return sorted(paths, key=_counting)
-
-
-def _counting(path: Path) -> list[tuple[int, int | str]]:
-    """Sort shot 2 before shot 10."""
-    parts = re.split(r"(\d+)", path.name.lower())
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts if part]
-
-
 def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
     """Describe a run of shots as one lazy stack; only the first that can be read is read now.
 
@@ -196,9 +198,12 @@ def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
         If none of the files can be read.
     """
     first, at = _first_readable(paths)
+    for text in first.warnings:
+        show_caution(f"{paths[at].name}: {text}")
     height, width = first.image.shape
     plane_of = partial(_plane_of, shape=(height, width))
     stack = lazy_stack(plane_of, paths, (height, width), ready=first.image, at=at)
+    origin = paths[at].name + (f", one of {len(paths)} shots" if len(paths) > 1 else "")
     layer = shot_layer(
         stack,
         name or paths[0].parent.name or "shots",
@@ -206,7 +211,7 @@ def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
         intensity_limits(first.image),
         frame=_frame(first),
         paths=[str(path) for path in paths],
-        **_facts(first),
+        **_facts(first, origin),
     )
     return [layer]
 

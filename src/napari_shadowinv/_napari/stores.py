@@ -27,6 +27,7 @@ from napari_shadowinv._napari.layers import (
 )
 from napari_shadowinv._napari.marks import mark
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.safety import refusing_damage
 
 if TYPE_CHECKING:
     import xarray
@@ -41,6 +42,7 @@ _SHOT = "shot"
 _DONE = 1  # as a store's variable "status" marks a shot
 
 
+@refusing_damage
 def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
     """Describe the layers of a store.
 
@@ -68,24 +70,19 @@ def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
     return _StoreLayers(path, dataset, name).layers()
 
 
+@refusing_damage
 def opened_store(path: Path) -> xarray.Dataset:
     """Open a store lazily, or say why it is none."""
     import xarray as xr
 
+    from napari_shadowinv.io.store_files import CheckedStore
+
     if not path.is_dir():
         raise FileFormatError(f"{path} does not exist: expected a folder made by an inversion")
-    try:
-        # Nothing in it is a time, whatever its units look like.
-        dataset: xr.Dataset = xr.open_zarr(
-            path, chunks={}, decode_times=False, mask_and_scale=False, consolidated=False
-        )
-    except MemoryError:
-        raise
-    except Exception as error:
-        raise FileFormatError(
-            f"{path} is no store of results or is damaged: expected a Zarr folder; run the "
-            "inversion again, finished shots are kept"
-        ) from error
+    # Nothing in it is a time, whatever its units look like.
+    dataset: xr.Dataset = xr.open_zarr(
+        CheckedStore(path), chunks={}, decode_times=False, mask_and_scale=False, consolidated=False
+    )
     if "displacement" not in dataset or _SHOT not in dataset["displacement"].dims:
         raise FileFormatError(
             f"{path} is a Zarr folder without the displacement of a run of shots: open it with "
@@ -250,7 +247,7 @@ class _StoreLayers:
         data, spacing = thinned_arrows(self._plane("displacement"))
         keywords = {"visible": True, **arrow_keywords(data, spacing)}
         return self._layer(
-            at_shot(data, self._done), "vectors", "arrows", "arrows", "px", **keywords
+            at_shot(data, self._done), "vectors", "arrows", "displacement arrows", "px", **keywords
         )
 
 

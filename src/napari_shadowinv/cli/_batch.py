@@ -16,8 +16,10 @@ import typer
 
 from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interrupted
 from napari_shadowinv.cli._inputs import picture_mask, setup_from
-from napari_shadowinv.cli._tables import Rows, options_text, say, two_columns
+from napari_shadowinv.cli._tables import Rows, options_text, two_columns
+from napari_shadowinv.cli._terminal import plain, say, say_on_stderr
 from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.safety import refusing_damage
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -95,7 +97,7 @@ def run_batch(
     quiet: bool,
 ) -> None:
     """Invert all shots into a store, tell of it, and end with what became of them."""
-    from napari_shadowinv.io import binned_setup
+    from napari_shadowinv.physics.setup import binned_setup
     from napari_shadowinv.stack import STORED, read_shot, run_stack
 
     _check(out, resume or redo_failed, overwrite)
@@ -173,18 +175,17 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
         SpinnerColumn,
         TextColumn,
     )
-    from rich.text import Text
 
     console = Console(stderr=True)
     columns = (
         SpinnerColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"),
         TextColumn("{task.fields[left]}"),
-        TextColumn("[red]{task.fields[failed]}"),
-        TextColumn("[dim]{task.fields[last]}"),
+        TextColumn("{task.fields[failed]}", style="red"),
+        TextColumn("{task.fields[last]}", style="dim", markup=False),
     )
     hidden = quiet or not console.is_terminal
     with Progress(*columns, console=console, disable=hidden) as bars:
@@ -205,10 +206,10 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
                 rate=ledger.rate_text,
                 left=ledger.left_text,
                 failed=f"{progress.failed} failed" if progress.failed else "",
-                last=last,
+                last=plain(last).plain,
             )
             if outcome is not None and outcome.reason and not quiet:
-                line = Text(f"failed: {progress.name}: {outcome.reason}", style="red")
+                line = plain(f"failed: {progress.name}: {outcome.reason}", "red")
                 console.print(line, soft_wrap=True)
 
         yield show
@@ -230,11 +231,8 @@ def _counts_text(done: int, failed: int, pending: int) -> str:
 
 
 def _tell_how_to_resume(out: Path, ledger: _Ledger) -> None:
-    from rich.console import Console
-
     state = _counts_text(*_counts(out)) if out.exists() else "nothing written"
-    text = f"Cancelled: {state}. Give the same command with --resume to go on."
-    Console(stderr=True).print(text, style="bold red", soft_wrap=True, highlight=False)
+    say_on_stderr(f"Cancelled: {state}. Give the same command with --resume to go on.")
 
 
 def _summary(out: Path, ledger: _Ledger) -> Table:
@@ -287,6 +285,7 @@ def _end(out: Path) -> None:
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
+@refusing_damage
 def status_tables(path: Path, every: bool) -> list[Table]:
     """Tell what a store is, and what became of each shot."""
     from rich import box
@@ -299,21 +298,24 @@ def status_tables(path: Path, every: bool) -> list[Table]:
         return tables
     store = StackStore(path)
     shots = Table(box=box.SIMPLE)
-    for heading in ("shot", "name", "status", "seconds", "iterations", "how it went"):
+    headings = "shot", "name", "status", "seconds", "iterations", "image residual", "how it went"
+    for heading in headings:
         shots.add_column(heading, overflow="fold")
     for index, (status, report) in enumerate(zip(store.statuses(), store.reports(), strict=True)):
         shots.add_row(
             str(index),
-            store.names[index],
+            plain(store.names[index]),
             STATUS_NAMES[status],
             f"{report['seconds']:.1f}" if "seconds" in report else "",
-            str(report.get("iterations", "")),
-            report.get("reason") or "; ".join(report.get("warnings", ())),
+            plain(report.get("iterations", "")),
+            f"{report['image_residual']:.2%}" if "image_residual" in report else "",
+            plain(report.get("reason") or "; ".join(report.get("warnings", ()))),
             style="red" if STATUS_NAMES[status] == "failed" else "",
         )
     return [*tables, shots]
 
 
+@refusing_damage
 def store_rows(path: Path, *, trouble: bool = True) -> Rows:
     """Tell what a store is."""
     from napari_shadowinv.io.store import StackStore

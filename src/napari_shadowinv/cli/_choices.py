@@ -17,6 +17,7 @@ from napari_shadowinv.io import read_toml
 from napari_shadowinv.recipes import (
     ESTIMATES,
     BackgroundFilter,
+    ButterworthFilter,
     Estimate,
     Filter,
     HighPassFilter,
@@ -24,13 +25,19 @@ from napari_shadowinv.recipes import (
 )
 from napari_shadowinv.validation import validated
 
-__all__ = ["KEYWORDS", "TABLE", "Choices", "choices_from"]
+__all__ = ["FILTER_CHOICES", "KEYWORDS", "TABLE", "Choices", "choices_from"]
 
 TABLE = "prepare"
 """Name of the table in an options file."""
 
 _EstimateName = Literal[
-    "uniform", "gaussian", "polynomial", "low-pass", "total-variation", "interpolated"
+    "uniform",
+    "isotropic",
+    "gaussian",
+    "polynomial",
+    "low-pass",
+    "total-variation",
+    "interpolated",
 ]
 
 
@@ -60,6 +67,25 @@ class Choices(BaseModel):
         title="Width of the high pass (px)",
         description="Structures much larger than this are taken away; the mean stays.",
     )
+    butterworth: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Cutoff of the Butterworth filter (px)",
+        description="Wavelength at which the amplitude falls by 1/√2.",
+    )
+    butterworth_order: int | None = Field(
+        default=None,
+        ge=1,
+        le=20,
+        title="Order of the Butterworth filter",
+        description="The amplitude falls as this power of the wavelength.",
+    )
+    butterworth_kind: Literal["high", "low"] | None = Field(
+        default=None,
+        title="Kind of the Butterworth filter",
+        description="'high' takes away structures larger than the cutoff, 'low' smaller ones.",
+    )
     low_pass: float | None = Field(
         default=None,
         gt=0,
@@ -69,6 +95,18 @@ class Choices(BaseModel):
     )
     source_from: _EstimateName | None = Field(
         default=None, title="Source from", description="How the source is guessed from the image."
+    )
+    source_centre_y: float | None = Field(
+        default=None,
+        allow_inf_nan=False,
+        title="Centre y (px)",
+        description="Row in which the detector faces an isotropic source.",
+    )
+    source_centre_x: float | None = Field(
+        default=None,
+        allow_inf_nan=False,
+        title="Centre x (px)",
+        description="Column in which the detector faces an isotropic source.",
     )
     source_degree: int | None = Field(
         default=None,
@@ -104,6 +142,10 @@ class Choices(BaseModel):
             chosen.append(BackgroundFilter(degree=self.background_degree))
         if self.high_pass is not None:
             chosen.append(HighPassFilter(width=self.high_pass))
+        if self.butterworth is not None:
+            more = self.given("butterworth_order", "butterworth_kind")
+            parameters = {name.removeprefix("butterworth_"): more[name] for name in more}
+            chosen.append(ButterworthFilter(cutoff=self.butterworth, **parameters))
         if self.low_pass is not None:
             chosen.append(LowPassFilter(width=self.low_pass))
         return tuple(chosen)
@@ -120,7 +162,19 @@ class Choices(BaseModel):
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
+FILTER_CHOICES = (
+    "background_degree",
+    "high_pass",
+    "butterworth",
+    "butterworth_order",
+    "butterworth_kind",
+    "low_pass",
+)
+"""What tells the filters after pixels were summed."""
+
 KEYWORDS: dict[str, tuple[str, tuple[_EstimateName, ...]]] = {
+    "source_centre_y": ("centre_y", ("isotropic",)),
+    "source_centre_x": ("centre_x", ("isotropic",)),
     "source_degree": ("degree", ("polynomial",)),
     "source_weight": ("weight", ("total-variation",)),
     "source_width": ("width", ("low-pass", "interpolated")),
@@ -151,8 +205,11 @@ def _check(chosen: Choices, has_source: bool, has_source_mask: bool) -> None:
         raise InputError(
             f"received --source and --source-from {chosen.source_from}: choose one of them"
         )
+    if chosen.butterworth is None:
+        for name in chosen.given("butterworth_order", "butterworth_kind"):
+            raise InputError(f"received {_flag(name)}: it needs --butterworth with a cutoff in px")
     if has_source and chosen.flattens:
-        name = "high_pass" if chosen.background_degree is None else "background_degree"
+        (name, *_) = chosen.given("background_degree", "high_pass", "butterworth")
         raise InputError(
             f"received --source and {_flag(name)}: what flattens the image takes the beam out of "
             "it, which the source still has; leave one of them out"
@@ -161,7 +218,7 @@ def _check(chosen: Choices, has_source: bool, has_source_mask: bool) -> None:
         if getattr(chosen, name) is not None and chosen.source_from not in estimates:
             wanted = " or ".join(f"--source-from {estimate}" for estimate in estimates)
             raise InputError(f"received {_flag(name)}: it needs {wanted}")
-    if has_source_mask and chosen.source_from in (None, "uniform"):
+    if has_source_mask and chosen.source_from in (None, "uniform", "isotropic"):
         raise InputError(
             "received --source-mask: it needs --source-from with an estimate that looks at the "
             "image, such as interpolated or polynomial"

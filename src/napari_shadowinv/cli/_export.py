@@ -15,7 +15,16 @@ if TYPE_CHECKING:
 
 FORMATS = ("tiff", "pradformat", "csv")
 
-_TABLE = ("shot", "name", "status", "converged", "flux_residual", "iterations", "reason")
+_TABLE = (
+    "shot",
+    "name",
+    "status",
+    "converged",
+    "flux_residual",
+    "image_residual",
+    "iterations",
+    "reason",
+)
 
 
 def opened(path: Path, shots: str | None) -> xarray.Dataset:
@@ -168,6 +177,7 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
                     STATUS_NAMES[statuses[index]],
                     report.get("converged", ""),
                     report.get("residual", ""),
+                    report.get("image_residual", ""),
                     report.get("iterations", ""),
                     report.get("reason", ""),
                     *(f"{columns[name][index]:.9g}" for name in names),
@@ -193,8 +203,8 @@ def write_movie(
     int
         Number of frames.
     """
-    from napari_shadowinv.io import check_output, replacing
-    from napari_shadowinv.plotting import in_few_colours, stack_frames
+    from napari_shadowinv.io import check_output
+    from napari_shadowinv.plotting import stack_frames, write_film
 
     check_output(out, overwrite, suffixes=(".mp4", ".gif"))
     protect_store(store, out)
@@ -204,10 +214,7 @@ def write_movie(
         raise InputError(f"rate is {rate:g}: expected more than 0 and at most 120 frames a second")
     dataset = opened(store, shots)
     frames = stack_frames(dataset, variable, limits=limits)
-    if out.suffix.lower() == ".gif":
-        frames = map(in_few_colours, frames)
-    with replacing(out, overwrite) as temporary:
-        return _write_frames(temporary, frames, rate)
+    return write_film(out, frames, rate, overwrite=overwrite)
 
 
 def _require_ffmpeg(out: Path) -> None:
@@ -218,20 +225,3 @@ def _require_ffmpeg(out: Path) -> None:
             f"{out} needs the package imageio-ffmpeg: install it with pip install "
             "'napari-shadowinv[movie]', or write a .gif"
         )
-
-
-def _write_frames(path: Path, frames: Iterator[Any], rate: float) -> int:
-    import imageio.v2 as iio
-
-    options: dict[str, Any] = (
-        {"fps": rate, "codec": "libx264", "quality": 8, "macro_block_size": 2}
-        if path.suffix.lower() == ".mp4"
-        else {"duration": 1000 / rate, "loop": 0}
-    )
-    count = 0
-    film: Any = iio.get_writer(path, **options)
-    with film:
-        for frame in frames:
-            film.append_data(frame)
-            count += 1
-    return count

@@ -3,9 +3,10 @@
 - what is read: `ImageFile`, `SourceFile`, `MaskFile`, `SetupFile`, `OptionsFile`, `StoreFolder`
 - which part of it: `Channel`, `Variable`, `SourceVariable`, `Bin`, `ChosenShots`
 - the inversion: `SiteCount`, `ClipNegative`, `Threads`, `Seed`, `Boundary`, `Margin`, `Flux`
-- filters before it: `HotPixels`, `BackgroundDegree`, `HighPass`, `LowPass`
-- a source estimated from the image: `SourceFrom`, `SourceDegree`, `SourceWeight`,
-  `SourceWidth`, `SourceMask`
+- filters before it: `HotPixels`, `BackgroundDegree`, `HighPass`, `LowPass`, `Butterworth`,
+  `ButterworthOrder`, `ButterworthKind`
+- a source estimated from the image: `SourceFrom`, `SourceCentreY`, `SourceCentreX`,
+  `SourceDegree`, `SourceWeight`, `SourceWidth`, `SourceMask`
 - what is written: `Result`, `Figure`, `Overwrite`, `Quiet`, `QuietInversion`
 
 `given` tells which of them a user gave.
@@ -146,17 +147,59 @@ LowPass = Annotated[
         rich_help_panel=_FILTERS,
     ),
 ]
+Butterworth = Annotated[
+    float | None,
+    Option(
+        metavar="PX",
+        help="Take away structures larger than this wavelength in px (after --bin), steeply.",
+        rich_help_panel=_FILTERS,
+    ),
+]
+ButterworthOrder = Annotated[
+    int | None,
+    Option(
+        metavar="N",
+        help="Of --butterworth: the amplitude falls as this power of the wavelength. Default: 2.",
+        rich_help_panel=_FILTERS,
+    ),
+]
+ButterworthKind = Annotated[
+    str | None,
+    Option(
+        help=(
+            "Of --butterworth: 'high' takes away what is larger (default), 'low' what is smaller, "
+            "of image and source."
+        ),
+        rich_help_panel=_FILTERS,
+    ),
+]
 
 SourceFrom = Annotated[
     str | None,
     Option(
         metavar="ESTIMATE",
         help=(
-            "Guess the undisturbed beam from the (filtered) image: uniform, gaussian, "
-            "polynomial, low-pass, total-variation or interpolated."
+            "Guess the undisturbed beam from the (filtered) image: uniform, isotropic (a point "
+            "source, needs --setup), gaussian, polynomial, low-pass, total-variation or "
+            "interpolated."
         ),
         rich_help_panel=_ESTIMATES,
     ),
+]
+SourceCentreY = Annotated[
+    float | None,
+    Option(
+        metavar="PX",
+        help=(
+            "For isotropic: row (after --bin) in which the detector faces the point source. "
+            "Default: the image's middle."
+        ),
+        rich_help_panel=_ESTIMATES,
+    ),
+]
+SourceCentreX = Annotated[
+    float | None,
+    Option(metavar="PX", help="Likewise, column.", rich_help_panel=_ESTIMATES),
 ]
 SourceDegree = Annotated[
     int | None,

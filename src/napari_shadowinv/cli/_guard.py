@@ -6,6 +6,7 @@ import functools
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, ParamSpec
 
 import typer
 
+from napari_shadowinv.cli._terminal import say_on_stderr
 from napari_shadowinv.errors import InputError, InversionCancelled
 
 if TYPE_CHECKING:
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 EXIT_MISTAKE = 2
 EXIT_NOT_CONVERGED = 3
 EXIT_CANCELLED = 130
+
+_ONE_WISH = 2.0  # seconds in which impatient fingers mean one and the same Ctrl-C
 
 P = ParamSpec("P")
 
@@ -45,7 +49,7 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
                 code, text = EXIT_MISTAKE, str(error) or "There is not enough memory for this"
             else:
                 raise
-            _say_on_stderr(text)
+            say_on_stderr(text)
             raise typer.Exit(code) from None
 
     return run
@@ -65,18 +69,10 @@ def _is_mistake(error: BaseException) -> bool:
     return isinstance(error, InputError | ValidationError)
 
 
-def _say_on_stderr(text: str) -> None:
-    from rich.console import Console
-    from rich.text import Text
-
-    line = " ".join(text.split())
-    Console(stderr=True).print(Text(line, style="bold red"), soft_wrap=True)
-
-
 def alarm_unless_converged(report: Report, out: Path) -> None:
     """End with an exit code of its own if what was written is not to be trusted."""
     if not report.converged:
-        _say_on_stderr(
+        say_on_stderr(
             f"NOT CONVERGED: {out} is written, but its flux residual is {report.residual:.2g} "
             f"where {report.tolerance:.2g} was asked for: do not trust the field"
         )
@@ -93,15 +89,21 @@ def _noting_interrupts() -> Iterator[None]:
     """Note Ctrl-C for `interrupted`.
 
     The interrupt is raised as usual, too; should a callback of compiled code swallow it,
-    the core still stops at its next step.
+    the core still stops at its next step. What is pressed again at once is not raised: it
+    would interrupt the clearing up after the first.
     """
     _ctrl_c.clear()
+    pressed = float("-inf")
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def stop(number: int, frame: object) -> None:
+        nonlocal pressed
         _ctrl_c.set()
+        if time.monotonic() < pressed + _ONE_WISH:
+            return
+        pressed = time.monotonic()
         # What is half made now complains when Python clears up.
         sys.unraisablehook = lambda _: None
         raise KeyboardInterrupt

@@ -16,6 +16,7 @@ from napari_shadowinv.cli._tables import (
     size_text,
     two_columns,
 )
+from napari_shadowinv.safety import refusing_damage
 
 if TYPE_CHECKING:
     import xarray
@@ -30,6 +31,7 @@ def described(path: Path, variable: str | None = None) -> Table:
     return two_columns(str(path), _rows(path, variable))
 
 
+@refusing_damage
 def _rows(path: Path, variable: str | None) -> Rows:
     from napari_shadowinv.cli._batch import store_rows
     from napari_shadowinv.io import Radiograph, is_stack, read
@@ -78,12 +80,19 @@ def _matlab_rows(path: Path, variable: str | None) -> Rows:
 
 def _picture_rows(path: Path, kind: str) -> Rows:
     from napari_shadowinv.io.images import read_picture
+    from napari_shadowinv.io.radiograph import film_warnings
 
     array, metadata = read_picture(path, kind)
+    warnings = film_warnings(array, None) if array.ndim == 2 else ()
     rows = [("kind", f"{kind.upper()} picture, {metadata['bits']} bits per sample")]
     if array.ndim == 3:
-        rows.append(("channels", f"{array.shape[-1]}: choose with --channel if they differ"))
-    return rows + _array_rows(array)
+        rows.append(
+            (
+                "channels",
+                f"{array.shape[-1]}: convert a scan of film to dose, or choose with --channel",
+            )
+        )
+    return [*rows, *_array_rows(array), *[("warning", text) for text in warnings]]
 
 
 def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> Rows:
@@ -98,6 +107,8 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> Rows:
     ]
     if shot.source is not None:
         rows.append(("source", "in the same file, below the image"))
+    if shot.mask is not None:
+        rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels left out"))
     return [*rows, *_geometry_rows(geometry), ("setup", setup_text(shot.setup, shot))]
 
 

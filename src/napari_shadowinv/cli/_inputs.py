@@ -26,6 +26,8 @@ class Experiment:
     shot: Radiograph
     source: Radiograph | None = None
     setup: Setup | None = None
+    doubts: tuple[str, ...] = ()
+    """Of a source that was not measured."""
 
 
 def options_from(
@@ -68,7 +70,9 @@ def experiment_from(
     source_mask: Path | None = None,
 ) -> Experiment:
     """Read what is to be inverted, binned alike and prepared as asked for."""
-    from napari_shadowinv.io import binned_setup, read_radiograph, read_toml
+    from napari_shadowinv.cli._choices import Choices
+    from napari_shadowinv.io import read_radiograph, read_toml
+    from napari_shadowinv.physics.setup import binned_setup
 
     entries = None if setup is None else read_toml(setup)
     shot = read_radiograph(image, channel=channel, variable=variable)
@@ -85,8 +89,8 @@ def experiment_from(
     else:
         beam = _own_source(image, shot, choices)
     bare = None if source_mask is None else _mask_of(source_mask, shot, "source mask")
-    shot, beam = _prepared(shot, beam, factor, choices, bare)
-    return Experiment(shot, beam, geometry)
+    shot, beam, doubts = _prepared(shot, beam, factor, choices or Choices(), bare, geometry)
+    return Experiment(shot, beam, geometry, doubts)
 
 
 def _own_source(path: Path, shot: Radiograph, choices: Choices | None) -> Radiograph | None:
@@ -105,12 +109,11 @@ def _prepared(
     shot: Radiograph,
     beam: Radiograph | None,
     factor: int,
-    choices: Choices | None,
+    choices: Choices,
     bare: NDArray[np.bool_] | None,
-) -> tuple[Radiograph, Radiograph | None]:
+    setup: Setup | None,
+) -> tuple[Radiograph, Radiograph | None, tuple[str, ...]]:
     """Filter a shot and its source, broken pixels before they are summed and the rest after."""
-    if choices is None:
-        return shot.binned(factor), None if beam is None else beam.binned(factor)
     from napari_shadowinv.cli._preparing import estimated, filtered, repaired
 
     whole = bare
@@ -121,8 +124,8 @@ def _prepared(
         beam = replace(beam, mask=shot.mask)
     shot = filtered(repaired(shot, choices).binned(factor), choices)
     if beam is None:
-        return shot, estimated(shot, choices, whole)
-    return shot, filtered(repaired(beam, choices).binned(factor), choices)
+        return shot, *estimated(shot, choices, whole, setup)
+    return shot, filtered(repaired(beam, choices).binned(factor), choices), ()
 
 
 def picture_mask(path: Path) -> NDArray[np.bool_]:

@@ -79,13 +79,15 @@ def make_folder(path: Path) -> None:
 def write_all(
     inversion: Inversion, experiment: Experiment, out: Path, report: Path, overwrite: bool
 ) -> None:
-    """Write result and figure; should drawing the figure fail, nothing is written."""
-    from napari_shadowinv.io import write
+    """Write result and figure, both or none of them."""
+    from napari_shadowinv.io import replacing, write
     from napari_shadowinv.io.files import text_of
-    from napari_shadowinv.plotting import report_figure, save_figure
+    from napari_shadowinv.plotting import report_figure
+    from napari_shadowinv.plotting._figures import DOTS_PER_INCH
 
     shot, setup = experiment.shot, experiment.setup
     title = "" if shot.path is None else text_of(shot.path.name)
     figure = report_figure(inversion, setup, title=title)
-    write(out, inversion, setup=setup, shot=shot, source=experiment.source, overwrite=overwrite)
-    save_figure(report, figure, overwrite)
+    with replacing(report, overwrite) as drawn:
+        figure.savefig(drawn, dpi=DOTS_PER_INCH)
+        write(out, inversion, setup=setup, shot=shot, source=experiment.source, overwrite=overwrite)

@@ -9,17 +9,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.cli._choices import KEYWORDS, Choices
+from napari_shadowinv.cli._choices import FILTER_CHOICES, KEYWORDS, Choices
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.filters import remove_hot_pixels
 from napari_shadowinv.io import Radiograph
 from napari_shadowinv.preparation import Preparation
-from napari_shadowinv.recipes import without_masked
+from napari_shadowinv.recipes import UniformEstimate, without_masked
+from napari_shadowinv.sources import uniform_warnings
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["estimated", "filtered", "repaired"]
 
@@ -48,18 +52,28 @@ def filtered(shot: Radiograph, chosen: Choices) -> Radiograph:
     with _named(shot):
         image = preparation.filtered(shot.image, shot.mask)
     notes = [one.described for one in preparation.filters]
-    return _with(shot, image, notes, chosen.given("background_degree", "high_pass", "low_pass"))
+    return _with(shot, image, notes, chosen.given(*FILTER_CHOICES))
 
 
-def estimated(shot: Radiograph, chosen: Choices, bare: Mask | None) -> Radiograph | None:
-    """Guess the source from a shot; `bare` is True where the object is not."""
+def estimated(
+    shot: Radiograph, chosen: Choices, bare: Mask | None, setup: Setup | None
+) -> tuple[Radiograph | None, tuple[str, ...]]:
+    """Guess the source from a shot, with doubts of it; `bare` is True where the object is not."""
     estimate = chosen.estimate()
+    doubts: list[str] = []
+    if estimate is None or isinstance(estimate, UniformEstimate):
+        height, width = shot.image.shape
+        doubts.extend(uniform_warnings((height, width), setup))
     if estimate is None:
-        return None
+        return None, tuple(doubts)
     with _named(shot):
-        beam = Preparation((), estimate, bare).estimated(shot.image, shot.mask)
+        estimate = estimate.placed(setup, shot.image.shape)
+        preparation = Preparation((), estimate, bare)
+        preparation.check(has_source=False, mask=shot.mask)
+        beam = preparation.estimated(shot.image, shot.mask, on_warning=doubts.append)
     recorded = {"source_from": chosen.source_from, **chosen.given(*KEYWORDS)}
-    return _with(Radiograph(beam), beam, [estimate.described], recorded)
+    source = _with(Radiograph(beam), beam, [estimate.described], recorded)
+    return source, tuple(doubts)
 
 
 @contextmanager

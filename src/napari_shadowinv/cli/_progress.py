@@ -27,7 +27,7 @@ def inverted(experiment: Experiment, options: InversionOptions, quiet: bool = Fa
     with nullcontext() if quiet else progress_bars() as show:
         ensure_compiled(show, interrupted)
         try:
-            return invert(
+            inversion = invert(
                 shot.image,
                 source=None if source is None else source.image,
                 mask=shot.mask,
@@ -37,6 +37,9 @@ def inverted(experiment: Experiment, options: InversionOptions, quiet: bool = Fa
             )
         except InputError as error:
             raise InputError(f"{shot.path}: {error}" if shot.path else str(error)) from error
+    told = (*experiment.doubts, *shot.warnings, *(() if source is None else source.warnings))
+    # Image and source may come from one file.
+    return inversion.with_warnings(dict.fromkeys(told))
 
 
 @contextmanager
@@ -51,10 +54,10 @@ def progress_bars() -> Iterator[OnProgress | None]:
         yield None
         return
     columns = (
-        TextColumn("{task.description:<10}"),
+        TextColumn("{task.description:<10}", markup=False),
         BarColumn(),
         TimeElapsedColumn(),
-        TextColumn("[dim]{task.fields[message]}"),
+        TextColumn("{task.fields[message]}", style="dim", markup=False),
     )
     with Bars(*columns, console=console) as bars:
         tasks: dict[str, TaskID] = {}

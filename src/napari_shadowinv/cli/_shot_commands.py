@@ -13,6 +13,9 @@ from napari_shadowinv.cli._flags import (
     BackgroundDegree,
     Bin,
     Boundary,
+    Butterworth,
+    ButterworthKind,
+    ButterworthOrder,
     Channel,
     ClipNegative,
     Figure,
@@ -31,6 +34,8 @@ from napari_shadowinv.cli._flags import (
     Seed,
     SetupFile,
     SiteCount,
+    SourceCentreX,
+    SourceCentreY,
     SourceDegree,
     SourceFile,
     SourceFrom,
@@ -63,19 +68,21 @@ from napari_shadowinv.cli._outputs import (
     write_all,
 )
 from napari_shadowinv.cli._progress import inverted
-from napari_shadowinv.cli._tables import say, size_text, summary
+from napari_shadowinv.cli._tables import size_text, summary
+from napari_shadowinv.cli._terminal import say
 from napari_shadowinv.errors import InputError
 
 INVERT_EPILOG = r"""
 [bold]Examples[/bold]
 shadowinv invert shot.tif
 shadowinv invert shot.tif --source reference.tif --setup setup.toml --bin 4
-shadowinv invert film.tif --channel red --clip-negative --out film.h5
+shadowinv invert dose.npy --mask usable.png --clip-negative --out film.h5
 shadowinv invert shots.mat --variable shot3 --source-variable beam
 shadowinv invert shot.tif --hot-pixels 6 --source-from polynomial --source-degree 2
 
 [bold]setup.toml[/bold]
-kind = "proton"                  # or "optical"
+kind = "proton"                  # any charged particles; or "optical"
+species = "proton"               # or "electron", "deuteron", "alpha", …
 energy = 14.7                    # MeV; for light: wavelength = 532e-9 (m)
 source_object_distance = 0.01    # m; inf for a collimated beam
 object_image_distance = 0.28     # m
@@ -119,6 +126,8 @@ def invert(
     margin: Margin = None,
     flux: Flux = None,
     source_from: SourceFrom = None,
+    source_centre_y: SourceCentreY = None,
+    source_centre_x: SourceCentreX = None,
     source_degree: SourceDegree = None,
     source_weight: SourceWeight = None,
     source_width: SourceWidth = None,
@@ -127,6 +136,9 @@ def invert(
     background_degree: BackgroundDegree = None,
     high_pass: HighPass = None,
     low_pass: LowPass = None,
+    butterworth: Butterworth = None,
+    butterworth_order: ButterworthOrder = None,
+    butterworth_kind: ButterworthKind = None,
 ) -> None:
     """Retrieve the deflection potential of one image.
 
@@ -148,7 +160,12 @@ def invert(
         background_degree=background_degree,
         high_pass=high_pass,
         low_pass=low_pass,
+        butterworth=butterworth,
+        butterworth_order=butterworth_order,
+        butterworth_kind=butterworth_kind,
         source_from=source_from,
+        source_centre_y=source_centre_y,
+        source_centre_x=source_centre_x,
         source_degree=source_degree,
         source_weight=source_weight,
         source_width=source_width,

@@ -11,6 +11,9 @@ from napari_shadowinv.cli._flags import (
     BackgroundDegree,
     Bin,
     Boundary,
+    Butterworth,
+    ButterworthKind,
+    ButterworthOrder,
     Channel,
     ChosenShots,
     ClipNegative,
@@ -24,6 +27,8 @@ from napari_shadowinv.cli._flags import (
     Quiet,
     SetupFile,
     SiteCount,
+    SourceCentreX,
+    SourceCentreY,
     SourceDegree,
     SourceFrom,
     SourceMask,
@@ -35,7 +40,7 @@ from napari_shadowinv.cli._flags import (
 )
 from napari_shadowinv.cli._guard import guarded
 from napari_shadowinv.cli._inputs import check_margin, options_from
-from napari_shadowinv.cli._tables import say
+from napari_shadowinv.cli._terminal import say
 
 BATCH_EPILOG = """
 [bold]Examples[/bold]
@@ -109,6 +114,8 @@ def batch(
     margin: Margin = None,
     flux: Flux = None,
     source_from: SourceFrom = None,
+    source_centre_y: SourceCentreY = None,
+    source_centre_x: SourceCentreX = None,
     source_degree: SourceDegree = None,
     source_weight: SourceWeight = None,
     source_width: SourceWidth = None,
@@ -117,6 +124,9 @@ def batch(
     background_degree: BackgroundDegree = None,
     high_pass: HighPass = None,
     low_pass: LowPass = None,
+    butterworth: Butterworth = None,
+    butterworth_order: ButterworthOrder = None,
+    butterworth_kind: ButterworthKind = None,
 ) -> None:
     """Invert many shots into one store that survives a crash."""
     from napari_shadowinv.cli._batch import run_batch
@@ -130,7 +140,12 @@ def batch(
         background_degree=background_degree,
         high_pass=high_pass,
         low_pass=low_pass,
+        butterworth=butterworth,
+        butterworth_order=butterworth_order,
+        butterworth_kind=butterworth_kind,
         source_from=source_from,
+        source_centre_y=source_centre_y,
+        source_centre_x=source_centre_x,
         source_degree=source_degree,
         source_weight=source_weight,
         source_width=source_width,

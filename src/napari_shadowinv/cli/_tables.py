@@ -2,7 +2,7 @@
 
 - after an inversion: `summary`
 - rows that other tables share: `inversion_rows`, `peak_rows`, `closing_rows`
-- texts: `setup_text`, `options_text`, `size_text`; all of it goes out through `say`
+- texts: `setup_text`, `options_text`, `size_text`
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from napari_shadowinv.cli._terminal import plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,24 +26,16 @@ if TYPE_CHECKING:
 Rows = list[tuple[str, str]]
 
 
-def say(text: str | Table) -> None:
-    """Print a sentence or a table."""
-    from rich.console import Console
-
-    Console().print(text, soft_wrap=isinstance(text, str), highlight=False)
-
-
 def two_columns(title: str, rows: Rows) -> Table:
     """Names on the left, values on the right, warnings in yellow."""
     from rich import box
     from rich.table import Table
-    from rich.text import Text
 
-    table = Table(title=title, title_justify="left", box=box.SIMPLE, show_header=False)
+    table = Table(title=plain(title), title_justify="left", box=box.SIMPLE, show_header=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in rows:
-        table.add_row(name, Text(value, style="yellow" if name == "warning" else ""))
+        table.add_row(plain(name), plain(value, "yellow" if name == "warning" else ""))
     return table
 
 
@@ -62,7 +56,6 @@ def summary(inversion: Inversion, experiment: Experiment, written: list[Path]) -
 def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
     """How well an inversion went, and the strongest point of its field."""
     report = inversion.report
-    residual = 100 * float((inversion.residual**2).mean() ** 0.5 / inversion.source.mean())
     verdict = "converged" if report.converged else "NOT converged"
     return [
         ("sites", f"{report.n_sites:,}"),
@@ -70,7 +63,7 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
             "flux residual",
             f"{report.residual:.2g} of a cell, asked for {report.tolerance:.2g}: {verdict}",
         ),
-        ("image residual", f"{residual:.2g} % of the mean (root mean square)"),
+        ("image residual", f"{100 * report.image_residual:.3g} % of the mean (root mean square)"),
         ("iterations", f"{report.iterations} on {len(report.levels)} levels"),
         (
             "floor",

@@ -20,8 +20,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv.geometry._kernel import njit
 
 __all__ = ["Density", "walk_edge"]
 

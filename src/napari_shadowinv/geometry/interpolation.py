@@ -17,9 +17,9 @@ in bending" (1965); P. Alfeld, Computer Aided Geometric Design 1, 169 (1984).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._threads import available_threads, in_ranges
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 

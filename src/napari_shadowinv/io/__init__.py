@@ -16,14 +16,13 @@ from napari_shadowinv.io.dataset import (
     setup_from_dataset,
 )
 from napari_shadowinv.io.files import check_output, replacing
-from napari_shadowinv.io.radiograph import Radiograph, binned_setup
+from napari_shadowinv.io.radiograph import Radiograph
 from napari_shadowinv.io.reading import read, read_dataset, read_radiograph, read_toml
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.io.writing import write
 
 __all__ = [
     "Radiograph",
-    "binned_setup",
     "check_output",
     "dataset_from_inversion",
     "inversion_from_dataset",

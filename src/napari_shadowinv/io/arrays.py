@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.safety import check_size, refusing_damage
 
 __all__ = ["read_npy", "write_npy"]
 
 
+@refusing_damage
 def read_npy(path: Path) -> NDArray[Any]:
     """Read an array of real numbers.
 
@@ -31,19 +34,18 @@ def read_npy(path: Path) -> NDArray[Any]:
     FileFormatError
         If it is damaged or holds anything but real numbers.
     """
+    # Mapped first: a header that promises too much then fails before memory is asked for.
     try:
-        # Mapped first: a header that promises too much then fails before memory is asked for.
-        array = np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
-    except (ValueError, EOFError, OSError, SyntaxError) as error:
-        if "Python objects" in str(error):
-            raise FileFormatError(
-                f"{path} holds Python objects: expected an array of numbers; "
-                "save it again with array.astype(float)"
-            ) from None
+        mapped = np.load(path, allow_pickle=False, mmap_mode="r")
+    except ValueError as error:
+        if "Python objects" not in str(error):
+            raise
         raise FileFormatError(
-            f"{path} begins as NPY but is damaged or cut short: expected a complete array; "
-            "copy or save it again"
+            f"{path} holds Python objects: expected an array of numbers; "
+            "save it again with array.astype(float)"
         ) from error
+    check_size(path, mapped.size * max(8, mapped.dtype.itemsize))
+    array = np.array(mapped)
     if array.dtype.kind not in "buif":
         raise FileFormatError(
             f"{path} holds {array.dtype} values: expected whole or real numbers; convert them"
@@ -53,5 +55,7 @@ def read_npy(path: Path) -> NDArray[Any]:
 
 def write_npy(path: Path, array: NDArray[Any]) -> None:
     """Write an array as it is."""
-    with path.open("wb") as file:
-        np.save(file, array, allow_pickle=False)
+    content = BytesIO()
+    np.save(content, array, allow_pickle=False)
+    # Numpy does not tell why it cannot write to a file.
+    path.write_bytes(content.getbuffer())

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.promises import check_promise
+from napari_shadowinv.safety import check_size
 
 __all__ = ["read_b16", "read_spe"]
 
@@ -143,4 +144,5 @@ def _frame(
         )
     count = height * width
     check_promise(path, header, start + count * dtype.itemsize, path.stat().st_size)
+    check_size(path, 8 * count)
     return np.fromfile(path, dtype, count=count, offset=start).reshape(shape)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -22,9 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
+from napari_shadowinv.io.hdf5 import check_arrays, hdf5_in_memory
 from napari_shadowinv.io.radiograph import Radiograph
+from napari_shadowinv.safety import refusing_damage
 
 if TYPE_CHECKING:
     import xarray
@@ -100,6 +103,7 @@ def dataset_from_inversion(
         "format": FORMAT,
         "options": inversion.options.model_dump_json(),
         "report": json.dumps(dataclasses.asdict(inversion.report)),
+        "image_residual": inversion.report.image_residual,
     }
     dataset = dataset_from_field(
         inversion.displacement,
@@ -121,7 +125,7 @@ def dataset_from_field(
     potential: NDArray[np.float64] | None,
     setup: ProtonSetup | OpticalSetup | None,
     *,
-    attributes: Mapping[str, str] | None = None,
+    attributes: Mapping[str, Any] | None = None,
 ) -> xarray.Dataset:
     """Label a displacement and its potential, in pixels and, with a setup, in SI units.
 
@@ -413,6 +417,7 @@ def inversion_from_dataset(dataset: xarray.Dataset) -> Inversion:
     """
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.options import InversionOptions
+    from napari_shadowinv.trust import image_residual
 
     missing = [name for name in _VARIABLES if name not in dataset.variables]
     missing += [name for name in ("options", "report") if name not in dataset.attrs]
@@ -421,9 +426,13 @@ def inversion_from_dataset(dataset: xarray.Dataset) -> Inversion:
             f"dataset has no {', '.join(map(repr, missing))}: expected the result of an inversion"
         )
     arrays = {name: np.ascontiguousarray(dataset[name].values) for name in _VARIABLES}
+    report = _report(json.loads(dataset.attrs["report"]))
+    if math.isnan(report.image_residual):  # a file of an older version
+        told = image_residual(arrays["image"], arrays["reprojection"], arrays["mask"])
+        report = dataclasses.replace(report, image_residual=told)
     return Inversion(
         **arrays,
-        report=_report(json.loads(dataset.attrs["report"])),
+        report=report,
         options=InversionOptions.model_validate_json(dataset.attrs["options"]),
     )
 
@@ -469,7 +478,15 @@ def write_result(path: Path, dataset: xarray.Dataset) -> None:
         The file.
     dataset : xarray.Dataset
         What to write.
+
+    Raises
+    ------
+    OSError
+        If there is no room for it.
     """
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
     encoding: dict[str, dict[str, Any]] = {}
     for name, variable in dataset.variables.items():
         numeric = variable.dtype.kind in "fiub"
@@ -478,9 +495,11 @@ def write_result(path: Path, dataset: xarray.Dataset) -> None:
             encoding[str(name)] = {**packed, "_FillValue": None}
     # A field that was read from a file of another format still says so.
     marked = dataset.assign_attrs(format=FORMAT)
-    marked.to_netcdf(path, engine="h5netcdf", encoding=encoding)
+    with hdf5_in_memory(path) as content, h5netcdf.File(content, "w") as file:
+        marked.dump_to_store(H5NetCDFStore(file), encoding=encoding)
 
 
+@refusing_damage
 def read_result(path: Path) -> xarray.Dataset:
     """Read a dataset that `write_result` wrote, all of it into memory.
 
@@ -501,13 +520,6 @@ def read_result(path: Path) -> xarray.Dataset:
     """
     import xarray as xr
 
-    try:
-        # Nothing in it is a time, whatever its units look like.
-        return xr.load_dataset(path, engine="h5netcdf", decode_times=False)
-    except MemoryError:
-        raise
-    except Exception as error:
-        raise FileFormatError(
-            f"{path} is a .shadowinv result but is damaged or cut short: expected a complete "
-            "file; copy it again or repeat the inversion"
-        ) from error
+    check_arrays(path)
+    # Nothing in it is a time, whatever its units look like.
+    return xr.load_dataset(path, engine="h5netcdf", decode_times=False)

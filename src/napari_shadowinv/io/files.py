@@ -2,6 +2,7 @@
 
 - tell the kind of a file from its first bytes: `kind_of`
 - its fingerprint: `sha256`; its name as text: `text_of`
+- order many, shot 2 before shot 10: `in_counting_order`
 - refuse an output before hours of work: `check_output`, `check_folder_of`
 - write all of a file or nothing: `replacing`
 """
@@ -9,19 +10,24 @@
 from __future__ import annotations
 
 import codecs
+import errno
 import hashlib
 import os
+import re
 import secrets
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.interrupts import interrupts_put_off
+from napari_shadowinv.safety import check_regular, refusing_damage
 
 __all__ = [
     "READABLE",
     "check_folder_of",
     "check_output",
+    "in_counting_order",
     "kind_of",
     "replacing",
     "sha256",
@@ -53,6 +59,9 @@ _TEXT_SUFFIXES = (".txt", ".csv", ".dat", ".asc")
 # Where Princeton's header keeps two numbers that are always the same, and these.
 _SPE_MARKS = ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55"))
 
+# The disk is full, the quota used up, or the file longer than is allowed.
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
 _OTHER_SIGNATURES: dict[bytes, str] = {
     b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
     b"\x1f\x8b": "a gzip archive",
@@ -63,7 +72,8 @@ _OTHER_SIGNATURES: dict[bytes, str] = {
 }
 
 
-def kind_of(path: str | Path) -> str:
+@refusing_damage
+def kind_of(path: Path) -> str:
     """Tell the kind of a file from its content; its name may lie.
 
     Numbers as text have no mark: they need one of the usual endings too.
@@ -84,7 +94,6 @@ def kind_of(path: str | Path) -> str:
     FileFormatError
         If there is no such file, it cannot be opened, is empty, or of another kind.
     """
-    path = Path(path)
     head = _first_bytes(path)
     if not head:
         raise FileFormatError(f"{path} is empty (0 bytes): expected {READABLE}; copy it again")
@@ -121,19 +130,9 @@ def is_spe(path: Path) -> bool:
 
 
 def _first_bytes(path: Path, count: int = 64) -> bytes:
-    if path.is_dir():
-        raise FileFormatError(f"{path} is a folder: expected one file ({READABLE})")
-    try:
-        with path.open("rb") as file:
-            return file.read(count)
-    except FileNotFoundError:
-        raise FileFormatError(
-            f"{path} does not exist: expected a file ({READABLE}); check the path"
-        ) from None
-    except OSError as error:
-        raise FileFormatError(
-            f"{path} cannot be opened ({error.strerror}): check its permissions and the path"
-        ) from None
+    check_regular(path, f"a file ({READABLE})")
+    with path.open("rb") as file:
+        return file.read(count)
 
 
 def _describe(head: bytes) -> str:
@@ -180,6 +179,33 @@ def text_of(path: str | Path) -> str:
     str
     """
     return os.fsencode(path).decode("utf-8", errors="backslashreplace")
+
+
+def in_counting_order(paths: Iterable[Path]) -> list[Path]:
+    """Sort files as one counts, folder by folder.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Files.
+
+    Returns
+    -------
+    list of Path
+        The same; numbers in their names, and in those of their folders, count by their value.
+        Upper and lower case are the same but for names that differ in nothing else.
+
+    Examples
+    --------
+    >>> [path.name for path in in_counting_order(map(Path, ["b2", "a10", "a9", "A1"]))]
+    ['A1', 'a9', 'a10', 'b2']
+    """
+    return sorted(paths, key=lambda path: ([_counting(part) for part in path.parts], path))
+
+
+def _counting(name: str) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d+)", name.lower())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
 
 
 def check_output(
@@ -263,12 +289,14 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     ------
     Path
         A new name beside `path`, with the same ending, to write to. It becomes `path`
-        when the block ends well, and is removed on any error or interruption.
+        when the block ends well and the disk has taken it, and is removed on any error or
+        interruption.
 
     Raises
     ------
     FileFormatError
-        As `check_output`, before the block and again when it has ended.
+        As `check_output`, before the block and again when it has ended; and if there is no
+        room for the file.
 
     Examples
     --------
@@ -285,6 +313,23 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         yield temporary
         # Someone else may have written the file during the work.
         check_output(path, overwrite)
-        os.replace(temporary, path)
+        with interrupts_put_off():
+            _flush(temporary)
+            os.replace(temporary, path)
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        raise FileFormatError(
+            f"{path} cannot be written ({error.strerror}): make room on its disk, or choose "
+            "another folder"
+        ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        # A second Ctrl-C must not leave the half of it behind.
+        with interrupts_put_off():
+            temporary.unlink(missing_ok=True)
+
+
+def _flush(path: Path) -> None:
+    """Wait until the disk has a file; only then is it known that there was room for it."""
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())

@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.safety import refusing_damage, small_text
 
 __all__ = ["read_film_table"]
 
 
-def read_film_table(path: str | Path) -> NDArray[np.float64]:
+@refusing_damage
+def read_film_table(path: Path) -> NDArray[np.float64]:
     """Read dose and pixels of every film.
 
     Parameters
@@ -34,7 +36,8 @@ def read_film_table(path: str | Path) -> NDArray[np.float64]:
         If the file is missing, has no such columns, or a row holds anything but numbers;
         the message tells the line.
     """
-    lines = _cells(Path(path))
+    text = small_text(path, "a calibration table, comma-separated values", "utf-8-sig")
+    lines = list(csv.reader(text.splitlines()))
     columns = _columns(path, [name.strip().lower() for name in lines[0]] if lines else [])
     rows: list[list[float]] = []
     for number, cells in enumerate(lines[1:], start=2):
@@ -45,25 +48,13 @@ def read_film_table(path: str | Path) -> NDArray[np.float64]:
             has_units = number == 2
             if any(cell.strip() for cell in cells) and not has_units:
                 raise FileFormatError(
-                    f"{path}, line {number} has {', '.join(map(repr, picked))}: expected a dose "
-                    "and three pixels as numbers; correct it"
+                    f"{path}, line {number} has {', '.join(map(repr, picked))[:80]}: expected a "
+                    "dose and three pixels as numbers; correct it"
                 ) from None
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
 
 
-def _cells(path: Path) -> list[list[str]]:
-    try:
-        return list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except FileNotFoundError:
-        raise FileFormatError(f"{path} does not exist: expected a calibration table") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FileFormatError(
-            f"{path} cannot be read as a table ({type(error).__name__}): expected comma-separated "
-            "values"
-        ) from None
-
-
-def _columns(path: str | Path, names: list[str]) -> list[int]:
+def _columns(path: Path, names: list[str]) -> list[int]:
     found = [[at for at, name in enumerate(names) if "dose" in name and "log" not in name]]
     for colour in ("red", "green", "blue"):
         found.append([at for at, name in enumerate(names) if name.startswith(colour)])

@@ -2,7 +2,12 @@
 
 - the array that the user names: `read_hdf5`
 - what there is to choose from: `held_arrays`
-- open it, for a module that knows its layout: `opened_hdf5`
+- for a module that knows the layout: an item by its name, `member`; the values of an array,
+  `load_dataset`; all arrays at once, `check_arrays`
+- write one: `hdf5_in_memory`
+
+An HDF5 file can point to others: by external links, external storage and virtual arrays. No
+reader follows them, because whatever lies there would pass for the file's own pixels.
 
 Files of layouts that are known, pradformat and ``.shadowinv``, need no name.
 """
@@ -12,6 +17,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -19,46 +25,192 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.promises import load_dataset
+from napari_shadowinv.io.promises import DEFLATE_RATIO, check_promise
+from napari_shadowinv.safety import check_size, refusing_damage
 
-__all__ = ["held_arrays", "opened_hdf5", "read_hdf5"]
+__all__ = [
+    "check_arrays",
+    "hdf5_in_memory",
+    "held_arrays",
+    "load_dataset",
+    "member",
+    "members",
+    "read_hdf5",
+]
 
 # Whoever has more than that to choose from knows what is in the file.
 _MOST_LISTED = 30
+_MOST_LINKS = 16
 
 
-@contextmanager
-def opened_hdf5(path: Path) -> Iterator[Any]:
-    """Open a file to read; whatever h5py stumbles over in the block is damage to the file.
+def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
+    """Return an item by its name, without leaving the file.
 
     Parameters
     ----------
     path : Path
-        An HDF5 file.
+        The file, for the message.
+    group : h5py.Group
+        Where to look.
+    name : str
+        The item, with the names of the groups that it is in.
+    depth : int
+        How many links led here.
 
-    Yields
-    ------
-    h5py.File
+    Returns
+    -------
+    h5py.Dataset or h5py.Group or None
+        None if there is no such item.
 
     Raises
     ------
     FileFormatError
-        If the file is damaged.
+        If the name leads into another file.
     """
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except FileFormatError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-        raise FileFormatError(
-            f"{path} begins as HDF5 but is damaged or cut short: expected a complete file; "
-            "copy it again"
-        ) from error
+    item = group.file if name.startswith("/") else group
+    for part in filter(None, name.split("/")):
+        key = part.encode()
+        if not isinstance(item, h5py.Group) or not item.id.links.exists(key):
+            return None
+        kind = item.id.links.get_info(key).type
+        if kind == h5py.h5l.TYPE_EXTERNAL:
+            _refuse(path, name, f"links to {item.id.links.get_val(key)[0].decode()!r}")
+        if kind == h5py.h5l.TYPE_SOFT:
+            if depth > _MOST_LINKS:
+                raise ValueError(f"the links of {name!r} go round in a circle")
+            item = member(path, item, item.id.links.get_val(key).decode(), depth + 1)
+        else:
+            item = item[part]
+    return item
 
 
+def _refuse(path: Path, name: str, found: str) -> None:
+    raise FileFormatError(
+        f"{path} does not hold {name!r} itself but {found}: expected all data in one file; save "
+        "them as an array of this file"
+    )
+
+
+def members(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
+    """Yield names and items of a group, those in other files left out."""
+    import h5py
+
+    for name in group:
+        if group.id.links.get_info(name.encode()).type == h5py.h5l.TYPE_HARD:
+            yield name, group[name]
+
+
+def load_dataset(path: Path, dataset: Any) -> NDArray[Any]:
+    """Return the values of an array that the file really holds.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for the message.
+    dataset : h5py.Dataset
+        The array. HDF5 would fill what was never written with zeros.
+
+    Returns
+    -------
+    ndarray
+        Its values.
+
+    Raises
+    ------
+    FileFormatError
+        If its shape promises more than is stored or fits into memory, or its values lie in
+        another file.
+    """
+    check_size(path, _unfolded(path, dataset))
+    _check_promise(path, dataset)
+    return np.asarray(dataset[()])
+
+
+def _check_promise(path: Path, dataset: Any) -> None:
+    stored = int(dataset.id.get_storage_size())
+    is_packed = dataset.id.get_create_plist().get_nfilters() > 0
+    check_promise(path, "HDF5", dataset.nbytes, DEFLATE_RATIO * stored if is_packed else stored)
+
+
+def _unfolded(path: Path, dataset: Any) -> int:
+    """Bytes in memory of an array that lies in the file itself."""
+    layout = dataset.id.get_create_plist()
+    if layout.get_external_count():
+        other = layout.get_external(0)[0].decode(errors="replace")
+        _refuse(path, dataset.name, f"in the raw file {other!r}")
+    if dataset.is_virtual:
+        others = sorted({source.file_name for source in dataset.virtual_sources()})
+        _refuse(path, dataset.name, f"as a virtual array from {', '.join(map(repr, others))}")
+    # One chunk may be far larger than what is used of it.
+    chunk = int(np.prod(dataset.chunks or (0,), dtype=float)) * dataset.dtype.itemsize
+    return int(max(chunk, dataset.size * max(8, dataset.dtype.itemsize)))
+
+
+def check_arrays(path: Path) -> None:
+    """Refuse a file whose arrays lie in other files or do not fit into memory together.
+
+    Parameters
+    ----------
+    path : Path
+        An HDF5 file that is to be read as a whole.
+
+    Raises
+    ------
+    FileFormatError
+        If it is so, or some array is larger than it can be.
+    """
+    import h5py
+
+    total = 0
+    with h5py.File(path, "r") as file:
+        for dataset in _all_datasets(path, file):
+            total += _unfolded(path, dataset)
+            check_size(path, total)
+            # The length of a dimension without coordinates is an array without values.
+            if dataset.id.get_storage_size() or "CLASS" not in dataset.attrs:
+                _check_promise(path, dataset)
+
+
+def _all_datasets(path: Path, group: Any) -> Iterator[Any]:
+    import h5py
+
+    for name in group:
+        item = member(path, group, name)
+        if isinstance(item, h5py.Dataset):
+            yield item
+        elif isinstance(item, h5py.Group):
+            yield from _all_datasets(path, item)
+
+
+@contextmanager
+def hdf5_in_memory(path: Path) -> Iterator[BytesIO]:
+    """Make an HDF5 file in memory, and write it to the disk in one go.
+
+    The HDF5 library ends the process where it cannot write: a full disk, a quota.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Yields
+    ------
+    BytesIO
+        What h5py and h5netcdf take for a file. It is written when the block ends well.
+
+    Raises
+    ------
+    OSError
+        If there is no room for it.
+    """
+    content = BytesIO()
+    yield content
+    path.write_bytes(content.getbuffer())
+
+
+@refusing_damage
 def read_hdf5(path: Path, name: str) -> NDArray[Any]:
     """Read one array.
 
@@ -83,14 +235,15 @@ def read_hdf5(path: Path, name: str) -> NDArray[Any]:
     """
     import h5py
 
-    with opened_hdf5(path) as file:
-        item = file.get(name)
+    with h5py.File(path, "r") as file:
+        item = member(path, file, name)
         if isinstance(item, h5py.Dataset) and _is_numeric(item):
             return load_dataset(path, item)
-        held = ", ".join(_listed(file)) or "none"
+        held = ", ".join(_listed(path, file)) or "none"
     raise InputError(f"{path} has no array {name!r}: it holds {held}")
 
 
+@refusing_damage
 def held_arrays(path: Path) -> list[str]:
     """Name the images that a file holds, each with its shape and type.
 
@@ -110,30 +263,32 @@ def held_arrays(path: Path) -> list[str]:
     FileFormatError
         If the file is damaged.
     """
-    with opened_hdf5(path) as file:
-        return _listed(file)
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return _listed(path, file)
 
 
-def _listed(file: Any) -> list[str]:
+def _listed(path: Path, file: Any) -> list[str]:
     found = [
         f"{name!r} ({'×'.join(map(str, item.shape))} {item.dtype})"
-        for name, item in itertools.islice(_items(file), 10 * _MOST_LISTED)
+        for name, item in itertools.islice(_items(path, file), 10 * _MOST_LISTED)
         if _is_numeric(item) and item.ndim in (2, 3)
     ]
     return found if len(found) <= _MOST_LISTED else [*found[:_MOST_LISTED], "…"]
 
 
-def _items(file: Any) -> Iterator[tuple[str, Any]]:
+def _items(path: Path, file: Any) -> Iterator[tuple[str, Any]]:
     """Datasets of the file and of its groups."""
     import h5py
 
-    for name, item in file.items():
+    for name, item in members(path, file):
         if isinstance(item, h5py.Dataset):
             yield name, item
         elif isinstance(item, h5py.Group):
-            for inner, member in item.items():
-                if isinstance(member, h5py.Dataset):
-                    yield f"{name}/{inner}", member
+            for inner, one in members(path, item):
+                if isinstance(one, h5py.Dataset):
+                    yield f"{name}/{inner}", one
 
 
 def _is_numeric(item: Any) -> bool:

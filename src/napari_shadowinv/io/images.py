@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,16 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.camera import read_b16, read_spe
 from napari_shadowinv.io.matlab import read_mat
 from napari_shadowinv.io.promises import DEFLATE_RATIO, check_promise
-from napari_shadowinv.io.radiograph import to_grey
+from napari_shadowinv.io.radiograph import film_warnings, to_grey
 from napari_shadowinv.io.text import read_text
+from napari_shadowinv.safety import check_regular, check_size, refusing_damage
 
-__all__ = ["read_picture", "read_tiff_page", "tiff_pages", "write_png", "write_tiff"]
+__all__ = ["PICTURES", "read_picture", "read_tiff_page", "tiff_pages", "write_png", "write_tiff"]
+
+PICTURES = ("tiff", "png", "bmp", "jpeg")
+"""Kinds of `kind_of` that a scanner may have written."""
 
 
+@refusing_damage
 def read_picture(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
     """Read a picture as it is stored.
 
@@ -48,8 +54,7 @@ def read_picture(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
     FileFormatError
         If the file is damaged or holds anything else than one picture.
     """
-    with _decoding(f"{path} begins as {kind.upper()} but is", "a complete picture"):
-        array, metadata = _reader(kind)(path)
+    array, metadata = _reader(kind)(path)
     _check(path, kind, array)
     return array, metadata
 
@@ -68,25 +73,6 @@ def _reader(kind: str) -> Callable[[Path], tuple[NDArray[Any], dict[str, Any]]]:
         "spe": read_spe,
     }
     return readers.get(kind, _read_eight_bits)
-
-
-@contextmanager
-def _decoding(found: str, expected: str) -> Iterator[None]:
-    """Tell whatever a decoder raises as damage to its file."""
-    try:
-        yield
-    except (FileFormatError, InputError, MemoryError):
-        raise
-    except Exception as error:
-        # Decoders raise whatever comes: struct.error, zlib.error, KeyError, SyntaxError …
-        raise FileFormatError(
-            f"{found} damaged or cut short ({_one_line(error)}): expected {expected}; copy or "
-            "export it again"
-        ) from error
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
 
 
 def _check(path: Path, kind: str, array: NDArray[Any]) -> None:
@@ -141,6 +127,7 @@ def _read_page(path: Path, page: Any) -> tuple[NDArray[Any], dict[str, Any]]:
     return array, {"bits": int(page.bitspersample)}
 
 
+@refusing_damage
 def tiff_pages(path: Path) -> int:
     """Return how many pages a TIFF has.
 
@@ -161,17 +148,14 @@ def tiff_pages(path: Path) -> int:
     """
     import tifffile
 
-    with (
-        _decoding(f"{path} begins as TIFF but is", "complete pages"),
-        _silent("tifffile"),
-        tifffile.TiffFile(path) as tiff,
-    ):
+    with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
         return len(tiff.pages)
 
 
+@refusing_damage
 def read_tiff_page(
     path: Path, number: int, *, channel: str | int | None = None
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """Read one page of a TIFF that holds many.
 
     Parameters
@@ -185,8 +169,10 @@ def read_tiff_page(
 
     Returns
     -------
-    ndarray, shape (H, W)
+    image : ndarray, shape (H, W)
         Its pixels.
+    warnings : tuple of str
+        See `Radiograph`.
 
     Raises
     ------
@@ -195,14 +181,12 @@ def read_tiff_page(
     """
     import tifffile
 
-    with (
-        _decoding(f"page {number} of {path} is", "a complete picture"),
-        _silent("tifffile"),
-        tifffile.TiffFile(path) as tiff,
-    ):
+    check_regular(path, "a TIFF")
+    with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
         array, _ = _read_page(path, tiff.pages[number].aspage())
     _check(path, "tiff", array)
-    return to_grey(array, channel, f"page {number} of {path}")
+    where = f"page {number} of {path}"
+    return to_grey(array, channel, where), film_warnings(array, channel)
 
 
 def _decode(path: Path, page: Any) -> NDArray[Any]:
@@ -238,6 +222,8 @@ def _check_complete(path: Path, page: Any) -> None:
     held = sum(page.databytecounts)
     packing = 1 if page.compression.name == "NONE" else _TIFF_RATIO
     check_promise(path, "TIFF", page.size * page.bitspersample // 8, packing * held)
+    # One tile may be far larger than what is used of it.
+    check_size(path, max(page.size, math.prod(page.chunks)) * max(8, page.dtype.itemsize))
 
 
 def _apply_palette(array: NDArray[Any], palette: NDArray[np.uint16]) -> NDArray[np.uint16]:
@@ -265,9 +251,10 @@ def _read_with_pillow(path: Path, index: int = 0) -> NDArray[Any]:
 
     # A file object, because imageio would believe the name.
     with path.open("rb") as file, iio.imopen(file, "r", plugin="pillow") as picture:
-        height, width = picture.properties(index=index).shape[:2]
+        shape = picture.properties(index=index).shape
         # A pixel has one bit at least.
-        check_promise(path, "picture", height * width // 8, DEFLATE_RATIO * path.stat().st_size)
+        check_promise(path, "picture", math.prod(shape) // 8, DEFLATE_RATIO * path.stat().st_size)
+        check_size(path, 8 * math.prod(shape))
         return np.asarray(picture.read(index=index))
 
 
@@ -311,5 +298,6 @@ def write_png(path: Path, plane: NDArray[Any]) -> float:
 
     level = max(float(np.max(plane)), 0.0) / 65535 or 1.0
     grey = np.clip(np.rint(np.asarray(plane) / level), 0, 65535).astype(np.uint16)
-    iio.imwrite(path, grey, extension=".png", plugin="pillow")
+    # A file that imageio cannot write to complains once more when Python clears up.
+    path.write_bytes(iio.imwrite("<bytes>", grey, extension=".png", plugin="pillow"))
     return level

@@ -7,116 +7,192 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import socket
+import stat
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import BinaryIO, cast
 
 from napari_shadowinv.errors import FileFormatError
 
 __all__ = ["locked"]
 
-_SILENT_AFTER = 120.0  # seconds without a sign of life after which another host's lock is stale
+_BEAT = 2.0  # seconds between two signs of life
+_WATCH = 30.0  # seconds without one after which a lock is stale
+_SETTLE = 1.0  # seconds after which another that took a stale lock, too, has been seen
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[Callable[[], None]]:
+def locked(path: Path) -> Iterator[None]:
     """Keep other processes from writing to something, until the block ends.
 
-    The operating system takes the lock from a process that dies. Where a file system is
-    shared and its locks do not reach other hosts, signs of life stand in for them.
+    The operating system takes the lock from a process that dies. Where a file system has no
+    locks, or is shared and they do not reach other hosts, signs of life stand in for them: a
+    lock whose file does not change while one watches is stale, whatever the clocks say.
 
     Parameters
     ----------
     path : Path
         What is written to; the lock is a hidden file beside it.
 
-    Yields
-    ------
-    callable
-        To be called now and then as a sign of life.
-
     Raises
     ------
     FileFormatError
-        If a living process holds the lock; the sentence names it.
+        If a living process holds the lock; the sentence names it. Or if the lock cannot be
+        written, or is no file of its own.
     """
     lock = path.with_name(f".{path.name}.lock")
-    with _opened(path, lock) as file:
-        if not _taken(file) or _alive_elsewhere(file):
-            raise FileFormatError(
-                f"{path} is being written by {_holder(file)}: wait for it, or stop it first"
-            )
-        _sign(file)
-
-        def live() -> None:
-            with suppress(OSError):
-                os.utime(lock)
-
+    file, is_new = _opened(path, lock)
+    with file:
+        _take(path, lock, file, is_new)
+        ended = threading.Event()
+        beating = threading.Thread(target=_beat, args=(lock, ended), daemon=True, name="lock")
+        beating.start()
         try:
-            yield live
+            yield
         finally:
+            ended.set()
             _give_back(file, lock)
 
 
-def _opened(path: Path, lock: Path) -> IO[str]:
+def _opened(path: Path, lock: Path) -> tuple[BinaryIO, bool]:
+    """Open the lock file without following links, and tell whether it was made here."""
+    flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)
     try:
-        # Not truncated: who holds it is told in it.
-        return os.fdopen(os.open(lock, os.O_RDWR | os.O_CREAT, 0o666), "r+", encoding="utf-8")
+        while True:
+            try:
+                number, is_new = os.open(lock, flags | os.O_CREAT | os.O_EXCL, 0o666), True
+            except FileExistsError:
+                try:
+                    # Not truncated: who holds it is told in it.
+                    number, is_new = os.open(lock, flags), False
+                except FileNotFoundError:
+                    continue
+            break
     except OSError as error:
-        raise FileFormatError(
-            f"{path} cannot be written ({error.strerror}): choose a folder that can"
-        ) from None
+        if lock.is_symlink():
+            raise _no_file_of_its_own(path, lock) from None
+        raise _not_writable(path, error) from None
+    file = cast(BinaryIO, os.fdopen(number, "r+b", buffering=0))
+    found = os.fstat(number)
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+        file.close()
+        raise _no_file_of_its_own(path, lock)
+    return file, is_new
 
 
-def _give_back(file: IO[str], lock: Path) -> None:
+def _not_writable(path: Path, error: OSError) -> FileFormatError:
+    return FileFormatError(f"{path} cannot be written ({error.strerror}): choose a folder that can")
+
+
+def _no_file_of_its_own(path: Path, lock: Path) -> FileFormatError:
+    return FileFormatError(
+        f"{path} cannot be written: its lock {lock} is a link or no file at all; remove it"
+    )
+
+
+def _take(path: Path, lock: Path, file: BinaryIO, is_new: bool) -> None:
+    """Make the lock this process's own."""
+    taken = _taken(file)
+    is_ours_to_take = taken is not False
+    is_certain = is_new or (taken and _content(file).get("host") in (None, socket.gethostname()))
+    if is_ours_to_take and not is_certain:
+        is_ours_to_take = _is_silent(lock)
+    if not is_ours_to_take:
+        raise _held(path, file)
+    try:
+        signature = _sign(file)
+    except OSError as error:
+        _give_back(file, lock)
+        raise _not_writable(path, error) from None
+    if not is_certain:
+        time.sleep(_SETTLE)
+        if _content(file) != signature:
+            raise _held(path, file)
+
+
+def _held(path: Path, file: BinaryIO) -> FileFormatError:
+    return FileFormatError(
+        f"{path} is being written by {_holder(file)}: wait for it, or stop it first"
+    )
+
+
+def _is_silent(lock: Path) -> bool:
+    """Watch whether a lock stays as it is."""
+    before = _look(lock)
+    end = time.monotonic() + _WATCH
+    while time.monotonic() < end:
+        time.sleep(_BEAT / 4)
+        if _look(lock) != before:
+            return False
+    return True
+
+
+def _look(lock: Path) -> tuple[int, bytes] | None:
+    """Time stamp and content; opened anew, as a network file system looks only then."""
+    try:
+        with lock.open("rb") as file:
+            return os.fstat(file.fileno()).st_mtime_ns, file.read()
+    except OSError:
+        return None
+
+
+def _beat(lock: Path, ended: threading.Event) -> None:
+    while not ended.wait(_BEAT):
+        with suppress(OSError):
+            os.utime(lock)
+
+
+def _give_back(file: BinaryIO, lock: Path) -> None:
     with suppress(OSError):
-        file.seek(0)
-        file.truncate()
-        if os.name != "nt":
-            lock.unlink()
+        if os.path.samestat(os.fstat(file.fileno()), os.stat(lock)):
+            file.seek(0)
+            file.truncate()
+            if os.name != "nt":
+                lock.unlink()
     with suppress(OSError):
         _free(file)
 
 
-def _sign(file: IO[str]) -> None:
+def _sign(file: BinaryIO) -> dict[str, object]:
+    signature: dict[str, object] = {
+        "host": socket.gethostname(),
+        "pid": os.getpid(),
+        "run": secrets.token_hex(8),
+    }
     file.seek(0)
     file.truncate()
-    json.dump({"host": socket.gethostname(), "pid": os.getpid()}, file)
-    file.flush()
+    file.write(json.dumps(signature).encode())
+    return signature
 
 
-def _content(file: IO[str]) -> dict[str, object]:
+def _content(file: BinaryIO) -> dict[str, object]:
     file.seek(0)
     try:
-        found = json.loads(file.read() or "{}")
+        found = json.loads(file.read() or b"{}")
     except (ValueError, OSError):
         return {}
     return found if isinstance(found, dict) else {}
 
 
-def _alive_elsewhere(file: IO[str]) -> bool:
-    found = _content(file)
-    if not found or found.get("host") == socket.gethostname():
-        return False
-    return time.time() - os.fstat(file.fileno()).st_mtime < _SILENT_AFTER
-
-
-def _holder(file: IO[str]) -> str:
+def _holder(file: BinaryIO) -> str:
     found = _content(file)
     if not found:
         return "another process"
     return f"process {found.get('pid')} on {found.get('host')}"
 
 
+# `_taken` tells whether the operating system gave the lock; None where it has no locks.
 if os.name == "nt":  # pragma: no cover - Windows only
     import msvcrt
 
     _BEYOND = 1 << 30  # locks there are mandatory: one on the text would forbid to read it
 
-    def _taken(file: IO[str]) -> bool:
+    def _taken(file: BinaryIO) -> bool | None:
         file.seek(_BEYOND)
         try:
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
@@ -124,7 +200,7 @@ if os.name == "nt":  # pragma: no cover - Windows only
             return False
         return True
 
-    def _free(file: IO[str]) -> None:
+    def _free(file: BinaryIO) -> None:
         file.seek(_BEYOND)
         msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)  # type: ignore[attr-defined]
 
@@ -132,14 +208,14 @@ else:
     import errno
     import fcntl
 
-    def _taken(file: IO[str]) -> bool:
+    def _taken(file: BinaryIO) -> bool | None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            # A file system without locks: signs of life must do.
-            return error.errno in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
+            has_none = error.errno in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
+            return None if has_none else False
         # Whoever had it may have removed the file after it was opened here.
         return os.fstat(file.fileno()).st_nlink > 0
 
-    def _free(file: IO[str]) -> None:
+    def _free(file: BinaryIO) -> None:
         fcntl.flock(file, fcntl.LOCK_UN)

@@ -21,10 +21,10 @@ from typing import Any, BinaryIO, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.promises import DEFLATE_RATIO, check_promise
+from napari_shadowinv.safety import check_size
 
-__all__ = ["Variable", "damaged", "variables_5"]
+__all__ = ["Variable", "variables_5"]
 
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
@@ -85,14 +85,6 @@ class Variable:
         return f"'{self.name}' ({'×'.join(map(str, self.shape))} {self.type})"
 
 
-def damaged(path: Path) -> FileFormatError:
-    """Return the error for a MAT-file that makes no sense."""
-    return FileFormatError(
-        f"{path} begins as a MATLAB file but is damaged or cut short: expected a complete file; "
-        "copy or save it again"
-    )
-
-
 def variables_5(path: Path) -> list[Variable]:
     """List the variables of a MAT-file of version 5 to 7, without their values.
 
@@ -109,19 +101,16 @@ def variables_5(path: Path) -> list[Variable]:
     Raises
     ------
     FileFormatError
-        If the file is damaged or cut short.
+        If the file promises more than it holds; other damage raises whatever comes.
     """
-    try:
-        with path.open("rb") as file:
-            return list(_elements(path, file))
-    except (struct.error, zlib.error, IndexError, ValueError) as error:
-        raise damaged(path) from error
+    with path.open("rb") as file:
+        return list(_elements(path, file))
 
 
 def _elements(path: Path, file: BinaryIO) -> Iterator[Variable]:
     """Walk over the variables' headers without reading their values."""
     size = path.stat().st_size
-    order = _order(path, file)
+    order = _order(file)
     start = _HEADER
     while start < size:
         file.seek(start)
@@ -137,14 +126,14 @@ def _elements(path: Path, file: BinaryIO) -> Iterator[Variable]:
             name, shape, type_name, _ = _preamble(body, order)
             check_promise(path, "MATLAB", math.prod(shape), DEFLATE_RATIO * count)
             if name:
-                yield Variable(name, shape, type_name, _loader(path, start, count))
+                yield Variable(name, shape, type_name, _loader(path, start, count, shape))
         start += 8 + count
 
 
-def _order(path: Path, file: BinaryIO) -> str:
+def _order(file: BinaryIO) -> str:
     order = {b"IM": "<", b"MI": ">"}.get(file.read(_HEADER)[126:])
     if order is None:
-        raise damaged(path)
+        raise ValueError("no byte order in its header")
     return order
 
 
@@ -177,10 +166,13 @@ def _field(body: _Bytes, start: int, order: str) -> tuple[int, _Bytes, int]:
     return kind & 0xFFFF, body[start : start + count], start + (4 if short else -(-count // 8) * 8)
 
 
-def _loader(path: Path, start: int, count: int) -> Callable[[], NDArray[Any]]:
+def _loader(
+    path: Path, start: int, count: int, shape: tuple[int, ...]
+) -> Callable[[], NDArray[Any]]:
     def load() -> NDArray[Any]:
+        check_size(path, 8 * math.prod(shape))
         with path.open("rb") as file:
-            order = _order(path, file)
+            order = _order(file)
             file.seek(start)
             (kind,) = struct.unpack(f"{order}I4x", file.read(8))
             body = file.read(count)
@@ -192,6 +184,7 @@ def _loader(path: Path, start: int, count: int) -> Callable[[], NDArray[Any]]:
 def _unpacked(path: Path, packed: bytes, order: str) -> bytes:
     unpacker = zlib.decompressobj()
     count = struct.unpack(f"{order}4xI", unpacker.decompress(packed, 8))[0]
+    check_size(path, count)
     body = unpacker.decompress(unpacker.unconsumed_tail, max(count, 1))
     check_promise(path, "MATLAB", count, len(body))
     return body

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.mat5 import Variable, damaged, variables_5
-from napari_shadowinv.io.promises import load_dataset
+from napari_shadowinv.io.hdf5 import load_dataset, member, members
+from napari_shadowinv.io.mat5 import Variable, variables_5
+from napari_shadowinv.safety import refusing_damage
 
 __all__ = ["is_mat73", "is_other_hdf5", "mat_variables", "read_mat"]
 
@@ -33,6 +34,7 @@ def _is_foreign(attributes: Container[str]) -> bool:
     return any(mark in attributes for mark in _FOREIGN_MARKS)
 
 
+@refusing_damage
 def is_mat73(path: Path) -> bool:
     """Tell whether an HDF5 file is one of MATLAB's, though it begins as plain HDF5.
 
@@ -48,14 +50,12 @@ def is_mat73(path: Path) -> bool:
     """
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            marked = any("MATLAB_class" in item.attrs for item in file.values())
-            return marked and not _is_foreign(file.attrs)
-    except (OSError, RuntimeError, KeyError, AttributeError):
-        return False
+    with h5py.File(path, "r") as file:
+        marked = any("MATLAB_class" in item.attrs for _, item in members(path, file))
+        return marked and not _is_foreign(file.attrs)
 
 
+@refusing_damage
 def is_other_hdf5(path: Path) -> bool:
     """Tell whether a file is HDF5 of another family, though it begins as MATLAB's.
 
@@ -71,13 +71,13 @@ def is_other_hdf5(path: Path) -> bool:
     """
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            return _is_foreign(file.attrs)
-    except (OSError, RuntimeError, KeyError):
+    if not h5py.is_hdf5(path):
         return False
+    with h5py.File(path, "r") as file:
+        return _is_foreign(file.attrs)
 
 
+@refusing_damage
 def read_mat(path: Path, variable: str | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
     """Read an image from a MAT-file.
 
@@ -103,13 +103,7 @@ def read_mat(path: Path, variable: str | None = None) -> tuple[NDArray[Any], dic
         If it holds several and none was named, or the name is not that of an image.
     """
     chosen = _choose(path, mat_variables(path), variable)
-    try:
-        array = chosen.load()
-    except (FileFormatError, MemoryError):
-        raise
-    except Exception as error:
-        # Readers of both layouts raise whatever comes: TypeError, ValueError, zlib.error …
-        raise damaged(path) from error
+    array = chosen.load()
     if array.dtype.kind not in "buif" or array.shape != chosen.shape:
         raise FileFormatError(
             f"{path} holds {chosen} as {array.dtype} values of shape {array.shape}: expected a "
@@ -118,6 +112,7 @@ def read_mat(path: Path, variable: str | None = None) -> tuple[NDArray[Any], dic
     return array, {"variable": chosen.name, "bits": 8 * array.dtype.itemsize, "geometry": {}}
 
 
+@refusing_damage
 def mat_variables(path: Path) -> list[Variable]:
     """List the variables of a MAT-file, without their values.
 
@@ -169,12 +164,10 @@ def _choose(path: Path, variables: list[Variable], name: str | None) -> Variable
 def _variables_73(path: Path) -> list[Variable]:
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            # Names that begin with # are MATLAB's own.
-            return [_described(path, name, file[name]) for name in file if not name.startswith("#")]
-    except (OSError, RuntimeError, KeyError) as error:
-        raise damaged(path) from error
+    with h5py.File(path, "r") as file:
+        # Names that begin with # are MATLAB's own.
+        names = [name for name in file if not name.startswith("#")]
+        return [_described(path, name, member(path, file, name)) for name in names]
 
 
 def _described(path: Path, name: str, item: Any) -> Variable:
@@ -198,6 +191,6 @@ def _loader_73(path: Path, name: str) -> Callable[[], NDArray[Any]]:
         import h5py
 
         with h5py.File(path, "r") as file:
-            return load_dataset(path, file[name]).T
+            return load_dataset(path, member(path, file, name)).T
 
     return load

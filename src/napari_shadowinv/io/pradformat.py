@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.dataset import FORMAT, dataset_from_field, displacement_from_potential
-from napari_shadowinv.io.hdf5 import held_arrays, opened_hdf5
-from napari_shadowinv.io.promises import load_dataset
+from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
+from napari_shadowinv.safety import check_regular, refusing_damage
 
 if TYPE_CHECKING:
     import xarray
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "VERSION",
     "check_pradformat_setup",
+    "is_ours",
     "is_result",
     "read_pradformat",
     "write_pradformat",
@@ -53,6 +54,7 @@ _SYMBOLS: dict[Species, str] = {
 }
 
 
+@refusing_damage
 def is_result(path: Path) -> bool:
     """Tell whether an HDF5 file is a ``.shadowinv`` result, whatever its name.
 
@@ -72,6 +74,29 @@ def is_result(path: Path) -> bool:
         If the file is damaged.
     """
     return str(_root_attributes(path).get("format", "")).startswith(FORMAT)
+
+
+@refusing_damage
+def is_ours(path: Path) -> bool:
+    """Tell whether an HDF5 file is a ``.shadowinv`` result or pradformat; much else is HDF5 too.
+
+    Parameters
+    ----------
+    path : Path
+        A file.
+
+    Returns
+    -------
+    bool
+
+    Raises
+    ------
+    FileFormatError
+        If it is no regular file, or damaged.
+    """
+    check_regular(path, "an HDF5 file")
+    attributes = _root_attributes(path)
+    return "format" in attributes or attributes.get("object_type") in ("radiograph", "inversion")
 
 
 # They are looked up by name: walking all attributes of a damaged file may never end.
@@ -103,7 +128,9 @@ _ATTRIBUTES = (
 
 
 def _root_attributes(path: Path) -> dict[str, Any]:
-    with opened_hdf5(path) as file:
+    import h5py
+
+    with h5py.File(path, "r") as file:
         known = [name for name in _ATTRIBUTES if name in file.attrs]
         return {name: _plain(file.attrs[name]) for name in known}
 
@@ -117,6 +144,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
+@refusing_damage
 def read_pradformat(path: Path) -> tuple[NDArray[Any], dict[str, Any]] | xarray.Dataset:
     """Read a radiograph, or a potential or field that some code retrieved.
 
@@ -162,16 +190,9 @@ def read_pradformat(path: Path) -> tuple[NDArray[Any], dict[str, Any]] | xarray.
 def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            return {name: load_dataset(path, file[name]) for name in names if name in file}
-    except FileFormatError:
-        raise
-    except (OSError, RuntimeError, KeyError, TypeError, AttributeError) as error:
-        raise FileFormatError(
-            f"{path} begins as pradformat but its data are damaged or cut short: expected a "
-            "complete file; copy it again"
-        ) from error
+    with h5py.File(path, "r") as file:
+        found = {name: member(path, file, name) for name in names}
+        return {name: load_dataset(path, item) for name, item in found.items() if item is not None}
 
 
 def _geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, Any]:
@@ -268,7 +289,7 @@ def write_pradformat(
     particles = check_pradformat_setup(setup)
     angle = particles.deflection_angle(displacement)
     datasets = {"phi": -particles.potential(potential), "defl_ax1": angle[0], "defl_ax2": angle[1]}
-    with h5py.File(path, "w") as file:
+    with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
         for name, values in datasets.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
         file.attrs.update(_inversion_attributes(particles, radiograph_filename))

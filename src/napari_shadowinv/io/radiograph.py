@@ -15,9 +15,13 @@ from napari_shadowinv.errors import InputError
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
-__all__ = ["CHANNELS", "Radiograph", "to_grey"]
+__all__ = ["CHANNELS", "Radiograph", "film_warnings", "to_grey"]
 
 CHANNELS = ("red", "green", "blue", "mean")
+
+# Of a picture of film that is exposed in its middle: the rim's width over the shorter side, its
+# least brightness over the brightest, and the middle's greatest over the rim's.
+_RIM, _AS_BRIGHT, _DARKER = 0.05, 0.9, 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,8 @@ class Radiograph:
         The undisturbed beam.
     mask : ndarray of bool, shape (H, W), or None
         True where a pixel can be used.
+    warnings : tuple of str
+        What the user should know before trusting what the file says.
     """
 
     image: NDArray[np.float64]
@@ -47,6 +53,7 @@ class Radiograph:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     source: NDArray[np.float64] | None = None
     mask: NDArray[np.bool_] | None = None
+    warnings: tuple[str, ...] = ()
 
     def binned(self, factor: int) -> Radiograph:
         """Sum blocks of pixels; the setup's pixel grows with them.
@@ -74,6 +81,8 @@ class Radiograph:
         array([[4., 4., 4.],
                [4., 4., 4.]])
         """
+        from napari_shadowinv.physics.setup import binned_setup
+
         height, width = self.image.shape
         if min(height, width) < 2:
             raise InputError(
@@ -101,28 +110,6 @@ class Radiograph:
                 "cropped": (height % factor, width % factor),
             },
         )
-
-
-def binned_setup(setup: ProtonSetup | OpticalSetup, factor: int) -> ProtonSetup | OpticalSetup:
-    """Return the setup of an image whose pixels were summed in blocks.
-
-    Parameters
-    ----------
-    setup : ProtonSetup or OpticalSetup
-        Setup of the image as measured.
-    factor : int
-        Side of a block in pixels.
-
-    Returns
-    -------
-    ProtonSetup or OpticalSetup
-        The same with a pixel that is `factor` times as wide.
-    """
-    values = setup.model_dump()
-    for name in ("pixel_size", "detector_pixel_size"):
-        if values.get(name) is not None:
-            values[name] *= factor
-    return type(setup)(**values)
 
 
 def _blocks(array: NDArray[Any], factor: int) -> NDArray[Any]:
@@ -162,8 +149,9 @@ def to_grey(
         return np.ascontiguousarray(colours[..., 0], dtype=np.float64)
     if channel is None:
         raise InputError(
-            f"{where} is a colour image with {colours.shape[-1]} channels: choose one with channel "
-            '"red", "green", "blue" or "mean", or its number'
+            f"{where} is a colour image with {colours.shape[-1]} channels: convert a scan of film, "
+            "which darkens with dose, to dose first (napari_shadowinv.film), or choose a channel "
+            'that is linear in fluence, "red", "green", "blue" or "mean", or its number'
         )
     if channel == "mean":
         return np.ascontiguousarray(colours.mean(axis=-1, dtype=np.float64))
@@ -180,3 +168,49 @@ def _channel_index(channel: str | int, count: int, where: str | Path) -> int:
             f'"red", "green", "blue", "mean" or a number from 0 to {count - 1}'
         )
     return index
+
+
+def film_warnings(array: NDArray[Any], channel: str | int | None) -> tuple[str, ...]:
+    """Warn of a picture that may be a scan of film, whose grey levels fall with dose.
+
+    Parameters
+    ----------
+    array : ndarray, shape (H, W) or (H, W, C)
+        The picture as it is stored.
+    channel : {"red", "green", "blue", "mean"} or int or None
+        What is taken of a colour image.
+
+    Returns
+    -------
+    tuple of str
+        A sentence if it is a colour image, or if its rim is as bright as anything in it and the
+        middle clearly darker, as where only the middle of a film was exposed; else none. Light
+        or particles that are deflected out of the middle make something else brighter.
+    """
+    grey = to_grey(array, "mean", "")
+    is_colour = array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, ""))
+    if is_colour:
+        return (
+            f"channel {channel!r} of a colour image was taken as the fluence: a scan of film, "
+            "which darkens with dose, gives a field of the wrong sign unless it is converted to "
+            "dose first (napari_shadowinv.film)",
+        )
+    if array.dtype.kind in "iu" and _is_lit_around(grey):
+        return (
+            "the rim is as bright as anything in the image and the middle is darker, as on film, "
+            "which darkens with dose: a scan gives a field of the wrong sign unless it is "
+            "converted to dose first (napari_shadowinv.film)",
+        )
+    return ()
+
+
+def _is_lit_around(image: NDArray[np.float64]) -> bool:
+    """Whether all four sides are as bright as the brightest part, and the middle is darker."""
+    height, width = image.shape
+    rim = max(1, round(_RIM * min(height, width)))
+    sides = (image[:rim], image[-rim:], image[:, :rim], image[:, -rim:])
+    dimmest = min(float(np.median(side)) for side in sides)
+    middle = image[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    return bool(
+        np.median(middle) < _DARKER * dimmest and _AS_BRIGHT * np.percentile(image, 99) < dimmest
+    )

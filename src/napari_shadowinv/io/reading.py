@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,11 +20,12 @@ from napari_shadowinv.io.arrays import read_npy
 from napari_shadowinv.io.dataset import read_result
 from napari_shadowinv.io.files import kind_of, sha256
 from napari_shadowinv.io.hdf5 import read_hdf5
-from napari_shadowinv.io.images import read_picture
+from napari_shadowinv.io.images import PICTURES, read_picture
 from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5, read_mat
 from napari_shadowinv.io.pradformat import is_result, read_pradformat
-from napari_shadowinv.io.radiograph import Radiograph, to_grey
+from napari_shadowinv.io.radiograph import Radiograph, film_warnings, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
+from napari_shadowinv.safety import refusing_damage, small_text
 
 if TYPE_CHECKING:
     import xarray
@@ -35,8 +37,9 @@ __all__ = ["read", "read_dataset", "read_radiograph", "read_toml"]
 _COMPLETE = {"energy", "source_object_distance", "object_image_distance"}
 
 
+@refusing_damage
 def read(
-    path: str | Path, *, channel: str | int | None = None, variable: str | None = None
+    path: Path, *, channel: str | int | None = None, variable: str | None = None
 ) -> Radiograph | xarray.Dataset:
     """Read an image or a result.
 
@@ -67,7 +70,6 @@ def read(
         If it is a colour image and no channel, or one that it has not, was chosen; the
         same for the variables of a MATLAB or HDF5 file.
     """
-    path = Path(path)
     if is_stack(path):
         return read_stack(path)
     kind = _family(path)
@@ -97,7 +99,8 @@ def read(
     grey = to_grey(array, channel, path)
     if array.ndim == 3 and channel is not None:
         metadata["channel"] = channel
-    return _radiograph(path, kind, grey, {"dtype": str(array.dtype), **metadata})
+    shot = _radiograph(path, kind, grey, {"dtype": str(array.dtype), **metadata})
+    return replace(shot, warnings=film_warnings(array, channel)) if kind in PICTURES else shot
 
 
 def _named_plane(path: Path, variable: str) -> Radiograph:
@@ -137,13 +140,16 @@ def _radiograph(path: Path, kind: str, array: NDArray[Any], metadata: dict[str, 
         raise FileFormatError(
             f"{path} holds no finite pixel: expected an image; check how it was saved"
         )
-    source = metadata.get("source")
+    source, mask = metadata.get("source"), metadata.get("mask")
     return Radiograph(
         image=np.ascontiguousarray(array, dtype=np.float64),
         setup=_complete_setup(path, metadata.get("geometry", {})),
         path=path,
-        metadata={name: value for name, value in described.items() if name != "source"},
+        metadata={
+            name: value for name, value in described.items() if name not in ("source", "mask")
+        },
         source=None if source is None else np.ascontiguousarray(source, dtype=np.float64),
+        mask=mask,
     )
 
 
@@ -216,7 +222,8 @@ def read_dataset(path: str | Path) -> xarray.Dataset:
     return content
 
 
-def read_toml(path: str | Path) -> dict[str, Any]:
+@refusing_damage
+def read_toml(path: Path) -> dict[str, Any]:
     """Read the keys and values of a TOML file.
 
     Parameters
@@ -236,16 +243,8 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     InputError
         If it is not TOML; the message names the line.
     """
-    path = Path(path)
+    text = small_text(path, "a TOML file")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FileFormatError(f"{path} does not exist: expected a TOML file; check the path") from (
-            None
-        )
-    except UnicodeDecodeError:
-        raise FileFormatError(f"{path} is not a text file: expected TOML") from None
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be opened ({error.strerror})") from None
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not valid TOML: {error}") from None

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.dataset import field_in_si, setup_from_dataset, variable_labels
 from napari_shadowinv.io.files import check_folder_of
+from napari_shadowinv.safety import refusing_damage, small_text
 
 if TYPE_CHECKING:
     import xarray
@@ -52,6 +53,10 @@ STORE_SUFFIX = ".shadowinv.zarr"
 SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
     "converged": (bool, {"units": "1", "long_name": "The flux residual fell below the tolerance"}),
     "flux_residual": (float, {"units": "1", "long_name": "Largest relative flux error of a cell"}),
+    "image_residual": (
+        float,
+        {"units": "1", "long_name": "Image minus re-projection, r.m.s. over the mean"},
+    ),
     "iterations": (int, {"units": "1", "long_name": "Solver steps, all levels together"}),
     "seconds": (float, {"units": "s", "long_name": "Time that its worker spent on the shot"}),
 }
@@ -102,9 +107,10 @@ def is_stack(path: str | Path) -> bool:
 
 def _attributes(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+        found = json.loads(small_text(path / "zarr.json", "metadata of a store"))
         return dict(found["attributes"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except Exception:
+        # A folder of another kind, or a damaged one, is no store; who opens it tells more.
         return {}
 
 
@@ -113,12 +119,6 @@ def store_error(path: Path, error: OSError) -> StoreError:
     return StoreError(
         f"{path} cannot be written ({error.strerror or error}): make room or see to its folder, "
         "then run again to resume"
-    )
-
-
-def _damaged(path: Path, error: Exception) -> FileFormatError:
-    return FileFormatError(
-        f"{path} is a stack of shots but is damaged ({error}): run it again with overwriting"
     )
 
 
@@ -215,8 +215,6 @@ class StackStore:
     """
 
     def __init__(self, path: Path) -> None:
-        import zarr
-
         self.path = path
         if not path.exists():
             raise FileFormatError(
@@ -226,12 +224,9 @@ class StackStore:
         self.attributes = _attributes(path)
         if self.attributes.get("format") != FORMAT:
             raise FileFormatError(f"{path} is no stack of shots: expected name{STORE_SUFFIX}")
-        try:
-            self._arrays = dict(zarr.open_group(path, mode="r").arrays())
-            self.names = tuple(map(str, np.asarray(self._arrays["name"][...]).tolist()))
-            self.statuses()
-        except Exception as error:
-            raise _damaged(path, error) from error
+        self._arrays = _readable(path)
+        self.names = tuple(map(str, self._values("name").tolist()))
+        self.statuses()
 
     @property
     def writer(self) -> ShotWriter:
@@ -240,11 +235,11 @@ class StackStore:
 
     def statuses(self) -> NDArray[np.int8]:
         """Return the status of each shot, shape (shot,): PENDING, DONE or FAILED."""
-        return np.asarray(self._arrays["status"][...])
+        return self._values("status")
 
     def report(self, index: int) -> dict[str, Any]:
         """Return how a shot went; ``reason`` tells why it failed."""
-        return self._parsed([str(self._arrays["report"][index])])[0]
+        return _parsed(self.path, [str(self._values("report", index))])[0]
 
     def reports(self) -> Sequence[dict[str, Any]]:
         """Return how each shot went.
@@ -254,17 +249,10 @@ class StackStore:
         FileFormatError
             If the reports are damaged.
         """
-        try:
-            texts = np.asarray(self._arrays["report"][...]).tolist()
-        except Exception as error:
-            raise _damaged(self.path, error) from error
-        return self._parsed(texts)
+        return _parsed(self.path, self._values("report").tolist())
 
-    def _parsed(self, texts: Sequence[str]) -> list[dict[str, Any]]:
-        try:
-            return [dict(json.loads(text)) if text else {} for text in texts]
-        except ValueError as error:
-            raise _damaged(self.path, error) from error
+    def _values(self, name: str, which: Any = ...) -> NDArray[Any]:
+        return _values(self.path, self._arrays, name, which)
 
     def summarise(self) -> None:
         """Gather numbers of each shot from their reports, for those who open the store.
@@ -278,6 +266,8 @@ class StackStore:
         group = self.writer.arrays()
         try:
             for name, (kind, _) in SUMMARY.items():
+                if name not in group:  # a store of an older version
+                    continue
                 missing = np.nan if kind is float else 0
                 key = "residual" if name == "flux_residual" else name
                 values = [report.get(key, missing) for report in reports]
@@ -286,7 +276,44 @@ class StackStore:
             raise store_error(self.path, error) from error
 
 
-def read_stack(path: str | Path) -> xarray.Dataset:
+@refusing_damage
+def _readable(path: Path) -> dict[str, Any]:
+    """Arrays of a store by name, as long as what is there."""
+    import zarr
+
+    from napari_shadowinv.io.store_files import CheckedStore
+
+    arrays: dict[str, Any] = dict(zarr.open_group(CheckedStore(path), mode="r").arrays())
+    names = arrays["name"]
+    shots = names.shape[0]
+    lengths = {array.shape[0] for array in arrays.values() if is_along_shots(array)}
+    last = path / "name" / "c" / str((shots - 1) // names.chunks[0])
+    if lengths != {shots} or (shots and not last.exists()):
+        raise FileFormatError(
+            f"{path} is damaged: it tells of {max(lengths)} shots, but they are not there; copy it "
+            "again, or run it again with overwriting"
+        )
+    return arrays
+
+
+@refusing_damage
+def _values(path: Path, arrays: Mapping[str, Any], name: str, which: Any) -> NDArray[Any]:
+    return np.asarray(arrays[name][which])
+
+
+@refusing_damage
+def _parsed(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
+    """Reports from their JSON."""
+    return [dict(json.loads(text)) if text else {} for text in texts]
+
+
+def is_along_shots(array: Any) -> bool:
+    """Tell whether an array of a store has a value for each shot."""
+    return tuple(array.metadata.dimension_names or ())[:1] == ("shot",)
+
+
+@refusing_damage
+def read_stack(path: Path) -> xarray.Dataset:
     """Open a store of many shots; arrays are read when they are asked for.
 
     Parameters
@@ -307,20 +334,18 @@ def read_stack(path: str | Path) -> xarray.Dataset:
     """
     import xarray as xr
 
-    path = Path(path)
+    from napari_shadowinv.io.store_files import CheckedStore
+
     store = StackStore(path)
-    try:
-        dataset: xr.Dataset = xr.open_zarr(
-            path, decode_times=False, mask_and_scale=False, chunks={}
-        )
-        setup = setup_from_dataset(dataset)
-        complete = _with_fields(dataset, setup)
-        # The folder's own order is arbitrary.
-        order = [*variable_labels(setup), *_OWN_ORDER]
-        shown = complete[[name for name in order if name in complete]]
-        return shown.assign(status=shown["status"].copy(data=store.statuses()))
-    except Exception as error:
-        raise _damaged(path, error) from error
+    dataset: xr.Dataset = xr.open_zarr(
+        CheckedStore(path), decode_times=False, mask_and_scale=False, chunks={}
+    )
+    setup = setup_from_dataset(dataset)
+    complete = _with_fields(dataset, setup)
+    # The folder's own order is arbitrary.
+    order = [*variable_labels(setup), *_OWN_ORDER]
+    shown = complete[[name for name in order if name in complete]]
+    return shown.assign(status=shown["status"].copy(data=store.statuses()))
 
 
 def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:

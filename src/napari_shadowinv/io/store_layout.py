@@ -33,6 +33,7 @@ from napari_shadowinv.io.store import (
     STATUS_NAMES,
     SUMMARY,
     StackStore,
+    is_along_shots,
     store_error,
 )
 
@@ -164,7 +165,7 @@ def grow_store(
 
     try:
         arrays = dict(zarr.open_group(path, mode="r+").arrays())
-        longer = [name for name, array in arrays.items() if _is_along_shots(array)]
+        longer = [name for name, array in arrays.items() if is_along_shots(array)]
         for name in longer:
             array: Any = arrays[name]
             before = array.shape[0]
@@ -176,10 +177,6 @@ def grow_store(
     except OSError as error:
         raise store_error(path, error) from error
     return StackStore(path)
-
-
-def _is_along_shots(array: Any) -> bool:
-    return tuple(array.metadata.dimension_names or ())[:1] == ("shot",)
 
 
 def _tell_length(path: Path, names: list[str], length: int, attributes: Mapping[str, Any]) -> None:

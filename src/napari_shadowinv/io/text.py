@@ -15,8 +15,13 @@ key                          meaning
 ``energy``                   in MeV; ``Ep_MeV`` in pradreader's files
 ===========================  ==========================================================
 
-A unit may follow the value (``1.4 cm``) or end the key (``bin_um``). pradreader, the reader
-of the code PRaLine, stacks an image and its reference: it tells ``flux2D (rows, columns)``.
+A unit may follow the value (``1.4 cm``) or end the key (``bin_um``).
+
+PRadReader, which prepares radiographs for other codes, writes several images one below the other
+and tells their shapes in the order of the blocks: ``flux2D (rows, columns)``, the shot;
+``flux2D_ref``, the undisturbed beam; in some versions ``mask``, 0 where a pixel can be used.
+Without that block, ``x-mask 20 % - 80 %`` and ``y-mask`` tell which share of the rows (x) and of
+the columns (y) can be used.
 """
 
 from __future__ import annotations
@@ -31,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.safety import check_size
 
 __all__ = ["read_text"]
 
@@ -75,7 +81,8 @@ _ENTRY = re.compile(
     r"^[#%\s]*(?P<key>[^\W\d][\w\- ()\[\]]*?)\s*(?P<sign>[=:]\s*|\s)(?P<value>[-+.\d].*)$"
 )
 _VALUE = re.compile(r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\W\d]*)\s*$")
-_ROWS = re.compile(r"^[#%]\s*flux2D\s*\((\d+)")
+_BLOCK = re.compile(r"^[#%]\s*(flux2D|flux2D_ref|mask)\s*(?:\(\s*(\d+)\s*,\s*(\d+)\s*\))?\s*$")
+_SELECTED = re.compile(r"^[#%]\s*([xy])-mask\s+([\d.]+)\s*%?\s*-\s*([\d.]+)")
 
 
 def read_text(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
@@ -92,33 +99,87 @@ def read_text(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
         The numbers, the first line on top.
     metadata : dict
         ``bits``; ``geometry``, the fields of `ProtonSetup` that the comments tell; and, where
-        the file holds it, ``source``, the image without the object.
+        the file holds them, ``source``, the image without the object, and ``mask``, True where
+        a pixel can be used.
 
     Raises
     ------
     FileFormatError
         If a line is no row of numbers or longer or shorter than the first; the message
-        tells which.
+        tells which. The same if the header tells other blocks than there are.
     """
     # Once to find mistakes, once to keep: a bad file never fills the memory.
     height = 0
     width: int | None = None
-    half: int | None = None
     told: dict[str, float] = {}
+    blocks: dict[str, tuple[int, int]] = {}
+    selected: dict[str, tuple[float, float]] = {}
     for number, line in _lines(path):
         if line[0] in "#%":
             told |= _geometry_of(path, number, line)
-            found = _ROWS.match(line)
-            half = int(found[1]) if found else half
+            if block := _BLOCK.match(line):
+                told_first = next(iter(blocks.values()), (0, 0))
+                blocks[block[1]] = (int(block[2]), int(block[3])) if block[2] else told_first
+            if part := _SELECTED.match(line):
+                selected[part[1]] = float(part[2]), float(part[3])
         else:
             width = _row(path, number, line, width).size
             height += 1
+            if not height % 1000:
+                check_size(path, 8 * height * width)
+    if "flux2D" in blocks:
+        if selected and "mask" not in blocks and height == 3 * blocks["flux2D"][0]:
+            # Some versions write the mask without telling its shape.
+            blocks["mask"] = blocks["flux2D"]
+        _check_blocks(path, blocks, (height, width or 0))
+    check_size(path, 8 * height * (width or 0))
     image = _filled(path, height, width or 0)
     metadata: dict[str, Any] = {"bits": 64, "geometry": _complete(told)}
-    if half is not None and 2 * half == height:
-        metadata["source"] = image[half:]
-        image = image[:half]
+    if "flux2D" in blocks:
+        image, parts = _split(path, image, blocks, selected)
+        metadata |= parts
     return image, metadata
+
+
+def _check_blocks(path: Path, blocks: dict[str, tuple[int, int]], found: tuple[int, int]) -> None:
+    rows = sum(height for height, _ in blocks.values())
+    if len(set(blocks.values())) > 1 or found != (rows, blocks["flux2D"][1]):
+        told = ", ".join(f"{name} {shape}" for name, shape in blocks.items())
+        raise FileFormatError(
+            f"{path} holds {found[0]} rows of {found[1]} numbers, but its header tells {told}: "
+            "expected blocks of one shape below each other, as many as the header names; write "
+            "it again"
+        )
+
+
+def _split(
+    path: Path,
+    stacked: NDArray[np.float64],
+    blocks: dict[str, tuple[int, int]],
+    selected: dict[str, tuple[float, float]],
+) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
+    """Return the image of several blocks, and source and mask where there are some."""
+    planes = dict(zip(blocks, np.split(stacked, len(blocks)), strict=True))
+    image, parts = planes["flux2D"], {}
+    if "flux2D_ref" in planes:
+        parts["source"] = planes["flux2D_ref"]
+    if "mask" in planes:
+        if not np.isin(planes["mask"], (0, 1)).all():
+            raise FileFormatError(
+                f"{path} has other numbers than 0 (to be used) and 1 in its mask: write it again"
+            )
+        parts["mask"] = planes["mask"] == 0
+    elif any(share != (0, 100) for share in selected.values()):
+        rows = _part(selected.get("x"), image.shape[0])
+        columns = _part(selected.get("y"), image.shape[1])
+        parts["mask"] = np.zeros(image.shape, dtype=bool)
+        parts["mask"][rows, columns] = True
+    return image, parts
+
+
+def _part(share: tuple[float, float] | None, length: int) -> slice:
+    first, last = share or (0.0, 100.0)
+    return slice(round(first * length / 100), round(last * length / 100))
 
 
 def _filled(path: Path, height: int, width: int) -> NDArray[np.float64]:

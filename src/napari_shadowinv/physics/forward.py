@@ -17,11 +17,12 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solveh_banded
 
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry._kernel import njit
+from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 
 __all__ = ["jacobian_determinant", "synthetic_image"]
 
@@ -42,6 +43,8 @@ def synthetic_image(
     *,
     rays_per_pixel: int = 16,
     threads: int | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
 ) -> FloatArray:
     """Image that a displaced source makes on the detector.
 
@@ -60,6 +63,10 @@ def synthetic_image(
         Tiles that each pixel of the source is cut into; the next square number is used.
     threads : int, optional
         Threads to use. Default: all cores. The result does not depend on it.
+    on_progress : callable, optional
+        Receives a `napari_shadowinv.progress.Progress` for each band of rows.
+    should_stop : callable, optional
+        Asked after each band; when it returns true the work ends.
 
     Returns
     -------
@@ -71,6 +78,8 @@ def synthetic_image(
     InputError
         If a shape does not fit, a value is not finite, or the source is negative or
         zero everywhere.
+    InversionCancelled
+        If `should_stop` returned true.
 
     References
     ----------
@@ -103,10 +112,18 @@ def synthetic_image(
             _deposit_band(coefficients, *samples[0], *samples[1], flux, tiles, *rows, top, window)
         return top, window
 
+    report = Reporter(on_progress, should_stop)
+    bands = _bands(shape[0])
     image = np.zeros(shape)
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        for top, window in pool.map(image_of_band, _bands(shape[0])):
+    report("image", 0, len(bands))
+    pool = ThreadPoolExecutor(threads or os.cpu_count())
+    try:
+        for done, (top, window) in enumerate(pool.map(image_of_band, bands), start=1):
             image[top : top + len(window)] += window
+            report("image", done, len(bands))
+    finally:
+        # Whoever asks to stop need not wait for bands that nobody has begun.
+        pool.shutdown(cancel_futures=True)
     return image
 
 

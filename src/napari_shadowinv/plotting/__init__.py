@@ -2,7 +2,8 @@
 
 - all of one shot on a page: `report_figure`
 - fields side by side on one scale: `comparison_figure`
-- frames of a film of many shots: `stack_frames`, for a GIF also `in_few_colours`
+- frames of a film of many shots: `stack_frames`, for a GIF also `in_few_colours`; the film:
+  `write_film`
 - write a figure, whole or not at all: `save_figure`
 - the field that an experimenter asks for, in a handy unit: `shown_fields`; the potential:
   `shown_potential`
@@ -12,7 +13,7 @@ disturb the figures of a notebook.
 """
 
 from napari_shadowinv.plotting._figures import comparison_figure, report_figure, save_figure
-from napari_shadowinv.plotting._movie import in_few_colours, stack_frames
+from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
 from napari_shadowinv.plotting._units import ShownField, shown_fields, shown_potential
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "shown_fields",
     "shown_potential",
     "stack_frames",
+    "write_film",
 ]

@@ -126,11 +126,10 @@ def _outline_caustics(panel: Panel, caustic: NDArray[np.bool_]) -> None:
 
 def draw_residual(panel: Panel, inversion: Inversion) -> None:
     """Show image minus re-projection in percent of the mean."""
-    percent = 100 * inversion.residual / inversion.source.mean()
+    percent = 100 * inversion.residual / inversion.image[inversion.mask].mean()
     # Limits that a handful of pixels at a caustic cannot blow up.
     limit = min(float(np.percentile(np.abs(percent), 99.5)) or 1.0, _LARGEST_RESIDUAL)
-    rms = float(np.sqrt(np.mean(percent**2)))
-    title = f"Residual: {rms:.2g} % rms"
+    title = f"Residual: {100 * inversion.report.image_residual:.3g} % rms"
     panel.show(percent, title, "Difference (% of mean)", _RESIDUAL_MAP, (-limit, limit))
 
 

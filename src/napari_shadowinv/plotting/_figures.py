@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
+DOTS_PER_INCH = 160  # of a figure's file
 _ALARM_COLOUR = "#b00020"
 _QUIET_COLOUR = "0.3"
 
@@ -147,7 +148,7 @@ def save_figure(path: str | Path, figure: Figure, overwrite: bool = False) -> Pa
         If the file exists and must not be replaced, or its folder cannot be written.
     """
     with replacing(path, overwrite) as temporary:
-        figure.savefig(temporary, dpi=160)
+        figure.savefig(temporary, dpi=DOTS_PER_INCH)
     return Path(path)
 
 

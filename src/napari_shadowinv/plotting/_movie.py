@@ -2,33 +2,43 @@
 
 - the frames: `stack_frames`
 - the same in the 256 colours that a GIF has: `in_few_colours`
+- a film of them, as MP4 or GIF: `write_film`
 """
 
 from __future__ import annotations
 
+import re
+import subprocess
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
+from io import BytesIO
+from itertools import chain
+from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.interrupts import interrupts_put_off
 from napari_shadowinv.io.dataset import setup_from_dataset
+from napari_shadowinv.io.files import replacing
 from napari_shadowinv.plotting._panels import STYLE, choose_grid, new_page
 from napari_shadowinv.plotting._units import _prefix, image_scale
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["in_few_colours", "stack_frames"]
+__all__ = ["in_few_colours", "stack_frames", "write_film"]
 
 _DOTS_PER_INCH = 120
 _OUTLIERS = 0.02  # share of the shots whose extremes may lie beyond the colour scale
 _UNITS_WITH_PREFIX = {"m", "rad", "T m", "V"}
 _COLOURS = "viridis"
+_QUALITY = 10  # constant rate factor of H.264: 0 is without loss, 51 the worst
 _GREYS = 56  # of the colours of a GIF, for what is written
 _LETTER, _LINE = 0.075, 0.15  # inches
 
@@ -168,3 +178,111 @@ def _palette() -> tuple[Any, NDArray[np.uint8]]:
     greys = np.repeat(np.linspace(0, 255, _GREYS), 3).reshape(-1, 3)
     colours = np.concatenate([scale, greys]).round().astype(np.uint8)
     return cKDTree(colours), colours
+
+
+def write_film(
+    path: Path, frames: Iterable[NDArray[np.uint8]], rate: float, *, overwrite: bool = False
+) -> int:
+    """Write frames as a film, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        The film, ``.mp4`` or ``.gif``.
+    frames : iterable of ndarray of uint8, shape (rows, columns, 3)
+        From `stack_frames`, one at least.
+    rate : float
+        Frames a second.
+    overwrite : bool
+        Whether an existing film may be replaced.
+
+    Returns
+    -------
+    int
+        Number of frames.
+
+    Raises
+    ------
+    FileFormatError
+        If the film exists and must not be replaced, or cannot be written.
+    """
+    with replacing(path, overwrite) as temporary:
+        if path.suffix.lower() == ".gif":
+            return _write_gif(temporary, frames, rate)
+        try:
+            return _write_mp4(temporary, frames, rate)
+        except _FFmpegFailed as error:
+            raise FileFormatError(
+                f"{path} cannot be written (ffmpeg: {error}): make room on its disk, choose "
+                "another folder, or write a .gif"
+            ) from None
+
+
+class _FFmpegFailed(Exception):  # noqa: N818 - it is what happened
+    """What ffmpeg gave as its reason."""
+
+
+def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int:
+    from imageio_ffmpeg import count_frames_and_secs
+
+    rest = iter(frames)
+    first = next(rest)
+    count = 0
+    with TemporaryFile() as said:
+        ffmpeg = _started_ffmpeg(path, first.shape, rate, said)
+        try:
+            for frame in chain([first], rest):
+                ffmpeg.stdin.write(frame.tobytes())
+                count += 1
+            ffmpeg.communicate()
+        except BrokenPipeError:
+            ffmpeg.wait()
+        finally:
+            with interrupts_put_off():
+                ffmpeg.kill()
+                ffmpeg.wait()
+        if ffmpeg.returncode:
+            said.seek(0)
+            raise _FFmpegFailed(_reason(said.read(), ffmpeg.returncode))
+    try:
+        found = count_frames_and_secs(str(path))[0]
+    except RuntimeError:
+        found = 0
+    if found != count:
+        raise _FFmpegFailed(f"{found} of {count} frames can be read back")
+    return count
+
+
+def _started_ffmpeg(path: Path, shape: tuple[int, ...], rate: float, said: Any) -> Any:
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{shape[1]}x{shape[0]}"]
+    frames = [*pixels, "-r", str(rate), "-i", "-"]
+    film = ["-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", str(_QUALITY)]
+    return subprocess.Popen(
+        [get_ffmpeg_exe(), "-v", "error", "-y", *frames, *film, str(path.absolute())],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=said,
+        # Ctrl-C is for this process, which then ends the other.
+        start_new_session=True,
+    )
+
+
+def _reason(said: bytes, code: int) -> str:
+    lines = said.decode(errors="replace").splitlines()
+    # Without which of its parts speaks: "[out#0/mp4 @ 0x560c9438a4c0] ".
+    return re.sub(r"^\[[^]]*\] ", "", lines[-1]) if lines else f"exit code {code}"
+
+
+def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int:
+    import imageio.v2 as iio
+
+    content, count = BytesIO(), 0
+    film: Any = iio.get_writer(content, format="GIF", duration=1000 / rate, loop=0)
+    with film:
+        for frame in frames:
+            film.append_data(in_few_colours(frame))
+            count += 1
+    path.write_bytes(content.getbuffer())
+    return count

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -214,7 +214,7 @@ def engine_for(
     InputError
         If there is no such engine.
     EngineError
-        If the scheduler does not answer.
+        If the scheduler does not answer, or processes cannot be started.
     InversionCancelled
         If `should_stop` returned true.
     """
@@ -270,9 +270,23 @@ def _threads(count: int) -> Iterator[Engine]:
 
 
 def _processes(count: int) -> Iterator[Engine]:
-    with local_client(count) as client:
-        name = f"{count} process{'es' if count > 1 else ''}"
+    name = f"{count} process{'es' if count > 1 else ''}"
+    with ExitStack() as opened:
+        try:
+            client = opened.enter_context(local_client(count))
+        except (OSError, RuntimeError) as error:
+            raise EngineError(
+                f"{name} for the shots could not be started ({_last_cause(error)}): where memory "
+                "is short take fewer workers, then run again to resume"
+            ) from error
         yield _Cluster(client, name, count)
+
+
+def _last_cause(error: BaseException) -> str:
+    """What dask wraps in what it says itself."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return str(error).rstrip(".") or type(error).__name__
 
 
 def _given(scheduler: Any, should_stop: ShouldStop | None) -> Iterator[Engine]:
@@ -285,7 +299,7 @@ def _given(scheduler: Any, should_stop: ShouldStop | None) -> Iterator[Engine]:
     except (OSError, TypeError, ValueError) as error:
         raise EngineError(
             f"no scheduler answers at {scheduler} ({type(error).__name__}): start it with "
-            "'dask scheduler', and check the address"
+            "'dask scheduler', and check the address, and for tls:// the keys"
         ) from None
     with client:
         yield _Cluster(client, f"the scheduler at {_address(client)}")

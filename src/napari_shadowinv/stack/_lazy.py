@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["invert_stack"]
 
 # One number for each shot, beside the arrays of an inversion.
-_NUMBERS = ("converged", "flux_residual", "iterations")
+_NUMBERS = ("converged", "flux_residual", "image_residual", "iterations")
 
 
 def invert_stack(
@@ -88,10 +88,10 @@ def invert_stack(
     -------
     xarray.Dataset
         The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
-        chunk, and ``converged``, ``flux_residual`` and ``iterations``. Sites have no
-        dimension ``shot`` where all shots share a source. With a free boundary and a source
-        for each shot, shots differ in their number of sites, and there are no variables of
-        sites. Nothing is computed yet.
+        chunk, and ``converged``, ``flux_residual``, ``image_residual`` and ``iterations``. Sites
+        have no dimension ``shot`` where all shots share a source. With a free boundary and a
+        source for each shot, shots differ in their number of sites, and there are no variables
+        of sites. Nothing is computed yet.
 
     Raises
     ------
@@ -160,6 +160,7 @@ def _numbers_of(inversion: Inversion) -> dict[str, Any]:
     return {
         "converged": np.bool_(report.converged),
         "flux_residual": np.float64(report.residual),
+        "image_residual": np.float64(report.image_residual),
         "iterations": np.int64(report.iterations),
     }
 

@@ -1,6 +1,9 @@
 """Worker processes on this machine, as runs of shots need them.
 
 - start some, connected: `local_client`
+
+Whoever may talk to a scheduler or a worker of dask can have it run any code. So these talk among
+themselves only: encrypted, with a key that is made for the run and exists nowhere but in them.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from multiprocessing import resource_tracker
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from napari_shadowinv.interrupts import interrupts_put_off
@@ -34,6 +38,11 @@ def local_client(count: int) -> Iterator[Any]:
     Yields
     ------
     distributed.Client
+
+    Raises
+    ------
+    OSError, RuntimeError
+        If the processes cannot be started, or end while they start.
     """
     distributed: Any = import_module("distributed")
     dask: Any = import_module("dask")
@@ -41,13 +50,19 @@ def local_client(count: int) -> Iterator[Any]:
         environment = dask.config.get(_ENVIRONMENT)
         opened.enter_context(dask.config.set(_settings(environment)))
         opened.enter_context(_forgotten(_TRIMMING, environment.get(_TRIMMING)))
+        # What they put aside when memory is short is code to whoever could exchange it.
+        own = opened.enter_context(TemporaryDirectory(prefix="shadowinv-"))
         # A cluster that is half made cannot be closed.
         with interrupts_put_off(), _hidden_from_workers():
             cluster = distributed.LocalCluster(
                 n_workers=count,
                 threads_per_worker=1,
                 host="127.0.0.1",
+                protocol="tls://",
+                security=distributed.Security.temporary(),
                 dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
+                local_directory=own,
                 # Workers that die are told of by the shots that they were at.
                 silence_logs=logging.CRITICAL,
                 preload=["napari_shadowinv.stack._preload"],
@@ -60,6 +75,9 @@ def local_client(count: int) -> Iterator[Any]:
 def _settings(environment: dict[str, Any]) -> dict[str, Any]:
     """Return what differs from dask's own settings."""
     return {
+        # They tell all the machine what is at work, to nobody's use.
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
         # Its records grow by megabytes a minute, and nobody would look at them.
         "distributed.worker.profile.enabled": False,
         # Dask looks at itself fifty times a second in each process, and writes down what it sees:

@@ -165,14 +165,14 @@ def run_stack(
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
     if is_here(scheduler):
         _compile(len(stack.shots), on_progress, should_stop)
-    with locked(path) as live:
+    with locked(path):
         store = StackStore(path) if path.exists() and not overwrite else None
         arrived = False
         if store is not None:
             stack = continued(store, stack, kept)
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
-                _Run(stack, store, (), on_progress, should_stop, live).tell("nothing to do")
+                _Run(stack, store, (), on_progress, should_stop).tell("nothing to do")
                 return read_stack(path)
         # Before a store is made: a scheduler that does not answer shall leave nothing behind.
         with engine_for(scheduler, workers, should_stop) as engine:
@@ -180,7 +180,7 @@ def run_stack(
                 store = create_store(path, contents_of(stack, kept), overwrite=overwrite)
             elif arrived:
                 store = lengthened(store, stack, kept)
-            _Run(stack, store, again, on_progress, should_stop, live).on(engine)
+            _Run(stack, store, again, on_progress, should_stop).on(engine)
     return read_stack(path)
 
 
@@ -204,13 +204,11 @@ class _Run:
         again: tuple[int, ...],
         on_progress: OnRunProgress | None,
         should_stop: ShouldStop | None,
-        live: Callable[[], None],
     ) -> None:
         self._stack = stack
         self._store = store
         self._on_progress = on_progress
         self._should_stop = should_stop
-        self._live = live
         statuses = store.statuses()
         self._todo = {int(index) for index in np.flatnonzero(np.isin(statuses, again))}
         self._counts = {
@@ -293,7 +291,6 @@ class _Run:
         """Return a task that has ended, or None after a while."""
         if self._should_stop is not None and self._should_stop():
             raise InversionCancelled("stopped on request; run again to resume")
-        self._live()
         try:
             return ended.get(timeout=_POLL)
         except queue.Empty:

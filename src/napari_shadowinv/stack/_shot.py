@@ -10,13 +10,17 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from napari_shadowinv.io.radiograph import Radiograph
 
 __all__ = [
     "ArrayShot",
@@ -37,7 +41,10 @@ class Shot(Protocol):
     """One image that is read when it is asked for; it can be sent to a worker."""
 
     def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Return the image, and what tells it from others: a checksum at least."""
+        """Return the image, and what tells it from others: a checksum at least.
+
+        ``warnings`` beside it are for the shot's report.
+        """
         ...
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
@@ -53,6 +60,7 @@ def read_shot(
     variable: str | None = None,
     factor: int = 1,
     hot_pixels: float | None = None,
+    warnings: list[str] | None = None,
 ) -> NDArray[np.float64]:
     """Read the image of a shot; this is the reader where none is given.
 
@@ -71,6 +79,8 @@ def read_shot(
     hot_pixels : float, optional
         Before that, replace pixels that differ from the median of their neighbours by more
         standard deviations of the noise.
+    warnings : list of str, optional
+        What the user should know before trusting the image is put in here.
 
     Returns
     -------
@@ -88,12 +98,32 @@ def read_shot(
     if page is None:
         shot = read_radiograph(path, channel=channel, variable=variable)
     else:
-        shot = Radiograph(read_tiff_page(path, page, channel=channel))
+        image, told = read_tiff_page(path, page, channel=channel)
+        shot = Radiograph(image, warnings=told)
+    if warnings is not None:
+        warnings += [*shot.warnings, *_left_out(shot)]
     if hot_pixels is not None:
         from napari_shadowinv.filters import remove_hot_pixels
 
         shot = replace(shot, image=remove_hot_pixels(shot.image, threshold=hot_pixels)[0])
     return shot.binned(factor).image
+
+
+def _left_out(shot: Radiograph) -> list[str]:
+    """What a file holds beside its image, which all shots of a stack have in common."""
+    parts = [name for name in ("source", "mask") if getattr(shot, name) is not None]
+    if not parts:
+        return []
+    return [f"the file holds its own {' and '.join(parts)}, which a stack leaves out: give it one"]
+
+
+def _read(reader: Reader, path: Path, **chosen: int) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Image of a file, and warnings if the reader can tell some."""
+    if "warnings" not in inspect.signature(reader).parameters:
+        return np.asarray(reader(path, **chosen)), {}
+    warnings: list[str] = []
+    image = np.asarray(reader(path, **chosen, warnings=warnings))
+    return image, {"warnings": warnings} if warnings else {}
 
 
 @dataclass(frozen=True)
@@ -127,8 +157,8 @@ class FileShot:
         """Read the file, with its checksum."""
         from napari_shadowinv.io.files import sha256
 
-        image = np.asarray(self.reader(self.path))
-        return image, {**_stamp(self.path), "sha256": sha256(self.path)}
+        image, told = _read(self.reader, self.path)
+        return image, {**_stamp(self.path), "sha256": sha256(self.path), **told}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare size and time, and only where these differ the checksum."""
@@ -156,8 +186,8 @@ class PageShot:
 
     def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
         """Read the page, with its checksum."""
-        image = np.asarray(self.reader(self.path, page=self.page))
-        return image, {"sha256": checksum(image)}
+        image, told = _read(self.reader, self.path, page=self.page)
+        return image, {"sha256": checksum(image), **told}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Read the page again and compare."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.files import text_of
+from napari_shadowinv.io.files import in_counting_order, text_of
 from napari_shadowinv.stack._shot import (
     ArrayShot,
     BlockShot,
@@ -143,7 +143,7 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
     if path.is_dir():
         raise InputError(f"{text} is a folder: say which files, such as '{text}/*.tif'")
     if _MAGIC.search(text) and not path.exists():
-        found = sorted(map(Path, glob.glob(text, recursive=True)), key=_natural)
+        found = in_counting_order(map(Path, glob.glob(text, recursive=True)))
         if not found:
             raise InputError(f"no file matches {text}: expected shots; check folder and pattern")
         return _from_files(found, reader, shape)
@@ -155,12 +155,6 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
         tuple(f"{text_of(path.name)}[{page}]" for page in range(pages)),
         shape,
     )
-
-
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sort shot_2 before shot_10."""
-    parts = re.split(r"(\d+)", str(path))
-    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
 def _page_count(path: Path) -> int:

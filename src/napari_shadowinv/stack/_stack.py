@@ -177,8 +177,10 @@ def describe_stack(
         raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
     usable = None if mask is None else checked_mask(mask, found.shape)
     bare = None if source_mask is None else checked_mask(source_mask, found.shape)
+    if estimate is not None:
+        estimate = estimate.placed(setup, found.shape)
     preparation = Preparation(tuple(filters), estimate, bare)
-    preparation.check(has_source=sources is not None, has_mask=usable is not None)
+    preparation.check(has_source=sources is not None, mask=usable)
     beam = None
     if not isinstance(sources, Shots):
         if sources is not None:
@@ -266,7 +268,7 @@ def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
     source = None if beam.source is None else checked_source(beam.source, beam.mask)
     return {
         "sites": level.sites - plan.margin,
-        "site_mass": level.mass,
+        "site_mass": level.mass * plan.unit,
         "mask": mask,
         "source": source,
     }

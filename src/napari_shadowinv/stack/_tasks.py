@@ -131,5 +131,6 @@ def _write(
         "stages": inversion.report.seconds,
         "seconds": seconds,
         **origin,
+        "warnings": [*inversion.report.warnings, *origin.get("warnings", ())],
     }
     settings.writer.write(index, settings.work.arrays(inversion), report)

@@ -29,7 +29,8 @@ from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preparation import Preparation
-from napari_shadowinv.progress import OnProgress, ShouldStop
+from napari_shadowinv.progress import OnProgress, OnWarning, ShouldStop
+from napari_shadowinv.sources import uniform_warnings
 from napari_shadowinv.stack._shot import checksum
 from napari_shadowinv.transport.sites import SitePlan
 
@@ -251,18 +252,27 @@ class Work:
                 f"image has shape {np.shape(image)}, expected {self.shape} as {others}"
             )
         image = self.preparation.filtered(image, self.mask, should_stop)
+        doubts: list[str] = []
         if beam is None:
-            beam = Beam.of(self.shape, self._source(image, source, should_stop), self.mask)
+            own = self._source(image, source, should_stop, doubts.append)
+            beam = Beam.of(self.shape, own, self.mask)
+        elif beam.source is None:
+            doubts.extend(uniform_warnings(self.shape, self.setup))
         options = self.options
         if options.threads is None:
             options = options.model_copy(update={"threads": threads_here(workers)})
-        return invert_shot(image, beam, options, start=start, should_stop=should_stop)
+        inversion = invert_shot(image, beam, options, start=start, should_stop=should_stop)
+        return inversion.with_warnings(doubts)
 
     def _source(
-        self, image: NDArray[Any], source: NDArray[Any] | None, should_stop: ShouldStop | None
+        self,
+        image: NDArray[Any],
+        source: NDArray[Any] | None,
+        should_stop: ShouldStop | None,
+        on_warning: OnWarning,
     ) -> NDArray[Any]:
         if source is None:
-            return self.preparation.estimated(image, self.mask, should_stop)
+            return self.preparation.estimated(image, self.mask, should_stop, on_warning)
         if np.shape(source) != self.shape:
             raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
         return self.preparation.filtered(source, self.mask, should_stop)

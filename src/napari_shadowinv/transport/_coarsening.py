@@ -21,10 +21,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
+
+from napari_shadowinv.geometry._kernel import njit
 
 __all__ = ["Hierarchy", "Network", "build_hierarchy", "require_connected"]
 

@@ -18,10 +18,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._threads import in_ranges
 from napari_shadowinv.transport._coarsening import Hierarchy, Network, build_hierarchy
 

@@ -20,11 +20,13 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 
-__all__ = ["newton", "with_full_cells"]
+__all__ = ["SHORTEST_STEP", "newton", "with_full_cells"]
 
 Array = NDArray[np.float64]
 
-_SHORTEST_STEP = 1e-7
+SHORTEST_STEP = 1e-7
+
+_PATIENCE = 15  # steps within which the error must halve, or the start was a bad one
 _LINEAR_TOLERANCE = 1e-2
 _SHARES_OF_START = (0.999, 0.99, 0.9, 0.5)
 _LEAST_START = 1e-12  # of a mean cell's flux
@@ -36,10 +38,12 @@ def newton(
     *,
     tolerance: float,
     max_iterations: int,
-    shortest_step: float = _SHORTEST_STEP,
+    shortest_step: float = SHORTEST_STEP,
     report: Reporter | None = None,
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
+
+    It gives up early where the error has not halved in many steps: the start was a bad one.
 
     Parameters
     ----------
@@ -64,11 +68,11 @@ def newton(
     diagram = objective.diagram(weights)
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
-    iterations = 0
+    errors = [_length(mass - diagram.masses)]
     reason = f"the solver used all {max_iterations} iterations allowed"
-    while residual > tolerance and iterations < max_iterations:
+    while residual > tolerance and len(errors) <= max_iterations:
         message = f"{len(mass):,} sites, residual {residual:.2g}"
-        alive = partial(report or Reporter(), "transport", iterations, None, message)
+        alive = partial(report or Reporter(), "transport", len(errors) - 1, None, message)
         alive()
         gap = mass - diagram.masses
         laplacian = diagram.laplacian()
@@ -87,10 +91,13 @@ def newton(
             break
         weights, diagram = damped
         residual = objective.residual(diagram)
-        iterations += 1
+        errors.append(_length(mass - diagram.masses))
+        if len(errors) > _PATIENCE and errors[-1] > 0.5 * errors[-1 - _PATIENCE]:
+            reason = f"the error has not halved in {_PATIENCE} steps"
+            break
     converged = residual <= tolerance
     reason = "" if converged else reason
-    return Solution(objective.in_gauge(weights), residual, iterations, converged, reason)
+    return Solution(objective.in_gauge(weights), residual, len(errors) - 1, converged, reason)
 
 
 def _damped_step(

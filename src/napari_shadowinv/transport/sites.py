@@ -19,10 +19,10 @@ from threading import Event
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import mirrored_across_border
@@ -131,12 +131,15 @@ class SitePlan:
     outside : Outside or None
         The margin around the image that the sites cover too, where the boundary is free; the
         levels' coordinates are then those of image and margin.
+    unit : float
+        Flux of the source that the levels' masses count as 1.
     """
 
     source: Array
     levels: tuple[Level, ...]
     mask: NDArray[np.bool_] | None = None
     outside: Outside | None = None
+    unit: float = 1.0
 
     @property
     def margin(self) -> int:

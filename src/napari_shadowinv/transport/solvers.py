@@ -10,15 +10,16 @@ Paper, section III.A ("multi-stage approach"); Q. Mérigot, Computer Graphics Fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import dctn, idctn
 
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Reporter
+from napari_shadowinv.transport.continuation import blurred, sharpen
 from napari_shadowinv.transport.descent import lbfgs, quasi_newton
 from napari_shadowinv.transport.newton import newton, with_full_cells
 from napari_shadowinv.transport.objective import Solution, TransportObjective
@@ -31,7 +32,7 @@ __all__ = ["LevelSolution", "fitted_flux", "solve"]
 Array = NDArray[np.float64]
 
 _COARSE_TOLERANCE = 3e-2
-_BLURS = (4.0, 2.0, 1.0, 0.5)
+_STALLED = 0.1  # a residual above this is no solution of anything
 _WARM_STEPS = 10
 _SITES_OF_FIT = 1500
 _STEPS_OF_FIT = (0.03, 0.01)
@@ -105,7 +106,8 @@ def solve(
     Returns
     -------
     list of LevelSolution
-        One for each level that was solved; the last is the answer.
+        One for each level that was tried, and for the finest one tried afresh where a level
+        led nowhere; the last is the answer.
 
     Raises
     ------
@@ -119,20 +121,35 @@ def solve(
         nearby = _solve_from(start, levels[-1], target, options, report)
         if nearby is not None:
             return [nearby]
+    by_newton = options.solver == "newton"
     solutions: list[LevelSolution] = []
     for number, level in enumerate(levels):
-        if number > 0:
-            weights = _prolong(levels[number - 1], solutions[-1], level, options.threads)
-        elif options.solver == "newton":
-            weights = _coarsest_start(level, target, options, report)
-        else:
-            weights = np.zeros(len(level.sites))
-        objective = target.objective(level)
         finest = level is levels[-1]
         tolerance = options.tolerance if finest else max(options.tolerance, _COARSE_TOLERANCE)
-        solution = _solve_level(objective, weights, options, tolerance, report)
+        objective = target.objective(level)
+        if number == 0 and by_newton:
+            solution = target.sharpened(level, tolerance, report)
+        else:
+            weights = (
+                _prolong(levels[number - 1], solutions[-1], level, options.threads)
+                if number > 0
+                else np.zeros(len(level.sites))
+            )
+            solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
+        if by_newton and solution.residual > _STALLED and len(levels) > 1:
+            return [*solutions, _afresh(levels[-1], target, solution if finest else None, report)]
     return solutions
+
+
+def _afresh(
+    level: Level, target: _Target, stalled: Solution | None, report: Reporter | None
+) -> LevelSolution:
+    """Solve the finest level without the coarser ones, which led nowhere."""
+    solution = target.sharpened(level, target.options.tolerance, report)
+    if stalled is not None and stalled.residual < solution.residual:
+        solution = replace(stalled, iterations=solution.iterations)
+    return LevelSolution.of_level(level, target.objective(level), solution)
 
 
 def fitted_flux(
@@ -212,13 +229,23 @@ class _Target:
 
     def objective(self, level: Level, blur: float = 0.0) -> TransportObjective:
         """Pose the problem for the sites of a level and an image blurred by so many px."""
-        image = _blurred(self.image, blur) if blur else self.image
+        image = blurred(self.image, blur) if blur else self.image
         threads = self.options.threads
         if self.outside is not None:
             decay_length = self.options.decay_length or self.outside.margin
             return OpenObjective(level, image, self.outside, decay_length, threads=threads)
         density = Density.from_image(image)
         return TransportObjective(level.triangulation.copy(), level.mass, density, threads=threads)
+
+    def sharpened(self, level: Level, tolerance: float, report: Reporter | None) -> Solution:
+        """Solve a level from zero weights, by way of blurred images."""
+        return sharpen(
+            level,
+            partial(self.objective, level),
+            tolerance=tolerance,
+            max_iterations=self.options.max_iterations,
+            report=report,
+        )
 
 
 def _solve_level(
@@ -239,28 +266,6 @@ def _solve_level(
         max_iterations=options.max_iterations,
         report=report,
     )
-
-
-def _coarsest_start(
-    level: Level, target: _Target, options: InversionOptions, report: Reporter | None
-) -> Array:
-    """Follow the solution from a blurred image to a sharp one."""
-    weights = np.zeros(len(level.sites))
-    for blur in _BLURS:
-        objective = target.objective(level, blur * level.spacing)
-        weights = _solve_level(objective, weights, options, _COARSE_TOLERANCE, report).weights
-    return weights
-
-
-def _blurred(image: Array, width: float) -> Array:
-    """Blur by a Gaussian, mirrored at the border, so that the flux stays."""
-    spectrum = dctn(image)
-    for axis in (0, 1):
-        waves = np.pi * np.arange(image.shape[axis]) / image.shape[axis]
-        damping = np.exp(-0.5 * (width * waves) ** 2)
-        spectrum *= np.expand_dims(damping, 1 - axis)
-    blurred: Array = idctn(spectrum)
-    return blurred
 
 
 def _prolong(coarse: Level, solution: LevelSolution, fine: Level, threads: int | None) -> Array:

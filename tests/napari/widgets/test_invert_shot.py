@@ -233,7 +233,7 @@ def test_crop_mask_and_source_are_used(
     beam = 300 * (1 + np.linspace(0, 0.2, shot.shape[1]) + np.zeros(shot.shape))
     np.save(tmp_path / "beam.npy", beam)
     window.add_image(beam, name="beam")
-    metadata = mark("image", "", proton_setup, source=beam)
+    metadata = mark("shot", "", proton_setup, source=beam)
     window.add_image(shot, name="measured", metadata=metadata)
     tool.source.layers.layer = window.layers["beam"]
     tool.source.file.edit.setText(str(tmp_path / "beam.npy"))
@@ -249,6 +249,18 @@ def test_crop_mask_and_source_are_used(
     tool.source.picker.set_kind("low_pass")
     estimated = computed(tool).source
     assert 0 < estimated.std() < 0.2 * estimated.mean()
+
+
+def test_what_a_file_brings_is_used_and_told(window: Any, tool: Any, shot: Array) -> None:
+    mask = np.zeros(shot.shape, np.uint8)
+    mask[:, :5] = 1
+    window.add_labels(mask, metadata=mark("mask", "", path="a.txt"))
+    metadata = mark("shot", "", path="a.txt", warnings=["it may be film"])
+    tool.masks.painted_is_unusable.setChecked(False)
+    tool.image.layer = window.add_image(shot, name="other", metadata=metadata)
+    inversion = computed(tool)
+    assert (inversion.mask == (mask == 0)).all()
+    assert inversion.report.warnings[-1] == "it may be film"
 
 
 def test_a_saved_result_tells_how_it_was_made(
@@ -294,8 +306,7 @@ def test_cancel_takes_effect_within_a_second(
     tool.panel.runner.progressed.connect(heard.append)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: any(news.stage == "sites" for news in heard), timeout=PATIENCE)
-    assert "Spreading the sites" in tool.panel.status.text()
-    assert any("Invert shot" in bar.desc for bar in progress._all_instances)
+    qtbot.waitUntil(lambda: "Spreading the sites" in tool.panel.status.text(), timeout=PATIENCE)
     start, used = time.perf_counter(), time.process_time()
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
@@ -303,6 +314,49 @@ def test_cancel_takes_effect_within_a_second(
     assert min(time.perf_counter() - start, time.process_time() - used) < 1
     assert [layer.name for layer in window.layers] == ["shot"]
     assert not progress._all_instances
+
+
+def test_a_run_replaces_the_last_result_of_its_shot(
+    window: Any, tool: Any, run: Any, shot: Array, proton_setup: ProtonSetup, told: list[str]
+) -> None:
+    run(tool)
+    first = list(window.layers)
+    layer_of(window, "caustic").visible = True
+    layer_of(window, "sites").visible = True
+    tool.setup.show_setup(proton_setup.model_dump())
+    tool.options.set_values({"n_sites": 300})
+    run(tool)
+    roles = [role_of(layer) for layer in window.layers if result_of(layer) is not None]
+    assert len(roles) == len(set(roles)) == len(first)  # and the field has arrows now
+    few = InversionOptions(n_sites=300)
+    expected = invert(shot, options=few)
+    for layer in window.layers:
+        result = result_of(layer)
+        if result is not None:
+            assert result.content.options == few
+    np.testing.assert_allclose(layer_of(window, "sites").data, expected.sites)
+    assert layer_of(window, "sites").visible
+    assert layer_of(window, "caustic").visible
+    strength = np.hypot(*proton_setup.path_integrated_b(expected.displacement))
+    field = layer_of(window, "field")
+    assert field in first
+    assert field.data.max() == pytest.approx(1e3 * strength.max(), rel=1e-6)
+    assert "mT·m" in field.name
+    np.testing.assert_allclose(layer_of(window, "arrows").scale, (1.5, 1.5))
+
+    # Another shot has results of its own, and so has a run that is told to keep the last.
+    count = len(window.layers)
+    assert told == []
+    metadata = mark("shot", "", proton_setup)
+    tool.image.layer = window.add_image(2 * shot, name="second", metadata=metadata)
+    run(tool)
+    assert len(window.layers) == count + 1 + len(roles)
+    tool.keep_earlier.setChecked(True)
+    run(tool)
+    assert len(window.layers) == count + 1 + 2 * len(roles)
+    bars = [one.name for one in window.layers if getattr(one, "colorbar", None) is not None]
+    shown = [one for one in window.layers if one.name in bars and one.colorbar.visible]
+    assert [(role_of(one), one.visible) for one in shown] == [("field", True)]
 
 
 MISTAKES = {
@@ -329,6 +383,9 @@ def expecting(told: list[str], qtbot: Any) -> Any:
             assert len(told) == 1, told
             assert words in told[0]
             assert "\n" not in told[0]
+            # It can be read when the notification is gone.
+            assert words.lower() in tool.panel.status.text().lower()
+            assert tool.panel.status.isVisible()
             assert tool.panel.button.text() == "Run"
             assert tool.panel.button.isEnabled()
 

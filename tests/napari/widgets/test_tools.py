@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -14,15 +14,19 @@ from qtpy.QtWidgets import QFileDialog
 from napari_shadowinv import ProtonSetup, sources
 from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.marks import mark, role_of, source_of, unit_of
+from napari_shadowinv._napari.widgets.forward_model import DEFLECTORS
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.io.dataset import displacement_from_potential
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import (
     coaxial_line,
     four_toroids,
+    gaussian_blob,
     paper_setup,
     wakefield,
     wakefield_setup,
 )
+from napari_shadowinv.physics.projection import Deflector, project
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
@@ -87,11 +91,14 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     tool = open_widget("Forward model")
 
     def made() -> Any:
-        count = len(window.layers)
+        before = [layer.data for layer in window.layers]
+
+        def new() -> list[Any]:
+            return [one for one in window.layers if not any(one.data is old for old in before)]
+
         tool.panel.button.click()
-        qtbot.waitUntil(lambda: len(window.layers) > count, timeout=PATIENCE)
-        qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
-        return window.layers[-1]
+        qtbot.waitUntil(lambda: bool(new()), timeout=PATIENCE)
+        return new()[-1]
 
     tool.object.set_kind("four_toroids")
     tool.height_px.setValue(60)
@@ -119,10 +126,105 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     shown = solved.reprojection / solved.source.mean()
     assert abs(again - shown)[inner].max() < 0.02 * shown.max()
 
+    # It knows its experiment.
     tool.setup.picker.set_kind("none")
+    np.testing.assert_allclose(made().data, again)
+    assert told == []
+    lost = window.add_image(potential.data, name="lost", metadata=mark("potential", "µm"))
+    tool.potential.layer = lost
+    told.clear()  # napari's own word on the units
     tool.panel.button.click()
     assert len(told) == 1
     assert "choose the setup" in told[0]
+    assert "choose the setup" in tool.panel.status.text()
+
+
+def test_only_what_may_be_a_field_is_offered_and_it_says_what_it_is_taken_for(
+    window: Any, open_widget: Any, qtbot: Any, told: list[str], solved: Inversion,
+    proton_setup: ProtonSetup, shot: Array,
+) -> None:  # fmt: skip
+    tool = open_widget("Forward model")
+    tool.object.set_kind("layer")
+    assert "open a .shadowinv file" in tool.expected.text()
+    tool.panel.button.click()
+    assert len(told) == 1
+    assert "there is no potential or result" in told[0].lower()
+    assert tool.panel.status.text() == told[0]
+    told.clear()
+
+    window.add_image(shot, name="counts")
+    window.add_image(shot, name="beam", metadata=mark("source", "intensity"))
+    add_inversion(window, solved, proton_setup, name="solved")
+    offered = [tool.potential.itemText(n) for n in range(tool.potential.count())]
+    assert len(offered) == 5  # potential, three of the field, and the image of unknown origin
+    assert "counts" in offered
+    assert "beam" not in offered
+    tool.potential.layer = window.layers["counts"]
+    assert "taken for one in px²" in tool.expected.text()
+    tool.object.set_kind("toroid")
+    tool.object.set_kind("layer")
+    assert role_of(tool.potential.layer) == "field"
+    assert tool.expected.text() == "The displacement of this result."
+    assert tool.setup.setup() == proton_setup
+
+
+def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
+    window: Any, open_widget: Any, qtbot: Any, told: list[str], solved: Inversion,
+    proton_setup: ProtonSetup,
+) -> None:  # fmt: skip
+    assert get_args(Deflector) == DEFLECTORS
+    add_inversion(window, solved, proton_setup, name="solved")
+    tool = open_widget("Forward model")
+    tool.object.set_kind("layer")
+    slow = proton_setup.model_copy(update={"energy": 3.0})
+    tool.setup.show_setup(slow.model_dump())
+
+    def image() -> Any:
+        before = tool._last._last
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: tool._last._last is not before, timeout=PATIENCE)
+        name = f"{tool.potential.layer.name.partition(' (')[0]} image"
+        qtbot.waitUntil(lambda: name in window.layers, timeout=PATIENCE)
+        return window.layers[name].data
+
+    expected = project(solved.displacement, proton_setup, slow)
+    np.testing.assert_allclose(image(), expected)
+    assert "magnetic field alone" in tool.warning.text()
+    tool.deflector.setCurrentText("electric field")
+    expected = project(solved.displacement, proton_setup, slow, deflector="electric field")
+    np.testing.assert_allclose(image(), expected)
+    tool.setup.show_setup(proton_setup.model_dump())
+    np.testing.assert_allclose(image(), synthetic_image(solved.displacement))
+    # A potential in µm goes the same way.
+    potential = next(one for one in window.layers if role_of(one) == "potential")
+    tool.potential.layer = potential
+    tool.deflector.setCurrentIndex(0)
+    tool.setup.show_setup(slow.model_dump())
+    expected = project(displacement_from_potential(solved.potential), proton_setup, slow)
+    np.testing.assert_allclose(image(), expected, atol=1e-9)
+    assert told == []
+
+
+def test_a_potential_from_a_file_and_the_shot_in_view_of_a_stack_make_their_images(
+    window: Any, open_widget: Any, qtbot: Any, told: list[str], tmp_path: Path
+) -> None:
+    potentials = [gaussian_blob((40, 50), size, 6.0).potential for size in (10.0, 20.0)]
+    np.save(tmp_path / "phi.npy", potentials[0])
+    window.open(str(tmp_path / "phi.npy"), plugin="napari")
+    window.add_image(np.stack(potentials), name="run", metadata=mark("potential", "px²"))
+    tool = open_widget("Forward model")
+    tool.setup.picker.set_kind("none")
+    tool.object.set_kind("layer")
+    for name, expected in (("phi", potentials[0]), ("run", potentials[1])):
+        window.dims.set_current_step(0, 1)
+        tool.potential.layer = window.layers[name]
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda name=name: f"{name} image" in window.layers, timeout=PATIENCE)
+        np.testing.assert_allclose(
+            window.layers[f"{name} image"].data,
+            synthetic_image(displacement_from_potential(expected)),
+        )
+    assert told == []
 
 
 def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
@@ -197,6 +299,39 @@ def test_a_profile_has_true_units_on_both_axes(profile: Any, qtbot: Any) -> None
     axes = profile.plot.figure.axes
     assert {axis.get_ylabel() for axis in axes} == {"nm", "T"}
     assert axes[-1].get_xlabel() == "distance (µm)"
+
+
+def test_a_profile_is_averaged_over_its_width(profile: Any, window: Any, qtbot: Any) -> None:
+    y = np.mgrid[:40, :50][0].astype(float)
+    window.layers["height"].data = y**2
+    profile.check(window.layers["field"], False)
+    profile.lines.layer.add_lines(np.array([[20.0, 5.0], [20.0, 45.0]]))
+
+    def shows(value: float) -> bool:
+        return bool(profile.profiles) and profile.profiles[0].values[3] == pytest.approx(value)
+
+    qtbot.waitUntil(lambda: shows(400), timeout=PATIENCE)
+    profile.width_edit.setValue(9)
+    qtbot.waitUntil(lambda: shows(400 + 80 / 12), timeout=PATIENCE)
+    axes = profile.plot.figure.axes
+    assert axes[-1].get_xlabel() == "distance (µm), mean over 9 px"
+    assert "height (nm), mean over 9 px" in profile.table()
+    profile.width_unit.setCurrentText("µm")  # pixels of 2 µm
+    profile.width_edit.setValue(10)
+    qtbot.waitUntil(lambda: shows(400 + 24 / 12), timeout=PATIENCE)
+    assert axes[-1] not in profile.plot.figure.axes
+    assert "mean over 10 µm" in profile.table()
+
+
+def test_a_profile_lies_on_a_layer_that_was_turned(profile: Any, window: Any, qtbot: Any) -> None:
+    profile.check(window.layers["field"], False)
+    window.layers["height"].rotate = 90
+    qtbot.wait(50)
+    profile.lines.layer.add_lines(np.array([[-5.0, 20.0], [-5.0, 10.0]]))
+    qtbot.waitUntil(lambda: bool(profile.profiles), timeout=PATIENCE)
+    # 90°: world (y, x) = (-column, row), in pixels of 2 µm.
+    rows, column = np.linspace(20, 10, 11), 5
+    np.testing.assert_allclose(profile.profiles[0].values, 3 * rows + column)
 
 
 def test_a_profile_follows_the_line_and_the_layers(window: Any, profile: Any, qtbot: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from qtpy.QtCore import QSize, Qt, Signal
 from qtpy.QtWidgets import (
@@ -18,7 +18,11 @@ from qtpy.QtWidgets import (
     QWidget,
 )
 
+from napari_shadowinv._napari.widgets._docking import Docked
 from napari_shadowinv._napari.widgets._state import StateKeeper
+
+if TYPE_CHECKING:
+    from napari_shadowinv._napari.widgets._panels import RunPanel
 
 __all__ = ["Part", "PathEdit", "ToolPanel", "with_button"]
 
@@ -37,8 +41,10 @@ class Part(Protocol):
         ...
 
 
-class ToolPanel(QWidget):
+class ToolPanel(Docked):
     """A column of controls that scrolls where the window is low, never sideways.
+
+    A subclass has a `panel` with its button.
 
     Parameters
     ----------
@@ -47,6 +53,8 @@ class ToolPanel(QWidget):
     name : str
         The key of the state that is kept between sessions.
     """
+
+    panel: RunPanel
 
     def __init__(self, viewer: Any, name: str) -> None:
         super().__init__()
@@ -71,6 +79,10 @@ class ToolPanel(QWidget):
 
     def sizeHint(self) -> QSize:
         return QSize(_WIDTH + 30, 600)
+
+    def show_problem(self, text: str) -> None:
+        """Show what is wrong, where it can be read until the next run."""
+        self.panel.say(text, problem=True)
 
     def parts(self) -> dict[str, Part]:
         """The controls whose states are kept between sessions, by name."""

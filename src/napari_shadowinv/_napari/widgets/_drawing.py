@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._napari.frame import frame_of
+from napari_shadowinv._napari.marks import MASK, mark
 from napari_shadowinv._napari.widgets._reading import image_of, stack_of
 
 __all__ = ["new_mask", "new_shapes"]
 
 
-def new_mask(viewer: Any, image: Any) -> Any:
+def new_mask(viewer: Any, image: Any, title: str = "mask") -> Any:
     """Add labels of an image's size, ready to paint.
 
     Parameters
@@ -21,6 +22,8 @@ def new_mask(viewer: Any, image: Any) -> Any:
         Where to add them.
     image : napari.layers.Image or None
         The image, or the stack, to be masked.
+    title : str
+        What it is for; the layer's name ends with it.
 
     Returns
     -------
@@ -32,7 +35,8 @@ def new_mask(viewer: Any, image: Any) -> Any:
         If there is no image, or it is in colour.
     """
     shape = (image_of(image) if image is None or image.ndim != 3 else stack_of(image)).shape[-2:]
-    labels = _added(viewer, image, "labels", np.zeros(shape, np.uint8), "mask")
+    labels = _added(viewer, image, "labels", np.zeros(shape, np.uint8), title)
+    labels.metadata = mark(MASK, "")
     labels.mode = "paint"
     return labels
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.progress import ShouldStop
+from napari_shadowinv.progress import OnWarning, ShouldStop
 from napari_shadowinv.recipes import Estimate
 
 __all__ = ["SourceCache", "quick_source", "same_array"]
@@ -26,7 +26,7 @@ Mask = NDArray[np.bool_]
 class SourceCache:
     """The last estimate, for the next run with the same image."""
 
-    _kept: tuple[tuple[Estimate, bool], Image, Mask | None, Image] | None = field(
+    _kept: tuple[tuple[Estimate, bool], Image, Mask | None, Image, list[str]] | None = field(
         default=None, repr=False
     )
 
@@ -37,6 +37,7 @@ class SourceCache:
         mask: Mask | None,
         most_pixels: int | None = None,
         should_stop: ShouldStop | None = None,
+        on_warning: OnWarning | None = None,
     ) -> Image:
         """Return the source of an image.
 
@@ -52,6 +53,8 @@ class SourceCache:
             Merge pixels until there are no more than these, to be quick.
         should_stop : callable, optional
             Asked at each step of an estimate that takes long.
+        on_warning : callable, optional
+            Receives a sentence where the estimate has to be doubted.
 
         Returns
         -------
@@ -59,16 +62,24 @@ class SourceCache:
         """
         key = (estimate, most_pixels is not None)
         if self._kept is not None:
-            last_key, last_image, last_mask, source = self._kept
+            last_key, last_image, last_mask, source, doubts = self._kept
             same = same_array(image, last_image) and same_array(mask, last_mask)
             if key == last_key and same:
-                return source
+                return _told(source, doubts, on_warning)
+        doubts = []
         if most_pixels is None:
-            source = estimate.source(image, mask, should_stop)
+            source = estimate.source(image, mask, should_stop, doubts.append)
         else:
-            source = quick_source(estimate, image, mask, most_pixels, should_stop)
-        self._kept = key, image, mask, source
-        return source
+            source = quick_source(estimate, image, mask, most_pixels, should_stop, doubts.append)
+        self._kept = key, image, mask, source, doubts
+        return _told(source, doubts, on_warning)
+
+
+def _told(source: Image, doubts: list[str], on_warning: OnWarning | None) -> Image:
+    if on_warning is not None:
+        for doubt in doubts:
+            on_warning(doubt)
+    return source
 
 
 def quick_source(
@@ -77,12 +88,13 @@ def quick_source(
     mask: Mask | None,
     most_pixels: int,
     should_stop: ShouldStop | None = None,
+    on_warning: OnWarning | None = None,
 ) -> Image:
     """Estimate the source from an image whose pixels are merged, and spread it again.
 
     Parameters
     ----------
-    estimate, image, mask, most_pixels, should_stop
+    estimate, image, mask, most_pixels, should_stop, on_warning
         See `SourceCache.source`.
 
     Returns
@@ -92,7 +104,7 @@ def quick_source(
     """
     factor = int(np.ceil(np.sqrt(image.size / most_pixels)))
     if factor == 1 or min(image.shape) < 8 * factor:
-        return estimate.source(image, mask, should_stop)
+        return estimate.source(image, mask, should_stop, on_warning)
     from scipy.ndimage import map_coordinates
     from skimage.transform import downscale_local_mean
 
@@ -103,7 +115,8 @@ def quick_source(
     sums = merged(np.where(usable, image, 0.0), (factor, factor))
     known = share > 0
     coarse = np.where(known, sums / np.where(known, share, 1.0), 0.0)
-    beam = estimate.coarser(factor).source(coarse, None if known.all() else known, should_stop)
+    coarser = estimate.coarser(factor)
+    beam = coarser.source(coarse, None if known.all() else known, should_stop, on_warning)
     middle = (factor - 1) / 2
     places = np.meshgrid(*((np.arange(n) - middle) / factor for n in image.shape), indexing="ij")
     fine = map_coordinates(beam, places, order=1, mode="nearest")

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 
 if TYPE_CHECKING:
+    from napari_shadowinv.physics.projection import Deflector
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 __all__ = ["Forecast", "ForwardJob"]
@@ -41,6 +42,8 @@ class Forecast:
         Share of the pixels whose rays cross or nearly do.
     kept : float
         Share of the flux that lands inside the image.
+    assumed : str
+        In words, what is taken to bend the beam in another experiment; empty in its own.
     """
 
     image: Image
@@ -48,11 +51,12 @@ class Forecast:
     source: Image | None
     caustic_share: float
     kept: float
+    assumed: str = ""
 
     @property
     def warning(self) -> str:
         """What to know before planning with it; empty if there is nothing."""
-        texts = []
+        texts = [self.assumed] if self.assumed else []
         if self.caustic_share > 0:
             texts.append(
                 f"Caustics: rays cross, or nearly do, in {self.caustic_share:.2%} of the pixels. "
@@ -69,14 +73,18 @@ class ForwardJob:
 
     Attributes
     ----------
-    field : array_like, shape (H, W), or PhantomRecipe
-        A potential, or an object to make one.
+    field : array_like, shape (H, W) or (2, H, W), or PhantomRecipe
+        A potential, a displacement in px, or an object to make one.
     shape : tuple of int
         Height and width of a phantom's image; a potential has its own.
     to_px2 : float
         Factor that brings the potential to px².
     setup : ProtonSetup or OpticalSetup, optional
         The experiment; a magnetic phantom needs it.
+    made_with : ProtonSetup or OpticalSetup, optional
+        The experiment that the field was found in, if it is another one.
+    deflector : str, optional
+        What bends the beam, see `napari_shadowinv.physics.projection`.
     source : array_like, shape (H, W), optional
         The undisturbed beam. Default: uniform.
     caustic_jacobian : float
@@ -87,6 +95,8 @@ class ForwardJob:
     shape: tuple[int, int] = (200, 200)
     to_px2: float = 1.0
     setup: ProtonSetup | OpticalSetup | None = None
+    made_with: ProtonSetup | OpticalSetup | None = None
+    deflector: Deflector | None = None
     source: ArrayLike | None = None
     caustic_jacobian: float = InversionOptions.model_fields["caustic_jacobian"].default
 
@@ -106,17 +116,17 @@ class ForwardJob:
 
         report = Reporter(on_progress, should_stop)
         report("field", 0, None)
-        displacement = self._displacement()
+        displacement, assumed = self._seen(self._displacement())
         source, shadow = self._source(displacement.shape[1:])
-        report("image", 0, None)
-        image = synthetic_image(displacement, source)
-        report("image", 1, 1)
+        image = synthetic_image(
+            displacement, source, on_progress=on_progress, should_stop=should_stop
+        )
         caustic = jacobian_determinant(displacement) < self.caustic_jacobian
         if shadow is not None:
             caustic &= ~shadow
         flux = image.size if source is None else source.sum()
         kept = float(image.sum() / flux) if flux else 1.0
-        return Forecast(image, displacement, source, float(caustic.mean()), kept)
+        return Forecast(image, displacement, source, float(caustic.mean()), kept, assumed)
 
     def _source(self, shape: tuple[int, ...]) -> tuple[Image | None, Mask | None]:
         """The beam that passes, and where the object stops it."""
@@ -128,9 +138,29 @@ class ForwardJob:
             return source, None
         return np.where(shadow, 0.0, np.ones(shape) if source is None else source), shadow
 
+    def _seen(self, displacement: Image) -> tuple[Image, str]:
+        """The displacement in the experiment that is asked for, and what that assumes."""
+        from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
+
+        made_with, setup = self.made_with, self.setup
+        if made_with is None or setup is None or made_with == setup:
+            return displacement, ""
+        deflector = self.deflector or default_deflector(made_with, setup)
+        shape: Any = None if self.source is None else np.shape(self.source)
+        moved = transferred_displacement(
+            displacement,
+            made_with,
+            setup,
+            deflector=deflector,
+            shape=shape,
+        )
+        return moved, f"In another experiment, as if a {deflector} alone deflected."
+
     def _displacement(self) -> Image:
         from napari_shadowinv.io.dataset import displacement_from_potential
 
         if isinstance(self.field, PhantomRecipe):
             return self.field.phantom(self.shape, self.setup).displacement
+        if np.ndim(self.field) == 3:
+            return np.asarray(self.field, dtype=np.float64)
         return displacement_from_potential(self.to_px2 * plane_of(self.field, "the potential"))

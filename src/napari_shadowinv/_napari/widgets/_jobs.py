@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +22,13 @@ from napari_shadowinv._napari.widgets._estimating import SourceCache, quick_sour
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preparation import Preparation, as_beam
-from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
-from napari_shadowinv.recipes import Estimate, Filter
+from napari_shadowinv.preparation import Preparation
+from napari_shadowinv.progress import OnProgress, OnWarning, Reporter, ShouldStop
+from napari_shadowinv.recipes import Estimate, Filter, UniformEstimate
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
     from napari_shadowinv.transport.sites import SitePlan
 
 __all__ = ["PREVIEW_SITES", "Crop", "PlanCache", "ShotJob", "SourceJob", "plane_of"]
@@ -126,6 +128,12 @@ class ShotJob:
         The source that the last run has guessed.
     preview : bool
         Whether to be quick rather than exact.
+    source_mask : ndarray of bool, shape (H, W), optional
+        True where the object is not: an estimate of the source looks at no other pixels.
+    setup : ProtonSetup or OpticalSetup, optional
+        The experiment, for what depends on it before the inversion.
+    warnings : tuple of str
+        What is known against the image, for the report.
     """
 
     image: ArrayLike
@@ -137,6 +145,9 @@ class ShotJob:
     cache: PlanCache = field(default_factory=PlanCache)
     estimates: SourceCache = field(default_factory=SourceCache)
     preview: bool = False
+    source_mask: Mask | None = None
+    setup: ProtonSetup | OpticalSetup | None = None
+    warnings: tuple[str, ...] = ()
 
     def for_preview(self) -> ShotJob:
         """The same with few enough sites, and pixels of an estimate, to be quick."""
@@ -164,18 +175,20 @@ class ShotJob:
         seconds: dict[str, float] = {}
         clock = time.perf_counter()
         report("prepare", 0, None, "image and source")
-        image, mask = self._image_and_mask()
-        estimate = self.source if isinstance(self.source, Estimate) else None
-        preparation = Preparation(() if self.cleaning is None else (self.cleaning,), estimate)
-        preparation.check(has_source=estimate is None, has_mask=mask is not None)
+        image, mask, bare = self._image_and_masks()
+        estimate = self._estimate()
+        preparation = Preparation(() if self.cleaning is None else (self.cleaning,), estimate, bare)
+        preparation.check(has_source=estimate is None, mask=mask)
         image = preparation.filtered(image, mask, should_stop)
         # Before the sites are spread: a mistake is told at once.
         report("prepare", 0, None)
         prepare(image, None, self.options, mask)
         if estimate is not None:
             report("source", 0, None, estimate.title)
-        source = self._source(image, mask, preparation, should_stop)
+        doubts = self._doubts_of_uniform()
+        source = self._source(image, mask, preparation, should_stop, doubts.append)
         report("prepare", 0, None)
+        prepare(image, source, self.options, mask)
         seconds["source"] = time.perf_counter() - clock
         ensure_compiled(on_progress, should_stop)
         clock = time.perf_counter()
@@ -196,7 +209,8 @@ class ShotJob:
             self.cache.keep(plan, inversion)
         spent = inversion.report.seconds
         seconds |= {stage: spent[stage] + seconds.get(stage, 0.0) for stage in spent}
-        return replace(inversion, report=replace(inversion.report, seconds=seconds))
+        inversion = replace(inversion, report=replace(inversion.report, seconds=seconds))
+        return inversion.with_warnings((*doubts, *self.warnings))
 
     def attributes(self) -> dict[str, str]:
         """What is done before the inversion, as `napari_shadowinv.io.dataset.provenance` tells."""
@@ -216,14 +230,40 @@ class ShotJob:
             told["source_file"] = text_of(self.source.name)
         return told
 
-    def _image_and_mask(self) -> tuple[Image, Mask | None]:
+    def _image_and_masks(self) -> tuple[Image, Mask | None, Mask | None]:
         image = plane_of(self.image, "the image")
-        mask = self.mask
-        if mask is not None and mask.shape != image.shape:
-            raise InputError(f"mask has shape {mask.shape}, image {image.shape}: they must match")
+        masks = {"mask": self.mask, "source mask": self.source_mask}
+        for name, mask in masks.items():
+            if mask is not None and mask.shape != image.shape:
+                raise InputError(
+                    f"{name} has shape {mask.shape}, image {image.shape}: they must match"
+                )
         if self.crop is None:
-            return image, mask
-        return _cropped(image, self.crop), None if mask is None else mask[self.crop]
+            return image, self.mask, self.source_mask
+        usable, bare = (None if mask is None else mask[self.crop] for mask in masks.values())
+        return _cropped(image, self.crop), usable, bare
+
+    def _corner(self) -> tuple[int, int]:
+        """First row and column of what is inverted."""
+        return (0, 0) if self.crop is None else (self.crop[0].start, self.crop[1].start)
+
+    def _estimate(self) -> Estimate | None:
+        """How the source is guessed, for the part of the image that is inverted."""
+        if not isinstance(self.source, Estimate):
+            return None
+        return self.source.placed(self.setup, np.shape(self.image), self._corner())
+
+    def _doubts_of_uniform(self) -> list[str]:
+        from napari_shadowinv.sources import uniform_warnings
+
+        if not isinstance(self.source, UniformEstimate):
+            return []
+        height, width = np.shape(self.image)
+        top, left = self._corner()
+        middle = (height - 1) / 2 - top, (width - 1) / 2 - left
+        if self.crop is not None:
+            height, width = (part.stop - part.start for part in self.crop)
+        return list(uniform_warnings((height, width), self.setup, centre=middle))
 
     def _source(
         self,
@@ -231,14 +271,15 @@ class ShotJob:
         mask: Mask | None,
         preparation: Preparation,
         should_stop: ShouldStop | None,
+        on_warning: OnWarning,
     ) -> Image:
         from napari_shadowinv.preprocess import checked_source
 
-        if isinstance(self.source, Estimate):
+        if preparation.estimate is not None:
             most_pixels = PREVIEW_PIXELS if self.preview else None
-            return self.estimates.source(
-                self.source, as_beam(image, mask), mask, most_pixels, should_stop
-            )
+            kept = partial(self.estimates.source, preparation.estimate, most_pixels=most_pixels)
+            return preparation.estimated(image, mask, should_stop, on_warning, by=kept)
+        assert not isinstance(self.source, Estimate)
         given = self.source
         if isinstance(given, Path):
             from napari_shadowinv.io import read_radiograph

@@ -69,12 +69,15 @@ class LivePanel(ToolPanel):
         if self._ready and self.live.isChecked():
             self._settle.start()
 
-    @reporting
     def _run_or_cancel(self) -> None:
         if self.panel.runner.running and not self._running_preview:
             self.panel.cancel()
             return
-        request = self.request()
+        try:
+            request = self.request()
+        except MISTAKES as error:
+            self.panel.refuse(error)
+            return
         self._running_preview = False
         self.panel.run(request.run, request)
 

@@ -8,6 +8,7 @@ from typing import Any
 from qtpy.QtCore import Signal
 from qtpy.QtWidgets import QCheckBox, QVBoxLayout, QWidget
 
+from napari_shadowinv._napari.marks import MASK, mark_of, may_be_mask, role_of
 from napari_shadowinv._napari.widgets._base import with_button
 from napari_shadowinv._napari.widgets._drawing import new_mask
 from napari_shadowinv._napari.widgets._forms import labelled
@@ -31,6 +32,8 @@ class MaskPicker(QWidget):
         Layer types that may be a mask.
     tip : str
         What is to be marked.
+    title : str
+        What it is called in the window; names of new layers end with it.
 
     Signals
     -------
@@ -44,11 +47,16 @@ class MaskPicker(QWidget):
     changed = Signal()
 
     def __init__(
-        self, viewer: Any, image: Callable[[], Any], kinds: tuple[str, ...], tip: str
+        self,
+        viewer: Any,
+        image: Callable[[], Any],
+        kinds: tuple[str, ...],
+        tip: str,
+        title: str = "Mask",
     ) -> None:
         super().__init__()
-        self._viewer, self._image = viewer, image
-        self.layers = LayerPicker(viewer, kinds, none="none")
+        self._viewer, self._image, self._title = viewer, image, title
+        self.layers = LayerPicker(viewer, kinds, none="none", suits=may_be_mask)
         self.layers.setToolTip(f"<qt>{tip}</qt>")
         self.painted_is_unusable = QCheckBox("painted = unusable")
         self.painted_is_unusable.setChecked(True)
@@ -59,7 +67,7 @@ class MaskPicker(QWidget):
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
         for row in (
-            labelled("Mask", with_button(self.layers, "✎", "Paint a mask.", self.paint)),
+            labelled(title, with_button(self.layers, "✎", f"Paint a {title.lower()}.", self.paint)),
             labelled("", self.painted_is_unusable),
         ):
             column.addWidget(row)
@@ -86,6 +94,24 @@ class MaskPicker(QWidget):
         """
         return mask_of(self.layer, image, self.painted_is_unusable.isChecked())
 
+    def described(self, image: Any) -> str:
+        """Which layer it is, and how much it leaves out; empty for none, or nothing painted.
+
+        Parameters and errors are those of `usable`.
+        """
+        usable = self.usable(image)
+        if usable is None or self.layer is None:
+            return ""
+        return f"layer '{self.layer.name}', leaves out {1 - usable.mean():.1%} of the pixels"
+
+    def follow(self, image: Any) -> None:
+        """Choose the mask that came with an image's file, if one did."""
+        path = mark_of(image).get("path")
+        for layer in self._viewer.layers:
+            if path and role_of(layer) == MASK and mark_of(layer).get("path") == path:
+                self.layer = layer
+                self.painted_is_unusable.setChecked(True)
+
     def state(self) -> bool:
         """What is kept: layers belong to a session."""
         return bool(self.painted_is_unusable.isChecked())
@@ -97,4 +123,4 @@ class MaskPicker(QWidget):
     @reporting
     def paint(self) -> None:
         """Add an empty mask and choose it."""
-        self.layer = new_mask(self._viewer, self._image())
+        self.layer = new_mask(self._viewer, self._image(), self._title.lower())

@@ -1,7 +1,7 @@
 """What the widgets tell the user: one sentence in napari's notifications, no traceback.
 
-- tell: `tell_error`, `tell_warning`, `tell_info`
-- a method whose user's mistakes become notifications: `reporting`
+- tell: `tell_error`, `tell_warning`, `tell_info`; the sentence itself: `error_text`
+- a method whose user's mistakes become notifications, and stay in its widget: `reporting`
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from napari.utils.notifications import show_error, show_info, show_warning
 
 from napari_shadowinv.errors import InputError
 
-__all__ = ["MISTAKES", "reporting", "tell_error", "tell_info", "tell_warning"]
+__all__ = ["MISTAKES", "error_text", "reporting", "tell_error", "tell_info", "tell_warning"]
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -23,10 +23,20 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 MISTAKES = (InputError, OSError, MemoryError)
 
 
+def error_text(error: BaseException | str) -> str:
+    """What is wrong and what to do; of a fault of the program's, at least its name."""
+    text = str(error)
+    if isinstance(error, MemoryError) and not text:
+        text = "there is not enough memory for this"
+    elif not isinstance(error, (str, *MISTAKES)):
+        first = text.partition("\n")[0]
+        text = f"fault of the program: {type(error).__name__}: {first} (see the notification)"
+    return text[:1].upper() + text[1:]
+
+
 def tell_error(error: BaseException | str) -> None:
     """Say what is wrong and what to do."""
-    text = str(error) or "there is not enough memory for this"
-    show_error(text[:1].upper() + text[1:])
+    show_error(error_text(error))
 
 
 def tell_warning(text: str) -> None:
@@ -40,7 +50,10 @@ def tell_info(text: str) -> None:
 
 
 def reporting(method: Method) -> Method:
-    """Turn a user's mistake within a method into one notification."""
+    """Turn a user's mistake within a widget's method into one notification.
+
+    The widget, or the first around it that can, also shows it: with a method `show_problem`.
+    """
 
     @functools.wraps(method)
     def told(*args: Any, **kwargs: Any) -> Any:
@@ -48,6 +61,16 @@ def reporting(method: Method) -> Method:
             return method(*args, **kwargs)
         except MISTAKES as error:
             tell_error(error)
+            _show_within(args[0], error_text(error))
             return None
 
     return told  # type: ignore[return-value]
+
+
+def _show_within(widget: Any, text: str) -> None:
+    while widget is not None:
+        show = getattr(widget, "show_problem", None)
+        if show is not None:
+            show(text)
+            return
+        widget = widget.parent()

@@ -7,10 +7,11 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 from napari.utils import progress as activity
-from qtpy.QtCore import Qt
+from qtpy.QtCore import Qt, QTimer
 from qtpy.QtWidgets import (
     QAbstractItemView,
     QHeaderView,
@@ -26,7 +27,7 @@ from superqt import QCollapsible
 
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, wrapping_label
 from napari_shadowinv._napari.widgets._lifetime import when_destroyed
-from napari_shadowinv._napari.widgets._messages import tell_error
+from napari_shadowinv._napari.widgets._messages import error_text, tell_error
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv.progress import Progress
 
@@ -46,6 +47,10 @@ _STAGES = {
     "image": "Tracing the rays",
     "shots": "Inverting",
 }
+
+
+_LOOK_EVERY = 500  # ms
+_SHOW_SECONDS_FROM = 2.0
 
 
 class _Activity:
@@ -73,6 +78,11 @@ class _Activity:
 class RunPanel(QWidget):
     """A button that runs and cancels, with a progress bar and a line of text.
 
+    Whatever changes beside the canvas makes the whole window be drawn anew. Without a graphics
+    card, an animated bar thus takes the processor that the work needs: the bar stands still
+    between two looks, and napari's activity dock, which is animated, is used only while the
+    panel cannot be seen.
+
     Parameters
     ----------
     what : str
@@ -93,6 +103,8 @@ class RunPanel(QWidget):
         self.bar.setTextVisible(False)
         self.bar.setFixedHeight(8)
         self.bar.setVisible(False)
+        # Nothing of napari's or of the system's style animates a bar that has a range.
+        self.bar.setRange(0, 1)
         self.status = wrapping_label()
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
@@ -101,6 +113,11 @@ class RunPanel(QWidget):
         self._activity = _Activity()
         self._quiet = False
         self._said = ("", False)
+        self._news: Progress | None = None
+        self._start = 0.0
+        self._looking = QTimer(self)
+        self._looking.setInterval(_LOOK_EVERY)
+        self._looking.timeout.connect(self._look)
         self.runner.started.connect(self._on_start)
         self.runner.progressed.connect(self._on_progress)
         self.runner.ended.connect(self._on_end)
@@ -137,24 +154,43 @@ class RunPanel(QWidget):
         self.status.setStyleSheet(PROBLEM_STYLE if problem else "")
         self.status.setVisible(bool(text))
 
+    def refuse(self, error: BaseException) -> None:
+        """Tell a mistake of the user's; it stands here when the notification is gone."""
+        tell_error(error)
+        self.say(error_text(error), problem=True)
+
     def _on_start(self) -> None:
         if self._quiet:
             return
+        self._news, self._start = None, time.monotonic()
         self.button.setText("Cancel")
-        self.bar.setRange(0, 0)
+        self.bar.setRange(0, 1)
+        self.bar.setValue(0)
         self.bar.setVisible(True)
         self.say("Starting…")
+        self._looking.start()
 
     def _on_progress(self, news: Progress) -> None:
-        if self._quiet:
+        self._news = news
+
+    def _look(self) -> None:
+        """Show the latest news."""
+        news = self._news
+        if news is None or self.runner.cancelling:
             return
-        self._activity.show(self._what, news)
-        self.bar.setRange(0, news.total or 0)
-        self.bar.setValue(news.step)
+        if self.isVisible():
+            self._activity.close()
+        else:
+            self._activity.show(self._what, news)
+        self.bar.setRange(0, news.total or 1)
+        self.bar.setValue(news.step if news.total else 0)
         stage = _STAGES.get(news.stage, news.stage)
-        self.say(f"{stage}: {news.message}" if news.message else f"{stage}…")
+        text = f"{stage}: {news.message}" if news.message else f"{stage}…"
+        seconds = time.monotonic() - self._start
+        self.say(f"{text} ({seconds:.0f} s)" if seconds >= _SHOW_SECONDS_FROM else text)
 
     def _on_end(self, outcome: Outcome) -> None:
+        self._looking.stop()
         self._activity.close()
         self.bar.setVisible(False)
         if self.button.text() != self._run_text:
@@ -163,27 +199,25 @@ class RunPanel(QWidget):
         self.say("Cancelled." if outcome.cancelled and not self._quiet else "")
         if outcome.error is None:
             return
+        # A notification is gone after seconds: what is wrong stays here until the next run.
+        self.say(error_text(outcome.error), problem=True)
         if not outcome.is_mistake:
             from napari.utils.notifications import notification_manager
 
             error = outcome.error
             notification_manager.receive_error(type(error), error, error.__traceback__)
-        elif self._quiet:
-            self.say(str(outcome.error), problem=True)
-        else:
+        elif not self._quiet:
             tell_error(outcome.error)
 
 
 def report_rows(inversion: Inversion) -> list[tuple[str, str]]:
     """How an inversion went, in two columns of text; warnings come last."""
     report = inversion.report
-    mean = float(inversion.source[inversion.mask].mean())
-    error = float((inversion.residual[inversion.mask] ** 2).mean() ** 0.5) / mean
     stages = [(f"  {stage}", f"{seconds:.2f} s") for stage, seconds in report.seconds.items()]
     return [
         ("Converged", "yes" if report.converged else "NO"),
         ("Flux residual", f"{report.residual:.2g} (asked for {report.tolerance:.2g})"),
-        ("Image residual", f"{100 * error:.2g} % of the mean, r.m.s."),
+        ("Image residual", f"{100 * report.image_residual:.3g} % of the mean, r.m.s."),
         ("Iterations", f"{report.iterations} on {len(report.levels)} levels"),
         ("Sites", f"{report.n_sites:,}"),
         ("Caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
@@ -222,6 +256,11 @@ class ReportTable(QTableWidget):
                 self.setItem(number, column, item)
         self.setVisible(True)
         self._fit()
+
+    def empty(self) -> None:
+        """Show nothing."""
+        self.setRowCount(0)
+        self.setVisible(False)
 
     def texts(self) -> dict[str, str]:
         """What is shown, by name."""

@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from qtpy.QtCore import QObject, QSignalBlocker, Signal
@@ -35,6 +35,8 @@ class LayerPicker(SteadyComboBox):
         Layer types, such as ``"image"``.
     none : str
         What to show for no layer; without it the latest layer is chosen.
+    suits : callable, optional
+        Which of these layers are offered. Default: all.
 
     Signals
     -------
@@ -44,14 +46,20 @@ class LayerPicker(SteadyComboBox):
 
     picked = Signal()
 
-    def __init__(self, viewer: Any, kinds: tuple[str, ...], none: str = "") -> None:
+    def __init__(
+        self,
+        viewer: Any,
+        kinds: tuple[str, ...],
+        none: str = "",
+        suits: Callable[[Any], bool] | None = None,
+    ) -> None:
         super().__init__()
-        self._viewer, self._kinds, self._none = viewer, kinds, none
+        self._viewer, self._kinds, self._none, self._suits = viewer, kinds, none, suits
         self._offered: list[Any] = []
-        self._fill()
+        self.fill()
         self.currentIndexChanged.connect(lambda _: self.picked.emit())
         for emitter in (viewer.layers.events.inserted, viewer.layers.events.removed):
-            while_alive(self, emitter, self._fill)
+            while_alive(self, emitter, self.fill)
         for layer in viewer.layers:
             self._watch_name(layer)
         while_alive(self, viewer.layers.events.inserted, self._on_insertion)
@@ -73,11 +81,17 @@ class LayerPicker(SteadyComboBox):
         self._watch_name(event.value)
 
     def _watch_name(self, layer: Any) -> None:
-        while_alive(self, layer.events.name, self._fill)
+        while_alive(self, layer.events.name, self.fill)
 
-    def _fill(self, event: Any = None) -> None:
+    @property
+    def offered(self) -> list[Any]:
+        """The layers to choose from."""
+        return list(self._offered)
+
+    def fill(self, event: Any = None) -> None:
+        """Offer what the viewer has now; what is chosen stays while it is there."""
         before = self.layer
-        offered = [layer for layer in self._viewer.layers if kind_of(layer) in self._kinds]
+        offered = [layer for layer in self._viewer.layers if self._is_offered(layer)]
         with QSignalBlocker(self):
             self.clear()
             self._offered = offered
@@ -91,6 +105,9 @@ class LayerPicker(SteadyComboBox):
                 self.layer = offered[-1]
         if self.layer is not before:
             self.picked.emit()
+
+    def _is_offered(self, layer: Any) -> bool:
+        return kind_of(layer) in self._kinds and (self._suits is None or self._suits(layer))
 
 
 class LayerWatch(QObject):

@@ -50,7 +50,8 @@ class ProfilePlot(QWidget):
                     axis.plot(distance, profile.values, color=colour, label=_short(profile.name))
             if profiles:
                 axis.legend(fontsize=8, labelcolor=ink, facecolor=paper, edgecolor=ink)
-        axes[-1].set_xlabel(f"distance ({unit})", color=ink)
+        averaged = f", {profiles[0].averaged}" if profiles and profiles[0].averaged else ""
+        axes[-1].set_xlabel(f"distance ({unit}){averaged}", color=ink)
         self._canvas.draw_idle()
 
     def _make_canvas(self) -> None:

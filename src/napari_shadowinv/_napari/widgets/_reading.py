@@ -1,4 +1,8 @@
-"""Arrays from layers: `image_of`, `stack_of`, `mask_of`, `crop_of`."""
+"""Arrays from layers.
+
+- `image_of`, `stack_of`, `shown_plane`, `mask_of`, `crop_of`
+- what speaks against an image: `warnings_of`
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._napari.marks import mark_of
 from napari_shadowinv._napari.widgets._picking import kind_of
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.radiograph import film_warnings
 
-__all__ = ["crop_of", "image_of", "mask_of", "stack_of"]
+__all__ = ["crop_of", "image_of", "mask_of", "shown_plane", "stack_of", "warnings_of"]
 
 Mask = NDArray[np.bool_]
+_PICTURES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
 
 def image_of(layer: Any | None, role: str = "image") -> Any:
@@ -78,6 +85,27 @@ def stack_of(layer: Any | None) -> Any:
     return whole
 
 
+def shown_plane(layer: Any, point: Any) -> Any:
+    """The plane of an image, or of a stack of them, that is shown now.
+
+    Parameters
+    ----------
+    layer : napari.layers.Image
+        The image.
+    point : sequence of float
+        Where the viewer is along all axes: its ``dims.point``.
+
+    Returns
+    -------
+    array_like, shape (H, W)
+    """
+    data = layer.data[0] if getattr(layer, "multiscale", False) else layer.data
+    if data.ndim == 2:
+        return data
+    at = np.round(layer.world_to_data(point[-layer.ndim :])[:-2]).astype(int)
+    return data[tuple(np.clip(at, 0, np.array(data.shape[:-2]) - 1))]
+
+
 def _grey(layer: Any | None, role: str) -> Any:
     if layer is None:
         raise InputError(
@@ -86,10 +114,30 @@ def _grey(layer: Any | None, role: str) -> Any:
         )
     if getattr(layer, "rgb", False):
         raise InputError(
-            f"'{layer.name}' is a colour image, expected a grey one: split it (right click on "
-            "the layer → Split RGB) and choose one channel"
+            f"'{layer.name}' is a colour image, expected a grey one: convert a scan of film, which "
+            "darkens with dose, to dose first (napari_shadowinv.film), or if it is linear in "
+            "fluence split it (right click on the layer → Split RGB) and choose one channel"
         )
     return layer.data[0] if getattr(layer, "multiscale", False) else layer.data
+
+
+def warnings_of(layer: Any) -> tuple[str, ...]:
+    """What is known against an image: what its reader said, or that it looks like scanned film.
+
+    Parameters
+    ----------
+    layer : napari.layers.Image
+        A grey image; where napari itself has read a picture, its pixels are looked at.
+
+    Returns
+    -------
+    tuple of str
+    """
+    known = mark_of(layer)
+    path = str(layer.source.path or "").lower()
+    if known or not path.endswith(_PICTURES) or not isinstance(layer.data, np.ndarray):
+        return tuple(known.get("warnings", ()))
+    return film_warnings(layer.data, None)
 
 
 def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> Mask | None:

@@ -2,7 +2,8 @@
 
 - where a result lies: `result_frame`
 - place an image and what belongs to it by a setup: `place_together`
-- show a result in layers of its own: `ResultLayers`
+- show a result in layers of its own: `ResultLayers`; in those of the last result of the same
+  shot: `LastResults`, `keep_earlier_box`
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from qtpy.QtCore import QObject, QTimer, Signal
+from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, place
 from napari_shadowinv._napari.marks import role_of
@@ -20,7 +23,13 @@ from napari_shadowinv._napari.widgets._picking import kind_of
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
 
-__all__ = ["ResultLayers", "place_together", "result_frame"]
+__all__ = [
+    "LastResults",
+    "ResultLayers",
+    "keep_earlier_box",
+    "place_together",
+    "result_frame",
+]
 
 _VISIBLE = 0.02  # of what limits span
 
@@ -139,18 +148,35 @@ class ResultLayers(QObject):
         self._before = self._viewer.layers.selection.active
         here = self.layers
         self._order = [_role(keywords) for _, keywords, _ in described]
+        self._remove_all_but(set(self._order))
         waiting = []
         for data, keywords, kind in described:
             layer = self._layers.get(_role(keywords))
-            if layer is not None and layer in here and kind_of(layer) == kind:
+            if layer is None or layer not in here:
+                waiting.append((data, keywords, kind))
+            elif kind_of(layer) == kind and _can_be_updated(layer, keywords):
                 _update(layer, data, keywords)
             else:
+                keywords = {**keywords, "visible": layer.visible}
+                self._viewer.layers.remove(layer)
                 waiting.append((data, keywords, kind))
         self._waiting = sorted(waiting, key=lambda layer: not layer[1].get("visible", True))
         if self._waiting:
             self._timer.start()
         else:
             self.complete.emit()
+
+    def take_over(self, earlier: ResultLayers) -> None:
+        """Show the next result in the layers of another one, which shows nothing any more."""
+        earlier._timer.stop()
+        self._layers, earlier._layers = earlier._layers, {}
+
+    def _remove_all_but(self, roles: set[str]) -> None:
+        for role, layer in list(self._layers.items()):
+            if role not in roles:
+                del self._layers[role]
+                if layer in self._viewer.layers:
+                    self._viewer.layers.remove(layer)
 
     def hide(self) -> None:
         """Switch them off."""
@@ -181,8 +207,67 @@ class ResultLayers(QObject):
         return next((layer for layer in layers if layer in self._viewer.layers), None)
 
 
+def keep_earlier_box() -> QCheckBox:
+    """A check box whether the next result leaves the last one of the same shot as it is."""
+    box = QCheckBox("Keep earlier results")
+    box.setToolTip(
+        "<qt>Add the next result to those of earlier runs. Else it replaces the last one of the "
+        "same shot.</qt>"
+    )
+    return box
+
+
+class LastResults:
+    """The last result of each shot, which the next one of the same shot replaces.
+
+    Parameters
+    ----------
+    viewer : napari.Viewer
+        Where they are shown.
+    parent : QObject
+        The widget that shows them.
+    """
+
+    def __init__(self, viewer: Any, parent: QObject) -> None:
+        self._viewer, self._parent = viewer, parent
+        self._last: list[tuple[Any, ResultLayers]] = []
+
+    def next_of(self, shot: Any, *, keep: bool) -> ResultLayers:
+        """Return what shows the next result of a shot.
+
+        Parameters
+        ----------
+        shot : object
+            What was inverted or estimated from, such as an image layer.
+        keep : bool
+            Whether the layers of its last result stay as they are.
+        """
+        results = ResultLayers(self._viewer, self._parent)
+        for known, last in self._last:
+            if known == shot and not keep:
+                results.take_over(last)
+        self._last = [(known, last) for known, last in self._last if known != shot]
+        self._last.append((shot, results))
+        return results
+
+
 def _role(keywords: dict[str, Any]) -> str:
     return str(role_of(keywords))
+
+
+def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:
+    """Whether nothing has to change that is easier to make anew."""
+    if kind_of(layer) not in ("image", "labels", "vectors"):
+        return False
+    now, upright = frame_of(layer), Frame()
+    rotate = np.asarray(keywords.get("rotate", upright.rotate))[-2:, -2:]
+    shear = np.ravel(keywords.get("shear", upright.shear))[-1]
+    affine = np.asarray(keywords.get("affine", upright.affine))[-3:, -3:]
+    return (
+        np.allclose(now.rotate, rotate)
+        and np.allclose(now.shear, shear)
+        and np.allclose(now.affine, affine)
+    )
 
 
 def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
@@ -198,6 +283,9 @@ def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
     limits = keywords.get("contrast_limits")
     if limits is not None and _differ(layer.contrast_limits, limits):
         layer.contrast_limits = limits
+    for name in ("features", "length", "edge_width"):
+        if name in keywords and kind_of(layer) == "vectors":
+            setattr(layer, name, keywords[name])
 
 
 def _differ(shown: Sequence[float], limits: Sequence[float]) -> bool:

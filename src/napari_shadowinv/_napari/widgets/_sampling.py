@@ -1,5 +1,6 @@
 """Values along a line across images, as plain arrays: no napari, no Qt.
 
+- points along a line: `along`; beside it, to average over: `abreast`
 - sample an image: `sampled`
 - several of them on one axis: `Profile`; as a table: `table_text`
 """
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Profile", "along", "sampled", "table_text"]
+__all__ = ["Profile", "abreast", "along", "sampled", "table_text"]
 
 Array = NDArray[np.float64]
 
@@ -33,11 +34,14 @@ class Profile:
         Unit of the values; empty if unknown.
     values : ndarray, shape (n,)
         NaN where the line is outside the image.
+    averaged : str
+        In words, what the values are averaged over; empty for those on the line alone.
     """
 
     name: str
     unit: str
     values: Array
+    averaged: str = ""
 
 
 def along(vertices: ArrayLike, step: float) -> tuple[Array, Array]:
@@ -63,13 +67,63 @@ def along(vertices: ArrayLike, step: float) -> tuple[Array, Array]:
     >>> distance
     array([0., 1., 2., 3., 4., 5.])
     """
-    corners = np.asarray(vertices, dtype=np.float64)
-    lengths = np.hypot(*np.diff(corners, axis=0).T)
-    reached = np.concatenate([[0.0], np.cumsum(lengths)])
+    corners, reached = _corners(vertices)
     count = min(int(np.ceil(reached[-1] / step - 1e-9)) + 1, _MOST_SAMPLES)
     distance = np.linspace(0, reached[-1], max(count, 2))
-    points = np.stack([np.interp(distance, reached, corners[:, axis]) for axis in (0, 1)], axis=1)
-    return points, distance
+    return _on_path(corners, reached, distance), distance
+
+
+def _corners(vertices: ArrayLike) -> tuple[Array, Array]:
+    """Corners of a path, no two of them in one place, and its length up to each."""
+    corners = np.asarray(vertices, dtype=np.float64)
+    lengths = np.hypot(*np.diff(corners, axis=0).T)
+    moves = np.concatenate([[True], lengths > 0])
+    if moves.sum() > 1:
+        corners, lengths = corners[moves], lengths[moves[1:]]
+    return corners, np.concatenate([[0.0], np.cumsum(lengths)])
+
+
+def _on_path(corners: Array, reached: Array, distance: Array) -> Array:
+    return np.stack([np.interp(distance, reached, corners[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def abreast(vertices: ArrayLike, distance: Array, width: float, step: float) -> Array:
+    """Points of a strip around a path, in rows at right angles to it.
+
+    Parameters
+    ----------
+    vertices : array_like, shape (k, 2)
+        Corners of the path.
+    distance : ndarray, shape (n,)
+        Where the rows are, as `along` returns it.
+    width : float
+        Width of the strip; with 0 each row is the point on the path alone.
+    step : float
+        Greatest distance of two points of a row.
+
+    Returns
+    -------
+    ndarray, shape (m, n, 2)
+        m points in the middles of equal parts of the width, at each of the n distances.
+
+    Examples
+    --------
+    >>> abreast([[0, 0], [0, 9]], np.array([4.0]), 3.0, 1.0)[:, 0]
+    array([[-1.,  4.],
+           [ 0.,  4.],
+           [ 1.,  4.]])
+    """
+    corners, reached = _corners(vertices)
+    points = _on_path(corners, reached, distance)
+    edges = np.diff(corners, axis=0)
+    edge = np.clip(np.searchsorted(reached, distance, side="right") - 1, 0, len(edges) - 1)
+    lengths = np.maximum(np.hypot(*edges.T), np.finfo(float).tiny)
+    along_y, along_x = (edges / lengths[:, None])[edge].T
+    across = np.stack([along_x, -along_y], axis=1)
+    count = min(max(int(np.ceil(width / step - 1e-9)), 1), _MOST_SAMPLES)
+    offsets = width * ((np.arange(count) + 0.5) / count - 0.5)
+    rows: Array = points + offsets[:, None, None] * across
+    return rows
 
 
 def sampled(image: ArrayLike, points: Array, to_pixels: Callable[[Array], Array]) -> Array:
@@ -79,8 +133,8 @@ def sampled(image: ArrayLike, points: Array, to_pixels: Callable[[Array], Array]
     ----------
     image : array_like, shape (H, W)
         The image.
-    points : ndarray, shape (n, 2)
-        Where, in the world.
+    points : ndarray, shape (n, 2) or (m, n, 2)
+        Where, in the world; over the m the values are averaged, without those outside.
     to_pixels : callable
         Brings points of the world to pixels of the image.
 
@@ -92,11 +146,13 @@ def sampled(image: ArrayLike, points: Array, to_pixels: Callable[[Array], Array]
     from scipy.ndimage import map_coordinates
 
     plane = np.asarray(image, dtype=np.float64)
-    pixels = to_pixels(points)
+    pixels = to_pixels(points.reshape(-1, 2))
     values = np.asarray(map_coordinates(plane, pixels.T, order=1, mode="nearest"))
     size = np.array(plane.shape)
     inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1)
-    return np.where(inside, values, np.nan)
+    rows = np.where(inside, values, 0.0).reshape(-1, points.shape[-2])
+    count = inside.reshape(rows.shape).sum(axis=0)
+    return np.where(count > 0, rows.sum(axis=0) / np.maximum(count, 1), np.nan)
 
 
 def table_text(distance: Array, unit: str, profiles: Sequence[Profile]) -> str:
@@ -124,7 +180,8 @@ def table_text(distance: Array, unit: str, profiles: Sequence[Profile]) -> str:
 
 
 def _heading(profile: Profile) -> str:
-    """Its name, with the unit if the name does not tell it."""
-    if not profile.unit or f"({profile.unit})" in profile.name:
-        return profile.name
-    return f"{profile.name} ({profile.unit})"
+    """Its name, with the unit if the name does not tell it, and what it is averaged over."""
+    name = profile.name
+    if profile.unit and f"({profile.unit})" not in name:
+        name = f"{name} ({profile.unit})"
+    return f"{name}, {profile.averaged}" if profile.averaged else name

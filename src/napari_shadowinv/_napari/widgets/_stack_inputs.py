@@ -14,6 +14,7 @@ from typing import Any
 
 from qtpy.QtWidgets import QFileDialog, QLineEdit, QSpinBox
 
+from napari_shadowinv._napari.marks import may_be_shot
 from napari_shadowinv._napari.widgets._base import PathEdit
 from napari_shadowinv._napari.widgets._forms import RowPicker, labelled
 from napari_shadowinv._napari.widgets._picking import LayerPicker
@@ -90,7 +91,7 @@ class ShotsPicker(RowPicker):
     """
 
     def __init__(self, viewer: Any) -> None:
-        self.layers = LayerPicker(viewer, ("image",))
+        self.layers = LayerPicker(viewer, ("image",), suits=may_be_shot)
         self.layers.setToolTip("Image layer (shot, y, x); one on a disk is read shot by shot.")
         self.files = _FilesEdit("Files of the shots", "shots/*.tif")
         self.files.edit.setToolTip(
@@ -110,6 +111,13 @@ class ShotsPicker(RowPicker):
     def layer(self) -> Any | None:
         """The chosen layer; None where files are chosen."""
         return self.layers.layer if self.picker.kind == _LAYER else None
+
+    @property
+    def name(self) -> str:
+        """What to call the shots."""
+        if self.picker.kind == _FILES:
+            return self.files.path
+        return "" if self.layer is None else str(self.layer.name)
 
     def shots(self) -> Any:
         """The chosen shots, as `napari_shadowinv.stack.run_stack` takes them.

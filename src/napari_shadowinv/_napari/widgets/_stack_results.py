@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QHeaderView
 
-from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.marks import KEY, role_of
+from napari_shadowinv._napari.widgets._origins import Origins
 from napari_shadowinv._napari.widgets._panels import ReportTable
 from napari_shadowinv._napari.widgets._picking import kind_of
 from napari_shadowinv._napari.widgets._results import result_frame
@@ -47,6 +48,8 @@ class StackRequest:
         What lies on it.
     place : dict
         Keywords that place the results.
+    origins : Origins
+        What the shots are inverted with.
     described : list of (data, keywords, layer type)
         Layers over the store, once it has a finished shot.
     """
@@ -55,6 +58,7 @@ class StackRequest:
     image: Any
     companions: tuple[Any, ...]
     place: dict[str, Any]
+    origins: Origins
     described: list[FullLayerData] = field(default_factory=list)
     # Written by the run's thread, so that the window only reads them.
     _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -120,6 +124,7 @@ class StackRequest:
         # What napari remembers of a pending shot would hide that it is done.
         more = {"cache": False, **self.place}
         for _, keywords, kind in layers:
+            keywords["metadata"][KEY]["made_from"] = self.origins.attributes()
             if kind == "image":
                 limits = keywords["contrast_limits"]
                 self._limits[str(role_of(keywords))] = limits

@@ -77,8 +77,8 @@ class StackJob:
         The undisturbed beam, of all shots or of each, or how to guess it for each.
     cleaning : Filter, optional
         What is done to the images first.
-    mask : ndarray of bool, shape (H, W), optional
-        True where a pixel is usable.
+    mask, source_mask : ndarray of bool, shape (H, W), optional
+        True where a pixel is usable, and where an estimate of the source may look.
     options, setup, scheduler, workers, overwrite, redo_failed
         See `napari_shadowinv.stack.run_stack`.
     books : RunBooks
@@ -97,6 +97,7 @@ class StackJob:
     overwrite: bool = False
     redo_failed: bool = False
     books: RunBooks = field(default_factory=RunBooks)
+    source_mask: Mask | None = None
 
     def run(
         self,
@@ -143,6 +144,7 @@ class StackJob:
             self.out,
             source=self.source,
             mask=self.mask,
+            source_mask=self.source_mask,
             filters=() if self.cleaning is None else (self.cleaning,),
             options=self.options,
             setup=self.setup,

@@ -6,7 +6,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.marks import mark, setup_of
+from napari_shadowinv._napari.marks import (
+    SOURCE,
+    mark,
+    may_be_shot,
+    setup_of,
+    setup_origin_of,
+)
 from napari_shadowinv._napari.widgets._base import Part
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._jobs import SourceJob
@@ -15,7 +21,11 @@ from napari_shadowinv._napari.widgets._masks import MaskPicker
 from napari_shadowinv._napari.widgets._panels import RunPanel
 from napari_shadowinv._napari.widgets._picking import LayerPicker, LayerWatch
 from napari_shadowinv._napari.widgets._reading import image_of
-from napari_shadowinv._napari.widgets._results import ResultLayers
+from napari_shadowinv._napari.widgets._results import (
+    LastResults,
+    ResultLayers,
+    keep_earlier_box,
+)
 from napari_shadowinv.progress import OnProgress, ShouldStop
 from napari_shadowinv.recipes import ESTIMATES
 
@@ -29,6 +39,7 @@ __all__ = ["EstimateSource"]
 class _Request:
     job: SourceJob
     image: Any
+    made_from: dict[str, str]
     preview: bool
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
@@ -51,7 +62,8 @@ class EstimateSource(LivePanel):
             RunPanel("Estimate source", "Estimate", "Make an image layer of the beam."),
         )
         self.previewed = ResultLayers(viewer, self)
-        self.image = LayerPicker(viewer, ("image",))
+        self._last = LastResults(viewer, self)
+        self.image = LayerPicker(viewer, ("image",), suits=may_be_shot)
         self.image.setToolTip("The shot: a grey image layer.")
         self.masks = MaskPicker(
             viewer,
@@ -62,11 +74,13 @@ class EstimateSource(LivePanel):
         self.method = ModelPicker("Method", kinds_of(ESTIMATES))
         self.method.set_kind("total_variation")
         self.live.setToolTip("The estimate follows every change.")
+        self.keep_earlier = keep_earlier_box()
         for row in (
             labelled("Image", self.image),
             self.masks,
             self.method,
             self.live,
+            self.keep_earlier,
             self.panel,
         ):
             self.column.addWidget(row)
@@ -89,11 +103,16 @@ class EstimateSource(LivePanel):
         return {"method": self.method, "painted_is_unusable": self.masks}
 
     def request(self, preview: bool = False) -> _Request:
-        layer = self.image.layer
+        layer: Any = self.image.layer
         image = image_of(layer)
         mask = self.masks.usable(layer)
-        estimate: Any = self.method.model()
-        return _Request(SourceJob(image, estimate, mask, quick=preview), layer, preview)
+        model: Any = self.method.model()
+        estimate = model.placed(setup_of(layer), image.shape)
+        made_from = {"image": layer.name, "estimate": estimate.described}
+        if mask is not None:
+            made_from["source_mask"] = self.masks.described(layer)
+        job = SourceJob(image, estimate, mask, quick=preview)
+        return _Request(job, layer, made_from, preview)
 
     def show_result(self, value: Any, request: _Request) -> None:
         layer, preview = request.image, request.preview
@@ -101,14 +120,22 @@ class EstimateSource(LivePanel):
             value,
             {
                 "name": f"{layer.name} source{' preview' if preview else ''}",
-                "metadata": mark("source", "", setup_of(layer)),
+                "metadata": mark(
+                    SOURCE,
+                    "",
+                    setup_of(layer),
+                    setup_origin=setup_origin_of(layer),
+                    made_from=request.made_from,
+                    source_mask=request.job.mask,
+                ),
                 "colormap": layer.colormap.name,
                 "contrast_limits": tuple(layer.contrast_limits),
                 **frame_of(layer).keywords(),
             },
             "image",
         )
-        shown = self.previewed if preview else ResultLayers(self.viewer, self)
+        shown = self.previewed
         if not preview:
             self.previewed.hide()
+            shown = self._last.next_of(layer, keep=self.keep_earlier.isChecked())
         shown.show([described], select=not preview)

@@ -7,23 +7,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.marks import Result, role_of
+from napari_shadowinv._napari.marks import KEY, SOURCE, Result, may_be_shot, role_of
 from napari_shadowinv._napari.widgets._base import Part, with_button
 from napari_shadowinv._napari.widgets._cleaning import CleaningSection
+from napari_shadowinv._napari.widgets._cost import cost_of
 from napari_shadowinv._napari.widgets._drawing import new_shapes
 from napari_shadowinv._napari.widgets._estimating import SourceCache
-from napari_shadowinv._napari.widgets._forms import labelled
+from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled, wrapping_label
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
 from napari_shadowinv._napari.widgets._live import LivePanel
 from napari_shadowinv._napari.widgets._masks import MaskPicker
 from napari_shadowinv._napari.widgets._messages import reporting, tell_warning
 from napari_shadowinv._napari.widgets._options import OptionsForm
+from napari_shadowinv._napari.widgets._origins import Origins
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, report_rows, section
 from napari_shadowinv._napari.widgets._picking import LayerPicker, LayerWatch
-from napari_shadowinv._napari.widgets._reading import crop_of, image_of
-from napari_shadowinv._napari.widgets._results import ResultLayers, place_together, result_frame
+from napari_shadowinv._napari.widgets._reading import crop_of, image_of, warnings_of
+from napari_shadowinv._napari.widgets._results import (
+    LastResults,
+    ResultLayers,
+    keep_earlier_box,
+    place_together,
+    result_frame,
+)
 from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._sources import SourcePicker
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.progress import OnProgress, ShouldStop
 
@@ -52,6 +61,7 @@ class _Request:
     companions: tuple[Any, ...]
     setup: Any
     frame: Frame
+    origins: Origins
     preview: bool
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> _Answer:
@@ -62,8 +72,14 @@ class _Request:
         name = f"{self.image.name} preview" if self.preview else self.image.name
         file = self.image.source.path
         told = {} if file is None else {"input_file": text_of(Path(file).name)}
-        result = Result(inversion, self.setup, {**told, **self.job.attributes()})
+        attributes = {**told, **self.job.attributes(), **self.origins.attributes()}
+        result = Result(inversion, self.setup, attributes)
         described = result_layers(result, self.frame, name)
+        bare = self.job.source_mask
+        for _, keywords, _ in described:
+            if role_of(keywords) == SOURCE and bare is not None:
+                part = bare if self.job.crop is None else bare[self.job.crop]
+                keywords["metadata"][KEY]["source_mask"] = part
         if self.preview:
             described = [layer for layer in described if role_of(layer[1]) in _PREVIEW_ROLES]
         return _Answer(inversion, described)
@@ -86,6 +102,7 @@ class InvertShot(LivePanel):
         )
         self._cache, self._estimates = PlanCache(), SourceCache()
         self.previewed = ResultLayers(viewer, self)
+        self._last = LastResults(viewer, self)
         self._build()
         self._connect()
         self.restore_last()
@@ -94,14 +111,23 @@ class InvertShot(LivePanel):
 
     def _build(self) -> None:
         viewer = self.viewer
-        self.image = LayerPicker(viewer, ("image",))
+        self.image = LayerPicker(viewer, ("image",), suits=may_be_shot)
         self.image.setToolTip("The shot: a grey image layer.")
         self.source = SourcePicker(viewer)
         self.masks = MaskPicker(
             viewer,
             lambda: self.image.layer,
             ("labels", "shapes"),
-            "Labels or shapes that mark pixels of the detector.",
+            "Labels or shapes that mark pixels of the detector. The inversion looks at no masked "
+            "pixel: what is to be found must not be under it.",
+        )
+        self.source_masks = MaskPicker(
+            viewer,
+            lambda: self.image.layer,
+            ("labels", "shapes"),
+            "Labels or shapes that hide the object from the estimate of the source, and from that "
+            "alone: the inversion sees it.",
+            "Source mask",
         )
         self.crop = LayerPicker(viewer, ("shapes",), none="none")
         self.crop.setToolTip("<qt>A rectangle in a shapes layer: only that part is inverted.</qt>")
@@ -111,11 +137,14 @@ class InvertShot(LivePanel):
         self.live.setToolTip(
             f"<qt>The field follows every change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
+        self.keep_earlier = keep_earlier_box()
+        self.cost, self._pace = wrapping_label(), 1.0
         self.report = ReportTable()
 
         for row in (
             labelled("Image", self.image),
             self.source,
+            self.source_masks,
             self.masks,
             labelled("Crop", with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)),
             self.setup,
@@ -123,16 +152,27 @@ class InvertShot(LivePanel):
         ):
             self.column.addWidget(row)
         self.column.addWidget(section("Options", self.options))
-        for widget in (self.live, self.panel, self.report):
+        for widget in (self.live, self.keep_earlier, self.cost, self.panel, self.report):
             self.column.addWidget(widget)
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
-        self._edits = LayerWatch((self.image, self.masks, self.crop, self.source.layers))
-        self._edits.setParent(self)
+        self._edits = LayerWatch(
+            (self.image, self.masks, self.source_masks, self.crop, self.source.layers)
+        )
+        self._new_image = LayerWatch((self.image,))
+        for watch in (self._edits, self._new_image):
+            watch.setParent(self)
+        self._new_image.edited.connect(self._forget_report)
+        # Also for a run that is cancelled, or refused before it starts.
+        for signal in (self.panel.button.clicked, self.panel.runner.started):
+            signal.connect(lambda: self.report.empty())
+        self.source.changed.connect(self._show_source_mask)
+        self._show_source_mask()
         for signal in (
             self.source.changed,
             self.masks.changed,
+            self.source_masks.changed,
             self.crop.picked,
             self._edits.edited,
             self.setup.changed,
@@ -150,29 +190,41 @@ class InvertShot(LivePanel):
             "cleaning": self.cleaning,
             "options": self.options,
             "painted_is_unusable": self.masks,
+            "painted_is_object": self.source_masks,
         }
 
     def request(self, preview: bool = False) -> _Request:
-        layer = self.image.layer
+        layer: Any = self.image.layer
         image = image_of(layer)
+        setup = self.setup.setup()
+        mask = self.masks.usable(layer)
+        self.source.check(mask)
         job = ShotJob(
             image=image,
             source=self.source.source(layer),
-            mask=self.masks.usable(layer),
+            mask=mask,
+            source_mask=self.source_masks.usable(layer) if self.source.is_guessed else None,
             crop=crop_of(self.crop.layer, layer),
             cleaning=self.cleaning.model(),
             options=self.options.model(),  # type: ignore[arg-type]
             cache=self._cache,
             estimates=self._estimates,
+            setup=setup,
+            warnings=warnings_of(layer),
         )
-        setup = self.setup.setup()
-        companions = (self.masks.layer, self.crop.layer, self.source.layers.layer)
+        companions = (
+            self.masks.layer,
+            self.source_masks.layer,
+            self.crop.layer,
+            self.source.layers.layer,
+        )
         return _Request(
             job.for_preview() if preview else job,
             layer,
             tuple(one for one in companions if one is not None and one is not layer),
             setup,
             result_frame(layer, setup, job.crop),
+            Origins.of(self, layer, layer.name),
             preview,
         )
 
@@ -190,19 +242,58 @@ class InvertShot(LivePanel):
             if not value.inversion.report.converged:
                 self.panel.say(f"Preview {value.inversion.report.warnings[0]}", problem=True)
             return
-        self.report.show_rows(report_rows(value.inversion))
+        self.report.show_rows([*request.origins.rows(), *report_rows(value.inversion)])
+        self._learn_pace(value.inversion)
         self.previewed.hide()
-        self.results = ResultLayers(self.viewer, self)
+        self.results = self._last.next_of(image, keep=self.keep_earlier.isChecked())
         self.results.show(value.described)
+
+    def on_change(self) -> None:
+        super().on_change()
+        self._tell_cost()
+
+    def _tell_cost(self) -> None:
+        """Say how long it will take, once the image is large."""
+        try:
+            shape = image_of(self.image.layer).shape
+            crop = crop_of(self.crop.layer, self.image.layer)
+            if crop is not None:
+                shape = tuple(part.stop - part.start for part in crop)
+            cost = cost_of(shape, self.options.model(), self._pace)  # type: ignore[arg-type]
+        except InputError:
+            self.cost.setVisible(False)  # Run tells what is wrong
+            return
+        self.cost.setText(cost.text)
+        self.cost.setStyleSheet(PROBLEM_STYLE if cost.is_too_much else "")
+        self.cost.setVisible(bool(cost.text))
+
+    def _learn_pace(self, inversion: Inversion) -> None:
+        seconds = inversion.report.seconds
+        forecast = cost_of(inversion.potential.shape, inversion.options).seconds
+        # The sites may have been there already, and small images tell little.
+        if forecast > 1 and seconds.get("sites", 0) > 0.1:
+            self._pace = sum(seconds.values()) / forecast
+            self._tell_cost()
 
     # Layers
 
     def _on_image(self) -> None:
         layer = self.image.layer
+        self.source.follow(layer)
+        self.setup.follow(layer)
         if layer is not None:
-            self.source.follow(layer)
-            self.setup.follow(layer)
+            self.masks.follow(layer)
+        self._forget_report()
         self.on_change()
+
+    def _forget_report(self) -> None:
+        """What was said of one image does not hold for another."""
+        self.report.empty()
+        if not self.panel.runner.running:
+            self.panel.say("")
+
+    def _show_source_mask(self) -> None:
+        self.source_masks.setVisible(self.source.is_guessed)
 
     @reporting
     def _draw_crop(self) -> None:

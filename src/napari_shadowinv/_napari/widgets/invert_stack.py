@@ -16,9 +16,10 @@ from napari_shadowinv._napari.widgets._base import Part, ToolPanel
 from napari_shadowinv._napari.widgets._cleaning import CleaningSection
 from napari_shadowinv._napari.widgets._forms import labelled
 from napari_shadowinv._napari.widgets._masks import MaskPicker
-from napari_shadowinv._napari.widgets._messages import reporting
+from napari_shadowinv._napari.widgets._messages import MISTAKES, reporting
 from napari_shadowinv._napari.widgets._options import OptionsForm
-from napari_shadowinv._napari.widgets._panels import RunPanel, section
+from napari_shadowinv._napari.widgets._origins import Origins
+from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, section
 from napari_shadowinv._napari.widgets._reading import stack_of
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._runner import Outcome
@@ -78,7 +79,16 @@ class InvertStack(ToolPanel):
             self.viewer,
             lambda: self.shots.layer,
             ("labels",),
-            "Labels that mark pixels of the detector, in all shots.",
+            "Labels that mark pixels of the detector, in all shots. The inversion looks at no "
+            "masked pixel: what is to be found must not be under it.",
+        )
+        self.source_masks = MaskPicker(
+            self.viewer,
+            lambda: self.shots.layer,
+            ("labels",),
+            "Labels that hide the object from the estimates of the sources, and from those alone: "
+            "the inversion sees it.",
+            "Source mask",
         )
         self.setup = SetupPicker()
         self.cleaning = CleaningSection()
@@ -89,12 +99,14 @@ class InvertStack(ToolPanel):
         self.redo_failed = QCheckBox("redo failed shots")
         self.redo_failed.setToolTip("<qt>Try shots again that failed in an earlier run.</qt>")
         self.engine = EnginePicker()
+        self.report = ReportTable()
         self.failures_title = QLabel("Failed shots")
         self.failures_title.setVisible(False)
         self.failures = FailureTable()
         for row in (
             self.shots,
             self.source,
+            self.source_masks,
             self.masks,
             self.setup,
             self.cleaning,
@@ -104,6 +116,7 @@ class InvertStack(ToolPanel):
             labelled("", self.redo_failed),
             self.engine,
             self.panel,
+            self.report,
             self.failures_title,
             self.failures,
         ):
@@ -118,8 +131,11 @@ class InvertStack(ToolPanel):
             self.options.changed,
             self.engine.changed,
             self.masks.changed,
+            self.source_masks.changed,
         ):
             signal.connect(self.keep)
+        self.source.changed.connect(self._show_source_mask)
+        self._show_source_mask()
         self.panel.button.clicked.connect(lambda: self._run_or_cancel())
         self.panel.runner.progressed.connect(self._on_progress)
         self.panel.runner.ended.connect(self._on_end)
@@ -134,6 +150,7 @@ class InvertStack(ToolPanel):
             "options": self.options,
             "engine": self.engine,
             "painted_is_unusable": self.masks,
+            "painted_is_object": self.source_masks,
         }
 
     def request(self) -> StackRequest:
@@ -147,11 +164,14 @@ class InvertStack(ToolPanel):
         layer = self.shots.layer
         setup = self.setup.setup()
         scheduler, workers = self.engine.engine()
+        mask = self.masks.usable(layer)
+        self.source.check(mask)
         job = StackJob(
             shots=self.shots.shots(),
             out=self.store.store,
             source=self._source(layer),
-            mask=self.masks.usable(layer),
+            mask=mask,
+            source_mask=self.source_masks.usable(layer) if self.source.is_guessed else None,
             cleaning=self.cleaning.model(),
             options=self.options.model(),  # type: ignore[arg-type]
             setup=setup,
@@ -160,12 +180,13 @@ class InvertStack(ToolPanel):
             overwrite=self.overwrite.isChecked(),
             redo_failed=self.redo_failed.isChecked(),
         )
-        companions = (self.masks.layer, self.source.layers.layer)
+        companions = (self.masks.layer, self.source_masks.layer, self.source.layers.layer)
         return StackRequest(
             job,
             layer,
             tuple(one for one in companions if one is not None and one is not layer),
             {} if layer is None else place_on(layer, setup),
+            Origins.of(self, layer, self.shots.name),
         )
 
     def _source(self, layer: Any) -> ArrayLike:
@@ -177,13 +198,16 @@ class InvertStack(ToolPanel):
 
     # A run
 
-    @reporting
     def _run_or_cancel(self) -> None:
         if self.panel.runner.running:
             self.panel.cancel()
             return
-        self._running, self._heard = self.request(), 0
-        self._show_failures([])
+        self._forget()
+        try:
+            self._running, self._heard = self.request(), 0
+        except MISTAKES as error:
+            self.panel.refuse(error)
+            return
         self.panel.run(self._running.run, self._running)
 
     def _on_progress(self, news: Progress) -> None:
@@ -236,6 +260,12 @@ class InvertStack(ToolPanel):
         if self._read_arrows is not None:
             self._read_arrows()
 
+    def _forget(self) -> None:
+        """What was said of one run does not hold for another."""
+        self.report.empty()
+        self._show_failures([])
+        self.panel.say("")
+
     def _show_failures(self, failures: list[tuple[str, str]]) -> None:
         self.failures.show_failures(failures)
         self.failures_title.setVisible(bool(failures))
@@ -248,6 +278,7 @@ class InvertStack(ToolPanel):
         if not books.total:
             return
         self._show(request)
+        self.report.show_rows(request.origins.rows())
         if outcome.cancelled:
             self.panel.say(f"Cancelled: {books.text}; Run goes on from there.")
         else:
@@ -258,7 +289,11 @@ class InvertStack(ToolPanel):
 
     def _on_layer(self) -> None:
         layer = self.shots.layer
-        if layer is not None:
-            self.source.follow(layer)
-            self.setup.follow(layer)
+        self.source.follow(layer)
+        self.setup.follow(layer, "" if layer is not None else self.shots.name)
+        if not self.panel.runner.running:
+            self._forget()
         self.keep()
+
+    def _show_source_mask(self) -> None:
+        self.source_masks.setVisible(self.source.is_guessed)

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from qtpy.QtCore import QSize, Qt, QTimer
+from qtpy.QtCore import QSignalBlocker, QSize, Qt, QTimer
 from qtpy.QtWidgets import (
+    QDoubleSpinBox,
     QFileDialog,
+    QHBoxLayout,
     QListWidget,
     QListWidgetItem,
     QPushButton,
@@ -20,13 +22,22 @@ from qtpy.QtWidgets import (
 
 from napari_shadowinv._napari.marks import role_of, unit_of
 from napari_shadowinv._napari.widgets._base import with_button
+from napari_shadowinv._napari.widgets._docking import Docked
 from napari_shadowinv._napari.widgets._drawing import new_shapes
-from napari_shadowinv._napari.widgets._forms import labelled, wrapping_label
+from napari_shadowinv._napari.widgets._fields import SteadyComboBox
+from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled, wrapping_label
 from napari_shadowinv._napari.widgets._lifetime import while_alive
 from napari_shadowinv._napari.widgets._messages import reporting, tell_info
 from napari_shadowinv._napari.widgets._picking import LayerPicker, kind_of
 from napari_shadowinv._napari.widgets._plotting import ProfilePlot
-from napari_shadowinv._napari.widgets._sampling import Profile, along, sampled, table_text
+from napari_shadowinv._napari.widgets._reading import shown_plane
+from napari_shadowinv._napari.widgets._sampling import (
+    Profile,
+    abreast,
+    along,
+    sampled,
+    table_text,
+)
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,9 +48,11 @@ __all__ = ["LineProfile"]
 _FOLLOW = 40  # ms between two drawings while the line moves
 _LAYER_ROLE = Qt.ItemDataRole.UserRole
 _STRAIGHT = ("line", "path")
+_PIXELS = "px"
+_WIDEST = 1e6
 
 
-class LineProfile(QWidget):
+class LineProfile(Docked):
     """Draw a line; see the values of the checked layers along it, in their units.
 
     Parameters
@@ -62,8 +75,21 @@ class LineProfile(QWidget):
         self.layers.setToolTip("Layers to read.")
         self.layers.setMaximumHeight(110)
         self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.width_edit = QDoubleSpinBox()
+        self.width_edit.setRange(0.0, _WIDEST)
+        self.width_edit.setDecimals(2)
+        self.width_edit.setSpecialValueText("0: the line alone")
+        self.width_edit.setKeyboardTracking(False)
+        self.width_unit = SteadyComboBox()
+        self.width_unit.addItem(_PIXELS)
+        for widget in (self.width_edit, self.width_unit):
+            widget.setToolTip(
+                "<qt>Width of the strip around the line, at right angles to it, over which the "
+                "values are averaged.</qt>"
+            )
         self.plot = ProfilePlot()
         self.hint = wrapping_label("Press ✎ and draw a line on the image.")
+        self.problem = wrapping_label(style=PROBLEM_STYLE)
         self.export = QPushButton("Export CSV…")
         self.export.setToolTip("Write what is shown as a table.")
         column = QVBoxLayout(self)
@@ -71,10 +97,16 @@ class LineProfile(QWidget):
         column.addWidget(
             labelled("Line", with_button(self.lines, "✎", "Draw a new line.", self._draw))
         )
-        for widget in (self.layers, self.hint):
+        width = QWidget()
+        row = QHBoxLayout(width)
+        row.setContentsMargins(0, 0, 0, 0)
+        row.addWidget(self.width_edit, 2)
+        row.addWidget(self.width_unit, 1)
+        for widget in (self.layers, labelled("Width", width), self.hint):
             column.addWidget(widget)
         column.addWidget(self.plot, 1)
-        column.addWidget(self.export)
+        for widget in (self.export, self.problem):
+            column.addWidget(widget)
         self.setMinimumWidth(330)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
         self._connect()
@@ -95,6 +127,8 @@ class LineProfile(QWidget):
         while_alive(self, self.viewer.dims.events.current_step, self._soon)
         self.lines.picked.connect(self._soon)
         self.layers.itemChanged.connect(lambda _: self._soon())
+        self.width_edit.valueChanged.connect(lambda _: self._soon())
+        self.width_unit.currentIndexChanged.connect(lambda _: self._soon())
         self.export.clicked.connect(lambda: self._export())
 
     def checked(self) -> list[Any]:
@@ -118,19 +152,48 @@ class LineProfile(QWidget):
         self.profiles = []
         if vertices is not None and layers:
             step = min(float(np.min(np.abs(layer.scale[-2:]))) for layer in layers)
-            points, self._distance = along(vertices, step)
+            _, self._distance = along(vertices, step)
             self._unit = f"{layers[0].units[-1]:~P}"
+            self._offer_width_in(self._unit)
+            width, averaged = self._width(step)
+            points = abreast(vertices, self._distance, width, step)
             now = self.viewer.dims.point
             self.profiles = [
                 Profile(
                     layer.name,
                     unit_of(layer),
-                    sampled(_plane(layer, now), points, _mapper(layer)),
+                    sampled(shown_plane(layer, now), points, _mapper(layer)),
+                    averaged,
                 )
                 for layer in layers
             ]
+            self.problem.setVisible(False)
         self.hint.setVisible(not self.profiles)
         self.plot.show_profiles(self._distance, self._unit, self.profiles)
+
+    def show_problem(self, text: str) -> None:
+        """Show what is wrong, where it can be read until there is another profile."""
+        self.problem.setText(text)
+        self.problem.setVisible(True)
+
+    def _offer_width_in(self, unit: str) -> None:
+        """Let the width be told in pixels or in the unit of the world."""
+        units = [_PIXELS] + ([] if unit in ("pixel", "pixels", _PIXELS) else [unit])
+        if units == [self.width_unit.itemText(n) for n in range(self.width_unit.count())]:
+            return
+        chosen = max(self.width_unit.currentIndex(), 0)
+        with QSignalBlocker(self.width_unit):
+            self.width_unit.clear()
+            self.width_unit.addItems(units)
+            self.width_unit.setCurrentIndex(min(chosen, len(units) - 1))
+
+    def _width(self, pixel: float) -> tuple[float, str]:
+        """Width of the strip in the unit of the world, and in words."""
+        number, unit = self.width_edit.value(), self.width_unit.currentText()
+        if not number:
+            return 0.0, ""
+        width = number * pixel if unit == _PIXELS else number
+        return width, f"mean over {number:g} {unit}"
 
     def table(self) -> str:
         """What is shown, as comma-separated values.
@@ -219,15 +282,12 @@ class LineProfile(QWidget):
         tell_info(f"Wrote {path}")
 
 
-def _plane(layer: Any, point: Any) -> Any:
-    """The plane of an image that is shown now."""
-    data = layer.data[0] if getattr(layer, "multiscale", False) else layer.data
-    if data.ndim == 2:
-        return data
-    at = np.round(layer.world_to_data(point[-layer.ndim :])[:-2]).astype(int)
-    return data[tuple(np.clip(at, 0, np.array(data.shape[:-2]) - 1))]
-
-
 def _mapper(layer: Any) -> Callable[[Any], Any]:
-    scale, translate = np.asarray(layer.scale[-2:]), np.asarray(layer.translate[-2:])
-    return lambda points: (points - translate) / scale
+    """What brings points of the world to pixels of a layer, also of one that was turned."""
+    leading = np.zeros(layer.ndim - 2)
+    origin, one_down, one_right = (
+        np.asarray(layer.data_to_world((*leading, *pixel))[-2:])
+        for pixel in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+    )
+    to_pixels = np.linalg.inv(np.stack([one_down - origin, one_right - origin], axis=1))
+    return lambda points: (points - origin) @ to_pixels.T

@@ -1,7 +1,7 @@
 """The experiment's geometry and probe, and what they make of a displacement.
 
 - describe an experiment: `ProtonSetup`, `OpticalSetup`; either of them: `Setup`
-- get it back from a file's content: `setup_from_dict`
+- get it back from a file's content: `setup_from_dict`; with larger pixels: `binned_setup`
 - convert pixels to SI and back: `BeamSetup.deflection_angle`, `BeamSetup.displacement`,
   `BeamSetup.potential`, `BeamSetup.normalized_potential`
 - from a potential in SI to a displacement in pixels: `BeamSetup.displacement_from_potential`
@@ -54,6 +54,7 @@ __all__ = [
     "ProtonSetup",
     "Setup",
     "Species",
+    "binned_setup",
     "setup_from_dict",
 ]
 
@@ -64,6 +65,11 @@ _KINDS: dict[str, type[ProtonSetup | OpticalSetup]] = {
     "optical": OpticalSetup,
 }
 
+_EXPECTED = (
+    "it must be 'proton' (any charged particles, named by 'species': "
+    f"{', '.join(SPECIES)}) or 'optical'"
+)
+
 
 def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> ProtonSetup | OpticalSetup:
     """Make the right setup from what a file holds.
@@ -71,7 +77,8 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> ProtonS
     Parameters
     ----------
     mapping : mapping of str to object
-        The fields, with ``kind`` "proton" or "optical".
+        The fields, with ``kind`` "proton" (and a ``species``, for electrons or other ions) or
+        "optical".
     where : str, optional
         Where the mapping comes from; an error's message begins with it.
 
@@ -101,9 +108,37 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> ProtonS
         raise InputError(f"{where}: received a {type(mapping).__name__}, expected keys with values")
     kind = mapping.get("kind")
     if kind is None:
-        raise InputError(f"{where}: 'kind' is missing, it must be 'proton' or 'optical'")
+        raise InputError(f"{where}: 'kind' is missing, {_EXPECTED}")
     if not isinstance(kind, str) or kind not in _KINDS:
-        match = nearest(str(kind), list(_KINDS))
-        hint = f", did you mean '{match}'?" if match else ""
-        raise InputError(f"{where}: 'kind' is {kind!r}, it must be 'proton' or 'optical'{hint}")
+        raise InputError(f"{where}: 'kind' is {kind!r}, {_EXPECTED}{_meant(str(kind))}")
     return validated(_KINDS[kind], mapping, where)
+
+
+def binned_setup(setup: ProtonSetup | OpticalSetup, factor: int) -> ProtonSetup | OpticalSetup:
+    """Return the setup of an image whose pixels were summed in blocks.
+
+    Parameters
+    ----------
+    setup : ProtonSetup or OpticalSetup
+        Setup of the image as measured.
+    factor : int
+        Side of a block in pixels.
+
+    Returns
+    -------
+    ProtonSetup or OpticalSetup
+        The same with a pixel that is `factor` times as wide.
+    """
+    values = setup.model_dump()
+    for name in ("pixel_size", "detector_pixel_size"):
+        if values.get(name) is not None:
+            values[name] *= factor
+    return type(setup)(**values)
+
+
+def _meant(kind: str) -> str:
+    """What somebody may have meant who named another kind."""
+    match = nearest(kind.lower(), list(dict.fromkeys([*_KINDS, *SPECIES])))
+    if match is None or match in _KINDS:
+        return f"; did you mean '{match}'?" if match else ""
+    return f'; for this beam give kind = "proton" and species = "{match}"'

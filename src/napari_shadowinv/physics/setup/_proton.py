@@ -90,7 +90,9 @@ class ProtonSetup(BeamSetup):
         description="Kinetic energy of a particle (all its nucleons together), in MeV.",
     )
     species: Species = Field(
-        default="proton", title="Species", description="Kind of the beam's particles."
+        default="proton",
+        title="Species",
+        description="Kind of the beam's particles; electrons bend the other way.",
     )
 
     @property

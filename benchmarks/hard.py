@@ -1,0 +1,135 @@
+"""Images with jumps, from one bright pixel to isolated usable ones: one table, as Markdown.
+
+    python benchmarks/hard.py [--n-sites 40000] [--only disc ring]
+
+Images of 200×200 px with the default options and one thread, after a warm-up. Times are processor
+time, as multiples of that of the smooth lens in the first row.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv import Inversion, InversionOptions, invert, synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from reference import DATA, toroid_case
+
+SIDE = 200
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Hard:
+    """An image with what goes with it into `invert`."""
+
+    name: str
+    image: FloatArray
+    source: FloatArray | None = None
+    mask: NDArray[np.bool_] | None = None
+    changes: dict[str, Any] = field(default_factory=dict)
+
+
+def lens() -> Hard:
+    """A smooth focusing lens: an ordinary image."""
+    blob = gaussian_blob((SIDE, SIDE), -250.0, 25.0)
+    return Hard("ordinary: a smooth lens", synthetic_image(blob.displacement))
+
+
+def toroids() -> list[Hard]:
+    """The reference toroids, where they are."""
+    if not (DATA / "toroid").is_dir():
+        return []
+    return [
+        Hard(f"ordinary: {case.name}", case.image, changes={"negative": "clip"})
+        for case in (toroid_case(97), toroid_case(194, noise=True))
+    ]
+
+
+def hard_images() -> list[Hard]:
+    y, x = np.indices((SIDE, SIDE), dtype=np.float64)
+    rng = np.random.default_rng(5)
+
+    def near(row: float, column: float, radius: float) -> FloatArray:
+        return (np.hypot(y - row, x - column) < radius).astype(np.float64)
+
+    middle = (SIDE - 1) / 2
+    pixel = np.zeros((SIDE, SIDE))
+    pixel[SIDE // 2, SIDE // 2] = 1
+    step = np.where(x < middle, 1e-6, 1.0)
+    disc = near(middle, middle, 50)
+    ring = near(middle, middle, 70) - near(middle, middle, 50)
+    corner = np.zeros((SIDE, SIDE))
+    corner[:20, :20] = 1
+    lines = np.ones((SIDE, SIDE))
+    lines[::20] = 100
+    line = np.zeros((SIDE, SIDE))
+    line[SIDE // 2] = 1
+    left, right = near(middle, 50, 24), near(middle, 150, 24)
+    salt = np.ones((SIDE, SIDE))
+    salt.ravel()[rng.choice(SIDE**2, SIDE**2 // 100, replace=False)] = 1e4
+    blob = 1 + 1.5 * np.exp(-((y - middle) ** 2 + (x - middle) ** 2) / (2 * 15**2))
+    free = {"boundary": "free"}
+    return [
+        Hard("one bright pixel", pixel),
+        Hard("step of 1,000,000:1", step),
+        Hard("step reversed", step, step[:, ::-1]),
+        Hard("disc", disc),
+        Hard("ring", ring),
+        Hard("all flux in one corner", corner),
+        Hard("bright lines", lines),
+        Hard("a single line", line),
+        Hard("swapped islands", left, right),
+        Hard("two discs", left + right),
+        Hard("salt of 10,000:1", salt),
+        Hard("isolated usable pixels", blob, mask=rng.random((SIDE, SIDE)) < 0.02),
+        Hard("free boundary: disc", disc, changes=free),
+        Hard("free boundary: corner", corner, changes=free),
+    ]
+
+
+def inverted(hard: Hard, n_sites: int) -> tuple[Inversion, float]:
+    """Invert on one thread, and the seconds of processor time that took."""
+    options = InversionOptions(n_sites=n_sites, threads=1, **hard.changes)
+    start = time.process_time()
+    inversion = invert(hard.image, source=hard.source, mask=hard.mask, options=options)
+    return inversion, time.process_time() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--n-sites", type=int, default=SIDE**2)
+    parser.add_argument("--only", nargs="+", default=[""], help="words in the names of images")
+    arguments = parser.parse_args()
+    ordinary, *all_hard = lens(), *hard_images()
+    free_lens = Hard("", ordinary.image, changes={"boundary": "free"})
+    for warm_up in (ordinary, free_lens, all_hard[3]):
+        inverted(warm_up, 2000)
+    unit = min(inverted(ordinary, arguments.n_sites)[1] for _ in range(3))
+    chosen = [
+        case
+        for case in (*toroids(), *all_hard)
+        if any(word in case.name for word in arguments.only)
+    ]
+    print(f"One unit of time is {unit:.2f} s.\n")
+    print("| image | converged | steps | flux residual | times | what is said |")
+    print("|---|---|---|---|---|---|", flush=True)
+    for case in (ordinary, *chosen):
+        inversion, seconds = inverted(case, arguments.n_sites)
+        report = inversion.report
+        said = [text.split("; ", 1)[1] for text in report.warnings if "not converged" in text]
+        print(
+            f"| {case.name} | {'yes' if report.converged else 'no'} | {report.iterations} "
+            f"| {report.residual:.2g} | {seconds / unit:.1f} | {' '.join(said)} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""The files of a Zarr store, each looked at before it is opened: `CheckedStore`.
+
+Zarr opens whatever has the right name and asks for as much memory as the first bytes of a chunk
+name. So a pipe behind a link would block it for ever, and four damaged bytes ask for gigabytes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from zarr.abc.store import ByteRequest
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import LocalStore
+
+from napari_shadowinv.io.promises import check_promise
+from napari_shadowinv.safety import check_regular, check_size, small_text
+
+__all__ = ["CheckedStore"]
+
+_METADATA = "zarr.json"
+_CHUNKS = "/c/"
+# Where the formats of chunks keep the number of texts, and of unpacked bytes.
+_TEXTS, _BLOSC = "vlen-utf8", "blosc"
+
+
+class _Chunk(NamedTuple):
+    """What each chunk of an array unfolds to."""
+
+    values: int
+    value_bytes: int
+    codecs: tuple[str, ...]
+
+
+class CheckedStore(LocalStore):
+    """A folder that is only read, and never more of it than is there.
+
+    Parameters
+    ----------
+    root : Path
+        The folder.
+    read_only : bool
+        As Zarr asks for it; it is true all the same.
+    """
+
+    def __init__(self, root: Path, *, read_only: bool = True) -> None:
+        super().__init__(root, read_only=True)
+        self._chunks: dict[str, _Chunk] = {}
+        # Tells what is read now from what was read before the store grew, where dask keeps either.
+        self._opened = time.time_ns()
+
+    async def get(
+        self,
+        key: str,
+        prototype: BufferPrototype | None = None,
+        byte_range: ByteRequest | None = None,
+    ) -> Buffer | None:
+        self._check(key)
+        return await super().get(key, prototype, byte_range)
+
+    def get_sync(
+        self,
+        key: str,
+        *,
+        prototype: BufferPrototype | None = None,
+        byte_range: ByteRequest | None = None,
+    ) -> Buffer | None:
+        self._check(key)
+        return super().get_sync(key, prototype=prototype, byte_range=byte_range)
+
+    async def get_partial_values(
+        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+    ) -> list[Buffer | None]:
+        wanted = list(key_ranges)
+        for key, _ in wanted:
+            self._check(key)
+        return await super().get_partial_values(prototype, wanted)
+
+    def _check(self, key: str) -> None:
+        path = self.root / key
+        if path.is_dir() or not path.exists():
+            return
+        check_regular(path, "a file of the store")
+        name, is_chunk, _ = key.partition(_CHUNKS)
+        if path.name == _METADATA:
+            small_text(path, "metadata of the store")
+        elif is_chunk:
+            self._check_chunk(path, name)
+        else:
+            check_size(path, path.stat().st_size)
+
+    def _metadata(self, name: str) -> dict[str, Any]:
+        """What is told of an array: the folder's own copy counts, where there is one."""
+        whole = _json(self.root / _METADATA).get("consolidated_metadata") or {"metadata": {}}
+        return whole["metadata"].get(name) or _json(self.root / name / _METADATA)
+
+    def _check_chunk(self, path: Path, name: str) -> None:
+        if name not in self._chunks:
+            self._chunks[name] = _chunk_of(self._metadata(name))
+        chunk = self._chunks[name]
+        size = chunk.values * chunk.value_bytes
+        check_size(path, max(size, path.stat().st_size))
+        with path.open("rb") as file:
+            head = np.frombuffer(file.read(8).ljust(8, b"\0"), "<u4")
+        if _TEXTS in chunk.codecs:
+            check_promise(path, "chunk's", int(head[0]), chunk.values)
+        elif _BLOSC in chunk.codecs:
+            check_promise(path, "chunk's", int(head[1]), size)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    return dict(json.loads(small_text(path, "metadata of the store")))
+
+
+def _chunk_of(content: dict[str, Any]) -> _Chunk:
+    shape = content["chunk_grid"]["configuration"]["chunk_shape"]
+    kind = content["data_type"]
+    if isinstance(kind, dict):
+        width = int(kind["configuration"].get("length_bytes", 8))
+    else:
+        width = 8 if kind == "string" else np.dtype(kind).itemsize
+    return _Chunk(math.prod(shape), width, tuple(codec["name"] for codec in content["codecs"]))

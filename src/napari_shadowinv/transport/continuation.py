@@ -1,0 +1,222 @@
+"""From a blurred image to the sharp one.
+
+Damped Newton steps from zero weights fail where the image jumps: between bright and dark a
+cell's flux is no smooth function of the weights, and cells in the dark must be kept from
+emptying. Blur the image enough and they succeed; and the weights depend almost linearly on the
+width of the blur, so the line through two solutions is a start for the next, narrower one.
+
+- solve one level for any image: `sharpen`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dctn, idctn
+
+from napari_shadowinv.progress import Reporter
+from napari_shadowinv.transport.newton import SHORTEST_STEP, newton, with_full_cells
+from napari_shadowinv.transport.objective import Solution, TransportObjective
+from napari_shadowinv.transport.sites import Level
+
+__all__ = ["blurred", "sharpen"]
+
+Array = NDArray[np.float64]
+Pose = Callable[[float], TransportObjective]
+
+_WIDEST = 1 / 6  # of the image's longer side
+_SHARP_ENOUGH = 0.5  # in site spacings: from there the sharp image is tried
+_SHARPER = 4.0  # times less blur before the sharp image is tried again
+_NARROWEST = 0.01  # px
+_CLOSEST = 1.02  # ratio of two widths
+_PATH_TOLERANCE = 0.3  # a blurred image's solution only has to start the next
+_SHORTEST_STEP = 1e-2
+_SHARES_OF_PREDICTION = (1.0, 0.5, 0.25)
+_LEAST_OF_PREDICTION = 1e-2  # of the smallest cell's flux before it
+
+
+def blurred(image: Array, width: float) -> Array:
+    """Let an image's flux diffuse, mirrored at the border.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W)
+        Positive.
+    width : float
+        Standard deviation in px.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+        Positive, with the same sum: the kernel is the discrete Gaussian, which solves the
+        diffusion equation on the pixels, and has no negative lobes at any width.
+
+    References
+    ----------
+    T. Lindeberg, IEEE Trans. Pattern Anal. Mach. Intell. 12, 234 (1990).
+    """
+    spectrum = dctn(image)
+    for axis in (0, 1):
+        waves = np.pi * np.arange(image.shape[axis]) / image.shape[axis]
+        damping = np.exp(-(width**2) * (1 - np.cos(waves)))
+        spectrum *= np.expand_dims(damping, 1 - axis)
+    diffused: Array = np.maximum(idctn(spectrum), image.min())
+    diffused *= image.sum() / diffused.sum()
+    return diffused
+
+
+def sharpen(
+    level: Level,
+    pose: Pose,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    report: Reporter | None = None,
+) -> Solution:
+    """Solve one level from zero weights by following the solution from a blurred image.
+
+    Parameters
+    ----------
+    level : Level
+        The sites.
+    pose : callable
+        Makes the objective for an image blurred by so many px.
+    tolerance : float
+        Largest relative flux error allowed in any cell.
+    max_iterations : int
+        Most Newton steps, on all blurred images together.
+    report : Reporter, optional
+        Told of each step.
+
+    Returns
+    -------
+    Solution
+        Where the sharp image could not be reached, that of the sharpest one that was; the
+        reason then tells its blur. Where the sharp image was nearly solved, that solution.
+    """
+    solved: list[_Solved] = []
+    nearest: Solution | None = None
+    width: float | None = _WIDEST * max(level.shape)
+    sharp_below = _SHARP_ENOUGH * level.spacing
+    steps = 0
+    while width is not None and steps < max_iterations:
+        objective = pose(width)
+        for start in _starts(objective, level, width, solved):
+            solution = newton(
+                objective,
+                start,
+                tolerance=_PATH_TOLERANCE if width else tolerance,
+                max_iterations=max_iterations - steps,
+                shortest_step=_SHORTEST_STEP if width else SHORTEST_STEP,
+                report=report,
+            )
+            steps += solution.iterations
+            if not width and (nearest is None or solution.residual < nearest.residual):
+                nearest = solution
+            if solution.converged or steps >= max_iterations:
+                break
+        if solution.converged and not width:
+            return replace(solution, iterations=steps)
+        if solution.converged:
+            solved.append(_Solved(width, solution.weights))
+        if solved and not width:
+            sharp_below = solved[-1].width / _SHARPER
+        width = _next_width(width, solved, level, sharp_below, converged=solution.converged)
+    answer = _blurred_answer(pose(0.0), solved, level, tolerance)
+    used_up = f"the solver used all {max_iterations} iterations allowed"
+    if nearest is not None and nearest.residual < min(answer.residual, _PATH_TOLERANCE):
+        reason = used_up if steps >= max_iterations else nearest.reason
+        return replace(nearest, iterations=steps, reason=reason)
+    reason = f"{used_up}; {answer.reason}" if steps >= max_iterations else answer.reason
+    return replace(answer, iterations=steps, reason=reason)
+
+
+class _Solved(NamedTuple):
+    """A blur in px and the weights that solve the image with it."""
+
+    width: float
+    weights: Array
+
+
+def _next_width(
+    width: float, solved: list[_Solved], level: Level, sharp_below: float, *, converged: bool
+) -> float | None:
+    """Return the blur to try after this one, None where there is no more to try."""
+    if converged:
+        return width / 2 if width >= 2 * sharp_below else 0.0
+    if not solved:
+        return 2 * width if width < max(level.shape) else None
+    before = solved[-1].width
+    width = np.sqrt(width * before) if width else before / 2
+    return float(width) if _NARROWEST < width < before / _CLOSEST else None
+
+
+def _starts(
+    objective: TransportObjective, level: Level, width: float, solved: list[_Solved]
+) -> Iterator[Array]:
+    """Yield the weights to start from, the most promising first."""
+    if not solved:
+        yield np.zeros(len(level.sites))
+        yield with_full_cells(objective, _same_moments(level, objective.image.image))
+        return
+    last = solved[-1]
+    if len(solved) > 1:
+        least = _LEAST_OF_PREDICTION * float(objective.diagram(last.weights).masses.min())
+        slope = (last.weights - solved[-2].weights) / (last.width - solved[-2].width)
+        for share in _SHARES_OF_PREDICTION if len(solved) > 2 else _SHARES_OF_PREDICTION[1:]:
+            predicted = last.weights + share * (width - last.width) * slope
+            diagram = objective.diagram_if_full(predicted)
+            if diagram is not None and diagram.masses.min() > least:
+                yield predicted
+                break
+    yield last.weights
+
+
+def _same_moments(level: Level, image: Array) -> Array:
+    """Return the weights of the affine map that gives the source the image's first two moments."""
+    pixels = np.indices(image.shape).reshape(2, -1).T.astype(np.float64)
+    centre, spread = _moments(level.sites, level.mass)
+    image_centre, image_spread = _moments(pixels, image.ravel())
+    root = _square_root(spread)
+    inverse = np.linalg.inv(root)
+    matrix = inverse @ _square_root(root @ image_spread @ root) @ inverse
+    away = level.sites - centre
+    # d = -∇φ with φ half the weight; no BLAS, whose idle threads spin
+    stretch = np.einsum("ni,ij,nj->n", away, np.eye(2) - matrix, away)
+    return np.asarray(stretch - 2 * (away * (image_centre - centre)).sum(axis=1))
+
+
+def _moments(points: Array, flux: Array) -> tuple[Array, Array]:
+    """Return the centre of flux and the covariance, that of a pixel included."""
+    share = (flux / flux.sum())[:, None]
+    centre = (share * points).sum(axis=0)
+    away = points - centre
+    return centre, np.einsum("ni,nj->ij", share * away, away) + np.eye(2) / 12
+
+
+def _square_root(matrix: Array) -> Array:
+    values, vectors = np.linalg.eigh(matrix)
+    root: Array = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
+    return root
+
+
+def _blurred_answer(
+    sharp: TransportObjective,
+    solved: list[_Solved],
+    level: Level,
+    tolerance: float,
+) -> Solution:
+    """Return the sharpest solution that was found, and how far it is from the sharp image's."""
+    width, weights = solved[-1] if solved else _Solved(np.inf, np.zeros(len(level.sites)))
+    residual = sharp.residual(sharp.diagram(weights))
+    rounded = float(f"{width:.2g}")
+    reason = (
+        f"only the image blurred by {rounded:g} px could be solved, and that answer is kept"
+        if solved
+        else "not even the blurred image could be solved; the field is left at zero"
+    )
+    return Solution(sharp.in_gauge(weights), residual, 0, residual <= tolerance, reason)

@@ -1,0 +1,109 @@
+"""An HDF5 file's pixels are its own: nothing that lies elsewhere passes for them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.io import read, read_radiograph, write
+
+IMAGE = np.random.default_rng(0).normal(100, 10, (20, 24))
+
+
+def external_link(file: h5py.File, name: str) -> None:
+    file[name] = h5py.ExternalLink("other.h5", "image")
+
+
+def link_to_a_link(file: h5py.File, name: str) -> None:
+    file["elsewhere"] = h5py.ExternalLink("other.h5", "/")
+    file[name] = h5py.SoftLink("/elsewhere/image")
+
+
+def raw_storage(file: h5py.File, name: str) -> None:
+    file.create_dataset(name, IMAGE.shape, "f8", external=[("other.bin", 0, IMAGE.nbytes)])
+
+
+def virtual(file: h5py.File, name: str) -> None:
+    layout = h5py.VirtualLayout(IMAGE.shape, "f8")
+    layout[...] = h5py.VirtualSource("other.h5", "image", IMAGE.shape)
+    file.create_virtual_dataset(name, layout)
+
+
+ELSEWHERE = {
+    "links to 'other.h5'": external_link,
+    "links to 'other.h5' ": link_to_a_link,
+    "in the raw file 'other.bin'": raw_storage,
+    "as a virtual array from 'other.h5'": virtual,
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["image"] = IMAGE
+    (tmp_path / "other.bin").write_bytes(os.urandom(IMAGE.nbytes))
+    return tmp_path
+
+
+@pytest.mark.parametrize("found", ELSEWHERE)
+def test_pradformat_and_any_array_by_name(folder: Path, found: str) -> None:
+    path = folder / "shot.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["object_type"] = "radiograph"
+        ELSEWHERE[found](file, "image")
+        file["own"] = IMAGE
+        file["again"] = h5py.SoftLink("own")
+    for variable in (None, "image"):
+        with pytest.raises(FileFormatError, match=found.strip()) as error:
+            read(path, variable=variable)
+        assert "image" in str(error.value)
+    for variable in ("own", "again", "/own"):
+        np.testing.assert_array_equal(read_radiograph(path, variable=variable).image, IMAGE)
+
+
+@pytest.mark.parametrize("found", ELSEWHERE)
+def test_matlab(folder: Path, found: str) -> None:
+    path = folder / "shot.mat"
+    with h5py.File(path, "w") as file:
+        file["own"] = IMAGE.T
+        file["own"].attrs["MATLAB_class"] = np.bytes_(b"double")
+        ELSEWHERE[found](file, "shot")
+    with pytest.raises(FileFormatError, match="other"):
+        read(path, variable="shot")
+
+
+@pytest.mark.parametrize("found", ELSEWHERE)
+def test_results(folder: Path, found: str, inversion: Inversion) -> None:
+    path = folder / "shot.shadowinv"
+    write(path, inversion)
+    with h5py.File(path, "r+") as file:
+        ELSEWHERE[found](file, "more")
+    with pytest.raises(FileFormatError, match="other"):
+        read(path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs pipes")
+@pytest.mark.parametrize("variable", [None, "image"])
+def test_a_link_to_a_pipe_does_not_block(folder: Path, variable: str | None) -> None:
+    os.mkfifo(folder / "pipe.h5")
+    path = folder / "shot.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["object_type"] = "radiograph"
+        file["image"] = h5py.ExternalLink("pipe.h5", "image")
+    with pytest.raises(FileFormatError, match=r"links to 'pipe\.h5'"):
+        read(path, variable=variable)
+
+
+def test_links_in_a_circle_end(tmp_path: Path) -> None:
+    path = tmp_path / "shot.h5"
+    with h5py.File(path, "w") as file:
+        file["here"], file["there"] = h5py.SoftLink("/there"), h5py.SoftLink("/here")
+    with pytest.raises(FileFormatError, match="circle"):
+        read(path, variable="here")

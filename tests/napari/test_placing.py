@@ -1,0 +1,57 @@
+"""Images that are opened beside results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from napari.components import ViewerModel
+
+from napari_shadowinv import ProtonSetup, add_inversion
+from napari_shadowinv._napari.frame import frame_of
+from napari_shadowinv._napari.marks import mark, role_of
+from napari_shadowinv.inversion import Inversion
+
+
+def test_an_image_of_the_same_size_lies_on_the_result(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, told: list[str],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    layers = add_inversion(viewer, solved, proton_setup, name="a", translate=(3.0, 4.0))
+    frame = frame_of(next(one for one in layers if role_of(one) == "field"))
+    for data in (np.ones((40, 52)), np.ones((5, 40, 52)), np.ones((40, 52), np.uint8)):
+        told.clear()
+        other = viewer.add_image(data, name="other")
+        assert frame_of(other) == frame
+        assert f"'{other.name}' has as many pixels as 'a |∫B×dz| (mT·m)'" in told[-1]
+        assert "1.5 µm" in told[-1]
+    np.savetxt(tmp_path / "other.txt", np.ones((40, 52)))
+    (opened,) = viewer.open(tmp_path / "other.txt", plugin="napari-shadowinv")
+    assert frame_of(opened) == frame
+    assert {str(unit) for one in viewer.layers for unit in one.units[-2:]} == {"micrometer"}
+
+
+def test_an_image_of_another_size_is_told_how_to_get_a_scale(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, told: list[str]
+) -> None:
+    add_inversion(viewer, solved, proton_setup, name="a")
+    other = viewer.add_image(np.ones((30, 52)), name="other")
+    assert tuple(other.scale) == (1, 1)
+    assert "'other' is in pixels, the results are in µm" in told[-1]
+    assert "Invert shot" in told[-1]
+
+
+def test_what_has_a_place_keeps_it(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, told: list[str]
+) -> None:
+    viewer.add_image(np.ones((40, 52)))
+    add_inversion(viewer, solved, name="in pixels")
+    first = viewer.add_image(np.ones((40, 52)))
+    add_inversion(viewer, solved, proton_setup, name="a")
+    told.clear()
+    placed = viewer.add_image(np.ones((40, 52)), scale=(2, 2), units=("um", "um"))
+    own = viewer.add_image(np.ones((40, 52)), metadata=mark("image", ""))
+    viewer.add_labels(np.ones((40, 52), int))
+    assert tuple(placed.scale) == (2, 2)
+    assert tuple(own.scale) == tuple(first.scale) == (1, 1)
+    assert not any("same place" in text or "in pixels" in text for text in told)

@@ -1,0 +1,118 @@
+"""The run button with its bar: what is seen during a run, and what that costs."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+from napari.utils import progress
+from qtpy.QtCore import Qt
+from qtpy.QtWidgets import QDockWidget
+
+from napari_shadowinv._napari.widgets._panels import RunPanel
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.progress import Progress
+
+PATIENCE = 60_000  # ms
+
+
+class Work:
+    """Two seconds that tell of themselves a hundred times a second."""
+
+    def __init__(self, total: int | None) -> None:
+        self.total = total
+
+    def __call__(self, on_progress: Any, should_stop: Any) -> None:
+        start = time.monotonic()
+        while (spent := time.monotonic() - start) < 2 and not should_stop():
+            step = int(100 * spent)
+            on_progress(Progress("transport", step if self.total else 0, self.total, f"at {step}"))
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def panel(window: Any, qtbot: Any) -> RunPanel:
+    made = RunPanel("Some work", "Run", "Do it.")
+    window.window.add_dock_widget(made, name="work", area="right")
+    qtbot.wait(500)
+    return made
+
+
+def finish(panel: RunPanel, qtbot: Any) -> None:
+    qtbot.waitUntil(lambda: not panel.runner.running, timeout=PATIENCE)
+
+
+@pytest.mark.parametrize("total", [None, 200])
+def test_a_run_seldom_makes_the_window_be_drawn(
+    panel: RunPanel, window: Any, qtbot: Any, total: int | None
+) -> None:
+    """Each time the canvas is composed anew costs a core 20 ms without a graphics card."""
+    drawn: list[float] = []
+    canvas = window.window._qt_viewer.canvas.native
+    canvas.aboutToCompose.connect(lambda: drawn.append(time.monotonic()))
+    texts: list[str] = []
+    panel.runner.progressed.connect(lambda _: texts.append(panel.status.text()))
+    start = time.monotonic()
+    panel.run(Work(total))
+    finish(panel, qtbot)
+    assert len(texts) > 15
+    # Begin, bar and text twice a second, end; with a busy bar more than 20 in a second.
+    assert len(drawn) <= 8 + 4 * (time.monotonic() - start)
+    assert len({text for text in texts if "Solving the transport: at" in text}) >= 2
+    assert panel.bar.maximum() > 0
+
+
+def test_a_panel_that_cannot_be_seen_uses_the_activity_dock(
+    panel: RunPanel, window: Any, qtbot: Any
+) -> None:
+    panel.run(Work(200))
+    qtbot.waitUntil(lambda: "Solving" in panel.status.text(), timeout=PATIENCE)
+    assert panel.bar.isVisible()
+    assert not progress._all_instances
+    panel.hide()
+    qtbot.waitUntil(lambda: bool(progress._all_instances), timeout=PATIENCE)
+    assert all("Some work" in bar.desc for bar in progress._all_instances)
+    finish(panel, qtbot)
+    assert not progress._all_instances
+
+
+def test_what_went_wrong_stays_until_the_next_run(
+    panel: RunPanel, qtbot: Any, told: list[str]
+) -> None:
+    def mistaken(*_: Any) -> None:
+        raise InputError("the film has no grain: expected some; take another one")
+
+    panel.run(mistaken)
+    finish(panel, qtbot)
+    qtbot.wait(700)
+    status = panel.status
+    assert status.text() == told[0] == "The film has no grain: expected some; take another one"
+    assert status.isVisible()
+    assert status.wordWrap()
+    assert status.textInteractionFlags() & Qt.TextInteractionFlag.TextSelectableByMouse
+    assert "color" in status.styleSheet()
+    panel.run(lambda *_: None)
+    assert status.text() == "Starting…"
+    assert status.styleSheet() == ""
+    finish(panel, qtbot)
+    assert not status.isVisible()
+
+
+def test_docks_of_this_plugin_share_their_place_as_tabs(
+    window: Any, open_widget: Any, qtbot: Any
+) -> None:
+    main = window.window._qt_window
+    tools = [open_widget(name) for name in ("Invert shot", "Line profile", "Forward model")]
+    docks = [next(d for d in main.findChildren(QDockWidget) if d.isAncestorOf(t)) for t in tools]
+    qtbot.waitUntil(lambda: len(main.tabifiedDockWidgets(docks[0])) == 2, timeout=PATIENCE)
+    assert set(main.tabifiedDockWidgets(docks[0])) == set(docks[1:])
+    qtbot.waitUntil(tools[-1].isVisible, timeout=PATIENCE)  # the latest is in front
+    assert tools[-1].height() > 0.7 * main.height()
+    # Whoever puts one elsewhere finds it there when it is shown again.
+    main.addDockWidget(Qt.DockWidgetArea.LeftDockWidgetArea, docks[0])
+    docks[0].hide()
+    docks[0].show()
+    qtbot.wait(100)
+    assert main.dockWidgetArea(docks[0]) == Qt.DockWidgetArea.LeftDockWidgetArea
+    assert docks[1] not in main.tabifiedDockWidgets(docks[0])

@@ -1,0 +1,519 @@
+"""What the widgets remember and offer; most of it needs no window, only a list of layers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.components import ViewerModel
+
+from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
+from napari_shadowinv._napari import commands
+from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.marks import (
+    mark,
+    mark_of,
+    result_of,
+    role_of,
+    setup_of,
+    setup_origin_of,
+    source_of,
+)
+from napari_shadowinv._napari.widgets._jobs import ShotJob
+from napari_shadowinv._napari.widgets._setups import SetupPicker
+from napari_shadowinv._napari.widgets._stacking import StackJob
+from napari_shadowinv._napari.widgets._toml import dump_toml
+from napari_shadowinv._napari.widgets.estimate_source import EstimateSource
+from napari_shadowinv._napari.widgets.forward_model import ForwardModel
+from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.recipes import PolynomialEstimate
+
+Array = np.ndarray[Any, Any]
+PATIENCE = 60_000  # ms
+PLUGIN = "napari-shadowinv"
+
+
+@pytest.fixture
+def opened(viewer: ViewerModel, qtbot: Any) -> Iterator[Any]:
+    """Make a widget of a class, as a session does when its menu is used first."""
+    made: list[Any] = []
+
+    def make(kind: Any) -> Any:
+        made.append(kind(viewer))
+        qtbot.addWidget(made[-1])
+        return made[-1]
+
+    yield make
+    # None writes into the settings of the next test.
+    for widget in made:
+        widget._keeper._timer.stop()
+
+
+@pytest.fixture
+def of_a_file(viewer: ViewerModel, shot: Array, proton_setup: ProtonSetup) -> Any:
+    """A shot that came with its setup."""
+    origin = "came with experiment.h5"
+    metadata = mark("shot", "", proton_setup, setup_origin=origin)
+    return viewer.add_image(shot, name="measured", metadata=metadata)
+
+
+@pytest.fixture
+def plain(viewer: ViewerModel, shot: Array) -> Any:
+    """A shot that napari itself has opened."""
+    return viewer.add_image(shot, name="plain")
+
+
+def typed(tool: Any, energy: float) -> None:
+    """Type a whole setup, field by field."""
+    tool.setup.picker.set_kind("proton")
+    values = {
+        "energy": energy,
+        "source_object_distance": 0.01,
+        "object_image_distance": 1.0,
+        "pixel_size": 2e-6,
+    }
+    for name, value in values.items():
+        tool.setup.picker.form.editors[name].set_value(value)
+
+
+@pytest.mark.parametrize("kind", [InvertShot, InvertStack])
+def test_a_setup_stays_with_the_image_that_it_came_with(
+    opened: Any, of_a_file: Any, plain: Any, proton_setup: ProtonSetup, kind: Any
+) -> None:
+    tool = opened(kind)
+    images = tool.image if kind is InvertShot else tool.shots.layers
+    for _ in range(2):
+        images.layer = of_a_file
+        assert tool.setup.setup() == proton_setup
+        assert tool.setup.note.text() == "Came with experiment.h5."
+        images.layer = plain
+        assert tool.setup.setup() is None
+        assert tool.setup.note.text() == ""
+    # Nor is it at hand in the form.
+    tool.setup.picker.set_kind("proton")
+    assert tool.setup.picker.form.is_empty
+
+
+@pytest.mark.parametrize("kind", [InvertShot, InvertStack])
+def test_the_setup_of_a_file_is_not_there_in_the_next_session(
+    viewer: ViewerModel, opened: Any, of_a_file: Any, shot: Array, kind: Any
+) -> None:
+    tool = opened(kind)
+    assert tool.setup.setup() is not None
+    energy = tool.setup.picker.form.editors["energy"]
+    energy.inner.setText("3 MeV")
+    energy.inner.editingFinished.emit()
+    assert setup_origin_of(of_a_file) == "came with experiment.h5, changed by hand"
+    tool._keeper.write()
+    viewer.layers.clear()
+    viewer.add_image(shot, name="another")
+    later = opened(kind)
+    assert later.setup.setup() is None
+    later.setup.picker.set_kind("proton")
+    assert later.setup.picker.form.is_empty
+
+
+def test_what_an_older_version_kept_is_not_taken_for_the_users(qtbot: Any) -> None:
+    picker = SetupPicker()
+    qtbot.addWidget(picker)
+    picker.restore({"kind": "proton", "values": {"proton": paper_setup().model_dump()}})
+    assert picker.setup() is None
+    picker.picker.set_kind("proton")
+    assert picker.picker.form.is_empty
+
+
+def test_what_the_user_typed_is_at_hand_and_says_for_what(
+    viewer: ViewerModel, opened: Any, plain: Any, shot: Array
+) -> None:
+    tool = opened(InvertShot)
+    typed(tool, 5.0)
+    own = tool.setup.setup()
+    assert own.pixel_size == pytest.approx(2e-6)
+    assert setup_of(plain) == own
+    other = viewer.add_image(shot, name="other")
+    tool.image.layer = other
+    assert tool.setup.setup() is None
+    assert setup_of(other) is None
+    tool.setup.picker.set_kind("proton")
+    assert tool.setup.setup() == own
+    assert tool.setup.note.text() == "Typed for 'plain'."
+    assert setup_origin_of(other) == "typed for 'plain'"
+    # An image keeps what was chosen for it, none too.
+    tool.image.layer = plain
+    tool.setup.picker.set_kind("none")
+    tool.image.layer = other
+    assert tool.setup.setup() == own
+    tool.image.layer = plain
+    assert tool.setup.setup() is None
+
+    tool._keeper.write()
+    viewer.layers.clear()
+    new = viewer.add_image(shot, name="new")
+    later = opened(InvertShot)
+    assert later.setup.setup() is None
+    later.setup.picker.set_kind("proton")
+    assert later.setup.setup() == own
+    assert setup_origin_of(new) == "typed for 'plain', in an earlier session"
+    typed(later, 6.0)
+    assert setup_origin_of(new) == "typed for 'new'"
+
+
+def test_a_setup_from_a_toml_file_says_so(
+    opened: Any, plain: Any, tmp_path: Path, proton_setup: ProtonSetup, monkeypatch: Any
+) -> None:
+    from qtpy.QtWidgets import QFileDialog
+
+    path = dump_toml(proton_setup.model_dump(exclude_none=True), tmp_path / "tcc.toml")
+    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (str(path), ""))
+    tool = opened(InvertShot)
+    tool.setup.files.load_button.click()
+    assert tool.setup.setup() == proton_setup
+    assert tool.setup.note.text() == "Loaded from tcc.toml for 'plain'."
+    assert setup_origin_of(plain) == "loaded from tcc.toml for 'plain'"
+
+
+def test_other_files_do_not_inherit_a_setup(viewer: ViewerModel, opened: Any) -> None:
+    tool = opened(InvertStack)
+    tool.shots.picker.set_kind("files")
+    typed(tool, 5.0)
+
+    def choose(pattern: str) -> None:
+        tool.shots.files.edit.setText(pattern)
+        tool.shots.files.changed.emit()
+
+    choose("monday/*.tif")
+    assert tool.setup.setup() is not None
+    choose("tuesday/*.tif")
+    assert tool.setup.setup() is None
+    tool.setup.picker.set_kind("proton")
+    assert tool.setup.setup() is not None
+    assert tool.setup.origin == "typed"
+
+
+def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(
+    viewer: ViewerModel, opened: Any
+) -> None:
+    tools = [opened(kind) for kind in (InvertShot, EstimateSource, InvertStack)]
+    viewer.open_sample(PLUGIN, "toroid")
+    shot, source = (
+        next(one for one in viewer.layers if role_of(one) == role) for role in ("shot", "source")
+    )
+    for tool in tools:
+        images = tool.shots.layers if isinstance(tool, InvertStack) else tool.image
+        assert images.offered == [shot]
+        assert images.layer is shot
+    first = tools[0]
+    assert first.source.picker.kind == "own"
+    assert first.setup.note.text() == "Came with the sample 'toroid'."
+    first.source.picker.set_kind("layer")
+    assert first.source.layers.layer is source
+
+
+def test_no_image_is_its_own_source(
+    viewer: ViewerModel, opened: Any, plain: Any, shot: Array
+) -> None:
+    tool = opened(InvertShot)
+    tool.source.picker.set_kind("layer")
+    assert tool.source.layers.offered == []
+    with pytest.raises(InputError, match="no layer of the source is chosen"):
+        tool.request()
+    # Which of two unknown images is the beam, nobody but the user can tell.
+    reference = viewer.add_image(shot, name="reference")
+    assert tool.image.layer is plain
+    assert tool.source.layers.offered == [reference]
+    assert tool.source.layers.layer is None
+    tool.source.layers.layer = reference
+    tool.image.layer = reference
+    assert tool.source.layers.layer is None
+    assert tool.source.layers.offered == [plain]
+
+
+def test_results_are_not_offered_as_shots(
+    viewer: ViewerModel, opened: Any, plain: Any, solved: Inversion
+) -> None:
+    add_inversion(viewer, solved, name="solved")
+    tool = opened(InvertShot)
+    assert tool.image.offered == [plain]
+    assert [role_of(layer) for layer in tool.masks.layers.offered] == []
+    assert all(role_of(layer) in (None, "source") for layer in tool.source.layers.offered)
+    tool.source.picker.set_kind("layer")
+    assert tool.source.layers.layer is None
+    offered = opened(ForwardModel).potential.offered
+    assert {role_of(layer) for layer in offered} >= {None, "potential", "field"}
+    assert not {role_of(layer) for layer in offered} & {"reprojection", "residual", "caustic"}
+    field = next(layer for layer in viewer.layers if role_of(layer) == "field")
+    for command in (commands.invert_uniform, commands.high_pass):
+        with pytest.raises(InputError, match="is part of a result: select the shot"):
+            command(field)
+
+
+def test_one_click_takes_the_setup_of_the_layer_and_says_so(
+    of_a_file: Any, plain: Any, proton_setup: ProtonSetup
+) -> None:
+    for layer, setup, origin in (
+        (of_a_file, proton_setup, "came with experiment.h5"),
+        (plain, None, None),
+    ):
+        for _, keywords, _ in commands.invert_uniform(layer):
+            assert setup_of(keywords) == setup
+            assert mark_of(keywords)["made_from"].get("setup_origin") == origin
+
+
+def test_a_source_can_be_filtered_and_stays_one(viewer: ViewerModel, opened: Any) -> None:
+    viewer.open_sample(PLUGIN, "toroid")
+    source = next(one for one in viewer.layers if role_of(one) == "source")
+    ((_, keywords, _),) = commands.high_pass(source)
+    assert role_of(keywords) == "source"
+    assert setup_origin_of(keywords) == "came with the sample 'toroid'"
+    with pytest.raises(InputError, match="is a source: select the shot"):
+        commands.invert_uniform(source)
+
+
+def test_the_source_that_was_chosen_comes_back_after_a_sample(
+    viewer: ViewerModel, opened: Any, plain: Any
+) -> None:
+    tool = opened(InvertShot)
+    tool.source.picker.set_kind("low_pass")
+    *_, sample = viewer.open_sample(PLUGIN, "toroid")
+    tool.image.layer = sample
+    assert tool.source.picker.kind == "own"
+    tool.image.layer = plain
+    assert tool.source.picker.kind == "low_pass"
+
+
+# The two masks
+
+
+@pytest.fixture(scope="module")
+def hump() -> tuple[Array, Array, Array]:
+    """A shot of an object under an uneven beam, its true potential, and where the object is."""
+    blob = gaussian_blob((64, 72), 30.0, 6.0, (30.0, 40.0))
+    y, x = np.mgrid[:64, :72]
+    beam = 300 * (1 + 0.3 * x / 72 + 0.2 * (y / 64) ** 2)
+    there = np.hypot(y - 30, x - 40) < 22
+    return synthetic_image(blob.displacement, beam), blob.potential, there
+
+
+def test_a_source_mask_hides_the_object_from_the_estimate_alone(
+    hump: tuple[Array, Array, Array],
+) -> None:
+    shot, potential, there = hump
+    job = ShotJob(
+        shot,
+        PolynomialEstimate(degree=2),
+        source_mask=~there,
+        options=InversionOptions(n_sites=1500),
+    )
+    found = job.run()
+    assert found.mask.all()
+    assert np.ptp(found.potential) == pytest.approx(np.ptp(potential), rel=0.1)
+    cropped = ShotJob(
+        shot, PolynomialEstimate(degree=2), source_mask=~there, crop=(slice(2, 62), slice(4, 70))
+    )
+    assert cropped._image_and_masks()[2].shape == (60, 66)
+    with pytest.raises(InputError, match="source mask has shape"):
+        ShotJob(shot, PolynomialEstimate(degree=2), source_mask=there[1:]).run()
+
+
+@pytest.mark.parametrize("kind", [InvertShot, InvertStack])
+def test_both_masks_can_be_chosen(
+    viewer: ViewerModel, opened: Any, hump: tuple[Array, Array, Array], kind: Any, tmp_path: Path
+) -> None:
+    shot, _, there = hump
+    viewer.add_image(shot if kind is InvertShot else np.stack([shot, shot]), name="shot")
+    tool = opened(kind)
+    if kind is InvertStack:
+        tool.store.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
+    assert tool.source_masks.isHidden()
+    tool.source.picker.set_kind("polynomial")
+    assert not tool.source_masks.isHidden()
+    tool.source_masks.paint()
+    assert tool.source_masks.layer.name == "shot source mask"
+    assert role_of(tool.source_masks.layer) == "mask"
+    tool.source_masks.layer.data = there.astype(int)
+    tool.masks.paint()
+    tool.masks.layer.data[:3, :3] = 1
+    job = tool.request().job
+    np.testing.assert_array_equal(job.source_mask, ~there)
+    assert (~job.mask).sum() == 9
+    # A mask that is not shown has no say.
+    tool.source.picker.set_kind("uniform")
+    assert tool.source_masks.isHidden()
+    assert tool.request().job.source_mask is None
+
+
+def test_a_mask_over_the_object_is_refused(
+    viewer: ViewerModel, opened: Any, hump: tuple[Array, Array, Array], qtbot: Any, told: list[str]
+) -> None:
+    shot, _, there = hump
+    image = viewer.add_image(shot, name="shot")
+    labels = viewer.add_labels(there.astype(int), name="object")
+    tool = opened(InvertShot)
+    tool.source.picker.set_kind("polynomial")
+    tool.masks.layer = tool.source_masks.layer = labels
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: bool(told) and not tool.panel.runner.running, timeout=PATIENCE)
+    words = "the object would be left out of the inversion"
+    assert words in tool.panel.status.text()
+
+    # As well if the estimate was made before, in a layer of its own.
+    estimating = opened(EstimateSource)
+    estimating.method.set_kind("polynomial")
+    estimating.masks.layer = labels
+    estimating.panel.button.click()
+    qtbot.waitUntil(lambda: "shot source" in viewer.layers, timeout=PATIENCE)
+    for kind, data in ((InvertShot, None), (InvertStack, np.stack([shot, shot]))):
+        later = opened(kind)
+        if data is not None:
+            later.shots.layers.layer = viewer.add_image(data, name="stack")
+            later.store.edit.setText("a.shadowinv.zarr")
+        else:
+            later.image.layer = image
+        later.source.picker.set_kind("layer")
+        assert later.source.layers.layer.name == "shot source"
+        later.masks.layer = labels
+        with pytest.raises(InputError, match=words):
+            later.request()
+        later.masks.layer = None
+        later.request()
+
+
+def test_a_stack_is_inverted_with_both_masks(
+    hump: tuple[Array, Array, Array], tmp_path: Path
+) -> None:
+    shot, potential, there = hump
+    job = StackJob(
+        np.stack([shot]),
+        tmp_path / "a.shadowinv.zarr",
+        PolynomialEstimate(degree=2),
+        source_mask=~there,
+        options=InversionOptions(n_sites=1500),
+        scheduler="synchronous",
+    )
+    job.run(lambda _: None, lambda: False)
+    found = np.asarray(read(job.out)["potential"][0])
+    assert np.ptp(found) == pytest.approx(np.ptp(potential), rel=0.1)
+
+
+# What is said of a run
+
+
+@pytest.fixture
+def run(qtbot: Any) -> Any:
+    def pressed(tool: Any) -> None:
+        before = getattr(tool, "results", None)
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: getattr(tool, "results", None) is not before, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
+
+    return pressed
+
+
+def test_a_result_says_where_everything_came_from(
+    viewer: ViewerModel, opened: Any, of_a_file: Any, run: Any
+) -> None:
+    tool = opened(InvertShot)
+    tool.options.set_values({"n_sites": 300})
+    tool.source.picker.set_kind("polynomial")
+    tool.source_masks.paint()
+    tool.source_masks.layer.data[10:30, 20:45] = 1
+    run(tool)
+    rows = tool.report.texts()
+    assert rows["Image"] == "measured"
+    assert rows["Source"].startswith("estimate: fitted polynomial")
+    assert rows["Source mask"] == "layer 'measured source mask', leaves out 17.4% of the pixels"
+    assert "Mask" not in rows
+    assert rows["Setup"] == "particles (protons, …), came with experiment.h5"
+    field = next(layer for layer in viewer.layers if role_of(layer) == "field")
+    told = mark_of(field)["made_from"]
+    assert told["setup_origin"] == "came with experiment.h5"
+    assert told["source_origin"] == rows["Source"]
+    assert told["source_mask_origin"] == rows["Source mask"]
+    assert dict(result_of(field).attributes) == told  # type: ignore[union-attr]
+    assert json.loads(told["source_preparation"])["source_from"] == "polynomial_source"
+
+
+def test_the_report_of_one_run_does_not_stand_beside_another(
+    opened: Any, plain: Any, of_a_file: Any, run: Any, qtbot: Any, told: list[str]
+) -> None:
+    tool = opened(InvertShot)
+    tool.options.set_values({"n_sites": 300})
+
+    def rerun() -> None:
+        run(tool)
+        assert tool.report.texts()["Converged"] == "yes"
+
+    rerun()
+    tool.panel.button.click()
+    assert tool.report.texts() == {}
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: tool.panel.status.text() == "Cancelled.", timeout=PATIENCE)
+    assert tool.report.texts() == {}
+    rerun()
+    tool.image.layer = plain
+    assert tool.report.texts() == {}
+    rerun()
+    plain.data = plain.data + 1
+    assert tool.report.texts() == {}
+    rerun()
+    tool.source.picker.set_kind("file")
+    tool.panel.button.click()
+    assert tool.report.texts() == {}
+    # The notification goes; the sentence stays until something else happens.
+    assert told == [tool.panel.status.text()]
+    assert "o file of the source" in tool.panel.status.text()
+    tool.image.layer = of_a_file
+    assert tool.panel.status.text() == ""
+
+
+def test_what_the_core_refuses_stays_in_the_widget(
+    opened: Any, plain: Any, qtbot: Any, told: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise InputError("both masks hide the object")
+
+    monkeypatch.setattr(ShotJob, "run", refuse)
+    tool = opened(InvertShot)
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    assert told == ["Both masks hide the object"]
+    assert tool.panel.status.text() == told[0]
+
+
+# The forward model
+
+
+def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
+    viewer: ViewerModel, opened: Any, solved: Inversion, proton_setup: ProtonSetup, qtbot: Any
+) -> None:
+    tool = opened(ForwardModel)
+    assert tool.setup.setup() == paper_setup()
+    assert tool.setup.note.text() == "The paper's beam."
+    typed(tool, 7.0)
+    own = tool.setup.setup()
+    add_inversion(viewer, solved, proton_setup, name="solved")
+    tool.object.set_kind("layer")
+    assert tool.setup.setup() == proton_setup
+    tool.object.set_kind("toroid")
+    assert tool.setup.setup() == own
+    tool._keeper.write()
+    later = opened(ForwardModel)
+    assert later.setup.setup() == own
+    tool.height_px.setValue(20)
+    tool.width_px.setValue(20)
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: role_of(viewer.layers[-1]) == "shot", timeout=PATIENCE)
+    made = viewer.layers[-1]
+    assert setup_of(made) == own
+    assert setup_origin_of(made).startswith("came with the forward model")
+    assert source_of(made) is None
+    # Opened in Invert shot, it is a file's setup like any other.
+    assert opened(InvertShot).setup.setup() == own

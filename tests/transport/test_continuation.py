@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import InversionOptions, invert
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.physics.forward import jacobian_determinant
+from napari_shadowinv.transport.continuation import blurred
+from napari_shadowinv.transport.sites import plan_levels
+from napari_shadowinv.transport.solvers import solve
+
+SIDE = 64
+MIDDLE = (SIDE - 1) / 2
+Y, X = np.indices((SIDE, SIDE), dtype=np.float64)
+FLOOR = 1e-3
+UNIFORM = np.ones((SIDE, SIDE))
+
+
+def near(row, column, radius):
+    return (np.hypot(Y - row, X - column) < radius).astype(np.float64)
+
+
+def raised(image):
+    """Raise the dark pixels to the floor and bring the mean to 1."""
+    image = np.maximum(image / image.mean(), FLOOR)
+    return image / image.mean()
+
+
+def one_pixel():
+    image = np.zeros((SIDE, SIDE))
+    image[SIDE // 2, SIDE // 2] = 1
+    return image
+
+
+def corner():
+    image = np.zeros((SIDE, SIDE))
+    image[:6, :6] = 1
+    return image
+
+
+def salt():
+    image = np.ones(SIDE**2)
+    chosen = np.random.default_rng(5).choice(image.size, image.size // 100, replace=False)
+    image[chosen] = 1e4
+    return image.reshape(SIDE, SIDE)
+
+
+DISC = near(MIDDLE, MIDDLE, 16)
+STEP = np.where(X < MIDDLE, 1e-6, 1.0)
+LEFT, RIGHT = near(MIDDLE, 16, 8), near(MIDDLE, 48, 8)
+HARD = {
+    "disc": (DISC, UNIFORM),
+    "ring": (near(MIDDLE, MIDDLE, 22) - DISC, UNIFORM),
+    "step": (STEP, UNIFORM),
+    "step reversed": (STEP, STEP[:, ::-1]),
+    "corner": (corner(), UNIFORM),
+    "swapped islands": (RIGHT, LEFT),
+    "two discs": (LEFT + RIGHT, UNIFORM),
+    "salt": (salt(), UNIFORM),
+    "one bright pixel": (one_pixel(), UNIFORM),
+}
+
+
+def planned(source, n_sites=2000):
+    return plan_levels(source / source.mean(), n_sites, lloyd_iterations=5)
+
+
+def residual(level, weights, image):
+    triangulation = RegularTriangulation(level.sites, weights)
+    masses = PowerDiagram(triangulation, Density.from_image(image)).masses
+    return np.max(np.abs(masses - level.mass) / level.mass)
+
+
+def smooth_image():
+    image = 0.3 + np.exp(-(((Y - 25) / 9) ** 2) - ((X - 33) / 8) ** 2)
+    return image / image.mean()
+
+
+@pytest.mark.parametrize("width", [0.01, 0.1, 0.5, 3.0, 12.0, 50.0])
+def test_blurring_keeps_flux_and_sign_at_any_width(width):
+    image = raised(one_pixel())
+    spread = blurred(image, width)
+    assert spread.sum() == pytest.approx(image.sum(), rel=1e-12)
+    assert spread.min() > 0
+    assert image.min() * (1 - 1e-12) <= spread.min() < spread.max() <= image.max() * (1 + 1e-12)
+
+
+def test_blurring_twice_adds_variances():
+    image = raised(salt())
+    np.testing.assert_allclose(
+        blurred(blurred(image, 3.0), 4.0), blurred(image, 5.0), rtol=1e-10, atol=0
+    )
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_images_with_jumps_are_solved(name):
+    image, source = HARD[name]
+    plan = planned(source)
+    level = plan.levels[-1]
+    answer = solve(plan.levels, raised(image), InversionOptions(tolerance=1e-3))[-1]
+    assert answer.converged, answer.reason
+    assert residual(level, answer.weights, raised(image)) <= 1e-3
+
+
+def test_stages_agree():
+    plan = planned(UNIFORM)
+    single, multi = (
+        solve(plan.levels, smooth_image(), InversionOptions(tolerance=1e-6, stages=stages))[-1]
+        for stages in ("single", "multi")
+    )
+    assert single.converged
+    assert multi.converged
+    np.testing.assert_allclose(single.weights, multi.weights, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("stages", ["single", "multi"])
+def test_an_unsolved_image_leaves_the_solution_of_a_blurred_one(stages):
+    plan = planned(UNIFORM)
+    image = raised(one_pixel())
+    options = InversionOptions(stages=stages, max_iterations=30)
+    answer = solve(plan.levels, image, options)[-1]
+    assert not answer.converged
+    assert "all 30 iterations" in answer.reason
+    told = re.search(r"blurred by (\S+) px", answer.reason)
+    level = plan.levels[-1]
+    widths = np.linspace(0.9, 1.1, 21) * float(told[1])
+    assert min(residual(level, answer.weights, blurred(image, w)) for w in widths) < 0.3
+    assert residual(level, answer.weights, image) == pytest.approx(answer.residual, rel=1e-6)
+
+
+def test_the_report_of_an_unsolved_image_names_the_blur():
+    report = invert(one_pixel(), options=InversionOptions(n_sites=2000, max_iterations=30)).report
+    assert not report.converged
+    assert re.search(r"not converged.*only the image blurred by \S+ px", report.warnings[0])
+
+
+def test_a_solution_short_of_the_tolerance_is_better_than_that_of_a_blurred_image():
+    """No solver gets below rounding: the tolerance asked for is out of reach."""
+    plan = planned(UNIFORM, 500)
+    answer = solve(plan.levels, smooth_image(), InversionOptions(tolerance=1e-16))[-1]
+    assert not answer.converged
+    assert answer.residual < 1e-11
+    assert "blurred" not in answer.reason
+
+
+@pytest.mark.parametrize("most", [1, 7, 25])
+def test_no_level_takes_more_steps_than_allowed(most):
+    plan = planned(UNIFORM)
+    for stages in ("single", "multi"):
+        options = InversionOptions(max_iterations=most, stages=stages)
+        answers = solve(plan.levels, raised(salt()), options)
+        assert max(answer.iterations for answer in answers) <= most
+        assert f"all {most} iterations" in answers[-1].reason
+
+
+def test_steps_on_a_level_that_led_nowhere_are_told():
+    """The coarser levels' start does not lead to a disc: the finest one is tried twice."""
+    plan = planned(UNIFORM)
+    answers = solve(plan.levels, raised(DISC), InversionOptions())
+    assert [len(answer.weights) for answer in answers] == [500, 2000, 2000]
+    assert answers[1].residual > 0.1
+    assert answers[1].iterations > 0
+    assert answers[2].converged
+
+
+def test_an_island_is_displaced_as_a_whole():
+    inversion = invert(RIGHT, source=LEFT, options=InversionOptions(n_sites=2000))
+    inside = near(MIDDLE, 16, 6) > 0
+    assert inversion.report.converged
+    np.testing.assert_allclose(inversion.displacement[0][inside], 0, atol=0.1)
+    np.testing.assert_allclose(inversion.displacement[1][inside], 32, atol=0.1)
+
+
+def test_a_square_on_a_disc_keeps_its_symmetry_and_shrinks_evenly():
+    inversion = invert(DISC, options=InversionOptions(n_sites=4096))
+    inner = slice(2, -2)  # at the edge the potential is extrapolated
+    potential = inversion.potential[inner, inner]
+    assert inversion.report.converged
+    for other in (np.rot90(potential), potential[::-1], potential.T):
+        np.testing.assert_allclose(other, potential, rtol=0, atol=2e-3 * np.ptp(potential))
+    shrinkage = jacobian_determinant(inversion.displacement)[8:-8, 8:-8]
+    expected = 1 / raised(DISC).max()
+    assert shrinkage.mean() == pytest.approx(expected, rel=0.02)
+    assert np.median(shrinkage) == pytest.approx(expected, rel=0.01)
+
+
+def test_threads_do_not_change_the_way_to_a_sharp_image():
+    plan = planned(UNIFORM, 12_000)
+    one, two = (
+        solve(
+            plan.levels[-1:],
+            raised(np.maximum(DISC, 0.1)),
+            InversionOptions(threads=threads),
+        )[-1]
+        for threads in (1, 2)
+    )
+    assert one.converged
+    assert one.iterations == two.iterations
+    np.testing.assert_array_equal(one.weights, two.weights)
