@@ -7,6 +7,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ON_SCREEN := xvfb-run -a -s "-screen 0 2560x1440x24"
+ON_BOTH_CORES := -n 2 --dist loadfile
 
 .PHONY: demo test gallery lint format clean
 
@@ -18,9 +19,8 @@ gallery: $(VENV)/installed
 
 test: lint
 	@sh .ci/need-display
-	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore tests/napari
-	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest tests/napari
-	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest -q \
+	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES)
+	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES) -q \
 		tests/napari/widgets/test_tools.py tests/napari/widgets/test_forms.py
 
 lint: $(VENV)/installed-dev

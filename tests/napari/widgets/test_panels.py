@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
+import numpy as np
 import pytest
 from napari.utils import progress
 from qtpy.QtCore import Qt
@@ -53,12 +54,12 @@ def test_a_run_seldom_makes_the_window_be_drawn(
     canvas.aboutToCompose.connect(lambda: drawn.append(time.monotonic()))
     texts: list[str] = []
     panel.runner.progressed.connect(lambda _: texts.append(panel.status.text()))
-    start = time.monotonic()
     panel.run(Work(total))
     finish(panel, qtbot)
     assert len(texts) > 15
-    # Begin, bar and text twice a second, end; with a busy bar more than 20 in a second.
-    assert len(drawn) <= 8 + 4 * (time.monotonic() - start)
+    # Bar and text change twice a second, and are then laid out anew; a busy bar never rests.
+    rests = np.diff(drawn)
+    assert rests[rests > 0.1].sum() > 0.5 * (drawn[-1] - drawn[0])
     assert len({text for text in texts if "Solving the transport: at" in text}) >= 2
     assert panel.bar.maximum() > 0
 
