@@ -11,6 +11,7 @@ pixel the integrands are polynomials of degree 3 at most, for which Simpson's ru
 exact. Beyond the image the density is zero, so polygons need no clipping.
 
 - make a density of an image: `Density`
+- the same density on smaller pixels: `split_pixels`
 - integrals along one edge: `walk_edge` (a numba kernel)
 """
 
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.geometry._kernel import njit
 
-__all__ = ["Density", "walk_edge"]
+__all__ = ["Density", "split_pixels", "walk_edge"]
 
 Array = NDArray[np.float64]
 
@@ -52,14 +53,7 @@ class Density:
     def from_image(cls, image: ArrayLike) -> Density:
         """Make a density of an image of shape (H, W)."""
         values = np.ascontiguousarray(image, dtype=np.float64)
-        height, width = values.shape
-        left = np.arange(width, dtype=np.float64)
-        right = left + 1
-        sums = np.zeros((3, height, width + 1))
-        for power in range(3):
-            of_pixel = values * (right ** (power + 1) - left ** (power + 1)) / (power + 1)
-            np.cumsum(of_pixel, axis=1, out=sums[power, :, 1:])
-        return cls(values, sums)
+        return cls(values, _row_sums(values))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -75,6 +69,38 @@ class Density:
     def total(self) -> float:
         """The image's flux."""
         return float(self.sums[0, :, -1].sum())
+
+
+@njit(nogil=True, cache=True)
+def _row_sums(image: Array) -> Array:
+    height, width = image.shape
+    sums = np.zeros((3, height, width + 1))
+    for row in range(height):
+        for left in range(width):
+            value = image[row, left]
+            right = left + 1
+            # ∫ s ds and ∫ s² ds over the pixel
+            sums[0, row, right] = sums[0, row, left] + value
+            sums[1, row, right] = sums[1, row, left] + value * (left + 0.5)
+            sums[2, row, right] = sums[2, row, left] + value * (left * right + 1 / 3)
+    return sums
+
+
+def split_pixels(image: Array, factor: int) -> Array:
+    """Split each pixel of an image into factor × factor that share its flux evenly.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W)
+        Flux of each pixel.
+    factor : int
+        1 or more.
+
+    Returns
+    -------
+    ndarray, shape (H · factor, W · factor)
+    """
+    return np.repeat(np.repeat(image / factor**2, factor, axis=0), factor, axis=1)
 
 
 @njit(nogil=True, cache=True, inline="always")

@@ -4,6 +4,8 @@ Damped Newton steps from zero weights fail where the image jumps: between bright
 cell's flux is no smooth function of the weights, and cells in the dark must be kept from
 emptying. Blur the image enough and they succeed; and the weights depend almost linearly on the
 width of the blur, so the line through two solutions is a start for the next, narrower one.
+That holds for widths below a pixel, too, where the pixels are split before the blur: else each
+row of cells that passes a pixel's edge bends the way.
 
 - solve one level for any image: `sharpen`
 """
@@ -12,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -19,22 +22,25 @@ from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv.progress import Reporter
-from napari_shadowinv.transport.newton import SHORTEST_STEP, newton, with_full_cells
+from napari_shadowinv.transport.newton import newton, with_full_cells
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 from napari_shadowinv.transport.sites import Level
 
 __all__ = ["blurred", "sharpen"]
 
 Array = NDArray[np.float64]
-Pose = Callable[[float], TransportObjective]
+Soften = Callable[[Level, float, int], TransportObjective]
 
 _WIDEST = 1 / 6  # of the image's longer side
 _SHARP_ENOUGH = 0.5  # in site spacings: from there the sharp image is tried
 _SHARPER = 4.0  # times less blur before the sharp image is tried again
-_NARROWEST = 0.01  # px
+_NARROWEST = 1e-3  # px
 _CLOSEST = 1.02  # ratio of two widths
 _PATH_TOLERANCE = 0.3  # a blurred image's solution only has to start the next
 _SHORTEST_STEP = 1e-2
+_SMOOTH = 1.5  # smallest blur, in pixels, that hides them
+_MOST_PARTS = 8  # of a pixel's side
+_MOST_PIXELS = 2**22  # after splitting
 _SHARES_OF_PREDICTION = (1.0, 0.5, 0.25)
 _LEAST_OF_PREDICTION = 1e-2  # of the smallest cell's flux before it
 
@@ -71,7 +77,8 @@ def blurred(image: Array, width: float) -> Array:
 
 def sharpen(
     level: Level,
-    pose: Pose,
+    sharp: TransportObjective,
+    soften: Soften,
     *,
     tolerance: float,
     max_iterations: int,
@@ -83,8 +90,11 @@ def sharpen(
     ----------
     level : Level
         The sites.
-    pose : callable
-        Makes the objective for an image blurred by so many px.
+    sharp : TransportObjective
+        What is to be solved.
+    soften : callable
+        Makes the objective for the level of split pixels, the blur in those pixels, and the
+        parts of a pixel's side (see `Level.split`).
     tolerance : float
         Largest relative flux error allowed in any cell.
     max_iterations : int
@@ -102,16 +112,20 @@ def sharpen(
     nearest: Solution | None = None
     width: float | None = _WIDEST * max(level.shape)
     sharp_below = _SHARP_ENOUGH * level.spacing
+    split = cache(level.split)
     steps = 0
     while width is not None and steps < max_iterations:
-        objective = pose(width)
-        for start in _starts(objective, level, width, solved):
+        parts = _parts(width, level.shape)
+        objective = soften(split(parts), parts * width, parts) if width else sharp
+        # weights are squares of lengths
+        before = [_Solved(one.width, parts**2 * one.weights) for one in solved[-2:]]
+        for start in _starts(objective, split(parts), width, before):
             solution = newton(
                 objective,
                 start,
                 tolerance=_PATH_TOLERANCE if width else tolerance,
                 max_iterations=max_iterations - steps,
-                shortest_step=_SHORTEST_STEP if width else SHORTEST_STEP,
+                shortest_step=_SHORTEST_STEP,
                 report=report,
             )
             steps += solution.iterations
@@ -122,17 +136,29 @@ def sharpen(
         if solution.converged and not width:
             return replace(solution, iterations=steps)
         if solution.converged:
-            solved.append(_Solved(width, solution.weights))
+            solved.append(_Solved(width, solution.weights / parts**2))
         if solved and not width:
             sharp_below = solved[-1].width / _SHARPER
         width = _next_width(width, solved, level, sharp_below, converged=solution.converged)
-    answer = _blurred_answer(pose(0.0), solved, level, tolerance)
+    answer = _blurred_answer(sharp, solved, level, tolerance)
     used_up = f"the solver used all {max_iterations} iterations allowed"
     if nearest is not None and nearest.residual < min(answer.residual, _PATH_TOLERANCE):
         reason = used_up if steps >= max_iterations else nearest.reason
         return replace(nearest, iterations=steps, reason=reason)
     reason = f"{used_up}; {answer.reason}" if steps >= max_iterations else answer.reason
     return replace(answer, iterations=steps, reason=reason)
+
+
+def _parts(width: float, shape: tuple[int, int]) -> int:
+    """Return into how many parts the side of a pixel is split for a blur of so many px."""
+    parts = 1
+    while (
+        0 < width * parts < _SMOOTH
+        and parts < _MOST_PARTS
+        and 4 * parts**2 * shape[0] * shape[1] <= _MOST_PIXELS
+    ):
+        parts *= 2
+    return parts
 
 
 class _Solved(NamedTuple):
@@ -167,11 +193,13 @@ def _starts(
     if len(solved) > 1:
         least = _LEAST_OF_PREDICTION * float(objective.diagram(last.weights).masses.min())
         slope = (last.weights - solved[-2].weights) / (last.width - solved[-2].width)
-        for share in _SHARES_OF_PREDICTION if len(solved) > 2 else _SHARES_OF_PREDICTION[1:]:
+        for share in _SHARES_OF_PREDICTION:
             predicted = last.weights + share * (width - last.width) * slope
             diagram = objective.diagram_if_full(predicted)
             if diagram is not None and diagram.masses.min() > least:
                 yield predicted
+                if not width:
+                    return
                 break
     yield last.weights
 

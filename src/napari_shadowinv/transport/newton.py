@@ -69,6 +69,7 @@ def newton(
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     errors = [_length(mass - diagram.masses)]
+    first = 1.0
     reason = f"the solver used all {max_iterations} iterations allowed"
     while residual > tolerance and len(errors) <= max_iterations:
         message = f"{len(mass):,} sites, residual {residual:.2g}"
@@ -84,12 +85,19 @@ def newton(
             break
         del laplacian
         damped = _damped_step(
-            objective, weights, step, gap, keep * mass.mean(), shortest_step, alive
+            objective,
+            weights,
+            step,
+            gap,
+            keep * mass.mean(),
+            (first, shortest_step),
+            alive,
         )
         if damped is None:
             reason = "no step along Newton's direction lowers the error without emptying a cell"
             break
-        weights, diagram = damped
+        weights, diagram, share = damped
+        first = min(1.0, (8 if share == first else 2) * share)
         residual = objective.residual(diagram)
         errors.append(_length(mass - diagram.masses))
         if len(errors) > _PATIENCE and errors[-1] > 0.5 * errors[-1 - _PATIENCE]:
@@ -106,12 +114,12 @@ def _damped_step(
     step: Array,
     gap: Array,
     least: float,
-    shortest: float,
+    shares: tuple[float, float],
     alive: Callable[[], None],
-) -> tuple[Array, PowerDiagram] | None:
-    """Halve the step until all cells keep some flux and the error falls."""
+) -> tuple[Array, PowerDiagram, float] | None:
+    """Halve the share of the step until all cells keep some flux and the error falls."""
     error = _length(gap)
-    share = 1.0
+    share, shortest = shares
     while share > shortest:
         diagram = None  # one at a time: they are large
         alive()
@@ -120,7 +128,7 @@ def _damped_step(
         if diagram is not None and diagram.masses.min() > least:
             now = _length(objective.mass - diagram.masses)
             if now < (1 - 0.1 * share) * error:
-                return trial, diagram
+                return trial, diagram, share
         share /= 2
     return None
 

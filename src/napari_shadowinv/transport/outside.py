@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from napari_shadowinv.geometry._threads import available_threads
-from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.transport.linear import solve_laplacian
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import Level
@@ -76,6 +76,10 @@ class Outside:
         outside = cls(beam, margin)
         outside.within(beam)[:] = source
         return outside
+
+    def split(self, factor: int) -> Outside:
+        """Return the same beam for pixels that are split into factor × factor."""
+        return Outside(split_pixels(self.beam, factor), factor * self.margin)
 
     def within(self, values: Array) -> Array:
         """Return the part of an array that belongs to the image; its last axes are y and x."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from threading import Event
 from typing import TYPE_CHECKING
@@ -114,6 +114,32 @@ class Level:
     def mirrored(self) -> Mirrored:
         """The sites with those near the border mirrored across it; made when first asked for."""
         return Mirrored.from_sites(self.sites, self.shape)
+
+    def split(self, factor: int) -> Level:
+        """Return the same sites for an image whose pixels are split.
+
+        Parameters
+        ----------
+        factor : int
+            Each pixel becomes factor × factor.
+
+        Returns
+        -------
+        Level
+            Positions count in the smaller pixels.
+        """
+        if factor == 1:
+            return self
+        height, width = factor * self.shape[0], factor * self.shape[1]
+        sites = factor * (self.sites + 0.5) - 0.5
+        region = [(-0.5, -0.5), (height - 0.5, width - 0.5)]
+        return replace(
+            self,
+            sites=sites,
+            centroids=factor * (self.centroids + 0.5) - 0.5,
+            triangulation=RegularTriangulation(sites, region=region),
+            shape=(height, width),
+        )
 
 
 @dataclass(frozen=True)

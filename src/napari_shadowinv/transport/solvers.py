@@ -11,12 +11,11 @@ Paper, section III.A ("multi-stage approach"); Q. Mérigot, Computer Graphics Fo
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.continuation import blurred, sharpen
@@ -227,21 +226,29 @@ class _Target:
     outside: Outside | None
     options: InversionOptions
 
-    def objective(self, level: Level, blur: float = 0.0) -> TransportObjective:
-        """Pose the problem for the sites of a level and an image blurred by so many px."""
-        image = blurred(self.image, blur) if blur else self.image
+    def objective(self, level: Level) -> TransportObjective:
+        """Pose the problem for the sites of a level."""
         threads = self.options.threads
         if self.outside is not None:
             decay_length = self.options.decay_length or self.outside.margin
-            return OpenObjective(level, image, self.outside, decay_length, threads=threads)
-        density = Density.from_image(image)
+            return OpenObjective(level, self.image, self.outside, decay_length, threads=threads)
+        density = Density.from_image(self.image)
         return TransportObjective(level.triangulation.copy(), level.mass, density, threads=threads)
+
+    def softened(self, level: Level, blur: float, factor: int) -> TransportObjective:
+        """Pose it for pixels that were split, each side by a factor, then blurred by so many."""
+        pixels = split_pixels(self.image, factor)
+        outside = self.outside and self.outside.split(factor)
+        decay_length = self.options.decay_length and factor * self.options.decay_length
+        options = self.options.model_copy(update={"decay_length": decay_length})
+        return _Target(blurred(pixels, blur), outside, options).objective(level)
 
     def sharpened(self, level: Level, tolerance: float, report: Reporter | None) -> Solution:
         """Solve a level from zero weights, by way of blurred images."""
         return sharpen(
             level,
-            partial(self.objective, level),
+            self.objective(level),
+            self.softened,
             tolerance=tolerance,
             max_iterations=self.options.max_iterations,
             report=report,
