@@ -42,7 +42,7 @@ _SMOOTH = 1.5  # smallest blur, in pixels, that hides them
 _MOST_PARTS = 8  # of a pixel's side
 _MOST_PIXELS = 2**22  # after splitting
 _SHARES_OF_PREDICTION = (1.0, 0.5, 0.25)
-_LEAST_OF_PREDICTION = 1e-2  # of the smallest cell's flux before it
+_LEAST_OF_PREDICTION = 1e-2  # of the smallest flux to reach
 
 
 def blurred(image: Array, width: float) -> Array:
@@ -191,7 +191,7 @@ def _starts(
         return
     last = solved[-1]
     if len(solved) > 1:
-        least = _LEAST_OF_PREDICTION * float(objective.diagram(last.weights).masses.min())
+        least = _LEAST_OF_PREDICTION * float(objective.mass.min())
         slope = (last.weights - solved[-2].weights) / (last.width - solved[-2].width)
         for share in _SHARES_OF_PREDICTION:
             predicted = last.weights + share * (width - last.width) * slope
