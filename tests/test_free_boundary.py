@@ -8,7 +8,7 @@ import pytest
 from napari_shadowinv import InputError, InversionOptions, invert, plan_sites, synthetic_image
 from napari_shadowinv.error_bars import uncertainty
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.transport.outside import Outside, crossings
+from napari_shadowinv.transport.margin import Margin, edge_flux
 
 SIDE, AROUND = 100, 40
 FREE = InversionOptions(boundary="free", n_sites=4000)
@@ -73,11 +73,11 @@ def test_the_flux_through_each_side_is_that_of_the_true_rays(across, plan):
     known = FREE.model_copy(update={"flux": "known"})
     report = invert(image, plan=plan, options=known).report
     field = shot(ACROSS)[1]
-    outside = Outside(np.ones(field.shape[1:]), AROUND)
-    of_image = np.zeros(outside.beam.shape)
-    outside.within(of_image)[:] = 1
-    left, entered = crossings(
-        synthetic_image(field, of_image), synthetic_image(field, 1 - of_image), outside
+    margin = Margin(np.ones(field.shape[1:]), AROUND)
+    of_image = np.zeros(margin.beam.shape)
+    margin.within(of_image)[:] = 1
+    left, entered = edge_flux(
+        synthetic_image(field, of_image), synthetic_image(field, 1 - of_image), margin
     )
     assert max(left.values()) > 0.001
     for side in ("top", "bottom", "left", "right"):
@@ -147,11 +147,11 @@ def test_error_bars_know_the_boundary(across, plan):
 def test_the_source_goes_on_beyond_the_edge_past_what_cannot_be_used():
     source = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     mask = np.array([[True, True, True], [False, True, True]])
-    outside = Outside.around(source, 2, mask)
-    np.testing.assert_array_equal(outside.within(outside.beam), source)
-    assert outside.beam[0, 0] == 1
-    assert outside.beam[-1, -1] == 6
-    assert outside.beam[3, 1] in (1, 5)  # beside the masked 4
+    margin = Margin.around(source, 2, mask)
+    np.testing.assert_array_equal(margin.within(margin.beam), source)
+    assert margin.beam[0, 0] == 1
+    assert margin.beam[-1, -1] == 6
+    assert margin.beam[3, 1] in (1, 5)  # beside the masked 4
 
 
 @pytest.mark.parametrize(

@@ -249,7 +249,7 @@ class _Sampling:
         image = self._image(seed)
         plan = self.plan
         solution = solve(
-            plan.levels, image, self.options, report, start=self.start, outside=plan.outside
+            plan.levels, image, self.options, report, start=self.start, margin=plan.margin
         )[-1]
         potential, displacement = (
             plan.within(values) for values in read_out(plan, solution, self.options)

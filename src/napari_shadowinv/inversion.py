@@ -33,7 +33,7 @@ from napari_shadowinv.preprocess import (
 )
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.readout import read_out
-from napari_shadowinv.transport.outside import Outside, crossings
+from napari_shadowinv.transport.margin import Margin, edge_flux
 from napari_shadowinv.transport.sites import SitePlan, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fitted_flux, solve
 from napari_shadowinv.trust import doubts, image_residual
@@ -251,7 +251,7 @@ def plan_sites(
     options = options or InversionOptions()
     ground = _ground(source, options, mask)
     plan = plan_levels(
-        ground.beam if ground.outside is None else ground.outside.beam,
+        ground.beam if ground.margin is None else ground.margin.beam,
         ground.n_sites,
         lloyd_iterations=options.lloyd_iterations,
         lloyd_tolerance=options.lloyd_tolerance,
@@ -263,7 +263,7 @@ def plan_sites(
         plan,
         source=ground.beam * ground.unit,
         mask=ground.mask,
-        outside=ground.outside,
+        margin=ground.margin,
         unit=ground.unit,
     )
 
@@ -300,7 +300,7 @@ class _Ground(NamedTuple):
     beam: Array
     unit: float
     mask: NDArray[np.bool_] | None
-    outside: Outside | None
+    margin: Margin | None
     n_sites: int
 
 
@@ -314,8 +314,8 @@ def _ground(source: ArrayLike, options: InversionOptions, mask: ArrayLike | None
     beam = beam / unit
     if options.boundary != "free":
         return _Ground(beam, unit, usable, None, n_sites)
-    outside = Outside.around(beam, margin_around(beam.shape, options), usable)
-    return _Ground(beam, unit, usable, outside, round(n_sites * outside.beam.sum() / beam.sum()))
+    margin = Margin.around(beam, margin_around(beam.shape, options), usable)
+    return _Ground(beam, unit, usable, margin, round(n_sites * margin.beam.sum() / beam.sum()))
 
 
 def invert(
@@ -411,9 +411,9 @@ def invert(
                 should_stop=should_stop,
             )
     with stopwatch("transport"):
-        if plan.outside is not None and options.flux == "fit":
+        if plan.margin is not None and options.flux == "fit":
             image_flux = fitted_flux(
-                plan.levels, prepared.floored_image, plan.outside, options, report
+                plan.levels, prepared.floored_image, plan.margin, options, report
             )
             scale = prepared.flux_scale / image_flux
             prepared = prepare(image, source, options, mask, flux_scale=scale)
@@ -424,7 +424,7 @@ def invert(
             options,
             report,
             start=weights,
-            outside=plan.outside,
+            margin=plan.margin,
         )
     with stopwatch("read-out"):
         fields = _read_fields(plan, prepared, solutions[-1], options, report)
@@ -435,7 +435,7 @@ def invert(
         source=prepared.source,
         potential=fields.potential,
         displacement=fields.displacement,
-        sites=level.sites - plan.margin,
+        sites=level.sites - plan.margin_width,
         weights=solutions[-1].weights,
         site_mass=level.mass * plan.unit,
         site_flux=solutions[-1].flux * plan.unit,
@@ -450,15 +450,15 @@ def invert(
 
 
 def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:
-    made_for = "closed" if plan.outside is None else "free"
+    made_for = "closed" if plan.margin is None else "free"
     if options.boundary != made_for:
         raise InputError(
             f"plan was made for a {made_for} boundary and options say '{options.boundary}': "
             "make the plan with the same options"
         )
-    if plan.outside is not None and plan.margin != margin_around(plan.source.shape, options):
+    if plan.margin is not None and plan.margin_width != margin_around(plan.source.shape, options):
         raise InputError(
-            f"plan has a margin of {plan.margin} px and options ask for "
+            f"plan has a margin of {plan.margin_width} px and options ask for "
             f"{margin_around(plan.source.shape, options)} px: make the plan with the same options"
         )
 
@@ -485,15 +485,15 @@ def _read_fields(
     source = prepared.source / prepared.unit
     left: dict[str, float] = {}
     entered: dict[str, float] = {}
-    if plan.outside is None:
+    if plan.margin is None:
         reprojection = _reprojection(displacement, source, options, report, _READ, _STEPS)
     else:
         halfway = (_READ + _STEPS) // 2
-        of_image, of_margin = plan.outside.parts(source)
+        of_image, of_margin = plan.margin.parts(source)
         from_image = _reprojection(displacement, of_image, options, report, _READ, halfway)
         from_margin = _reprojection(displacement, of_margin, options, report, halfway, _STEPS)
         reprojection = plan.within(from_image + from_margin)
-        left, entered = crossings(from_image, from_margin, plan.outside)
+        left, entered = edge_flux(from_image, from_margin, plan.margin)
     inner = plan.within(potential)
     return _Fields(
         np.ascontiguousarray(inner - border_mean(inner)),
@@ -529,7 +529,7 @@ def _reprojection(
 def _weights_of(start: Inversion, plan: SitePlan) -> Array:
     """Return the weights to start from, if they belong to the finest sites of this plan."""
     level = plan.levels[-1]
-    found, expected = start.sites + plan.margin, level.sites
+    found, expected = start.sites + plan.margin_width, level.sites
     if found.shape != expected.shape or np.abs(found - expected).max() > 1e-3 * level.spacing:
         raise InputError(
             f"start has {len(found):,} sites that are not the {len(expected):,} of this inversion: "

@@ -267,7 +267,7 @@ def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
     mask = np.ones(beam.shape, bool) if beam.mask is None else beam.mask
     source = None if beam.source is None else checked_source(beam.source, beam.mask)
     return {
-        "sites": level.sites - plan.margin,
+        "sites": level.sites - plan.margin_width,
         "site_mass": level.mass * plan.unit,
         "mask": mask,
         "source": source,

@@ -16,7 +16,6 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import cached_property
 from threading import Event
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +28,7 @@ from napari_shadowinv.geometry.interpolation import mirrored_across_border
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 from napari_shadowinv.progress import Reporter
-
-if TYPE_CHECKING:
-    from napari_shadowinv.transport.outside import Outside
+from napari_shadowinv.transport.margin import Margin
 
 __all__ = ["Level", "SitePlan", "lloyd", "plan_levels", "sample_sites"]
 
@@ -154,7 +151,7 @@ class SitePlan:
         Coarse to fine.
     mask : ndarray of bool, shape (H, W), or None
         Where the source is known; elsewhere it only keeps the cells together.
-    outside : Outside or None
+    margin : Margin or None
         The margin around the image that the sites cover too, where the boundary is free; the
         levels' coordinates are then those of image and margin.
     unit : float
@@ -164,17 +161,17 @@ class SitePlan:
     source: Array
     levels: tuple[Level, ...]
     mask: NDArray[np.bool_] | None = None
-    outside: Outside | None = None
+    margin: Margin | None = None
     unit: float = 1.0
 
     @property
-    def margin(self) -> int:
+    def margin_width(self) -> int:
         """Pixels by which the levels' coordinates exceed those of the image."""
-        return 0 if self.outside is None else self.outside.margin
+        return 0 if self.margin is None else self.margin.width
 
     def within(self, values: Array) -> Array:
         """Return the image's part of an array that covers what the levels cover."""
-        return values if self.outside is None else self.outside.within(values)
+        return values if self.margin is None else self.margin.within(values)
 
 
 @njit(nogil=True, cache=True)

@@ -20,9 +20,10 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.continuation import blurred, sharpen
 from napari_shadowinv.transport.descent import lbfgs, quasi_newton
+from napari_shadowinv.transport.margin import Margin
 from napari_shadowinv.transport.newton import newton, with_full_cells
 from napari_shadowinv.transport.objective import Solution, TransportObjective
-from napari_shadowinv.transport.outside import OpenObjective, Outside
+from napari_shadowinv.transport.open_objective import OpenObjective
 from napari_shadowinv.transport.potential import potential_surface
 from napari_shadowinv.transport.sites import Level
 
@@ -80,7 +81,7 @@ def solve(
     report: Reporter | None = None,
     *,
     start: Array | None = None,
-    outside: Outside | None = None,
+    margin: Margin | None = None,
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
@@ -91,7 +92,7 @@ def solve(
     levels : tuple of Level
         Coarse to fine.
     image : ndarray, shape (H, W)
-        Positive everywhere; without an `outside` with the flux of the source.
+        Positive everywhere; without a `margin` with the flux of the source.
     options : InversionOptions
         Solver, stages, tolerance, most iterations, threads.
     report : Reporter, optional
@@ -99,7 +100,7 @@ def solve(
     start : ndarray, shape (n,), optional
         Weights of the finest level that solve a similar image, px². Where they lead nowhere
         they have no influence on the answer.
-    outside : Outside, optional
+    margin : Margin, optional
         The margin that the levels cover too; without one no flux crosses the image's edge.
 
     Returns
@@ -115,7 +116,7 @@ def solve(
     """
     if options.stages == "single":
         levels = levels[-1:]
-    target = _Target(image, outside, options)
+    target = _Target(image, margin, options)
     if start is not None:
         nearby = _solve_from(start, levels[-1], target, options, report)
         if nearby is not None:
@@ -154,7 +155,7 @@ def _afresh(
 def fitted_flux(
     levels: tuple[Level, ...],
     image: Array,
-    outside: Outside,
+    margin: Margin,
     options: InversionOptions,
     report: Reporter | None = None,
 ) -> float:
@@ -165,7 +166,7 @@ def fitted_flux(
 
     Parameters
     ----------
-    levels, image, outside, options, report
+    levels, image, margin, options, report
         See `solve`; the image with the flux of the source.
 
     Returns
@@ -178,7 +179,7 @@ def fitted_flux(
     for step in _STEPS_OF_FIT:
         moves = [
             _move_at_edge(
-                few[-1], solve(few, trial * image, options, report, outside=outside)[-1], outside
+                few[-1], solve(few, trial * image, options, report, margin=margin)[-1], margin
             )
             for trial in (factor * (1 - step), factor, factor * (1 + step))
         ]
@@ -188,9 +189,9 @@ def fitted_flux(
     return factor
 
 
-def _move_at_edge(level: Level, solution: LevelSolution, outside: Outside) -> float:
+def _move_at_edge(level: Level, solution: LevelSolution, margin: Margin) -> float:
     """Return the mean square displacement of the sites along the image's edge."""
-    at_edge = np.abs(outside.edge_distance(level.sites).min(axis=-1)) < level.spacing
+    at_edge = np.abs(margin.edge_distance(level.sites).min(axis=-1)) < level.spacing
     return float((solution.displacement[at_edge] ** 2).sum(axis=1).mean())
 
 
@@ -223,25 +224,25 @@ class _Target:
     """Where the flux goes."""
 
     image: Array
-    outside: Outside | None
+    margin: Margin | None
     options: InversionOptions
 
     def objective(self, level: Level) -> TransportObjective:
         """Pose the problem for the sites of a level."""
         threads = self.options.threads
-        if self.outside is not None:
-            decay_length = self.options.decay_length or self.outside.margin
-            return OpenObjective(level, self.image, self.outside, decay_length, threads=threads)
+        if self.margin is not None:
+            decay_length = self.options.decay_length or self.margin.width
+            return OpenObjective(level, self.image, self.margin, decay_length, threads=threads)
         density = Density.from_image(self.image)
         return TransportObjective(level.triangulation.copy(), level.mass, density, threads=threads)
 
     def softened(self, level: Level, blur: float, factor: int) -> TransportObjective:
         """Pose it for pixels that were split, each side by a factor, then blurred by so many."""
         pixels = split_pixels(self.image, factor)
-        outside = self.outside and self.outside.split(factor)
+        margin = self.margin and self.margin.split(factor)
         decay_length = self.options.decay_length and factor * self.options.decay_length
         options = self.options.model_copy(update={"decay_length": decay_length})
-        return _Target(blurred(pixels, blur), outside, options).objective(level)
+        return _Target(blurred(pixels, blur), margin, options).objective(level)
 
     def sharpened(self, level: Level, tolerance: float, report: Reporter | None) -> Solution:
         """Solve a level from zero weights, by way of blurred images."""
