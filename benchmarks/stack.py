@@ -32,7 +32,7 @@ from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.stack import ShotOutcome, read_shot
 from napari_shadowinv.stack._local import local_client
-from napari_shadowinv.stack._work import Beam, invert_shot
+from napari_shadowinv.stack._worker import Beam, invert_shot
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 

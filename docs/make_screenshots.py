@@ -20,7 +20,7 @@ from qtpy.QtWidgets import QApplication
 
 import napari
 from napari_shadowinv import InversionOptions, add_inversion, invert
-from napari_shadowinv._napari.marks import setup_of
+from napari_shadowinv._napari.layer_metadata import setup_of
 from napari_shadowinv.stack import read_shot
 
 HERE = Path(__file__).parent / "pictures"

@@ -30,9 +30,9 @@ from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.memory import physical_memory
+from napari_shadowinv.normalise import prepare
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
-from napari_shadowinv.preprocess import prepare
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.readout import read_out
 from napari_shadowinv.transport.objective import TransportObjective

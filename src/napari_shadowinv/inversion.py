@@ -18,10 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
-from napari_shadowinv.physics.poisson import border_mean
-from napari_shadowinv.preprocess import (
+from napari_shadowinv.normalise import (
     Prepared,
     checked_mask,
     checked_source,
@@ -31,6 +28,9 @@ from napari_shadowinv.preprocess import (
     power_of_two,
     prepare,
 )
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
+from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.readout import read_out
 from napari_shadowinv.transport.margin import Margin, edge_flux

@@ -49,8 +49,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 if TYPE_CHECKING:
+    from napari_shadowinv.normalise import Prepared
     from napari_shadowinv.options import InversionOptions
-    from napari_shadowinv.preprocess import Prepared
 
 __all__ = ["doubts", "image_residual"]
 

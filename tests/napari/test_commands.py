@@ -10,7 +10,7 @@ from napari.components import ViewerModel
 
 from napari_shadowinv import InputError, ProtonSetup, invert
 from napari_shadowinv._napari import commands
-from napari_shadowinv._napari.marks import role_of, setup_of
+from napari_shadowinv._napari.layer_metadata import role_of, setup_of
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair

@@ -13,8 +13,8 @@ from napari.components import ViewerModel
 
 from napari_shadowinv import InputError, OpticalSetup, ProtonSetup, add_inversion, invert
 from napari_shadowinv._napari.frame import frame_for, place
+from napari_shadowinv._napari.layer_metadata import result_of, role_of, setup_of, unit_of
 from napari_shadowinv._napari.layers import inversion_layers, thinned_arrows
-from napari_shadowinv._napari.marks import result_of, role_of, setup_of, unit_of
 from napari_shadowinv._napari.sites import power_cells
 from napari_shadowinv.inversion import Inversion
 

@@ -9,7 +9,7 @@ from napari.components import ViewerModel
 
 from napari_shadowinv import ProtonSetup, add_inversion
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.marks import mark, role_of
+from napari_shadowinv._napari.layer_metadata import mark, role_of
 from napari_shadowinv.inversion import Inversion
 
 

@@ -11,7 +11,7 @@ from napari.components import ViewerModel
 
 from napari_shadowinv import OpticalSetup, ProtonSetup
 from napari_shadowinv._napari import samples
-from napari_shadowinv._napari.marks import role_of, setup_of, source_of
+from napari_shadowinv._napari.layer_metadata import role_of, setup_of, source_of
 from napari_shadowinv.physics.forward import synthetic_image
 
 SHOTS = ("toroid", "toroid_with_caustics", "four_toroids", "coaxial_line")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv import ProtonSetup, read, write
-from napari_shadowinv._napari.marks import role_of, setup_of
+from napari_shadowinv._napari.layer_metadata import role_of, setup_of
 from napari_shadowinv.inversion import Inversion
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -11,7 +11,7 @@ import pytest
 from napari.components import ViewerModel
 
 from napari_shadowinv import FileFormatError, ProtonSetup, add_inversion, read
-from napari_shadowinv._napari.marks import mark_of, result_of, role_of
+from napari_shadowinv._napari.layer_metadata import mark_of, result_of, role_of
 from napari_shadowinv._napari.writer import write_result
 from napari_shadowinv.inversion import Inversion
 

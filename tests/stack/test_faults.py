@@ -37,7 +37,7 @@ from napari_shadowinv.io.locking import locked
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import _engines
 from napari_shadowinv.stack._engines import engine_for
-from napari_shadowinv.stack._work import threads_here
+from napari_shadowinv.stack._worker import threads_here
 
 OPTIONS = InversionOptions(n_sites=100)
 PATIENCE = 90.0
@@ -196,23 +196,23 @@ def test_a_dask_array_on_the_cluster_is_inverted_there(night, out, expected, clu
 
 def count_plans() -> None:
     """Make this process count the plans that it makes."""
-    from napari_shadowinv.stack import _work
+    from napari_shadowinv.stack import _worker
 
-    original = _work.plan_sites
+    original = _worker.plan_sites
 
     def plan_sites(source, options, **more):
         plan_sites.made += 1
         return original(source, options, **more)
 
     plan_sites.made = 0
-    _work._entries.clear()
-    _work.plan_sites = plan_sites
+    _worker._entries.clear()
+    _worker.plan_sites = plan_sites
 
 
 def plans_made() -> int:
-    from napari_shadowinv.stack import _work
+    from napari_shadowinv.stack import _worker
 
-    return _work.plan_sites.made
+    return _worker.plan_sites.made
 
 
 def test_a_lazy_stack_on_the_cluster_makes_its_sites_once_in_each_worker(make_night, cluster):

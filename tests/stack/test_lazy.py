@@ -15,14 +15,14 @@ import xarray as xr
 
 from napari_shadowinv import FileFormatError, InputError, InversionOptions, invert, invert_stack
 from napari_shadowinv.physics.setup import OpticalSetup
-from napari_shadowinv.stack import _work
+from napari_shadowinv.stack import _worker
 
 OPTIONS = InversionOptions(n_sites=100)
 
 
 @pytest.fixture(autouse=True)
 def no_plans(monkeypatch):
-    monkeypatch.setattr(_work, "_entries", type(_work._entries)())
+    monkeypatch.setattr(_worker, "_entries", type(_worker._entries)())
 
 
 @pytest.fixture
@@ -33,8 +33,8 @@ def plans_made(monkeypatch):
         made.append(source)
         return original(source, options, **more)
 
-    original = _work.plan_sites
-    monkeypatch.setattr(_work, "plan_sites", plan_sites)
+    original = _worker.plan_sites
+    monkeypatch.setattr(_worker, "plan_sites", plan_sites)
     return made
 
 
@@ -106,13 +106,13 @@ def test_sites_are_made_once_for_shots_with_one_source(night, plans_made, schedu
 
 
 def test_threads_that_ask_at_once_get_the_same_plan(night, plans_made):
-    beam = _work.Beam.of(night.source.shape, night.source, None)
+    beam = _worker.Beam.of(night.source.shape, night.source, None)
     plans: list[object] = []
     start = threading.Barrier(4)
 
     def ask() -> None:
         start.wait()
-        plans.append(_work.shared_plan(beam, OPTIONS.model_copy(update={"threads": 1})))
+        plans.append(_worker.shared_plan(beam, OPTIONS.model_copy(update={"threads": 1})))
 
     threads = [threading.Thread(target=ask) for _ in range(4)]
     for thread in threads:
@@ -128,16 +128,16 @@ def test_plans_are_told_apart_by_source_mask_and_options_not_by_threads(night, p
     mask = np.ones(night.source.shape, bool)
     mask[0, 0] = False
     beams = [
-        _work.Beam.of(night.source.shape, night.source, None),
-        _work.Beam.of(night.source.shape, night.source + 1, None),
-        _work.Beam.of(night.source.shape, night.source, mask),
+        _worker.Beam.of(night.source.shape, night.source, None),
+        _worker.Beam.of(night.source.shape, night.source + 1, None),
+        _worker.Beam.of(night.source.shape, night.source, mask),
     ]
     for beam in beams:
         for _ in range(2):
-            _work.shared_plan(beam, OPTIONS)
-    _work.shared_plan(beams[2], OPTIONS.model_copy(update={"threads": 2}))
+            _worker.shared_plan(beam, OPTIONS)
+    _worker.shared_plan(beams[2], OPTIONS.model_copy(update={"threads": 2}))
     assert len(plans_made) == 3
-    _work.shared_plan(beams[2], OPTIONS.model_copy(update={"seed": 1}))
+    _worker.shared_plan(beams[2], OPTIONS.model_copy(update={"seed": 1}))
     assert len(plans_made) == 4
 
 
@@ -295,11 +295,11 @@ def test_only_what_is_asked_for_is_made(night):
     ("workers", "cores", "threads"), [(1, 8, 8), (2, 8, 4), (3, 8, 2), (8, 8, 1), (16, 8, 1)]
 )
 def test_all_shots_at_once_never_have_more_threads_than_cores(monkeypatch, workers, cores, threads):
-    monkeypatch.setattr(_work, "available_threads", lambda _: cores)
-    assert _work.threads_here(workers) == threads
+    monkeypatch.setattr(_worker, "available_threads", lambda _: cores)
+    assert _worker.threads_here(workers) == threads
     seen = []
     with dask.config.set(num_workers=workers):
-        ask = threading.Thread(target=lambda: seen.append(_work.threads_here()))
+        ask = threading.Thread(target=lambda: seen.append(_worker.threads_here()))
         ask.start()
         ask.join()
     assert seen == [threads]

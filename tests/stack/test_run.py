@@ -24,7 +24,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import read_shot
-from napari_shadowinv.stack._shot import described_reader
+from napari_shadowinv.stack._references import described_reader
 
 OPTIONS = InversionOptions(n_sites=100)
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.marks import (
+from napari_shadowinv._napari.layer_metadata import (
     SOURCE,
     may_be_shot,
     may_be_source,
@@ -26,7 +26,7 @@ from napari_shadowinv._napari.marks import (
     setup_of,
     setup_origin_of,
 )
-from napari_shadowinv._napari.notices import MISTAKES, in_event_loop, show_mistake, told
+from napari_shadowinv._napari.notifications import MISTAKES, in_event_loop, show_mistake, told
 from napari_shadowinv.errors import InputError, InversionCancelled
 
 if TYPE_CHECKING:
@@ -223,8 +223,8 @@ def _work_beside(picked: _Picked, work: Work, title: str, viewer: Any) -> None:
 
 
 def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+    from napari_shadowinv._napari.layer_metadata import Result
     from napari_shadowinv._napari.layers import result_layers
-    from napari_shadowinv._napari.marks import Result
     from napari_shadowinv.inversion import invert
 
     inversion = invert(picked.image, should_stop=should_stop)

@@ -5,7 +5,7 @@
 
 The lowest layer comes first. The strength of the field and the arrows are visible, all others
 are there to be switched on. What each layer shows, in which unit, and the whole result behind
-it are in its metadata; see `napari_shadowinv._napari.marks`.
+it are in its metadata; see `napari_shadowinv._napari.layer_metadata`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_for
+from napari_shadowinv._napari.layer_metadata import Result, mark, role_of
 from napari_shadowinv._napari.legend import follow_top_image
-from napari_shadowinv._napari.marks import Result, mark, role_of
 from napari_shadowinv._napari.placing import place_newcomers
 from napari_shadowinv.plotting import ShownField, shown_fields, shown_potential
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from napari_shadowinv._napari.following import LayerEvents
-from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.layer_metadata import role_of
 
 __all__ = ["follow_top_image"]
 

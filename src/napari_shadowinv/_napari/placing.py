@@ -10,7 +10,7 @@ from typing import Any
 
 from napari_shadowinv._napari.following import LayerEvents
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.layer_metadata import role_of
 
 __all__ = ["place_newcomers"]
 

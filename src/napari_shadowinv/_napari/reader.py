@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv._napari.notices import show_caution, told
+from napari_shadowinv._napari.notifications import show_caution, told
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.safety import refusing_damage
 
@@ -100,7 +100,7 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
     if not isinstance(path, str):
         return list(stack_layers([Path(item) for item in path]))
     if path.rstrip("/").endswith(_STORE_SUFFIX):
-        from napari_shadowinv._napari.leafing import follow_once_added
+        from napari_shadowinv._napari.arrow_sync import follow_once_added
         from napari_shadowinv._napari.stores import store_layers
 
         layers = store_layers(Path(path))
@@ -125,7 +125,7 @@ def _matches(pattern: str) -> list[Path]:
 
 @refusing_damage
 def _read_file(path: Path) -> list[FullLayerData]:
-    from napari_shadowinv._napari.saved import layers_of_dataset
+    from napari_shadowinv._napari.layer_state import layers_of_dataset
     from napari_shadowinv._napari.shots import radiograph_layers
     from napari_shadowinv.io import Radiograph, read
 

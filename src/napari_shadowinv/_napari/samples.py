@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._napari.layer_metadata import CAME_WITH
 from napari_shadowinv._napari.lazy import lazy_stack
-from napari_shadowinv._napari.marks import CAME_WITH
 from napari_shadowinv._napari.shots import radiograph_layers, shot_layer
 
 if TYPE_CHECKING:

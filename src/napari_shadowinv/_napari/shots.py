@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_for
+from napari_shadowinv._napari.layer_metadata import CAME_WITH, MASK, SHOT, SOURCE, mark
 from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
 from napari_shadowinv._napari.lazy import lazy_stack
-from napari_shadowinv._napari.marks import CAME_WITH, MASK, SHOT, SOURCE, mark
-from napari_shadowinv._napari.notices import show_caution
+from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
 

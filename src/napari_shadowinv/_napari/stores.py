@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_for
+from napari_shadowinv._napari.layer_metadata import mark
 from napari_shadowinv._napari.layers import (
     FullLayerData,
     arrow_keywords,
@@ -25,7 +26,6 @@ from napari_shadowinv._napari.layers import (
     symmetric_limits,
     thinned_arrows,
 )
-from napari_shadowinv._napari.marks import mark
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.safety import refusing_damage
 
@@ -58,7 +58,7 @@ def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
     list of (data, keywords, layer type)
         Layers over dask arrays of shape (shots, H, W), the lowest first: those of a single
         result as far as the store has them, without sites. The arrows are those of the first
-        finished shot; see `napari_shadowinv._napari.leafing`.
+        finished shot; see `napari_shadowinv._napari.arrow_sync`.
 
     Raises
     ------

@@ -18,8 +18,8 @@ import numpy as np
 from napari_shadowinv.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
+    from napari_shadowinv._napari.layer_metadata import Result
     from napari_shadowinv._napari.layers import FullLayerData
-    from napari_shadowinv._napari.marks import Result
 
 __all__ = ["write_pradformat", "write_result", "write_sites"]
 
@@ -101,7 +101,7 @@ def _write(path: str, layers: Sequence[FullLayerData], suffixes: tuple[str, ...]
 def _write_result(
     path: str, layers: Sequence[FullLayerData], suffixes: tuple[str, ...]
 ) -> list[str]:
-    from napari_shadowinv._napari.saved import dataset_of_layers
+    from napari_shadowinv._napari.layer_state import dataset_of_layers
     from napari_shadowinv.io import write
 
     own, result = _one_result(layers)
@@ -115,7 +115,7 @@ def _write_result(
 
 
 def _one_result(layers: Sequence[FullLayerData]) -> tuple[list[FullLayerData], Result]:
-    from napari_shadowinv._napari.marks import result_of
+    from napari_shadowinv._napari.layer_metadata import result_of
 
     results = {id(found): found for layer in layers if (found := result_of(layer[1])) is not None}
     if len(results) > 1:
@@ -136,8 +136,8 @@ def _one_result(layers: Sequence[FullLayerData]) -> tuple[list[FullLayerData], R
 def _warn_of_changes(layers: Sequence[FullLayerData], result: Result) -> None:
     """Say which layers no longer show what the file will hold."""
     from napari_shadowinv._napari.frame import Frame
+    from napari_shadowinv._napari.layer_metadata import role_of
     from napari_shadowinv._napari.layers import result_layers
-    from napari_shadowinv._napari.marks import role_of
 
     images = [layer for layer in layers if layer[2] == "image"]
     retrieved = {role_of(layer[1]): layer[0] for layer in result_layers(result, Frame())}

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.camera import read_b16, read_spe
 from napari_shadowinv.io.matlab import read_mat
-from napari_shadowinv.io.promises import DEFLATE_RATIO, check_promise
 from napari_shadowinv.io.radiograph import film_warnings, to_grey
+from napari_shadowinv.io.size_checks import DEFLATE_RATIO, check_promise
 from napari_shadowinv.io.text import read_text
 from napari_shadowinv.safety import check_regular, check_size, refusing_damage
 

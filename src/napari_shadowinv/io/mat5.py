@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.io.promises import DEFLATE_RATIO, check_promise
+from napari_shadowinv.io.size_checks import DEFLATE_RATIO, check_promise
 from napari_shadowinv.safety import check_size
 
 __all__ = ["Variable", "variables_5"]

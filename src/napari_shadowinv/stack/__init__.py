@@ -7,8 +7,8 @@
 """
 
 from napari_shadowinv.stack._lazy import invert_stack
+from napari_shadowinv.stack._references import read_shot
 from napari_shadowinv.stack._run import STORED, RunProgress, run_stack
-from napari_shadowinv.stack._shot import read_shot
 from napari_shadowinv.stack._statistics import stack_statistics
 from napari_shadowinv.stack._tasks import ShotOutcome
 

@@ -18,7 +18,7 @@ from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.progress import ShouldStop
 from napari_shadowinv.stack._local import local_client
-from napari_shadowinv.stack._shot import BlockShot, Shot
+from napari_shadowinv.stack._references import BlockShot, Shot
 
 __all__ = ["Engine", "EngineError", "WorkerDied", "engine_for", "is_here"]
 

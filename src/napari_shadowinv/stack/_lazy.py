@@ -14,8 +14,8 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.dataset import variable_labels
 from napari_shadowinv.io.store import SUMMARY
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.stack._shot import Reader, Shot, read_shot
-from napari_shadowinv.stack._stack import (
+from napari_shadowinv.stack._references import Reader, Shot, read_shot
+from napari_shadowinv.stack._spec import (
     Stack,
     attributes_of,
     coordinates_of,
@@ -23,7 +23,7 @@ from napari_shadowinv.stack._stack import (
     dtype_of,
     values_of_beam,
 )
-from napari_shadowinv.stack._work import Beam, Work
+from napari_shadowinv.stack._worker import Beam, Work
 
 if TYPE_CHECKING:
     import xarray

@@ -20,8 +20,8 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.dataset import variable_labels
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.io.store_layout import Contents, Variable, grow_store
-from napari_shadowinv.stack._shot import checksum
-from napari_shadowinv.stack._stack import (
+from napari_shadowinv.stack._references import checksum
+from napari_shadowinv.stack._spec import (
     Stack,
     attributes_of,
     coordinates_of,

@@ -28,9 +28,9 @@ from napari_shadowinv.io.store_layout import create_store
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Progress, ShouldStop
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
+from napari_shadowinv.stack._references import Reader, read_shot
 from napari_shadowinv.stack._resuming import contents_of, continued, lengthened
-from napari_shadowinv.stack._shot import Reader, read_shot
-from napari_shadowinv.stack._stack import Stack, describe_stack
+from napari_shadowinv.stack._spec import Stack, describe_stack
 from napari_shadowinv.stack._tasks import Settings, ShotOutcome, run_shots
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
-from napari_shadowinv.stack._shot import Shot, checksum
-from napari_shadowinv.stack._work import Beam, Work
+from napari_shadowinv.stack._references import Shot, checksum
+from napari_shadowinv.stack._worker import Beam, Work
 
 __all__ = ["Settings", "ShotOutcome", "run_shots"]
 

@@ -21,7 +21,7 @@ from qtpy.QtCore import QTimer
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.marks import mark, result_of, role_of, unit_of
+from napari_shadowinv._napari.layer_metadata import mark, result_of, role_of, unit_of
 from napari_shadowinv._napari.widgets import _runner
 from napari_shadowinv._napari.widgets._jobs import ShotJob
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert
-from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.recipes import LowPassEstimate, LowPassFilter
-from napari_shadowinv.stack import _engines, _work
+from napari_shadowinv.stack import _engines, _worker
 
 Array = np.ndarray[Any, Any]
 FEW = {"n_sites": 100}
@@ -71,7 +71,7 @@ def at_rest(tool: Any) -> bool:
 def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Hold each run at its third shot, as a large image would, until it is stopped or let go."""
     let_go = threading.Event()
-    original = _work.invert_shot
+    original = _worker.invert_shot
     count = iter(range(1000))
 
     def holding(*args: Any, should_stop: Any = None, **kwargs: Any) -> Any:
@@ -80,7 +80,7 @@ def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
                 time.sleep(0.01)
         return original(*args, should_stop=should_stop, **kwargs)
 
-    monkeypatch.setattr(_work, "invert_shot", holding)
+    monkeypatch.setattr(_worker, "invert_shot", holding)
     return let_go
 
 

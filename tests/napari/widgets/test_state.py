@@ -13,8 +13,7 @@ from napari.components import ViewerModel
 
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
 from napari_shadowinv._napari import commands
-from napari_shadowinv._napari.layers import add_inversion
-from napari_shadowinv._napari.marks import (
+from napari_shadowinv._napari.layer_metadata import (
     mark,
     mark_of,
     result_of,
@@ -23,6 +22,7 @@ from napari_shadowinv._napari.marks import (
     setup_origin_of,
     source_of,
 )
+from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets._jobs import ShotJob
 from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._stacking import StackJob

@@ -12,8 +12,8 @@ import pytest
 from qtpy.QtWidgets import QFileDialog
 
 from napari_shadowinv import ProtonSetup, sources
+from napari_shadowinv._napari.layer_metadata import mark, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_inversion
-from napari_shadowinv._napari.marks import mark, role_of, source_of, unit_of
 from napari_shadowinv._napari.widgets.forward_model import DEFLECTORS
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.dataset import displacement_from_potential

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.marks import MASK, mark
+from napari_shadowinv._napari.layer_metadata import MASK, mark
 from napari_shadowinv._napari.widgets._reading import image_of, stack_of
 
 __all__ = ["new_mask", "new_shapes"]

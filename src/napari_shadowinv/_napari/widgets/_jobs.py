@@ -169,7 +169,7 @@ class ShotJob:
         """
         from napari_shadowinv.compilation import ensure_compiled
         from napari_shadowinv.inversion import invert
-        from napari_shadowinv.preprocess import number_of_sites, prepare
+        from napari_shadowinv.normalise import number_of_sites, prepare
 
         report = Reporter(on_progress, should_stop)
         seconds: dict[str, float] = {}
@@ -273,7 +273,7 @@ class ShotJob:
         should_stop: ShouldStop | None,
         on_warning: OnWarning,
     ) -> Image:
-        from napari_shadowinv.preprocess import checked_source
+        from napari_shadowinv.normalise import checked_source
 
         if preparation.estimate is not None:
             most_pixels = PREVIEW_PIXELS if self.preview else None

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._napari.marks import may_be_shot, result_of, role_of, setup_of, unit_of
+from napari_shadowinv._napari.layer_metadata import (
+    may_be_shot,
+    result_of,
+    role_of,
+    setup_of,
+    unit_of,
+)
 from napari_shadowinv._napari.widgets._quantities import parsed
 from napari_shadowinv._napari.widgets._reading import image_of, shown_plane
 from napari_shadowinv.errors import InputError

@@ -8,7 +8,7 @@ from qtpy.QtCore import QTimer
 from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari.widgets._base import ToolPanel
-from napari_shadowinv._napari.widgets._messages import MISTAKES, reporting
+from napari_shadowinv._napari.widgets._notifications import MISTAKES, reporting
 from napari_shadowinv._napari.widgets._panels import RunPanel
 from napari_shadowinv._napari.widgets._runner import Outcome
 

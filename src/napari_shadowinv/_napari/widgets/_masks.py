@@ -8,11 +8,11 @@ from typing import Any
 from qtpy.QtCore import Signal
 from qtpy.QtWidgets import QCheckBox, QVBoxLayout, QWidget
 
-from napari_shadowinv._napari.marks import MASK, mark_of, may_be_mask, role_of
+from napari_shadowinv._napari.layer_metadata import MASK, mark_of, may_be_mask, role_of
 from napari_shadowinv._napari.widgets._base import with_button
 from napari_shadowinv._napari.widgets._drawing import new_mask
 from napari_shadowinv._napari.widgets._forms import labelled
-from napari_shadowinv._napari.widgets._messages import reporting
+from napari_shadowinv._napari.widgets._notifications import reporting
 from napari_shadowinv._napari.widgets._picking import LayerPicker
 from napari_shadowinv._napari.widgets._reading import Mask, mask_of
 

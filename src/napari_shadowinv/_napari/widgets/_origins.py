@@ -21,7 +21,7 @@ class Origins:
     mask, source_mask : str
         Likewise; empty if there is none.
     setup_origin : str
-        As `napari_shadowinv._napari.marks.setup_origin_of` tells it; empty for no setup.
+        As `napari_shadowinv._napari.layer_metadata.setup_origin_of` tells it; empty for no setup.
     """
 
     image: str

@@ -27,7 +27,7 @@ from superqt import QCollapsible
 
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, wrapping_label
 from napari_shadowinv._napari.widgets._lifetime import when_destroyed
-from napari_shadowinv._napari.widgets._messages import error_text, tell_error
+from napari_shadowinv._napari.widgets._notifications import error_text, tell_error
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv.progress import Progress
 

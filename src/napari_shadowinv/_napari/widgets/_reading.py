@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv._napari.marks import mark_of
+from napari_shadowinv._napari.layer_metadata import mark_of
 from napari_shadowinv._napari.widgets._picking import kind_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.radiograph import film_warnings

@@ -17,7 +17,7 @@ from qtpy.QtCore import QObject, QTimer, Signal
 from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, place
-from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv._napari.widgets._picking import kind_of
 
 if TYPE_CHECKING:

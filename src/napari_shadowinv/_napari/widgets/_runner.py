@@ -20,7 +20,7 @@ from typing import Any
 from qtpy.QtCore import QObject, QTimer, Signal
 
 from napari_shadowinv._napari.widgets._lifetime import when_destroyed
-from napari_shadowinv._napari.widgets._messages import MISTAKES
+from napari_shadowinv._napari.widgets._notifications import MISTAKES
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.progress import OnProgress, Progress, ShouldStop
 

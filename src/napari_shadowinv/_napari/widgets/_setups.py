@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QVBoxLayout, QWidget
 
-from napari_shadowinv._napari.marks import CAME_WITH, keep_setup, setup_of, setup_origin_of
+from napari_shadowinv._napari.layer_metadata import CAME_WITH, keep_setup, setup_of, setup_origin_of
 from napari_shadowinv._napari.widgets._forms import ModelPicker, wrapping_label
 from napari_shadowinv._napari.widgets._toml import TomlButtons
 from napari_shadowinv.errors import InputError

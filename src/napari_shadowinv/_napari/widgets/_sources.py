@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_shadowinv._napari.marks import (
+from napari_shadowinv._napari.layer_metadata import (
     SOURCE,
     mark_of,
     may_be_source,

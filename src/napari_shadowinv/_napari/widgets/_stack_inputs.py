@@ -14,7 +14,7 @@ from typing import Any
 
 from qtpy.QtWidgets import QFileDialog, QLineEdit, QSpinBox
 
-from napari_shadowinv._napari.marks import may_be_shot
+from napari_shadowinv._napari.layer_metadata import may_be_shot
 from napari_shadowinv._napari.widgets._base import PathEdit
 from napari_shadowinv._napari.widgets._forms import RowPicker, labelled
 from napari_shadowinv._napari.widgets._picking import LayerPicker

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QHeaderView
 
-from napari_shadowinv._napari.marks import KEY, role_of
+from napari_shadowinv._napari.layer_metadata import KEY, role_of
 from napari_shadowinv._napari.widgets._origins import Origins
 from napari_shadowinv._napari.widgets._panels import ReportTable
 from napari_shadowinv._napari.widgets._picking import kind_of

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from qtpy.QtWidgets import QFileDialog, QHBoxLayout, QPushButton, QWidget
 
-from napari_shadowinv._napari.widgets._messages import reporting
+from napari_shadowinv._napari.widgets._notifications import reporting
 from napari_shadowinv.errors import InputError
 
 __all__ = ["TomlButtons", "dump_toml", "load_toml"]

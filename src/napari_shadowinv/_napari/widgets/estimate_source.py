@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.marks import (
+from napari_shadowinv._napari.layer_metadata import (
     SOURCE,
     mark,
     may_be_shot,

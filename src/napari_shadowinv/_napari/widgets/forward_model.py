@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from qtpy.QtWidgets import QHBoxLayout, QLabel, QSpinBox, QWidget
 
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of
+from napari_shadowinv._napari.layer_metadata import CAME_WITH, SHOT, mark, may_be_source, unit_of
 from napari_shadowinv._napari.layers import intensity_limits
-from napari_shadowinv._napari.marks import CAME_WITH, SHOT, mark, may_be_source, unit_of
 from napari_shadowinv._napari.widgets._base import ToolPanel
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forecast import ForwardJob
@@ -25,7 +25,7 @@ from napari_shadowinv._napari.widgets._known_fields import (
     known_field,
     may_be_a_field,
 )
-from napari_shadowinv._napari.widgets._messages import MISTAKES, error_text
+from napari_shadowinv._napari.widgets._notifications import MISTAKES, error_text
 from napari_shadowinv._napari.widgets._panels import RunPanel
 from napari_shadowinv._napari.widgets._phantoms import PHANTOMS
 from napari_shadowinv._napari.widgets._picking import LayerPicker

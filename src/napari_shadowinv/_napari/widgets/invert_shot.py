@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.marks import KEY, SOURCE, Result, may_be_shot, role_of
+from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, may_be_shot, role_of
 from napari_shadowinv._napari.widgets._base import Part, with_button
 from napari_shadowinv._napari.widgets._cleaning import CleaningSection
 from napari_shadowinv._napari.widgets._cost import cost_of
@@ -17,7 +17,7 @@ from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled, wra
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
 from napari_shadowinv._napari.widgets._live import LivePanel
 from napari_shadowinv._napari.widgets._masks import MaskPicker
-from napari_shadowinv._napari.widgets._messages import reporting, tell_warning
+from napari_shadowinv._napari.widgets._notifications import reporting, tell_warning
 from napari_shadowinv._napari.widgets._options import OptionsForm
 from napari_shadowinv._napari.widgets._origins import Origins
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, report_rows, section

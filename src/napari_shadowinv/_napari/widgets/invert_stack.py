@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 from qtpy.QtCore import QTimer
 from qtpy.QtWidgets import QCheckBox, QLabel
 
-from napari_shadowinv._napari.leafing import follow_shots
-from napari_shadowinv._napari.marks import role_of
+from napari_shadowinv._napari.arrow_sync import follow_shots
+from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv._napari.widgets._base import Part, ToolPanel
 from napari_shadowinv._napari.widgets._cleaning import CleaningSection
 from napari_shadowinv._napari.widgets._forms import labelled
 from napari_shadowinv._napari.widgets._masks import MaskPicker
-from napari_shadowinv._napari.widgets._messages import MISTAKES, reporting
+from napari_shadowinv._napari.widgets._notifications import MISTAKES, reporting
 from napari_shadowinv._napari.widgets._options import OptionsForm
 from napari_shadowinv._napari.widgets._origins import Origins
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, section

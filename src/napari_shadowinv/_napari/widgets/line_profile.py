@@ -20,14 +20,14 @@ from qtpy.QtWidgets import (
     QWidget,
 )
 
-from napari_shadowinv._napari.marks import role_of, unit_of
+from napari_shadowinv._napari.layer_metadata import role_of, unit_of
 from napari_shadowinv._napari.widgets._base import with_button
 from napari_shadowinv._napari.widgets._docking import Docked
 from napari_shadowinv._napari.widgets._drawing import new_shapes
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled, wrapping_label
 from napari_shadowinv._napari.widgets._lifetime import while_alive
-from napari_shadowinv._napari.widgets._messages import reporting, tell_info
+from napari_shadowinv._napari.widgets._notifications import reporting, tell_info
 from napari_shadowinv._napari.widgets._picking import LayerPicker, kind_of
 from napari_shadowinv._napari.widgets._plotting import ProfilePlot
 from napari_shadowinv._napari.widgets._reading import shown_plane

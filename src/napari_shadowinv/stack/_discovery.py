@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, text_of
-from napari_shadowinv.stack._shot import (
+from napari_shadowinv.stack._references import (
     ArrayShot,
     BlockShot,
     FileShot,

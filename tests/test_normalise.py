@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.normalise import number_of_sites, prepare
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
-from napari_shadowinv.preprocess import number_of_sites, prepare
 
 
 def test_image_source_and_floored_image_have_one_flux():

@@ -31,7 +31,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preparation import Preparation
 from napari_shadowinv.progress import OnProgress, OnWarning, ShouldStop
 from napari_shadowinv.sources import uniform_warnings
-from napari_shadowinv.stack._shot import checksum
+from napari_shadowinv.stack._references import checksum
 from napari_shadowinv.transport.sites import SitePlan
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv._napari.layer_metadata import mark_of, role_of
 from napari_shadowinv._napari.layers import thinned_arrows
-from napari_shadowinv._napari.marks import mark_of, role_of
 from napari_shadowinv._napari.stores import at_shot, opened_store
 
 if TYPE_CHECKING:

@@ -21,13 +21,13 @@ from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
+from napari_shadowinv.normalise import checked_mask, checked_source
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preparation import Preparation
-from napari_shadowinv.preprocess import checked_mask, checked_source
 from napari_shadowinv.recipes import Estimate, Filter, UniformEstimate
-from napari_shadowinv.stack._shot import Reader, Shot, described_reader
-from napari_shadowinv.stack._shots import Shots, find_shots, find_source
-from napari_shadowinv.stack._work import Beam, Work, shared_plan, threads_here
+from napari_shadowinv.stack._discovery import Shots, find_shots, find_source
+from napari_shadowinv.stack._references import Reader, Shot, described_reader
+from napari_shadowinv.stack._worker import Beam, Work, shared_plan, threads_here
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari.frame import frame_for
+from napari_shadowinv._napari.layer_metadata import Result, role_of
 from napari_shadowinv._napari.layers import FullLayerData, result_layers
-from napari_shadowinv._napari.marks import Result, role_of
 
 if TYPE_CHECKING:
     import xarray
