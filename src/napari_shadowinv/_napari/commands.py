@@ -26,7 +26,12 @@ from napari_shadowinv._napari.layer_metadata import (
     setup_of,
     setup_origin_of,
 )
-from napari_shadowinv._napari.notifications import MISTAKES, in_event_loop, show_mistake, told
+from napari_shadowinv._napari.notifications import (
+    MISTAKES,
+    in_event_loop,
+    notify_errors,
+    show_mistake,
+)
 from napari_shadowinv.errors import InputError, InversionCancelled
 
 if TYPE_CHECKING:
@@ -60,7 +65,7 @@ def _nothing() -> list[Any]:
     return []
 
 
-@told(otherwise=_nothing)
+@notify_errors(otherwise=_nothing)
 def invert_uniform(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -86,7 +91,7 @@ def invert_uniform(
     return _begin(_picked(layer, viewer), _inverted, "Inverting", viewer)
 
 
-@told(otherwise=_nothing)
+@notify_errors(otherwise=_nothing)
 def remove_hot_pixels(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -107,7 +112,7 @@ def remove_hot_pixels(
     )
 
 
-@told(otherwise=_nothing)
+@notify_errors(otherwise=_nothing)
 def high_pass(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -126,7 +131,7 @@ def high_pass(
     return _begin(_picked(layer, viewer, may_be_source), _high_passed, "Filtering", viewer)
 
 
-@told(otherwise=_nothing)
+@notify_errors(otherwise=_nothing)
 def estimate_source(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:

@@ -1,7 +1,7 @@
 """What napari's user is told: one sentence for a mistake, not a traceback.
 
 - whether somebody is looking: `in_event_loop`
-- a function whose user's mistakes become notifications: `told`; one such: `show_mistake`
+- a function whose user's mistakes become notifications: `notify_errors`; one such: `show_mistake`
 - what to know before trusting a file: `show_caution`
 """
 
@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from napari_shadowinv.errors import InputError
 
-__all__ = ["MISTAKES", "in_event_loop", "show_caution", "show_mistake", "told"]
+__all__ = ["MISTAKES", "in_event_loop", "notify_errors", "show_caution", "show_mistake"]
 
 MISTAKES = (InputError, OSError, MemoryError)
 """What a user can mend; all else is a fault of the program, whose traceback is needed."""
@@ -35,7 +35,7 @@ def in_event_loop() -> bool:
     return thread is not None and thread.loopLevel() > 0
 
 
-def told(otherwise: Callable[[], Answer]) -> Callable[..., Callable[..., Answer]]:
+def notify_errors(otherwise: Callable[[], Answer]) -> Callable[..., Callable[..., Answer]]:
     """Turn a user's mistake into one notification, if a window is there to show it.
 
     Parameters

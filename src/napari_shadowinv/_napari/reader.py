@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv._napari.notifications import show_caution, told
+from napari_shadowinv._napari.notifications import notify_errors, show_caution
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.safety import refusing_damage
 
@@ -76,7 +76,7 @@ def _is_ours(path: Path) -> bool:
         return False
 
 
-@told(otherwise=lambda: [(None,)])  # napari's sign for: dealt with, and nothing to add
+@notify_errors(otherwise=lambda: [(None,)])  # napari's sign for: dealt with, and nothing to add
 def read_paths(path: str | Sequence[str]) -> list[Any]:
     """Read a file, a folder or a list of files as layers.
 

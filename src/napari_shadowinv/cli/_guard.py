@@ -32,7 +32,7 @@ P = ParamSpec("P")
 _ctrl_c = threading.Event()
 
 
-def guarded(command: Callable[P, None]) -> Callable[P, None]:
+def notify_errors(command: Callable[P, None]) -> Callable[P, None]:
     """Turn a user's mistake into one sentence, and Ctrl-C into a word."""
 
     @functools.wraps(command)

@@ -48,7 +48,7 @@ from napari_shadowinv.cli._flags import (
     given,
 )
 from napari_shadowinv.cli._forward import predicted, seen_with
-from napari_shadowinv.cli._guard import alarm_unless_converged, guarded
+from napari_shadowinv.cli._guard import alarm_unless_converged, notify_errors
 from napari_shadowinv.cli._info import described
 from napari_shadowinv.cli._inputs import (
     Experiment,
@@ -103,7 +103,7 @@ source_weight = 2                # px
 """
 
 
-@guarded
+@notify_errors
 def invert(
     image: ImageFile,
     source: SourceFile = None,
@@ -212,7 +212,7 @@ and covers what is known.
 """
 
 
-@guarded
+@notify_errors
 def forward(
     field: Annotated[
         Path,
@@ -302,7 +302,7 @@ def forward(
             say(note)
 
 
-@guarded
+@notify_errors
 def info(
     file: Annotated[Path, typer.Argument(help="An image or a result.", show_default=False)],
     variable: Variable = None,
@@ -311,7 +311,7 @@ def info(
     say(described(file, variable))
 
 
-@guarded
+@notify_errors
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path("demo"),
     dm: Annotated[float, typer.Option(help="Peak path-integrated field in MG·µm.")] = 97.0,

@@ -38,7 +38,7 @@ from napari_shadowinv.cli._flags import (
     Variable,
     given,
 )
-from napari_shadowinv.cli._guard import guarded
+from napari_shadowinv.cli._guard import notify_errors
 from napari_shadowinv.cli._inputs import check_margin, options_from
 from napari_shadowinv.cli._terminal import say
 
@@ -55,7 +55,7 @@ shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
 """
 
 
-@guarded
+@notify_errors
 def batch(
     shots: Annotated[
         list[str],
@@ -178,7 +178,7 @@ def batch(
     )
 
 
-@guarded
+@notify_errors
 def status(
     store: StoreFolder,
     every: Annotated[bool, typer.Option("--all", help="A line for each shot.")] = False,
@@ -190,7 +190,7 @@ def status(
         say(table)
 
 
-@guarded
+@notify_errors
 def export(
     store: StoreFolder,
     form: Annotated[
@@ -226,7 +226,7 @@ def export(
         say(f"Wrote {target}: {len(written)} {'file' if len(written) == 1 else 'files'}")
 
 
-@guarded
+@notify_errors
 def movie(
     store: StoreFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="The film: .mp4 or .gif.")],

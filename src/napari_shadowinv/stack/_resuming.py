@@ -1,8 +1,8 @@
 """The store of a run: what a new one holds, what may go on in one that is there.
 
 - a new store: `contents_of`
-- one of an earlier run: `continued` refuses what does not belong into it
-- room in it for shots that arrived since: `lengthened`
+- one of an earlier run: `resume` refuses what does not belong into it
+- room in it for shots that arrived since: `append_shots`
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from napari_shadowinv.stack._spec import (
     values_of_beam,
 )
 
-__all__ = ["contents_of", "continued", "lengthened"]
+__all__ = ["append_shots", "contents_of", "resume"]
 
 _APPENDED = "appended_at"  # attribute: where later runs began to append shots
 _INSTEAD = "give the same again, overwrite it, or choose another name"
@@ -128,7 +128,7 @@ def _sum_of(mask: NDArray[np.bool_] | None) -> str:
     return "" if mask is None else f"sha256 {checksum(mask)}"
 
 
-def continued(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
+def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
     """Refuse to mix what does not belong together in one store.
 
     Parameters
@@ -202,7 +202,7 @@ def _difference(before: str, now: str) -> str:
         return f"{shorten(before or 'none', 80)} there, {shorten(now or 'none', 80)} now"
 
 
-def lengthened(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackStore:
+def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackStore:
     """Append shots that arrived since the last run, pending, to its store.
 
     Parameters
@@ -210,7 +210,7 @@ def lengthened(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackSt
     store : StackStore
         The store.
     stack : Stack
-        As `continued` returned it.
+        As `resume` returned it.
     dtype : numpy.dtype
         Type of stored images.
 

@@ -29,7 +29,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.progress import Progress, ShouldStop
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
 from napari_shadowinv.stack._references import Reader, read_shot
-from napari_shadowinv.stack._resuming import contents_of, continued, lengthened
+from napari_shadowinv.stack._resuming import append_shots, contents_of, resume
 from napari_shadowinv.stack._spec import Stack, describe_stack
 from napari_shadowinv.stack._tasks import Settings, ShotOutcome, run_shots
 
@@ -169,7 +169,7 @@ def run_stack(
         store = StackStore(path) if path.exists() and not overwrite else None
         arrived = False
         if store is not None:
-            stack = continued(store, stack, kept)
+            stack = resume(store, stack, kept)
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
                 _Run(stack, store, (), on_progress, should_stop).tell("nothing to do")
@@ -179,7 +179,7 @@ def run_stack(
             if store is None:
                 store = create_store(path, contents_of(stack, kept), overwrite=overwrite)
             elif arrived:
-                store = lengthened(store, stack, kept)
+                store = append_shots(store, stack, kept)
             _Run(stack, store, again, on_progress, should_stop).on(engine)
     return read_stack(path)
 

@@ -8,7 +8,7 @@ from qtpy.QtCore import QTimer
 from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari.widgets._base import ToolPanel
-from napari_shadowinv._napari.widgets._notifications import MISTAKES, reporting
+from napari_shadowinv._napari.widgets._notifications import MISTAKES, notify_errors
 from napari_shadowinv._napari.widgets._panels import RunPanel
 from napari_shadowinv._napari.widgets._runner import Outcome
 
@@ -94,7 +94,7 @@ class LivePanel(ToolPanel):
         self._running_preview = True
         self.panel.run(request.run, request, quiet=True)
 
-    @reporting
+    @notify_errors
     def _on_end(self, outcome: Outcome) -> None:
         if outcome.value is not None:
             self.show_result(outcome.value, outcome.tag)

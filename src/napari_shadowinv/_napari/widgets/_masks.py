@@ -12,7 +12,7 @@ from napari_shadowinv._napari.layer_metadata import MASK, mark_of, may_be_mask, 
 from napari_shadowinv._napari.widgets._base import with_button
 from napari_shadowinv._napari.widgets._drawing import new_mask
 from napari_shadowinv._napari.widgets._forms import labelled
-from napari_shadowinv._napari.widgets._notifications import reporting
+from napari_shadowinv._napari.widgets._notifications import notify_errors
 from napari_shadowinv._napari.widgets._picking import LayerPicker
 from napari_shadowinv._napari.widgets._reading import Mask, mask_of
 
@@ -120,7 +120,7 @@ class MaskPicker(QWidget):
         """Show what `state` has returned."""
         self.painted_is_unusable.setChecked(bool(state))
 
-    @reporting
+    @notify_errors
     def paint(self) -> None:
         """Add an empty mask and choose it."""
         self.layer = new_mask(self._viewer, self._image(), self._title.lower())

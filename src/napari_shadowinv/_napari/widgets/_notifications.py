@@ -1,7 +1,7 @@
 """What the widgets tell the user: one sentence in napari's notifications, no traceback.
 
 - tell: `tell_error`, `tell_warning`, `tell_info`; the sentence itself: `error_text`
-- a method whose user's mistakes become notifications, and stay in its widget: `reporting`
+- a method whose user's mistakes become notifications, and stay in its widget: `notify_errors`
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from napari.utils.notifications import show_error, show_info, show_warning
 
 from napari_shadowinv.errors import InputError
 
-__all__ = ["MISTAKES", "error_text", "reporting", "tell_error", "tell_info", "tell_warning"]
+__all__ = ["MISTAKES", "error_text", "notify_errors", "tell_error", "tell_info", "tell_warning"]
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -49,7 +49,7 @@ def tell_info(text: str) -> None:
     show_info(text)
 
 
-def reporting(method: Method) -> Method:
+def notify_errors(method: Method) -> Method:
     """Turn a user's mistake within a widget's method into one notification.
 
     The widget, or the first around it that can, also shows it: with a method `show_problem`.

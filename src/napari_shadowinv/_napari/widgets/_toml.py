@@ -11,7 +11,7 @@ from pathlib import Path
 
 from qtpy.QtWidgets import QFileDialog, QHBoxLayout, QPushButton, QWidget
 
-from napari_shadowinv._napari.widgets._notifications import reporting
+from napari_shadowinv._napari.widgets._notifications import notify_errors
 from napari_shadowinv.errors import InputError
 
 __all__ = ["TomlButtons", "dump_toml", "load_toml"]
@@ -88,13 +88,13 @@ class TomlButtons(QWidget):
         self.load_button.clicked.connect(lambda: self._load())
         self.save_button.clicked.connect(lambda: self._save())
 
-    @reporting
+    @notify_errors
     def _load(self) -> None:
         path, _ = QFileDialog.getOpenFileName(self, f"Load {self._what}", "", _FILTER)
         if path:
             self._take(load_toml(path), path)
 
-    @reporting
+    @notify_errors
     def _save(self) -> None:
         values = self._values()
         if not values:

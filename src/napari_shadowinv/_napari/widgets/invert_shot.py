@@ -17,7 +17,7 @@ from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled, wra
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
 from napari_shadowinv._napari.widgets._live import LivePanel
 from napari_shadowinv._napari.widgets._masks import MaskPicker
-from napari_shadowinv._napari.widgets._notifications import reporting, tell_warning
+from napari_shadowinv._napari.widgets._notifications import notify_errors, tell_warning
 from napari_shadowinv._napari.widgets._options import OptionsForm
 from napari_shadowinv._napari.widgets._origins import Origins
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, report_rows, section
@@ -295,7 +295,7 @@ class InvertShot(LivePanel):
     def _show_source_mask(self) -> None:
         self.source_masks.setVisible(self.source.is_guessed)
 
-    @reporting
+    @notify_errors
     def _draw_crop(self) -> None:
         image_of(self.image.layer)
         self.crop.layer = new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")

@@ -16,7 +16,7 @@ from napari_shadowinv._napari.widgets._base import Part, ToolPanel
 from napari_shadowinv._napari.widgets._cleaning import CleaningSection
 from napari_shadowinv._napari.widgets._forms import labelled
 from napari_shadowinv._napari.widgets._masks import MaskPicker
-from napari_shadowinv._napari.widgets._notifications import MISTAKES, reporting
+from napari_shadowinv._napari.widgets._notifications import MISTAKES, notify_errors
 from napari_shadowinv._napari.widgets._options import OptionsForm
 from napari_shadowinv._napari.widgets._origins import Origins
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, section
@@ -270,7 +270,7 @@ class InvertStack(ToolPanel):
         self.failures.show_failures(failures)
         self.failures_title.setVisible(bool(failures))
 
-    @reporting
+    @notify_errors
     def _on_end(self, outcome: Outcome) -> None:
         request: StackRequest = outcome.tag
         books = request.job.books

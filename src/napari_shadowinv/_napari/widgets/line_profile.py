@@ -27,7 +27,7 @@ from napari_shadowinv._napari.widgets._drawing import new_shapes
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled, wrapping_label
 from napari_shadowinv._napari.widgets._lifetime import while_alive
-from napari_shadowinv._napari.widgets._notifications import reporting, tell_info
+from napari_shadowinv._napari.widgets._notifications import notify_errors, tell_info
 from napari_shadowinv._napari.widgets._picking import LayerPicker, kind_of
 from napari_shadowinv._napari.widgets._plotting import ProfilePlot
 from napari_shadowinv._napari.widgets._reading import shown_plane
@@ -256,7 +256,7 @@ class LineProfile(Docked):
         self.layers.blockSignals(False)
         self._soon()
 
-    @reporting
+    @notify_errors
     def _draw(self) -> None:
         images = self.checked() or [
             layer for layer in self.viewer.layers if kind_of(layer) == "image"
@@ -268,7 +268,7 @@ class LineProfile(Docked):
             )
         self.lines.layer = new_shapes(self.viewer, images[-1], "profile", "add_line")
 
-    @reporting
+    @notify_errors
     def _export(self) -> None:
         from napari_shadowinv.io import replacing
 
