@@ -129,7 +129,7 @@ def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
     assert "nothing to do" in flat(resumed.output)
     other = batch("--resume")
     assert other.exit_code == 2
-    assert "was started with another setup" in flat(other.output)
+    assert "was started with a different setup" in flat(other.output)
     assert batch("--overwrite").exit_code == 0
 
 

@@ -217,28 +217,28 @@ class TestRefusals:
         assert content(out) == before
 
     def test_other_options(self, night, out):
-        with pytest.raises(InputError, match=r"another options \(n_sites: 100 there, 50 now\)"):
+        with pytest.raises(InputError, match=r"different options \(n_sites: 100 there, 50 now\)"):
             night.run(out, options=InversionOptions(n_sites=50))
 
     def test_threads_are_no_other_option(self, night, out):
         night.run(out, options=OPTIONS.model_copy(update={"threads": 1}))
 
     def test_another_source(self, night, out):
-        with pytest.raises(InputError, match="another source image"):
+        with pytest.raises(InputError, match="different source image"):
             night.run(out, source=night.source + 1)
 
     def test_another_mask(self, night, out):
         mask = np.ones(night.source.shape, bool)
         mask[0] = False
-        with pytest.raises(InputError, match="another mask image"):
+        with pytest.raises(InputError, match="different mask image"):
             night.run(out, mask=mask)
 
     def test_another_setup(self, night, out, optical_setup):
-        with pytest.raises(InputError, match="another setup"):
+        with pytest.raises(InputError, match="different setup"):
             night.run(out, setup=optical_setup)
 
     def test_other_variables(self, night, out):
-        with pytest.raises(InputError, match="another stored"):
+        with pytest.raises(InputError, match="different stored"):
             night.run(out, variables=("potential",))
 
     def test_a_shot_that_is_not_given_any_more(self, night, out):
@@ -248,7 +248,7 @@ class TestRefusals:
 
     def test_another_order(self, night, out):
         paths = [night.path(index) for index in (0, 1, 3, 2, 4, 5)]
-        with pytest.raises(InputError, match=r"another order \(shot_2.npy before shot_3.npy\)"):
+        with pytest.raises(InputError, match=r"different order \(shot_2.npy before shot_3.npy\)"):
             night.run(out, shots=paths)
 
     def test_a_shot_that_changed(self, night, out):

@@ -32,7 +32,7 @@ from napari_shadowinv.stack._stack import (
 __all__ = ["contents_of", "continued", "lengthened"]
 
 _APPENDED = "appended_at"  # attribute: where later runs began to append shots
-_INSTEAD = "use the same one, overwrite the store, or choose another name"
+_INSTEAD = "use the same, overwrite the store, or choose another name"
 
 
 def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
@@ -153,8 +153,9 @@ def continued(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
     for name, value in {**found, "package_version": version("napari-shadowinv")}.items():
         before = str(store.attributes.get(name, ""))
         if before != value:
+            article = "" if name.endswith("s") else "a "
             raise InputError(
-                f"{store.path} was started with a different {name.replace('_', ' ')} "
+                f"{store.path} was started with {article}different {name.replace('_', ' ')} "
                 f"({_difference(before, value)}): {_INSTEAD}"
             )
     for index in np.flatnonzero(store.statuses() == DONE):

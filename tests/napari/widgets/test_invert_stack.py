@@ -272,10 +272,10 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     run(tool)
     before = written(out)
     tool.options.set_values({**FEW, "seed": 7})
-    expect("begun with another options (seed: 0 there, 7 now)")
+    expect("started with different options (seed: 0 there, 7 now)")
     tool.options.set_values(FEW)
     tool.source.picker.set_kind("low_pass")
-    expect("begun with another source")
+    expect("started with a different source")
     tool.source.picker.set_kind("uniform")
     assert written(out) == before
 
