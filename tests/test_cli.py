@@ -341,7 +341,7 @@ def test_files_that_are_no_image_are_refused(
     (folder / "notes.tif").write_text("not an image\n")
     refused("invert", "notes.tif", names=("notes.tif", "text file"))
     (folder / "cut.npy").write_bytes(shot.read_bytes()[:-100])
-    refused("invert", "cut.npy", names=("cut.npy", "cut short"))
+    refused("invert", "cut.npy", names=("cut.npy", "truncated"))
     for place in (folder, "", "."):
         refused("invert", place, names="is a folder")
     refused("info", "missing.tif", names="missing.tif")
@@ -582,7 +582,9 @@ def test_reference_in_a_text_image_is_the_source(folder: Path) -> None:
     estimate = read_experiment("both.txt", choices=chosen).source
     assert estimate is not None
     assert np.ptp(estimate.image) == 0
-    with pytest.raises(InputError, match="holds its own source, and the image is to be flattened"):
+    with pytest.raises(
+        InputError, match="contains its own source, but a filter would flatten the image"
+    ):
         read_experiment("both.txt", choices=Choices(high_pass=3))
 
 
@@ -748,7 +750,7 @@ def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
         (["--hot-pixels", 0], ("'hot_pixels' is 0", "greater than 0")),
         (["--low-pass", -1], ("'low_pass' is -1", "greater than 0")),
         (["--background-degree", 11], ("'background_degree' is 11", "at most 10")),
-        (["--variable", "shot"], ("shot.npy", "no MATLAB file nor HDF5")),
+        (["--variable", "shot"], ("shot.npy", "neither a MATLAB nor an HDF5 file")),
     ],
 )
 def test_choices_that_make_no_sense_are_refused(
@@ -764,7 +766,7 @@ def test_one_mask_for_bad_pixels_and_for_the_object_is_refused(
     iio.imwrite("bare.png", (np.hypot(y - 10, x - 18) > 7).astype(np.uint8))
     for estimate in ("polynomial", "interpolated"):
         flags = ["--source-from", estimate, "--mask", "bare.png", "--source-mask", "bare.png"]
-        refused("invert", shot, *flags, names=("shot.npy", "left out of the inversion"))
+        refused("invert", shot, *flags, names=("shot.npy", "excluded from the inversion"))
 
 
 def test_a_point_source_is_taken_for_one_or_told_of(folder: Path, shot: Path) -> None:
@@ -856,7 +858,7 @@ def test_demo_refuses_nonsense(folder: Path, refused: Callable[..., None]) -> No
     assert not (folder / "demo").exists()
     refused("demo", "--n-sites", 2, names="n_sites")
     (folder / "demo").write_text("a file")
-    refused("demo", names=("demo", "cannot be made a folder"))
+    refused("demo", names=("demo", "cannot be created as a folder"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names there are text")

@@ -245,7 +245,7 @@ def test_bad_arguments_are_one_clear_sentence(counts, arguments, says):
 
 
 def test_an_image_that_is_not_counts_needs_a_gain(clean):
-    with pytest.raises(InputError, match=r"no whole numbers.*give gain"):
+    with pytest.raises(InputError, match=r"not whole numbers.*give the gain"):
         uncertainty(clean)
 
 

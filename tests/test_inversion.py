@@ -417,7 +417,7 @@ def test_fewer_than_four_sites_are_refused():
 
 def test_given_both_a_plan_and_a_source_it_asks_for_one():
     source = np.ones((20, 20))
-    with pytest.raises(InputError, match="expected one"):
+    with pytest.raises(InputError, match="expected only one"):
         invert(source, source=source, plan=plan_sites(source))
 
 

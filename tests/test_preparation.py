@@ -41,7 +41,7 @@ def test_a_mask_that_hides_the_object_too_is_refused(
     mask: np.ndarray, source_mask: np.ndarray
 ) -> None:
     for estimate in (PolynomialEstimate(), InterpolatedEstimate()):
-        with pytest.raises(InputError, match="the object would be left out of the inversion"):
+        with pytest.raises(InputError, match="the object would be excluded from the inversion"):
             Preparation((), estimate, source_mask).check(has_source=False, mask=mask)
 
 

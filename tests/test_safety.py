@@ -54,10 +54,10 @@ def test_whatever_a_reader_raises_is_one_error_with_its_reason(tmp_path: Path) -
         raise error
 
     for reason in (KeyError("x"), SystemError("odd"), RecursionError("deep"), OSError("h5")):
-        with pytest.raises(FileFormatError, match=r"a\.tif is damaged or cut short") as told:
+        with pytest.raises(FileFormatError, match=r"a\.tif is damaged or truncated") as told:
             broken(tmp_path / "a.tif", reason)
         assert told.value.__cause__ is reason
-    with pytest.raises(FileFormatError, match="more memory than there is"):
+    with pytest.raises(FileFormatError, match="more memory than is available"):
         broken("a.tif", MemoryError())
     with pytest.raises(FileFormatError, match="Permission denied"):
         broken("a.tif", PermissionError(13, "Permission denied"))

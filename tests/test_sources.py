@@ -441,7 +441,7 @@ def test_a_gaussian_that_hides_behind_the_mask_is_not_taken(hidden_middle):
     source = gaussian_source(shot, mask=mask, on_warning=told.append)
     np.testing.assert_allclose(source, 1.0, rtol=1e-3)
     assert len(told) == 1
-    assert "no Gaussian beam can be told" in told[0]
+    assert "no Gaussian beam can be fitted" in told[0]
     with pytest.warns(UserWarning, match="no Gaussian beam"):
         gaussian_source(shot, mask=mask)
 
@@ -462,7 +462,7 @@ def test_an_estimate_that_runs_away_behind_the_mask_is_refused():
     shot = np.tile(np.exp(np.arange(60) / 8), (60, 1))
     mask = np.ones(shot.shape, bool)
     mask[:, 25:] = False
-    with pytest.raises(InputError, match="where the mask hides the image, which is"):
+    with pytest.raises(InputError, match="under the mask, while the image is"):
         polynomial_source(shot, degree=6, mask=mask)
     seen = shot[mask].max()
     assert 1.5 * seen < polynomial_source(shot, degree=1, mask=mask).max() < 10 * seen

@@ -44,7 +44,7 @@ def ensure_compiled(
     how_often = (
         "once, for a minute or so"
         if is_kept()
-        else "each time: set NUMBA_CACHE_DIR to a folder that can be written"
+        else "every time: set NUMBA_CACHE_DIR to a writable folder"
     )
     Reporter(on_progress, should_stop)("compile", 0, None, how_often)
     y, x = np.indices((_SIDE, _SIDE)) / _SIDE

@@ -180,7 +180,7 @@ def uncertainty(
     """
     options = options or InversionOptions()
     if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 2:
-        raise InputError(f"n is {n!r}, expected a whole number of samples, 2 at least")
+        raise InputError(f"n is {n!r}, expected a whole number of samples, at least 2")
     draw, described = _noise_of(image, noise, gain, mask if plan is None else plan.mask)
     if plan is None:
         beam = prepare(image, source, options, mask).source
@@ -328,17 +328,17 @@ def _poisson(values: Array, gain: float | None) -> tuple[Draw, str]:
     if gain is None:
         if np.any(values != np.rint(values)):
             raise InputError(
-                "image has values that are no whole numbers, so they are not counts: give gain, "
-                "the image's units per detected quantum, or the noise as a standard deviation"
+                "image has values that are not whole numbers, so they are not counts: give the "
+                "gain (image units per detected quantum), or the noise as a standard deviation"
             )
         gain = 1.0
     if not (np.isreal(gain) and 0 < gain < np.inf):
-        raise InputError(f"gain is {gain!r}, expected a positive number: units of the image")
+        raise InputError(f"gain is {gain!r}, expected a positive number: image units")
     quanta = np.maximum(values, 0) / gain
     if quanta.max(initial=0) > _MOST_QUANTA:
         raise InputError(
             f"gain is {gain:g} and the brightest pixel {values.max():g}: that is more than "
-            f"{_MOST_QUANTA:g} quanta in a pixel, expected fewer: check the gain's unit"
+            f"{_MOST_QUANTA:g} quanta in a pixel, expected fewer: check the unit of the gain"
         )
     return lambda rng: gain * rng.poisson(quanta), f"Poisson, gain {gain:g}"
 
@@ -420,8 +420,8 @@ def _warnings(inversion: Inversion, solutions: list[LevelSolution]) -> tuple[str
     failed = sum(not solution.converged for solution in solutions)
     if failed:
         warnings = (
-            f"{failed} of {len(solutions)} samples did not converge: where they scatter most "
-            "the deviations are not reliable",
+            f"{failed} of {len(solutions)} samples did not converge: the deviations are "
+            "unreliable where the samples scatter most",
             *warnings,
         )
     return warnings

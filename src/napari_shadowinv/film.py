@@ -87,7 +87,7 @@ class Calibration:
         if doses.ndim != 1 or len(doses) < 2 or pixels.shape != (len(doses), 3):
             raise InputError(
                 f"a calibration has doses of shape {doses.shape} and pixels of shape "
-                f"{pixels.shape}: expected (n,) and (n, 3), two films at least"
+                f"{pixels.shape}: expected (n,) and (n, 3), at least two films"
             )
         background = np.asarray(self.background, float)
         if background.size == 0:
@@ -127,8 +127,8 @@ class Calibration:
         used = table[(table[:, 0] >= dose_range[0]) & (table[:, 0] <= dose_range[1])]
         if len(used) < 2:
             raise InputError(
-                f"{path} has {len(used)} films between {dose_range[0]:g} and {dose_range[1]:g} Gy: "
-                "expected two at least; widen dose_range"
+                f"{path} has {len(used)} films between {dose_range[0]:g} and {dose_range[1]:g} "
+                "Gy: expected at least two; widen dose_range"
             )
         empty = np.empty(0) if background is None else np.asarray(background, float)
         return cls(used[:, 0], used[:, 1:], empty)
@@ -285,8 +285,8 @@ def dose(
     """
     if background is None and np.asarray(scan).dtype == np.uint8:
         raise InputError(
-            "the scan has 8 bits and no background was given, though calibrations have 16: give "
-            "the scan of unexposed film as background"
+            "the scan has 8 bits, calibrations have 16 and no background was given: give a scan "
+            "of unexposed film as background"
         )
     unexposed = calibration.background if background is None else background
     density = net_optical_density(scan, unexposed, channel)

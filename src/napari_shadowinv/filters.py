@@ -255,9 +255,9 @@ def remove_background(
         return np.asarray(values - background + background.mean())
     if background.min() <= 0 or values.mean() <= 0:
         raise InputError(
-            f"background of degree {degree} falls to {background.min():.4g} under an image of "
-            f"mean {values.mean():.4g}, expected both to be positive to divide by it: take a "
-            "lower degree, or kind='subtract'"
+            f"background of degree {degree} falls to {background.min():.4g} for an image of mean "
+            f"{values.mean():.4g}, expected both to be positive for division: use a lower "
+            "degree, or kind='subtract'"
         )
     flat = values / background
     return np.asarray(flat * (values.mean() / flat.mean()))
@@ -329,7 +329,9 @@ def remove_hot_pixels(
     threshold = checked_number("threshold", threshold, above=0, unit="deviations")
     size = checked_integer("size", size, least=3)
     if size % 2 == 0:
-        raise InputError(f"size is {size}, expected an odd number: a pixel is in the middle")
+        raise InputError(
+            f"size is {size}, expected an odd number, so that the window is centred on a pixel"
+        )
     local, bright, dark = _neighbours(values, size, Reporter(None, should_stop))
     difference = values - local
     limit = threshold * _noise(difference, local)
@@ -438,7 +440,7 @@ def fit_polynomial(
     if usable.sum() < terms:
         raise InputError(
             f"degree {degree} has {terms} coefficients, image has {int(usable.sum())} usable "
-            "pixels: take a lower degree or a larger mask"
+            "pixels: use a lower degree or mask fewer pixels"
         )
     rows, columns = (_basis(side, degree) for side in values.shape)
     fit = _weighted_fit(values, usable.astype(np.float64), rows, columns)
@@ -539,8 +541,8 @@ def checked_pixels(
     bad = int((~np.isfinite(values[usable])).sum())
     if bad:
         raise InputError(
-            f"{name} has {bad} usable pixels that are NaN or infinite, expected none: "
-            "replace them or leave them out by a mask"
+            f"{name} has {bad} usable pixels that are NaN or infinite, expected none: replace or "
+            "mask them"
         )
     values[~usable] = values[usable].mean()
     return values, usable

@@ -395,7 +395,8 @@ def invert(
         if plan is not None:
             if source is not None or mask is not None:
                 raise InputError(
-                    "got a plan and also a source or mask, expected one: a plan has its own"
+                    "got a plan together with a source or mask, expected only one: a plan "
+                    "contains its own source and mask"
                 )
             _check_boundary(plan, options)
             source, mask = plan.source, plan.mask
@@ -453,12 +454,12 @@ def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:
     made_for = "closed" if plan.margin is None else "free"
     if options.boundary != made_for:
         raise InputError(
-            f"plan was made for a {made_for} boundary and options say '{options.boundary}': "
+            f"the plan was made for a {made_for} boundary but options have '{options.boundary}': "
             "make the plan with the same options"
         )
     if plan.margin is not None and plan.margin_width != margin_around(plan.source.shape, options):
         raise InputError(
-            f"plan has a margin of {plan.margin_width} px and options ask for "
+            f"the plan has a margin of {plan.margin_width} px but options ask for "
             f"{margin_around(plan.source.shape, options)} px: make the plan with the same options"
         )
 
@@ -532,8 +533,8 @@ def _weights_of(start: Inversion, plan: SitePlan) -> Array:
     found, expected = start.sites + plan.margin_width, level.sites
     if found.shape != expected.shape or np.abs(found - expected).max() > 1e-3 * level.spacing:
         raise InputError(
-            f"start has {len(found):,} sites that are not the {len(expected):,} of this inversion: "
-            "make both with the same plan, source, mask and options"
+            f"start has {len(found):,} sites that differ from the {len(expected):,} sites of "
+            "this inversion: compute both with the same plan, source, mask and options"
         )
     return start.weights
 
@@ -553,7 +554,7 @@ def _report(
     reprojection = fields.reprojection / prepared.unit
     if not finest.converged:
         warnings = (
-            f"not converged: flux residual {finest.residual:.2g} per cell, asked for "
+            f"not converged: flux residual {finest.residual:.2g} per cell, tolerance "
             f"{options.tolerance:.2g}; {finest.reason}",
             *warnings,
         )

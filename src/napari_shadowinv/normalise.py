@@ -117,9 +117,9 @@ def prepare(
     negative = int((values < 0).sum())
     if negative and options.negative == "refuse":
         raise InputError(
-            f"image has {negative} negative pixels (least {values.min():.4g}), expected none: "
-            "if they are left over from background subtraction, ask for them to be clipped "
-            "(negative='clip', or --clip-negative on the command line)"
+            f"image has {negative} negative pixels (lowest {values.min():.4g}), expected none: "
+            "if they result from background subtraction, clip them (negative='clip', or "
+            "--clip-negative on the command line)"
         )
     values = np.maximum(values, 0)
     if not values.any():
@@ -179,8 +179,8 @@ def _refuse_the_image_itself(beam: Array, image: Array, mask: Mask) -> None:
     ones, others = (values[mask] / values[mask].mean() for values in (beam, image))
     if np.abs(ones - others).max() <= _ALIKE and np.ptp(ones) > 2 * _ALIKE:
         raise InputError(
-            "the source is the image itself, so nothing would be deflected: give an image of the "
-            "beam without the object, or an estimate of it"
+            "the source is the image itself, so the deflection would be zero: give an image of "
+            "the beam without the object, or an estimate of it"
         )
 
 
@@ -194,9 +194,8 @@ def _large_mask(usable: Mask) -> tuple[str, ...]:
     if share < _NOTABLE_MASK:
         return ()
     return (
-        f"the mask leaves out {share:.1%} of the pixels: the field there is only a smooth "
-        "continuation. A mask that hides the object from an estimate of the source is a source "
-        "mask, not this one",
+        f"the mask excludes {share:.1%} of the pixels: the field there is only a smooth "
+        "continuation. To hide the object from a source estimate, use a source mask instead",
     )
 
 
@@ -221,8 +220,8 @@ def _few_sites(pixels: int, options: InversionOptions) -> tuple[str, ...]:
     if options.n_sites is not None or pixels <= MAX_DEFAULT_SITES:
         return ()
     return (
-        f"{MAX_DEFAULT_SITES:,} sites for {pixels:,} pixels, the most that are taken by default: "
-        f"n_sites = {pixels:,} resolves single pixels, and takes longer and more memory",
+        f"{MAX_DEFAULT_SITES:,} sites for {pixels:,} pixels, the default maximum: n_sites = "
+        f"{pixels:,} resolves single pixels but needs more time and memory",
     )
 
 
@@ -276,11 +275,11 @@ def checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Mask:
         raise InputError(f"mask has shape {usable.shape}, image {shape}: they must match")
     if usable.dtype != bool:
         raise InputError(
-            f"mask has values of type {usable.dtype}, expected booleans, "
-            "true where a pixel can be used: compare it with something first"
+            f"mask has values of type {usable.dtype}, expected booleans, true where a pixel is "
+            "usable: compare it with a number, as in mask > 0"
         )
     if not usable.any():
-        raise InputError("mask is false everywhere, expected true where a pixel can be used")
+        raise InputError("mask is false everywhere, expected true where a pixel is usable")
     return usable
 
 
@@ -306,8 +305,8 @@ def _finite_image(values: ArrayLike, name: str, mask: Mask) -> Array:
     bad = int((~np.isfinite(array)).sum())
     if bad:
         raise InputError(
-            f"{name} has {bad} pixels that are NaN or infinite, expected none: "
-            "mask them, or replace them, for instance by the median of their neighbours"
+            f"{name} has {bad} pixels that are NaN or infinite, expected none: mask them, or "
+            "replace them, for example by the median of their neighbours"
         )
     return array
 
@@ -324,8 +323,8 @@ def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
         return max(_LEAST_MARGIN, round(_MARGIN_SHARE * min(shape)))
     if options.margin > max(shape):
         raise InputError(
-            f"margin is {options.margin:,} px beside an image of {shape[0]} × {shape[1]} px, "
-            f"expected at most {max(shape)} px: choose it about as wide as the object"
+            f"margin is {options.margin:,} px for an image of {shape[0]} × {shape[1]} px, "
+            f"expected at most {max(shape)} px: make it about as wide as the object"
         )
     return options.margin
 

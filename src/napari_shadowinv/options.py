@@ -36,8 +36,8 @@ class InversionOptions(BaseModel):
         ge=4,
         title="Sites",
         description=(
-            "Number of sites spread over the source. Default: as many as pixels, "
-            f"at most {MAX_DEFAULT_SITES:,}."
+            "Number of sites placed over the source. Default: one per pixel, at most "
+            f"{MAX_DEFAULT_SITES:,}."
         ),
     )
     floor: float = Field(
@@ -46,8 +46,8 @@ class InversionOptions(BaseModel):
         lt=1,
         title="Floor",
         description=(
-            "Smallest intensity of the image, as a share of its mean: darker pixels are raised "
-            "to it. It keeps the transport solvable; below 1e-3 it rarely converges."
+            "Minimum image intensity as a fraction of the mean: darker pixels are raised to it. "
+            "This keeps the transport solvable; values below 1e-3 rarely converge."
         ),
     )
     tolerance: float = Field(
@@ -55,76 +55,78 @@ class InversionOptions(BaseModel):
         gt=0,
         lt=1,
         title="Tolerance",
-        description="Largest relative flux error allowed in any cell when the solver ends.",
+        description="Convergence criterion: maximum relative flux error of any cell.",
     )
     lloyd_iterations: int = Field(
         default=5,
         ge=0,
         le=1000,
         title="Lloyd iterations",
-        description="Most steps of weighted Lloyd relaxation that even out the sites.",
+        description="Maximum Lloyd iterations, which space the sites evenly.",
     )
     lloyd_tolerance: float = Field(
         default=0.1,
         ge=0,
         title="Lloyd tolerance",
         description=(
-            "Lloyd relaxation ends when the sites move by less than this (root mean square), "
-            "in units of the mean spacing of the sites."
+            "Lloyd relaxation stops once the r.m.s. movement of the sites falls below this "
+            "fraction of their mean spacing."
         ),
     )
     readout: Literal["dual", "centroid"] = Field(
         default="dual",
         title="Read-out",
         description=(
-            "'dual': the potential is half the weight of each site. 'centroid': the paper's way, "
-            "natural-neighbour interpolation of centroid displacements, then integration."
+            "'dual': the potential is half the weight of each site. 'centroid': as in the "
+            "paper, natural-neighbour interpolation of the centroid displacements, then "
+            "integration."
         ),
     )
     integration: Literal["mean", "y", "x"] = Field(
         default="mean",
         title="Integration",
         description=(
-            "Of the centroid read-out only: integrate first along 'y' and then along x, first "
-            "along 'x', or take the 'mean' of both."
+            "Centroid read-out only: integrate along 'y' first, along 'x' first, or take the "
+            "'mean' of both."
         ),
     )
     solver: Literal["newton", "lbfgs", "quasi-newton"] = Field(
         default="newton",
         title="Solver",
         description=(
-            "'newton': damped Newton steps. 'lbfgs': limited-memory BFGS, as in the paper; slow, "
-            "for comparison. 'quasi-newton': BFGS with an n × n matrix, for few sites."
+            "'newton': damped Newton steps. 'lbfgs': limited-memory BFGS, as in the paper; "
+            "slow, for comparison. 'quasi-newton': BFGS with a dense n × n matrix, for small "
+            "numbers of sites."
         ),
     )
     stages: Literal["multi", "single"] = Field(
         default="multi",
         title="Stages",
         description=(
-            "'multi': solve with few sites first and carry the potential over to more. "
-            "'single': all sites at once, from zero weights."
+            "'multi': solve with few sites first and interpolate the potential to successively "
+            "more. 'single': all sites at once, starting from zero weights."
         ),
     )
     max_iterations: int = Field(
         default=300,
         ge=1,
         title="Iterations",
-        description="Most solver steps on each level before it gives up and says so.",
+        description="Maximum solver iterations on each level.",
     )
     negative: Literal["refuse", "clip"] = Field(
         default="refuse",
         title="Negative pixels",
         description=(
-            "'refuse': an image with negative values is an error. 'clip': negative values "
-            "(left over from background subtraction) become zero, and are counted in the report."
+            "'refuse': raise an error if the image has negative values. 'clip': set negative "
+            "values (left by background subtraction) to zero and count them in the report."
         ),
     )
     boundary: Literal["closed", "free"] = Field(
         default="closed",
         title="Boundary",
         description=(
-            "'closed': no flux crosses the image's edge, as in the paper. 'free': flux may leave "
-            "and enter, and the object's potential fades beyond the edge."
+            "'closed': no flux crosses the image edge, as in the paper. 'free': flux may leave "
+            "and enter, and the object's potential decays beyond the edge."
         ),
     )
     margin: int | None = Field(
@@ -132,8 +134,8 @@ class InversionOptions(BaseModel):
         ge=2,
         title="Margin (px)",
         description=(
-            "Of the free boundary: pixels beyond each edge that flux may come from; they get sites "
-            "of their own. Default: a twentieth of the image's shorter side."
+            "Free boundary only: width of the strip beyond each edge from which flux may enter; "
+            "it has its own sites. Default: a twentieth of the image's shorter side."
         ),
     )
     decay_length: float | None = Field(
@@ -141,17 +143,17 @@ class InversionOptions(BaseModel):
         gt=0,
         title="Decay length (px)",
         description=(
-            "Of the free boundary: distance over which the potential fades beyond the edge, of the "
-            "order of the object's size there. Default: the margin."
+            "Free boundary only: distance over which the potential decays beyond the edge; use "
+            "roughly the size of the object there. Default: the margin."
         ),
     )
     flux: Literal["conserve", "known", "fit"] = Field(
         default="conserve",
         title="Flux",
         description=(
-            "Of the free boundary: 'conserve': as much flux enters as leaves, so image and source "
-            "may have any units. 'known': image and source have the same exposure and units. "
-            "'fit': find the exposure for which the flux at the edge moves least."
+            "Free boundary only. 'conserve': inflow equals outflow, so image and source may "
+            "have different units. 'known': image and source have the same exposure and units. "
+            "'fit': find the exposure that minimises the movement of flux at the edge."
         ),
     )
     caustic_jacobian: float = Field(
@@ -159,34 +161,34 @@ class InversionOptions(BaseModel):
         ge=0,
         title="Caustic threshold",
         description=(
-            "Pixels whose map has a Jacobian determinant below this are marked as caustics: "
-            "there rays cross or nearly do, and the field is less certain."
+            "Pixels where the Jacobian determinant of the map is below this are marked as "
+            "caustics: rays cross or nearly cross there, and the field is less certain."
         ),
     )
     seed: int = Field(
         default=0,
         ge=0,
         title="Seed",
-        description="Seed of the random site positions; the same seed gives the same result.",
+        description="Random seed for the site positions; the same seed gives the same result.",
     )
     threads: int | None = Field(
         default=None,
         ge=1,
         title="Threads",
-        description="Threads of the kernels. Default: all cores. Results do not depend on it.",
+        description="Number of threads. Default: all cores. It does not affect the result.",
     )
 
     @model_validator(mode="after")
     def _boundary_fits_the_rest(self) -> Self:
         if self.boundary == "closed" and self.flux != "conserve":
             raise ValueError(
-                f"flux is '{self.flux}' and boundary 'closed', expected 'conserve': where nothing "
-                "crosses the edge the flux is that of the source; use boundary='free'"
+                f"flux is '{self.flux}' and boundary 'closed', expected 'conserve': a closed "
+                "boundary conserves the source's flux; use boundary='free'"
             )
         if self.boundary == "free" and self.solver != "newton":
             raise ValueError(
                 f"solver is '{self.solver}' and boundary 'free', expected solver='newton': the "
-                "others know closed boundaries only"
+                "other solvers support closed boundaries only"
             )
         return self
 

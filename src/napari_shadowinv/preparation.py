@@ -72,20 +72,20 @@ class Preparation:
         flattening = [one.described for one in self.filters if one.flattens]
         if has_source and flattening:
             raise InputError(
-                f"got a source and the filter {flattening[0]}, which takes the beam out of the "
-                "image while the source still has it: leave one of them out"
+                f"got a source and the filter {flattening[0]}, which removes the beam from the "
+                "image but not from the source: use only one of them"
             )
         if self.estimate is not None:
             if self.estimate.needs_mask and self.bare is None:
                 raise InputError(
-                    f"got the estimate '{self.estimate.title}' without a source mask, which hides "
-                    "the object from it and not from the inversion: give one"
+                    f"got the estimate '{self.estimate.title}' without a source mask, which "
+                    "hides the object from the estimate but not from the inversion: give one"
                 )
             check_masks(mask, self.bare)
         elif self.bare is not None:
             raise InputError(
-                "got a source mask, which an estimate of the source looks at, but no estimate: "
-                "leave the mask out, or choose an estimate"
+                "got a source mask but no source estimate to use it: leave the mask out, or "
+                "choose an estimate"
             )
 
     def filtered(
@@ -178,10 +178,10 @@ def check_masks(mask: Mask | None, bare: Mask | None) -> None:
     hidden, visible = hidden[objects], visible[objects]
     if (visible < _LEAST_VISIBLE * hidden).all():
         raise InputError(
-            f"the mask hides {1 - visible.sum() / hidden.sum():.0%} of what the source mask hides, "
-            "so the object would be left out of the inversion: let the mask hide unusable pixels "
-            "only, and the source mask the object; if it is the object that is unusable, leave "
-            "the source mask out, as no estimate looks at what the mask hides"
+            f"the mask hides {1 - visible.sum() / hidden.sum():.0%} of what the source mask "
+            "hides, so the object would be excluded from the inversion: use the mask for "
+            "unusable pixels only and the source mask for the object; if the object itself is "
+            "unusable, leave the source mask out, as estimates ignore masked pixels anyway"
         )
 
 
@@ -194,9 +194,9 @@ def _check_fall(
     seen, object_ = (bare, ~bare) if mask is None else (bare & mask, ~bare & mask)
     if object_.any() and source[object_].min() < image[seen].min() / _MOST_FALL:
         (warnings.warn if warn is None else warn)(
-            f"the estimated source falls to {source[object_].min():.3g} behind the source mask, "
-            f"the image is {image[seen].min():.3g} at least elsewhere: compare it with another "
-            "estimate"
+            f"the estimated source falls to {source[object_].min():.3g} under the source mask, "
+            f"while the image is at least {image[seen].min():.3g} elsewhere: compare it with "
+            "another estimate"
         )
 
 

@@ -95,8 +95,8 @@ class Estimate(_Recipe):
         """
         if self.needs_mask and not has_mask:
             raise InputError(
-                f"got the estimate '{self.title}' without a mask: it fills in what the mask "
-                "hides; choose a mask that covers the object"
+                f"got the estimate '{self.title}' without a mask: it fills in the masked pixels; "
+                "choose a mask that covers the object"
             )
 
     def placed(
@@ -283,13 +283,13 @@ class IsotropicEstimate(Estimate):
         default=None,
         allow_inf_nan=False,
         title="Centre y (px)",
-        description="Row in which the detector faces the source. Default: the image's middle.",
+        description="Row at which the detector faces the source. Default: the image centre.",
     )
     centre_x: float | None = Field(
         default=None,
         allow_inf_nan=False,
         title="Centre x (px)",
-        description="Column in which the detector faces the source. Default: the image's middle.",
+        description="Column at which the detector faces the source. Default: the image centre.",
     )
     # Not a parameter: every face of the package asks for the setup elsewhere.
     _setup: Any = PrivateAttr(default=None)
@@ -339,8 +339,8 @@ class IsotropicEstimate(Estimate):
 
 def _without_setup() -> InputError:
     return InputError(
-        "got the source 'isotropic' without a setup, which tells how far away the point is and how "
-        "large the pixels are: give one, or choose the source 'uniform'"
+        "got the source 'isotropic' without a setup, which is needed for the distance of the "
+        "point source and the pixel size: give a setup, or choose the source 'uniform'"
     )
 
 
@@ -357,7 +357,7 @@ class PolynomialEstimate(Estimate):
 
     title = "fitted polynomial"
     function = "polynomial_source"
-    degree: int = _degree(": 0 is flat, 2 a bowl, 10 follows much.")
+    degree: int = _degree(": 0 is flat, 2 is bowl-shaped, 10 follows fine detail.")
 
 
 class LowPassEstimate(Estimate):
@@ -366,7 +366,10 @@ class LowPassEstimate(Estimate):
     title = "blurred shot"
     function = "low_pass_source"
     width: float = _width(
-        30.0, "Standard deviation of the Gaussian blur in px: a few times the object.", 1.0, 200.0
+        30.0,
+        "Standard deviation of the Gaussian blur in px; use a few times the object's size.",
+        1.0,
+        200.0,
     )
 
 
@@ -380,8 +383,7 @@ class TotalVariationEstimate(Estimate):
         gt=0,
         title="Weight (px)",
         description=(
-            "How much is taken away, in px: it takes c·r/2 to remove a disc of radius r px and "
-            "contrast c."
+            "Strength of the smoothing, in px: c·r/2 removes a disc of radius r px and contrast c."
         ),
         json_schema_extra={"slider": [0.05, 20.0]},
     )
@@ -389,7 +391,7 @@ class TotalVariationEstimate(Estimate):
         default=1000,
         ge=1,
         title="Iterations",
-        description="Most steps; an object of radius r px needs about r² of them.",
+        description="Maximum iterations; an object of radius r px needs about r².",
     )
 
     def coarser(self, factor: int) -> Estimate:
@@ -405,14 +407,19 @@ class InterpolatedEstimate(Estimate):
     title = "filled in under the mask"
     function = "interpolated_source"
     width: float = _width(
-        5.0, "Length in px over which the surroundings are smoothed before they go on.", 0.5, 50.0
+        5.0,
+        "Standard deviation in px of the blur applied to the surroundings before they are "
+        "extrapolated.",
+        0.5,
+        50.0,
     )
     kind: Literal["biharmonic", "laplace"] = Field(
         default="biharmonic",
         title="Continuation",
         description=(
-            "'biharmonic' continues slope and curvature of the beam: for gaps inside the image. "
-            "'laplace' never leaves the range of the surroundings: for gaps at its edge."
+            "'biharmonic' continues the slope and curvature of the beam; use it for gaps inside "
+            "the image. 'laplace' stays within the range of the surrounding values; use it for "
+            "gaps at the edge."
         ),
     )
 
@@ -431,7 +438,7 @@ class HighPassFilter(Filter):
     title = "high-pass"
     function = "high_pass"
     width: float = _width(
-        50.0, "Structures much larger than this standard deviation, in px, vanish.", 1.0, 200.0
+        50.0, "Structures much larger than this standard deviation, in px, are removed.", 1.0, 200.0
     )
 
     @property
@@ -448,7 +455,7 @@ class ButterworthFilter(Filter):
         default=100.0,
         gt=0,
         title="Cutoff (px)",
-        description="Wavelength in px at which the amplitude falls by 1/√2.",
+        description="Wavelength in px at which the amplitude drops to 1/√2.",
         json_schema_extra={"slider": [2.0, 500.0]},
     )
     order: int = Field(
@@ -456,13 +463,16 @@ class ButterworthFilter(Filter):
         ge=1,
         le=20,
         title="Order",
-        description="The amplitude falls as this power of the wavelength; high orders ring.",
+        description=(
+            "Beyond the cutoff the amplitude falls as this power of the wavelength; high orders "
+            "ring."
+        ),
         json_schema_extra={"slider": [1, 20]},
     )
     kind: Literal["high", "low"] = Field(
         default="high",
         title="Keeps",
-        description="'high' takes away structures larger than the cutoff, 'low' smaller ones.",
+        description="'high' removes structures larger than the cutoff, 'low' removes smaller ones.",
     )
 
     @property
@@ -475,11 +485,11 @@ class BackgroundFilter(Filter):
 
     title = "flatten (polynomial)"
     function = "remove_background"
-    degree: int = _degree(" that is taken out of the image.")
+    degree: int = _degree(" that is divided out or subtracted.")
     kind: Literal["divide", "subtract"] = Field(
         default="divide",
         title="How",
-        description="'divide' by it, for an uneven beam, or 'subtract' it, for stray light.",
+        description="'divide' by the polynomial (uneven beam) or 'subtract' it (stray light).",
     )
 
     @property
@@ -504,8 +514,8 @@ class HotPixelFilter(Filter):
         gt=0,
         title="Threshold",
         description=(
-            "How many standard deviations of the noise a pixel may differ from the median of "
-            "its neighbours."
+            "Replace pixels that differ from the median of their neighbours by more than this "
+            "many standard deviations of the noise."
         ),
         json_schema_extra={"slider": [2.0, 20.0]},
     )

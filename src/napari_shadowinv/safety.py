@@ -64,8 +64,8 @@ def refusing_damage(
             raise
         except MemoryError as error:
             raise FileFormatError(
-                f"{path} needs more memory than there is: close other programs, or crop or bin "
-                "the image beforehand"
+                f"{path} needs more memory than is available: close other programs, or crop or "
+                "bin the image first"
             ) from error
         except Exception as error:
             if isinstance(error, OSError) and error.strerror:
@@ -73,7 +73,7 @@ def refusing_damage(
                     f"{path} cannot be read ({error.strerror}): check its permissions and the disk"
                 ) from error
             raise FileFormatError(
-                f"{path} is damaged or cut short ({_one_line(error)}): expected a complete file; "
+                f"{path} is damaged or truncated ({_one_line(error)}): expected a complete file; "
                 "copy or export it again"
             ) from error
 
@@ -159,7 +159,7 @@ def check_size(path: str | Path, promised: int) -> None:
     limit = size_limit()
     if promised > limit:
         raise FileFormatError(
-            f"{path} unfolds to {promised / 1e9:.3g} GB in memory, expected at most "
+            f"{path} expands to {promised / 1e9:.3g} GB in memory, expected at most "
             f"{limit / 1e9:.3g} GB: crop or bin it, or raise the environment variable "
             f"{LIMIT_VARIABLE}"
         )

@@ -149,9 +149,9 @@ def uniform_warnings(
     if fall <= _NOTABLE_FALL:
         return ()
     return (
-        f"the source is taken as uniform, but a point source {setup.source_object_distance:.3g} m "
-        f"from the object lights this image unevenly, by {fall:.1%} between brightest and dimmest "
-        "pixel: if yours shines evenly in all directions, choose the source 'isotropic'",
+        f"the source is assumed uniform, but a point source {setup.source_object_distance:.3g} m "
+        f"from the object lights this image unevenly, by {fall:.1%} between brightest and "
+        "dimmest pixel: if yours emits isotropically, choose the source 'isotropic'",
     )
 
 
@@ -222,8 +222,9 @@ def point_distance(setup: ProtonSetup | OpticalSetup) -> float:
     """
     if setup.collimated:
         raise InputError(
-            "got the source 'isotropic' and a setup with a collimated beam (source_object_distance "
-            "is inf): give the distance of the point, or choose the source 'uniform'"
+            "got the source 'isotropic' and a setup with a collimated beam "
+            "(source_object_distance is inf): give the distance of the point source, or choose "
+            "the source 'uniform'"
         )
     # The magnification enlarges distance and pixel alike.
     return setup.source_object_distance / setup.object_pixel_size
@@ -290,14 +291,14 @@ def gaussian_source(
     tell = _python_warning if on_warning is None else on_warning
     if rise > _MOST_EXTRAPOLATION:
         tell(
-            "no Gaussian beam can be told from the pixels that are not masked: the source is "
-            "taken as uniform; mask less, or choose another estimate"
+            "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
+            "uniform: mask less, or choose another estimate"
         )
         return uniform_source(image, mask=mask)
     if rise > _NOTABLE_EXTRAPOLATION:
         tell(
-            f"the Gaussian beam rises to {rise:.2g} times what the fit has seen, where the mask "
-            "hides the image: compare it with another estimate, or mask less"
+            f"the Gaussian beam rises to {rise:.2g} times the fitted data under the mask: "
+            "compare it with another estimate, or mask less"
         )
     return _with_flux_of(mean * beam, values, usable)
 
@@ -565,8 +566,8 @@ def _with_flux_of(beam: FloatArray, values: FloatArray, usable: BoolArray) -> Fl
     seen = float(values[usable].max())
     if not source.max() <= _MOST_EXTRAPOLATION * seen:
         raise InputError(
-            f"the estimated source rises to {source.max():.3g} where the mask hides the image, "
-            f"which is {seen:.3g} at most elsewhere: mask less, or choose another estimate"
+            f"the estimated source rises to {source.max():.3g} under the mask, while the image "
+            f"is at most {seen:.3g} elsewhere: mask less, or choose another estimate"
         )
     return source
 

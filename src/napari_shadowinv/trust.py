@@ -168,8 +168,10 @@ def _misfit(prepared: Prepared, reprojection: Array, n_sites: int) -> str:
     advice = (
         "use more sites"
         if n_sites < mask.sum()
-        else "the image is structured as finely as its pixels, so smooth it, or record it with "
-        "smaller ones"
+        else (
+            "the image has structure on the scale of its pixels, so smooth it or record it "
+            "with smaller pixels"
+        )
     )
     return (
         "the picture does not fit: the re-projection misses a pattern in the image, by "
@@ -226,9 +228,9 @@ def _nothing_found(noise: _Noise, rms: float) -> str:
     if rms > max(most, _ROUNDING):
         return ""
     return (
-        f"no deflection found: the displacement of {rms:.2g} px (r.m.s.) is no more than the "
-        f"image's noise of {noise.typical:.1%} per pixel makes by itself, {usual:.2g} px; average "
-        "shots, or bin or smooth the image, before you read anything into the field"
+        f"no deflection found: the displacement of {rms:.2g} px (r.m.s.) is no larger than the "
+        f"{usual:.2g} px expected from the image's noise of {noise.typical:.1%} per pixel; "
+        "average shots, or bin or smooth the image, before interpreting the field"
     )
 
 
@@ -296,7 +298,10 @@ def _cut_off(displacement: Array, mask: Mask, noise: _Noise, rms: float) -> str:
     turned = min(abs(float(np.mean(sides))), abs(float(np.median(sides))))
     by_noise = noise.largest * np.sqrt(depth / sum(side.size for side in outwards))
     if turned > max(_TURNED_BACK * rms, _BAND_DEVIATIONS * by_noise):
-        how = f"near the edge it moves rays by {turned:.2g} px towards or away from it on all sides"
+        how = (
+            f"near the edge it displaces rays by {turned:.2g} px towards or away from the edge "
+            "on all sides"
+        )
     elif rms > 2 * noise.displacements(noise.largest)[1] and _is_strongest_at_edge(
         np.concatenate(outwards), np.concatenate(along), float(np.nanmax(np.hypot(y, x)))
     ):
@@ -304,8 +309,8 @@ def _cut_off(displacement: Array, mask: Mask, noise: _Noise, rms: float) -> str:
     else:
         return ""
     return (
-        f"the field reaches the image's edge, which is closed: {how}, and what is cut off there "
-        "falsifies the field everywhere; try a free boundary (--boundary free), see "
+        f"the field reaches the image's edge, which is closed: {how}, and truncating it there "
+        "distorts the field everywhere; try a free boundary (--boundary free), see "
         "docs/boundary.md, or record a larger field of view"
     )
 

@@ -61,7 +61,9 @@ def validated(
     'tolerance'?
     """
     if not isinstance(mapping, Mapping):
-        raise InputError(f"{where}: received {_shown(mapping)}, expected keys with values")
+        raise InputError(
+            f"{where}: received {_shown(mapping)}, expected a table of keys and values"
+        )
     try:
         return model_class.model_validate(mapping)
     except ValidationError as error:

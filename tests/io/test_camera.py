@@ -91,7 +91,7 @@ def test_spe_is_known_by_its_marks_or_its_name(tmp_path: Path) -> None:
     pixels = RAMP.astype("<u2")
     assert read_radiograph(save_spe(tmp_path / "shot.dat", pixels, 3)).image[1, 2] == 11
     assert read_radiograph(save_spe(tmp_path / "a.SPE", pixels, 3, marked=False)).image[1, 2] == 11
-    with pytest.raises(FileFormatError, match="not an image that can be recognised"):
+    with pytest.raises(FileFormatError, match="not in a recognised image format"):
         read_radiograph(save_spe(tmp_path / "shot.bin", pixels, 3, marked=False))
 
 

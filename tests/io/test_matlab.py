@@ -81,7 +81,7 @@ def test_several_candidates_are_listed_and_chosen(tmp_path: Path, layout: str) -
 
 def test_variable_of_another_kind_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", RAMP)
-    with pytest.raises(InputError, match="is no MATLAB file nor HDF5"):
+    with pytest.raises(InputError, match="is neither a MATLAB nor an HDF5 file"):
         read_radiograph(tmp_path / "a.npy", variable="shot")
 
 

@@ -132,7 +132,7 @@ def test_truncated_file_is_named(tmp_path: Path, suffix: str) -> None:
     content = path.read_bytes()
     for share in (0.9, 0.5, 0.02):
         path.write_bytes(content[: max(16, int(share * len(content)))])
-        with pytest.raises(FileFormatError, match=r"damaged|cut short") as error:
+        with pytest.raises(FileFormatError, match=r"damaged|truncated") as error:
             read(path)
         assert str(path) in str(error.value)
         assert "\n" not in str(error.value)
@@ -231,7 +231,7 @@ def test_any_hdf5_gives_the_array_that_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"'stack' with shape \(2, 6, 9\)"):
         read(path, variable="stack")
     path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(FileFormatError, match="damaged or cut short"):
+    with pytest.raises(FileFormatError, match="damaged or truncated"):
         read(path, variable="shots/3/image")
 
 

@@ -147,7 +147,7 @@ def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
     with path.open("w") as file:
         file.write("# flux2D (5, 7)\n# mask (5, 7)\n")
         np.savetxt(file, np.vstack([VALUES, VALUES]))
-    with pytest.raises(FileFormatError, match="other numbers than 0"):
+    with pytest.raises(FileFormatError, match="numbers other than 0"):
         read_radiograph(path)
 
 

@@ -54,4 +54,4 @@ def test_what_has_a_place_keeps_it(
     viewer.add_labels(np.ones((40, 52), int))
     assert tuple(placed.scale) == (2, 2)
     assert tuple(own.scale) == tuple(first.scale) == (1, 1)
-    assert not any("same place" in text or "in pixels" in text for text in told)
+    assert not any("same position" in text or "in pixels" in text for text in told)

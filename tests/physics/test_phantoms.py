@@ -277,7 +277,7 @@ def test_wrong_input_of_the_papers_structures_is_told() -> None:
         toroid((9, 9), setup, 10, (1e-6, 1e-6, 1e-6))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="radius is 0: it must be positive, in m"):
         cosine_toroid((9, 9), setup, 10, 0)
-    with pytest.raises(InputError, match="three that are positive and increase"):
+    with pytest.raises(InputError, match="three positive, increasing"):
         coaxial_line((9, 9), setup, radii=(2e-6, 1e-6, 3e-6))
     with pytest.raises(InputError, match="width is -1: it must be positive, in m"):
         wakefield((9, 9), wakefield_setup(), width=-1)

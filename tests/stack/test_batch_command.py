@@ -126,10 +126,10 @@ def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
     assert store.stat().st_mtime_ns == before
     resumed = batch("--setup", "setup.toml", "--resume")
     assert resumed.exit_code == 0
-    assert "nothing was to be done" in flat(resumed.output)
+    assert "nothing to do" in flat(resumed.output)
     other = batch("--resume")
     assert other.exit_code == 2
-    assert "was begun with another setup" in flat(other.output)
+    assert "was started with a different setup" in flat(other.output)
     assert batch("--overwrite").exit_code == 0
 
 
@@ -165,9 +165,9 @@ def test_shots_that_came_since_are_appended_when_it_is_resumed(night, store):
         (["batch", "no/*.tif", "--out", "a.shadowinv.zarr"], "no file matches no/*.tif"),
         (["batch", "shots/*.npy", "--out", "a.zarr"], "ends with .shadowinv.zarr"),
         (["batch", "shots/*.npy", "--out", "a.shadowinv.zarr", "--source", "x.tif"], "not exist"),
-        (["status", "shots"], "is no stack of shots"),
+        (["status", "shots"], "is not a stack of shots"),
         (["status", "none.shadowinv.zarr"], "none.shadowinv.zarr does not exist"),
-        (["export", "shots", "--format", "csv"], "is no stack of shots"),
+        (["export", "shots", "--format", "csv"], "is not a stack of shots"),
     ],
 )
 def test_mistakes_are_told_in_one_sentence_and_nothing_is_written(folder, arguments, words):
@@ -187,7 +187,7 @@ def test_nothing_is_written_among_the_files_of_a_store(store):
     ):
         result = shadowinv(*arguments)
         assert result.exit_code == 2
-        assert "lies in the store that is read" in flat(result.output)
+        assert "is inside the store being read" in flat(result.output)
     assert sorted(store.rglob("*")) == before
 
 
@@ -202,7 +202,7 @@ def test_a_store_whose_reports_are_lost_or_damaged_is_told(store):
     result = shadowinv("status", store)
     assert result.exit_code == 2
     (line,) = result.stderr.splitlines()
-    assert "is damaged or cut short" in line
+    assert "is damaged or truncated" in line
 
 
 def test_a_tiff_with_pages_a_mask_and_bins(night, folder):
@@ -404,7 +404,7 @@ def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch
     finally:
         process.kill()
     assert process.returncode == 130
-    assert "Give the same command with --resume to go on" in flat(told)
+    assert "Repeat the command with --resume to continue" in flat(told)
     assert "Traceback" not in told
     statuses = StackStore(out).statuses()
     assert set(statuses) == {DONE, PENDING}
@@ -453,7 +453,7 @@ def test_ctrl_c_while_workers_start_is_told_in_one_sentence(night, folder):
     code, told = interrupted(starting, 0.6, "--workers", "1")
     assert code == 130
     assert told.splitlines() == [
-        "Cancelled: nothing written. Give the same command with --resume to go on."
+        "Cancelled: nothing written. Repeat the command with --resume to continue."
     ]
     assert sorted(folder.rglob("*")) == before
 

@@ -83,7 +83,7 @@ def test_a_store_has_the_shots_that_are_there(store, shots):
         if array["dimension_names"][:1] == ["shot"]:
             array["shape"][0] = shots
     file.write_text(json.dumps(content))
-    with pytest.raises(FileFormatError, match=f"tells of {shots} shots, but they are not there"):
+    with pytest.raises(FileFormatError, match=f"lists {shots} shots, but they are missing"):
         StackStore(store)
     result = status(store)
     assert result.exit_code == 2
@@ -109,7 +109,7 @@ def test_warnings_of_a_file_are_in_its_shots_report(night, tmp_path):
     assert result.exit_code == 0, result.output
     film, text = (StackStore(Path(out)).report(index)["warnings"] for index in (0, 1))
     assert any("of the wrong sign" in warning for warning in film)
-    assert any("holds its own source" in warning for warning in text)
+    assert any("contains its own source" in warning for warning in text)
 
 
 def test_status_shows_names_and_reasons_as_they_are(night, tmp_path, monkeypatch):

@@ -93,7 +93,7 @@ def test_a_shot_that_sorts_in_between_goes_to_the_end_and_no_number_changes(nigh
     alone = night.run(out.with_name("alone.shadowinv.zarr"), shots=shots)
     np.testing.assert_array_equal(grown.potential, alone.potential)
     # Those of one run keep their order.
-    with pytest.raises(InputError, match=r"another order \(shot_1.npy before shot_4.npy\)"):
+    with pytest.raises(InputError, match=r"different order \(shot_1.npy before shot_4.npy\)"):
         night.run(out, shots=[night.path(index) for index in (0, 2, 5, 4, 1, 3)])
 
 
@@ -137,7 +137,7 @@ def test_options_are_checked_as_ever(night, out, hidden):
     hidden(5)
     night.run(out)
     hidden()
-    with pytest.raises(InputError, match="another options"):
+    with pytest.raises(InputError, match="different options"):
         night.run(out, options=InversionOptions(n_sites=90))
     assert len(StackStore(out).names) == 5
 

@@ -247,7 +247,7 @@ class TestInputs:
             ([], "empty list"),
             (np.ones((5, 6)), r"shape \(5, 6\), expected \(shot, y, x\)"),
             (7, "are a int: expected an array"),
-            ([np.ones((5, 6)), np.ones((6, 5))], "expected one for all"),
+            ([np.ones((5, 6)), np.ones((6, 5))], "expected the same shape for all"),
         ],
     )
     def test_what_holds_no_shots_is_refused(self, shots, words):
@@ -255,7 +255,7 @@ class TestInputs:
             invert_stack(shots)
 
     def test_a_folder_is_refused(self, night):
-        with pytest.raises(InputError, match="is a folder: say which files"):
+        with pytest.raises(InputError, match="is a folder: specify the files"):
             invert_stack(night.folder)
 
     def test_files_of_which_none_can_be_read_are_refused(self, tmp_path):

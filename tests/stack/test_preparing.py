@@ -117,11 +117,11 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
     night.run(out, **begun)
     assert (night.run(out, **begun).status == DONE).all()
     for change, named in (
-        ({"filters": (LowPassFilter(width=1.5),)}, "another filters .low-pass .smooth., width 1.0"),
-        ({"filters": ()}, "another filters"),
-        ({"source": LowPassEstimate(width=7)}, "another source image"),
-        ({"source": None, "source_mask": None}, "another source image"),
-        ({"source_mask": ~bare}, "another source mask image"),
+        ({"filters": (LowPassFilter(width=1.5),)}, "different filters .low-pass .smooth., width 1.0"),
+        ({"filters": ()}, "different filters"),
+        ({"source": LowPassEstimate(width=7)}, "different source image"),
+        ({"source": None, "source_mask": None}, "different source image"),
+        ({"source_mask": ~bare}, "different source mask image"),
     ):
         with pytest.raises(InputError, match=named):
             night.run(out, **{**begun, **change})
@@ -130,7 +130,7 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ({"filters": (HighPassFilter(),)}, "takes the beam out of the image"),
+        ({"filters": (HighPassFilter(),)}, "removes the beam from the image"),
         ({"source_mask": np.eye(24, 28) > 0}, "got a source mask"),
         ({"source": InterpolatedEstimate()}, "without a source mask"),
         (
@@ -139,11 +139,11 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
                 "source_mask": np.arange(28) > np.zeros((24, 1)) + 9,
                 "mask": np.arange(28) > np.zeros((24, 1)) + 9,
             },
-            "left out of the inversion",
+            "excluded from the inversion",
         ),
         ({"source": IsotropicEstimate()}, "'isotropic' without a setup"),
-        ({"source": LowPassEstimate(width=6), "warm_start": 2}, "a source of its own"),
-        ({"source": np.ones((6, 24, 28)), "warm_start": 2}, "a source of its own"),
+        ({"source": LowPassEstimate(width=6), "warm_start": 2}, "its own source"),
+        ({"source": np.ones((6, 24, 28)), "warm_start": 2}, "its own source"),
         (
             {"source": LowPassEstimate(width=6), "source_mask": np.ones((3, 3), bool)},
             r"mask has shape \(3, 3\)",

@@ -142,7 +142,7 @@ def spoil(night) -> dict[int, str]:
     np.save(night.path(2), 0 * night.images[2])
     np.save(night.path(3), np.ones((7, 9)))
     np.save(night.path(4), np.where(night.images[4] > 101, np.nan, night.images[4]))
-    return {0: "is empty", 1: "cut short", 2: "no positive pixel", 3: "(7, 9)", 4: "NaN"}
+    return {0: "is empty", 1: "truncated", 2: "no positive pixel", 3: "(7, 9)", 4: "NaN"}
 
 
 def test_bad_shots_fail_alone_with_their_reason_and_can_be_redone(make_night, out):
@@ -217,28 +217,28 @@ class TestRefusals:
         assert content(out) == before
 
     def test_other_options(self, night, out):
-        with pytest.raises(InputError, match=r"another options \(n_sites: 100 there, 50 now\)"):
+        with pytest.raises(InputError, match=r"different options \(n_sites: 100 there, 50 now\)"):
             night.run(out, options=InversionOptions(n_sites=50))
 
     def test_threads_are_no_other_option(self, night, out):
         night.run(out, options=OPTIONS.model_copy(update={"threads": 1}))
 
     def test_another_source(self, night, out):
-        with pytest.raises(InputError, match="another source image"):
+        with pytest.raises(InputError, match="different source image"):
             night.run(out, source=night.source + 1)
 
     def test_another_mask(self, night, out):
         mask = np.ones(night.source.shape, bool)
         mask[0] = False
-        with pytest.raises(InputError, match="another mask image"):
+        with pytest.raises(InputError, match="different mask image"):
             night.run(out, mask=mask)
 
     def test_another_setup(self, night, out, optical_setup):
-        with pytest.raises(InputError, match="another setup"):
+        with pytest.raises(InputError, match="different setup"):
             night.run(out, setup=optical_setup)
 
     def test_other_variables(self, night, out):
-        with pytest.raises(InputError, match="another stored"):
+        with pytest.raises(InputError, match="different stored"):
             night.run(out, variables=("potential",))
 
     def test_a_shot_that_is_not_given_any_more(self, night, out):
@@ -248,7 +248,7 @@ class TestRefusals:
 
     def test_another_order(self, night, out):
         paths = [night.path(index) for index in (0, 1, 3, 2, 4, 5)]
-        with pytest.raises(InputError, match=r"another order \(shot_2.npy before shot_3.npy\)"):
+        with pytest.raises(InputError, match=r"different order \(shot_2.npy before shot_3.npy\)"):
             night.run(out, shots=paths)
 
     def test_a_shot_that_changed(self, night, out):
@@ -268,7 +268,7 @@ class TestRefusals:
         mine = tmp_path / "thesis.shadowinv.zarr"
         mine.mkdir()
         (mine / "chapter.txt").write_text("years of work")
-        with pytest.raises(FileFormatError, match="holds no stack of shots"):
+        with pytest.raises(FileFormatError, match="is not a stack of shots"):
             run_stack(night.images, mine, overwrite=True)
         assert (mine / "chapter.txt").read_text() == "years of work"
 
@@ -313,7 +313,7 @@ def test_a_writer_of_a_store_that_was_replaced_writes_nothing(night, out):
     old = StackStore(out).writer
     night.run(out, shots=night.images, overwrite=True)
     before = content(out)
-    with pytest.raises(OSError, match="is another store than at the start"):
+    with pytest.raises(OSError, match="is not the store the run started with"):
         old.write(0, {"potential": np.zeros(night.source.shape)}, {})
     assert content(out) == before
 
@@ -321,7 +321,7 @@ def test_a_writer_of_a_store_that_was_replaced_writes_nothing(night, out):
 def test_a_damaged_store_is_told_in_one_sentence(night, out):
     night.run(out, shots=night.images)
     (out / "status" / "c" / "2").write_bytes(b"")
-    with pytest.raises(FileFormatError, match="is damaged or cut short"):
+    with pytest.raises(FileFormatError, match="is damaged or truncated"):
         read(out)
 
 

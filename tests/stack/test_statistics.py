@@ -53,5 +53,5 @@ def test_one_shot_has_no_spread(night):
 
 
 def test_a_dataset_without_shots_is_refused(inversion):
-    with pytest.raises(InputError, match="no field of many shots"):
+    with pytest.raises(InputError, match="no fields of a series of shots"):
         stack_statistics(inversion.to_dataset())

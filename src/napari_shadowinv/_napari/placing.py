@@ -49,17 +49,17 @@ def _receive(layer: Any, fields: list[Any]) -> None:
     if not alike:
         unit = f"{fields[-1].units[-1]:~P}"
         show_warning(
-            f"'{layer.name}' is in pixels, the results are in {unit}, and their sizes differ: "
-            "they do not lie on each other. Give it a scale: choose it in 'Invert shot' with its "
-            "setup and press Run, or drag it into place (layer controls → transform)"
+            f"'{layer.name}' is in pixels, the results are in {unit}, and their sizes differ, so "
+            "they do not overlap. Set a scale: choose the layer in 'Invert shot' with its setup "
+            "and press Run, or move it into place (layer controls → transform)"
         )
         return
     frame = frame_of(alike[-1])
     for name, value in frame.keywords(stacked=layer.ndim > 2).items():
         setattr(layer, name, value)
     show_info(
-        f"'{layer.name}' has as many pixels as '{alike[-1].name}': it was given the same place, "
-        f"with pixels of {frame.scale[-1]:.4g} {alike[-1].units[-1]:~P}"
+        f"'{layer.name}' has the same shape as '{alike[-1].name}': it was placed at the same "
+        f"position, with pixels of {frame.scale[-1]:.4g} {alike[-1].units[-1]:~P}"
     )
 
 

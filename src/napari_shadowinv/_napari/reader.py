@@ -112,7 +112,7 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
         folder = Path(path)
         images = images_in(folder)
         if not images:
-            raise FileFormatError(f"{folder} holds no image: expected radiographs in it")
+            raise FileFormatError(f"{folder} contains no image: expected a folder of radiographs")
         return list(stack_layers(images, folder.name))
     return _read_file(Path(path))
 

@@ -225,7 +225,7 @@ def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
             return read_radiograph(path), index
         except (FileFormatError, InputError) as error:
             mistakes.append(str(error))
-    raise FileFormatError(f"none of {len(paths)} files can be read as a shot: {mistakes[0]}")
+    raise FileFormatError(f"none of the {len(paths)} files can be read as a shot: {mistakes[0]}")
 
 
 def _plane_of(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -236,10 +236,10 @@ def _plane_of(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
         image = read_radiograph(path).image
         if image.shape != shape:
             raise InputError(
-                f"{path} has {image.shape[0]}×{image.shape[1]} pixels, the first shot "
-                f"{shape[0]}×{shape[1]}: open it on its own"
+                f"{path} has {image.shape[0]}×{image.shape[1]} pixels, but the first shot has "
+                f"{shape[0]}×{shape[1]}: open it separately"
             )
     except (FileFormatError, InputError) as error:
-        warnings.warn(f"this shot is left dark: {error}", stacklevel=2)
+        warnings.warn(f"this shot is shown as zeros: {error}", stacklevel=2)
         return np.zeros(shape)
     return image

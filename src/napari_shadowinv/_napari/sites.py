@@ -74,8 +74,8 @@ def power_cells(inversion: Inversion) -> tuple[list[Array], NDArray[np.intp]]:
     count = len(inversion.sites)
     if count > MOST_CELLS:
         raise InputError(
-            f"the result has {count:,} sites: power cells can be shown for up to {MOST_CELLS:,}; "
-            "invert with fewer sites to see cells"
+            f"the result has {count:,} sites: power cells can be shown for up to {MOST_CELLS:,} "
+            "sites; invert with fewer sites to show the cells"
         )
     diagram, margin = _diagram(inversion)
     height, width = inversion.potential.shape

@@ -85,8 +85,8 @@ def opened_store(path: Path) -> xarray.Dataset:
     )
     if "displacement" not in dataset or _SHOT not in dataset["displacement"].dims:
         raise FileFormatError(
-            f"{path} is a Zarr folder without the displacement of a run of shots: open it with "
-            "napari's own reader"
+            f"{path} is a Zarr folder but not a store of inverted shots (it has no "
+            "displacement): open it with napari's own reader"
         )
     return dataset
 
@@ -113,7 +113,7 @@ class _StoreLayers:
         for shot in shots:
             if np.isfinite(displacement[shot].values).all():
                 return int(shot)
-        raise FileFormatError(f"{self._path} holds no finished shot yet: wait for the first one")
+        raise FileFormatError(f"{self._path} contains no finished shot yet: wait for the first one")
 
     def layers(self) -> list[FullLayerData]:
         return [

@@ -121,13 +121,13 @@ def _one_result(layers: Sequence[FullLayerData]) -> tuple[list[FullLayerData], R
     if len(results) > 1:
         names = [_name(layer) for layer in layers if result_of(layer[1]) is not None]
         raise InputError(
-            f"the layers show {len(results)} results ({_listed(names)}): select layers of one of "
-            "them and save the selected layers"
+            f"the layers show {len(results)} results ({_listed(names)}): select layers of one "
+            "result and save the selected layers"
         )
     if not results:
         raise InputError(
             f"no layer shows a result ({_listed([_name(layer) for layer in layers])}): expected "
-            "at least one that an inversion made; save others as images"
+            "at least one layer of an inversion; save other layers as images"
         )
     (result,) = results.values()
     return [layer for layer in layers if result_of(layer[1]) is result], result
@@ -148,8 +148,8 @@ def _warn_of_changes(layers: Sequence[FullLayerData], result: Result) -> None:
         from napari.utils.notifications import show_warning
 
         show_warning(
-            f"{_listed(changed)} changed since the inversion: the file keeps what was retrieved; "
-            "save the changed layers as images, too"
+            f"{_listed(changed)} changed since the inversion: the file contains the original "
+            "result; save the changed layers separately, as images"
         )
 
 

@@ -146,7 +146,7 @@ def _check(out: Path, resume: bool, overwrite: bool) -> None:
     if check_store_path(out).exists() and not (resume or overwrite):
         counts = _counts_text(*_counts(out))
         raise InputError(
-            f"{out} exists ({counts}): go on with --resume, begin anew with --overwrite, or choose "
+            f"{out} exists ({counts}): use --resume to continue, --overwrite to start again, or "
             "another name"
         )
 
@@ -232,7 +232,7 @@ def _counts_text(done: int, failed: int, pending: int) -> str:
 
 def _tell_how_to_resume(out: Path, ledger: _Ledger) -> None:
     state = _counts_text(*_counts(out)) if out.exists() else "nothing written"
-    say_on_stderr(f"Cancelled: {state}. Give the same command with --resume to go on.")
+    say_on_stderr(f"Cancelled: {state}. Repeat the command with --resume to continue.")
 
 
 def _summary(out: Path, ledger: _Ledger) -> Table:
@@ -241,7 +241,7 @@ def _summary(out: Path, ledger: _Ledger) -> Table:
     this_run = f"{ledger.ended} shots in {seconds:.1f} s, {ledger.rate_text}"
     rows = [
         ("shots", _counts_text(done, failed, pending)),
-        ("this run", this_run if ledger.ended else "nothing was to be done"),
+        ("this run", this_run if ledger.ended else "nothing to do"),
         *_trouble_rows(out),
         ("written", str(out)),
     ]
@@ -258,7 +258,7 @@ def _trouble_rows(out: Path) -> Rows:
     statuses = store.statuses()
     failed = [int(index) for index in np.flatnonzero(statuses == FAILED)]
     rows = [
-        ("failed", f"{store.names[i]}: {store.report(i).get('reason', 'its report is lost')}")
+        ("failed", f"{store.names[i]}: {store.report(i).get('reason', 'its report is missing')}")
         for i in failed[:_NAMED]
     ]
     if len(failed) > _NAMED:

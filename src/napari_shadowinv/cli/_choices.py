@@ -51,83 +51,85 @@ class Choices(BaseModel):
         gt=0,
         allow_inf_nan=False,
         title="Hot pixels (standard deviations)",
-        description="Pixels that stand out by more are replaced by their neighbours' median.",
+        description="Pixels that deviate by more are replaced by the median of their neighbours.",
     )
     background_degree: int | None = Field(
         default=None,
         ge=0,
         le=10,
-        title="Degree of the background",
+        title="Background degree",
         description="The image is divided by a polynomial of this degree fitted to it.",
     )
     high_pass: float | None = Field(
         default=None,
         gt=0,
         allow_inf_nan=False,
-        title="Width of the high pass (px)",
-        description="Structures much larger than this are taken away; the mean stays.",
+        title="High-pass width (px)",
+        description="Structures much larger than this are removed; the mean is kept.",
     )
     butterworth: float | None = Field(
         default=None,
         gt=0,
         allow_inf_nan=False,
-        title="Cutoff of the Butterworth filter (px)",
-        description="Wavelength at which the amplitude falls by 1/√2.",
+        title="Butterworth cutoff (px)",
+        description="Wavelength at which the amplitude drops to 1/√2.",
     )
     butterworth_order: int | None = Field(
         default=None,
         ge=1,
         le=20,
-        title="Order of the Butterworth filter",
+        title="Butterworth order",
         description="The amplitude falls as this power of the wavelength.",
     )
     butterworth_kind: Literal["high", "low"] | None = Field(
         default=None,
-        title="Kind of the Butterworth filter",
-        description="'high' takes away structures larger than the cutoff, 'low' smaller ones.",
+        title="Butterworth kind",
+        description="'high' removes structures larger than the cutoff, 'low' removes smaller ones.",
     )
     low_pass: float | None = Field(
         default=None,
         gt=0,
         allow_inf_nan=False,
-        title="Width of the low pass (px)",
-        description="Image and source are blurred by a Gaussian of this standard deviation.",
+        title="Low-pass width (px)",
+        description="Image and source are blurred with a Gaussian of this standard deviation.",
     )
     source_from: _EstimateName | None = Field(
-        default=None, title="Source from", description="How the source is guessed from the image."
+        default=None, title="Source from", description="How the source is estimated from the image."
     )
     source_centre_y: float | None = Field(
         default=None,
         allow_inf_nan=False,
         title="Centre y (px)",
-        description="Row in which the detector faces an isotropic source.",
+        description="Row at which the detector faces an isotropic source.",
     )
     source_centre_x: float | None = Field(
         default=None,
         allow_inf_nan=False,
         title="Centre x (px)",
-        description="Column in which the detector faces an isotropic source.",
+        description="Column at which the detector faces an isotropic source.",
     )
     source_degree: int | None = Field(
         default=None,
         ge=0,
         le=10,
-        title="Degree of the source",
-        description="Of a polynomial source.",
+        title="Source degree",
+        description="Degree of a polynomial source.",
     )
     source_weight: float | None = Field(
         default=None,
         gt=0,
         allow_inf_nan=False,
         title="Weight (px)",
-        description="Of a total-variation source: c r/2 removes a disc of contrast c, radius r.",
+        description=(
+            "For a total-variation source: c·r/2 removes a disc of contrast c and radius r."
+        ),
     )
     source_width: float | None = Field(
         default=None,
         gt=0,
         allow_inf_nan=False,
-        title="Width of the source's blur (px)",
-        description="Of a low-pass or interpolated source.",
+        title="Source blur width (px)",
+        description="Blur width of a low-pass or interpolated source.",
     )
 
     @property
@@ -211,8 +213,8 @@ def _check(chosen: Choices, has_source: bool, has_source_mask: bool) -> None:
     if has_source and chosen.flattens:
         (name, *_) = chosen.given("background_degree", "high_pass", "butterworth")
         raise InputError(
-            f"received --source and {_flag(name)}: what flattens the image takes the beam out of "
-            "it, which the source still has; leave one of them out"
+            f"received --source and {_flag(name)}: flattening removes the beam from the image "
+            "but not from the source; use only one of them"
         )
     for name, (_, estimates) in KEYWORDS.items():
         if getattr(chosen, name) is not None and chosen.source_from not in estimates:
@@ -220,16 +222,16 @@ def _check(chosen: Choices, has_source: bool, has_source_mask: bool) -> None:
             raise InputError(f"received {_flag(name)}: it needs {wanted}")
     if has_source_mask and chosen.source_from in (None, "uniform", "isotropic"):
         raise InputError(
-            "received --source-mask: it needs --source-from with an estimate that looks at the "
+            "received --source-mask: it needs --source-from with an estimate based on the "
             "image, such as interpolated or polynomial"
         )
     if chosen.source_from == "interpolated" and not has_source_mask:
         raise InputError(
-            "--source-from interpolated needs --source-mask: a picture of the image's size that "
-            "is 0 where the object covers the beam"
+            "--source-from interpolated needs --source-mask: an image of the same size that is "
+            "0 where the object covers the beam"
         )
     if chosen.source_from == "low-pass" and chosen.source_width is None:
         raise InputError(
             "--source-from low-pass needs --source-width: the standard deviation of the blur in "
-            "px, a few times the size of the object"
+            "px, a few times the object's size"
         )

@@ -37,7 +37,7 @@ def opened(path: Path, shots: str | None) -> xarray.Dataset:
     chosen = dataset if shots is None else dataset.isel(shot=parsed_shots(shots, _count(path)))
     done = chosen.isel(shot=np.flatnonzero(chosen["status"].values == DONE))
     if not done.sizes["shot"]:
-        raise InputError(f"{path} has no shot that is done among those: see shadowinv status")
+        raise InputError(f"{path} has no finished shots in this selection: see shadowinv status")
     return done
 
 
@@ -110,7 +110,7 @@ def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[tuple[
         if dims[:1] != ("shot",) or dims[-2:] != ("y", "x"):
             images = [name for name in dataset.data_vars if dataset[name].dims[-2:] == ("y", "x")]
             raise InputError(
-                f"the store has no images {variable!r}: expected some of "
+                f"the store has no images {variable!r}: expected one or more of "
                 f"{', '.join(map(str, images))}"
             )
     for index in range(dataset.sizes["shot"]):

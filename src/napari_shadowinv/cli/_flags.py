@@ -20,7 +20,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 _FILTERS = "Filters before the inversion"
-_BOUNDARY = "Flux across the image's edge (docs/boundary.md)"
+_BOUNDARY = "Flux across the image edge (docs/boundary.md)"
 _ESTIMATES = "Source estimated from the image (docs/sources.md)"
 
 
@@ -48,48 +48,54 @@ SourceFile = Annotated[
 ]
 MaskFile = Annotated[
     Path | None,
-    Option("--mask", help="Picture of the image's size, 0 where a pixel is unusable."),
+    Option("--mask", help="Image of the same size, 0 at unusable pixels."),
 ]
 SetupFile = Annotated[
     Path | None,
-    Option("--setup", help="TOML file with the experiment's geometry, for SI units."),
+    Option("--setup", help="TOML file with the experimental geometry, for results in SI units."),
 ]
 OptionsFile = Annotated[Path | None, Option("--options", help="TOML file with inversion options.")]
 Channel = Annotated[
     str | None,
-    Option(help="Of a colour image: red, green, blue, mean or a number from 0."),
+    Option(help="Channel of a colour image: red, green, blue, mean or an index from 0."),
 ]
 Variable = Annotated[
     str | None,
     Option(
         "--variable",
         metavar="NAME",
-        help="Array to take from a MATLAB file with several images, or from an HDF5 file.",
+        help="Name of the array in an HDF5 file, or in a MATLAB file with several images.",
     ),
 ]
 SourceVariable = Annotated[
     str | None,
     Option(
         metavar="NAME",
-        help="Array with the undisturbed beam, in the file of --source or else of the image.",
+        help=(
+            "Name of the array with the undisturbed beam, in the --source file or else in the "
+            "image file."
+        ),
     ),
 ]
-Bin = Annotated[int, Option("--bin", help="Sum blocks of so many pixels squared first.")]
+Bin = Annotated[int, Option("--bin", metavar="N", help="Bin N×N pixels first.")]
 ChosenShots = Annotated[
     str | None,
-    Option("--shots", help="Which, from 0: 3, 3:20, ::10 or 1,4,9. Default: all done."),
+    Option(
+        "--shots",
+        help=("Shots to use, counted from 0: 3, 3:20, ::10 or 1,4,9. Default: all finished shots."),
+    ),
 ]
 
-SiteCount = Annotated[int | None, Option(help="Number of sites. Default: as many as pixels.")]
+SiteCount = Annotated[int | None, Option(help="Number of sites. Default: one per pixel.")]
 ClipNegative = Annotated[
     bool, Option("--clip-negative", help="Set negative pixels to zero and count them.")
 ]
-Threads = Annotated[int | None, Option(help="Threads. Default: all cores.")]
-Seed = Annotated[int | None, Option(help="Seed of the random site positions.")]
+Threads = Annotated[int | None, Option(help="Number of threads. Default: all cores.")]
+Seed = Annotated[int | None, Option(help="Random seed for the site positions.")]
 Boundary = Annotated[
     str | None,
     Option(
-        help="'closed': nothing crosses the edge. 'free': flux may leave and enter.",
+        help="'closed': no flux crosses the edge. 'free': flux may leave and enter.",
         rich_help_panel=_BOUNDARY,
     ),
 ]
@@ -97,7 +103,7 @@ Margin = Annotated[
     int | None,
     Option(
         metavar="PX",
-        help="Of the free boundary: pixels beyond each edge that flux may come from.",
+        help="Free boundary: width of the strip beyond each edge from which flux may enter.",
         rich_help_panel=_BOUNDARY,
     ),
 ]
@@ -105,8 +111,8 @@ Flux = Annotated[
     str | None,
     Option(
         help=(
-            "Of the free boundary: 'conserve' (units of image and source may differ), 'known' "
-            "(same exposure) or 'fit'."
+            "Free boundary: 'conserve' (units of image and source may differ), 'known' (same "
+            "exposure) or 'fit'."
         ),
         rich_help_panel=_BOUNDARY,
     ),
@@ -117,8 +123,9 @@ HotPixels = Annotated[
     Option(
         metavar="DEVIATIONS",
         help=(
-            "Replace hot and dead pixels that differ from their neighbours' median by more "
-            "standard deviations of the noise; 6 suits most. Before --bin."
+            "Replace hot and dead pixels that differ from the median of their neighbours by "
+            "more than this many standard deviations of the noise; 6 suits most images. Applied "
+            "before --bin."
         ),
         rich_help_panel=_FILTERS,
     ),
@@ -135,7 +142,7 @@ HighPass = Annotated[
     float | None,
     Option(
         metavar="PX",
-        help="Take away structures much larger than this width in px (after --bin).",
+        help="Remove structures much larger than this width in px (after --bin).",
         rich_help_panel=_FILTERS,
     ),
 ]
@@ -143,7 +150,9 @@ LowPass = Annotated[
     float | None,
     Option(
         metavar="PX",
-        help="Blur image and source by a Gaussian of this standard deviation in px (after --bin).",
+        help=(
+            "Blur image and source with a Gaussian of this standard deviation in px (after --bin)."
+        ),
         rich_help_panel=_FILTERS,
     ),
 ]
@@ -151,7 +160,10 @@ Butterworth = Annotated[
     float | None,
     Option(
         metavar="PX",
-        help="Take away structures larger than this wavelength in px (after --bin), steeply.",
+        help=(
+            "Remove structures larger than this wavelength in px (after --bin), with a sharp "
+            "cutoff."
+        ),
         rich_help_panel=_FILTERS,
     ),
 ]
@@ -159,7 +171,10 @@ ButterworthOrder = Annotated[
     int | None,
     Option(
         metavar="N",
-        help="Of --butterworth: the amplitude falls as this power of the wavelength. Default: 2.",
+        help=(
+            "Order of --butterworth: the amplitude falls as this power of the wavelength. "
+            "Default: 2."
+        ),
         rich_help_panel=_FILTERS,
     ),
 ]
@@ -167,8 +182,8 @@ ButterworthKind = Annotated[
     str | None,
     Option(
         help=(
-            "Of --butterworth: 'high' takes away what is larger (default), 'low' what is smaller, "
-            "of image and source."
+            "Kind of --butterworth: 'high' removes larger structures (default), 'low' removes "
+            "smaller ones, in both image and source."
         ),
         rich_help_panel=_FILTERS,
     ),
@@ -179,8 +194,8 @@ SourceFrom = Annotated[
     Option(
         metavar="ESTIMATE",
         help=(
-            "Guess the undisturbed beam from the (filtered) image: uniform, isotropic (a point "
-            "source, needs --setup), gaussian, polynomial, low-pass, total-variation or "
+            "Estimate the undisturbed beam from the (filtered) image: uniform, isotropic (a "
+            "point source, needs --setup), gaussian, polynomial, low-pass, total-variation or "
             "interpolated."
         ),
         rich_help_panel=_ESTIMATES,
@@ -191,15 +206,19 @@ SourceCentreY = Annotated[
     Option(
         metavar="PX",
         help=(
-            "For isotropic: row (after --bin) in which the detector faces the point source. "
-            "Default: the image's middle."
+            "For isotropic: row (after --bin) at which the detector faces the point source. "
+            "Default: the image centre."
         ),
         rich_help_panel=_ESTIMATES,
     ),
 ]
 SourceCentreX = Annotated[
     float | None,
-    Option(metavar="PX", help="Likewise, column.", rich_help_panel=_ESTIMATES),
+    Option(
+        metavar="PX",
+        help=("For isotropic: column (after --bin) at which the detector faces the point source."),
+        rich_help_panel=_ESTIMATES,
+    ),
 ]
 SourceDegree = Annotated[
     int | None,
@@ -212,8 +231,8 @@ SourceWeight = Annotated[
     float | None,
     Option(
         help=(
-            "For total-variation: in px (after --bin); c·r/2 removes a disc of contrast c and "
-            "radius r px. Default: 2."
+            "For total-variation: strength in px (after --bin); c·r/2 removes a disc of "
+            "contrast c and radius r px. Default: 2."
         ),
         rich_help_panel=_ESTIMATES,
     ),
@@ -231,7 +250,7 @@ SourceWidth = Annotated[
 SourceMask = Annotated[
     Path | None,
     Option(
-        help="Picture of the image's size, 0 where the object hides the bare beam.",
+        help="Image of the same size, 0 where the object covers the beam.",
         rich_help_panel=_ESTIMATES,
     ),
 ]
@@ -240,17 +259,15 @@ Result = Annotated[
     Path | None,
     Option(
         help=(
-            "Result: .shadowinv (all of it), .h5 (pradformat) or .csv (sites). "
-            "Default: the image's name with .shadowinv, in the current folder."
+            "Result file: .shadowinv (complete), .h5 (pradformat) or .csv (sites). Default: the "
+            "image's name with .shadowinv, in the current folder."
         )
     ),
 ]
 Figure = Annotated[
     Path | None,
-    Option(help="Figure: .png, .pdf or .svg. Default: a PNG beside the result."),
+    Option(help="Figure file: .png, .pdf or .svg. Default: a PNG next to the result."),
 ]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
-Quiet = Annotated[bool, Option("--quiet", "-q", help="Print nothing but errors.")]
-QuietInversion = Annotated[
-    bool, Option("--quiet", "-q", help="Print nothing but errors and alarms.")
-]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]
+QuietInversion = Annotated[bool, Option("--quiet", "-q", help="Print errors and warnings only.")]

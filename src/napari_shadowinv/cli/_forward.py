@@ -46,7 +46,7 @@ def seen_with(
     """Find out which experiments are meant."""
     if told is not None and field.setup is not None and told != field.setup:
         raise InputError(
-            "received --made-with, but the field's file tells its own experiment, "
+            "received --made-with, but the field's file contains its own setup, "
             f"{setup_text(field.setup)}: leave it out"
         )
     made_with = field.setup if told is None else told
@@ -61,8 +61,8 @@ def seen_with(
     )
     if (deflector is not None or dispersion != 1) and not meant.is_elsewhere:
         raise InputError(
-            "received --deflector or --dispersion, but one experiment only: expected --setup with "
-            "another one, and for a field in px also --made-with"
+            "received --deflector or --dispersion, but only one setup: expected a different one "
+            "with --setup, and for a field in px also --made-with"
         )
     # In another experiment the beam is another one, too.
     return replace(meant, source=None) if meant.is_elsewhere else meant
@@ -85,6 +85,6 @@ def predicted(meant: Prediction, source: Plane | None) -> tuple[Plane, str]:
         source=source,
     )
     return image, (
-        f"From {setup_text(meant.made_with)} to {setup_text(meant.seen)}, as if a {deflector} "
-        "alone deflected"
+        f"From {setup_text(meant.made_with)} to {setup_text(meant.seen)}, assuming that only a "
+        f"{deflector} deflects the beam"
     )

@@ -73,8 +73,8 @@ def alarm_unless_converged(report: Report, out: Path) -> None:
     """End with an exit code of its own if what was written is not to be trusted."""
     if not report.converged:
         say_on_stderr(
-            f"NOT CONVERGED: {out} is written, but its flux residual is {report.residual:.2g} "
-            f"where {report.tolerance:.2g} was asked for: do not trust the field"
+            f"NOT CONVERGED: {out} was written, but its flux residual is {report.residual:.2g} "
+            f"(tolerance {report.tolerance:.2g}): do not trust the field"
         )
         raise typer.Exit(EXIT_NOT_CONVERGED)
 

@@ -108,7 +108,7 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> Rows:
     if shot.source is not None:
         rows.append(("source", "in the same file, below the image"))
     if shot.mask is not None:
-        rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels left out"))
+        rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels excluded"))
     return [*rows, *_geometry_rows(geometry), ("setup", setup_text(shot.setup, shot))]
 
 
@@ -145,7 +145,7 @@ def _result_rows(dataset: xarray.Dataset) -> Rows:
     experiment = [("image", size_text(displacement[0])), ("setup", setup_text(setup))]
     if "options" not in dataset.attrs:
         is_foreign = dataset.attrs.get("format") == "pradformat"
-        kind = "pradformat inversion" if is_foreign else "field that another program retrieved"
+        kind = "pradformat inversion" if is_foreign else "field retrieved by another program"
         return [("kind", kind), *experiment, *peak_rows(displacement, setup)]
     inversion = inversion_from_dataset(dataset)
     return [

@@ -99,8 +99,8 @@ def _own_source(path: Path, shot: Radiograph, choices: Choices | None) -> Radiog
         return None
     if choices is not None and choices.flattens:
         raise InputError(
-            f"{path} holds its own source, and the image is to be flattened: leave the filter "
-            "out, or put --source-from uniform in place of that source"
+            f"{path} contains its own source, but a filter would flatten the image: leave the "
+            "filter out, or replace the source with --source-from uniform"
         )
     return replace(shot, image=shot.source, source=None, mask=None)
 

@@ -43,14 +43,14 @@ def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
         if any(other is not None and _is_same(path, other) for other in inputs):
             raise InputError(f"{path} is both read and written: choose another name for the output")
     if len({path.resolve() for path in outputs}) < len(outputs):
-        raise InputError(f"{outputs[0]} is to be written twice: choose two names")
+        raise InputError(f"{outputs[0]} would be written twice: choose two names")
 
 
 def protect_store(store: Path, output: Path) -> None:
     """Refuse to write among the files of a store that is read."""
     if output.resolve().is_relative_to(store.resolve()):
         raise InputError(
-            f"{output} lies in the store that is read: choose another name for the output"
+            f"{output} is inside the store being read: choose another name for the output"
         )
 
 
@@ -72,7 +72,7 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileFormatError(
-            f"{path} cannot be made a folder ({error.strerror}): choose another name"
+            f"{path} cannot be created as a folder ({error.strerror}): choose another name"
         ) from None
 
 

@@ -40,7 +40,7 @@ def repaired(shot: Radiograph, chosen: Choices) -> Radiograph:
         clean, hot, dead = remove_hot_pixels(image, threshold=chosen.hot_pixels)
     usable = np.ones(image.shape, bool) if shot.mask is None else shot.mask
     counts = (int((pixels & usable).sum()) for pixels in (hot, dead))
-    note = "{} hot and {} dead pixels replaced (beyond {:g} deviations)".format(
+    note = "{} hot and {} dead pixels replaced (beyond {:g} standard deviations)".format(
         *counts, chosen.hot_pixels
     )
     return _with(shot, clean, [note], {"hot_pixels": chosen.hot_pixels})

@@ -88,18 +88,18 @@ source_object_distance = 0.01    # m; inf for a collimated beam
 object_image_distance = 0.28     # m
 detector_pixel_size = 145e-6     # m; or pixel_size at the object
 
-[bold]options.toml[/bold] (any of these and more, see InversionOptions)
+[bold]options.toml[/bold] (all optional; see InversionOptions for more)
 n_sites = 100000
 tolerance = 1e-4
 floor = 1e-3
-\[prepare]                        # the filters and estimates above, with _ for -
+\[prepare]                        # the filters and estimates above, with _ instead of -
 hot_pixels = 6                   # standard deviations
 source_from = "total-variation"
 source_weight = 2                # px
 
 [bold]Exit codes[/bold]
-0 done; 2 a mistake in what was given, nothing is written;
-3 written, but not converged; 130 cancelled.
+0 success; 2 invalid input, nothing written;
+3 result written, but not converged; 130 cancelled.
 """
 
 
@@ -142,8 +142,8 @@ def invert(
 ) -> None:
     """Retrieve the deflection potential of one image.
 
-    Writes potential, displacement, re-projection and residual, with all options,
-    to one file, and a figure beside it.
+    Writes potential, displacement, re-projection, residual and all options to one file,
+    and a figure next to it.
     """
     from napari_shadowinv.cli._choices import TABLE, choices_from
     from napari_shadowinv.io.writing import RESULT_SUFFIXES
@@ -203,12 +203,12 @@ shadowinv forward shot.shadowinv --setup lower_energy.toml --deflector electric-
 shadowinv forward d.npy --made-with first.toml --setup second.toml
 
 [bold]Another experiment[/bold]
-A deflection belongs to its beam. What both experiments have in common is the object's line
-integral, so say what deflects: a magnetic field (∫B dl, angles go with charge / momentum;
-the default for particles), an electric field (∫E dl, with charge / (momentum velocity)), a
-plasma (∫n dz, with the wavelength squared) or a refractive index (∫ln η dz, alike but for
-dispersion). Both images have the same middle; the predicted one has the pixels of --setup
-and covers what is known.
+A deflection depends on the beam; the object's line integral does not. To convert between
+experiments, choose what deflects the beam: a magnetic field (∫B dl, angles scale as charge /
+momentum; the default for particles), an electric field (∫E dl, charge / (momentum velocity)),
+a plasma (∫n dz, wavelength squared) or a refractive index (∫ln η dz, unchanged apart from
+dispersion). Both images have the same centre; the predicted one has the pixel size of --setup
+and covers the area where the field is known.
 """
 
 
@@ -218,8 +218,8 @@ def forward(
         Path,
         typer.Argument(
             help=(
-                ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) with a "
-                "displacement (2, H, W) in px or a potential (H, W) in px²."
+                ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) "
+                "containing a displacement (2, H, W) in px or a potential (H, W) in px²."
             ),
             show_default=False,
         ),
@@ -230,15 +230,18 @@ def forward(
         typer.Option(
             "--setup",
             help=(
-                "TOML file with the experiment to predict, such as another energy. Default: that "
-                "of the field."
+                "TOML file with the setup to predict the image for, for example another energy. "
+                "Default: the field's own setup."
             ),
         ),
     ] = None,
     made_with: Annotated[
         Path | None,
         typer.Option(
-            help="TOML file with the experiment that the field is from, if its file does not tell."
+            help=(
+                "TOML file with the setup the field was measured with, if its file does not "
+                "contain it."
+            )
         ),
     ] = None,
     deflector: Annotated[
@@ -246,27 +249,30 @@ def forward(
         typer.Option(
             metavar="WHAT",
             help=(
-                "What deflects, if --setup is another experiment: magnetic-field, electric-field, "
-                "plasma or refractive-index."
+                "What deflects the beam, if --setup differs from the field's: magnetic-field, "
+                "electric-field, plasma or refractive-index."
             ),
         ),
     ] = None,
     dispersion: Annotated[
         float,
         typer.Option(
-            help="For a refractive index: ln η at the new wavelength over that at the old one."
+            help=(
+                "For a refractive index: ratio of ln η at the new wavelength to ln η at the old "
+                "one."
+            )
         ),
     ] = 1.0,
     channel: Channel = None,
     variable: Variable = None,
     source_variable: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Array to take from the source's file.")
+        str | None, typer.Option(metavar="NAME", help="Name of the array in the source file.")
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             help=(
-                "Image: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
+                "Image file: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
                 "Default: the field's name with _image.tif, in the current folder."
             )
         ),
@@ -274,10 +280,10 @@ def forward(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Predict the image that a displacement makes of a source, here or in another experiment.
+    """Predict the image of a displacement field, with the same setup or another.
 
-    Without --source, a result's own source is used, or a uniform one; in another experiment a
-    uniform one.
+    Without --source, the result's own source is used if the setup is the same; otherwise
+    the source is uniform.
     """
     from napari_shadowinv.io import read_radiograph, write
     from napari_shadowinv.io.writing import IMAGE_SUFFIXES
@@ -286,7 +292,7 @@ def forward(
     check_outputs({path: IMAGE_SUFFIXES}, overwrite)
     protect([path], [field, source, setup, made_with])
     if source_variable is not None and source is None:
-        raise InputError("received --source-variable: it needs --source, the file to look in")
+        raise InputError("received --source-variable: it needs --source, the file that contains it")
     seen = None if setup is None else setup_from(setup)
     told = None if made_with is None else setup_from(made_with)
     known = seen_with(field_from(field, variable), seen, told, deflector, dispersion)
@@ -307,24 +313,24 @@ def info(
     file: Annotated[Path, typer.Argument(help="An image or a result.", show_default=False)],
     variable: Variable = None,
 ) -> None:
-    """Tell what a file is and what is in it."""
+    """Describe a file and its contents."""
     say(described(file, variable))
 
 
 @notify_errors
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path("demo"),
+    out: Annotated[Path, typer.Option(help="Output folder.")] = Path("demo"),
     dm: Annotated[float, typer.Option(help="Peak path-integrated field in MG·µm.")] = 97.0,
-    noise: Annotated[float, typer.Option(help="Noise, as a share of the mean.")] = 0.1,
+    noise: Annotated[float, typer.Option(help="Noise, as a fraction of the mean.")] = 0.1,
     n_sites: SiteCount = None,
 ) -> None:
-    """Simulate a toroidal field in a proton beam, invert the image, compare with the truth.
+    """Simulate a proton radiograph of a toroidal field, invert it and compare with the truth.
 
-    The experiment is that of Kasim et al., arXiv:1607.04179, Section IV. Caustics start
-    at about 185 MG·µm.
+    The setup is that of Kasim et al., arXiv:1607.04179, Section IV. Caustics form from
+    about 185 MG·µm.
     """
     if not 0 <= noise < float("inf"):
-        raise InputError(f"noise is {noise:g}: it must be 0 or more, as a share of the mean")
+        raise InputError(f"noise is {noise:g}: it must be 0 or more, as a fraction of the mean")
     if not math.isfinite(dm):
         raise InputError(f"dm is {dm:g}: it must be a finite number, in MG·µm")
     chosen = options_from(None, given(n_sites=n_sites), clip_negative=True)

@@ -50,8 +50,8 @@ shadowinv batch 'shots/*.tif' --source-from polynomial --low-pass 1 --out night.
 shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
 
 [bold]Exit codes[/bold]
-0 all done; 1 some shot failed, the others are written; 2 a mistake in what was given;
-3 all done, but some did not converge; 130 cancelled, --resume goes on.
+0 all done; 1 some shots failed, the others are written; 2 invalid input;
+3 all done, but some did not converge; 130 cancelled, continue with --resume.
 """
 
 
@@ -60,21 +60,24 @@ def batch(
     shots: Annotated[
         list[str],
         typer.Argument(
-            help="A glob in quotes, files, or one TIFF with a page for each shot.",
+            help="A quoted glob, a list of files, or one multi-page TIFF with one shot per page.",
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option(help="The store to write: name.shadowinv.zarr.")],
+    out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
     source: Annotated[
         str | None,
         typer.Option(
             "--source",
-            help="Undisturbed beam: one image, or a glob with one for each shot. Default: uniform.",
+            help=(
+                "Undisturbed beam: one image, or a glob matching one image per shot. Default: "
+                "uniform."
+            ),
         ),
     ] = None,
     mask: Annotated[
         Path | None,
-        typer.Option("--mask", help="Picture of the images' size, 0 where a pixel is unusable."),
+        typer.Option("--mask", help="Image of the same size, 0 at unusable pixels."),
     ] = None,
     setup: SetupFile = None,
     options: OptionsFile = None,
@@ -85,10 +88,14 @@ def batch(
     clip_negative: ClipNegative = False,
     variables: Annotated[
         str | None,
-        typer.Option(help="What to store, with commas. Default: potential,displacement,caustic."),
+        typer.Option(
+            help=(
+                "Variables to store, separated by commas. Default: potential,displacement,caustic."
+            )
+        ),
     ] = None,
     warm_start: Annotated[
-        int, typer.Option(help="Start from the shot before, in runs of so many shots.")
+        int, typer.Option(metavar="N", help="Initialise from the previous shot, in groups of N.")
     ] = 1,
     scheduler: Annotated[
         str | None,
@@ -97,17 +104,18 @@ def batch(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Shots at once on this machine. Default: one for each core.")
+        int | None,
+        typer.Option(
+            help=("Number of shots processed at once on this machine. Default: one per core.")
+        ),
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on where a run stopped; append shots that came since."),
+        typer.Option("--resume", help="Resume an interrupted run and append new shots."),
     ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Throw away an earlier run.")
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Discard an earlier run.")] = False,
     redo_failed: Annotated[
-        bool, typer.Option("--redo-failed", help="As --resume, and try failed shots again.")
+        bool, typer.Option("--redo-failed", help="Resume, and retry failed shots.")
     ] = False,
     quiet: Quiet = False,
     boundary: Boundary = None,
@@ -128,7 +136,7 @@ def batch(
     butterworth_order: ButterworthOrder = None,
     butterworth_kind: ButterworthKind = None,
 ) -> None:
-    """Invert many shots into one store that survives a crash."""
+    """Invert many shots into one store, which can be resumed after a crash."""
     from napari_shadowinv.cli._batch import run_batch
     from napari_shadowinv.cli._choices import TABLE, choices_from
 
@@ -181,9 +189,9 @@ def batch(
 @notify_errors
 def status(
     store: StoreFolder,
-    every: Annotated[bool, typer.Option("--all", help="A line for each shot.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Show one line per shot.")] = False,
 ) -> None:
-    """Tell which shots of a store are done, failed and why, or pending."""
+    """Show which shots of a store are done, pending or failed, and why."""
     from napari_shadowinv.cli._batch import status_tables
 
     for table in status_tables(store, every):
@@ -198,18 +206,22 @@ def export(
         typer.Option(
             "--format",
             help=(
-                "tiff (float32, a file for each shot and component), pradformat (a file for each "
-                "shot), or csv (a table with a row for each shot)."
+                "tiff (float32, one file per shot and component), pradformat (one file per "
+                "shot), or csv (a table with one row per shot)."
             ),
         ),
     ],
     shots: ChosenShots = None,
     variables: Annotated[
-        str, typer.Option(help="Of TIFF: which images, with commas.")
+        str, typer.Option(help="For tiff: variables to export, separated by commas.")
     ] = "potential",
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder, or file for csv. Default: the store's name, here."),
+        typer.Option(
+            help=(
+                "Output folder, or file for csv. Default: the store's name, in the current folder."
+            )
+        ),
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -229,21 +241,21 @@ def export(
 @notify_errors
 def movie(
     store: StoreFolder,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The film: .mp4 or .gif.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output movie: .mp4 or .gif.")],
     variable: Annotated[
         str | None,
-        typer.Option(help="What to show; of vectors the magnitude. Default: the potential."),
+        typer.Option(help="Variable to show; for vectors, the magnitude. Default: the potential."),
     ] = None,
     shots: ChosenShots = None,
-    rate: Annotated[float, typer.Option(help="Shots a second.")] = 10.0,
+    rate: Annotated[float, typer.Option(help="Shots per second.")] = 10.0,
     limits: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Ends of the colour scale. Default: those of all shots."),
+        typer.Option(help="Limits of the colour scale. Default: the range over all shots."),
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a film of a store, all shots on one colour scale."""
+    """Make a movie of a store, with all shots on one colour scale."""
     from napari_shadowinv.cli._export import write_movie
 
     frames = write_movie(

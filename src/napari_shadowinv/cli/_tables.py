@@ -61,7 +61,7 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
         ("sites", f"{report.n_sites:,}"),
         (
             "flux residual",
-            f"{report.residual:.2g} of a cell, asked for {report.tolerance:.2g}: {verdict}",
+            f"{report.residual:.2g} of a cell, tolerance {report.tolerance:.2g}: {verdict}",
         ),
         ("image residual", f"{100 * report.image_residual:.3g} % of the mean (root mean square)"),
         ("iterations", f"{report.iterations} on {len(report.levels)} levels"),
@@ -124,7 +124,7 @@ def setup_text(setup: Setup | None, shot: Radiograph | None = None) -> str:
         )
     if shot is not None and shot.metadata.get("geometry"):
         missing = _missing(shot.metadata["geometry"])
-        return f"none: the file tells the geometry but not the {missing}; give it with --setup"
+        return f"none: the file gives the geometry but not the {missing}; give it with --setup"
     return "none: results in pixels; give --setup for SI units"
 
 

@@ -41,8 +41,8 @@ def read_npy(path: Path) -> NDArray[Any]:
         if "Python objects" not in str(error):
             raise
         raise FileFormatError(
-            f"{path} holds Python objects: expected an array of numbers; "
-            "save it again with array.astype(float)"
+            f"{path} contains Python objects: expected an array of numbers; save it again with "
+            "array.astype(float)"
         ) from error
     check_size(path, mapped.size * max(8, mapped.dtype.itemsize))
     array = np.array(mapped)

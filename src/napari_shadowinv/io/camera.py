@@ -54,7 +54,7 @@ def read_b16(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
     Raises
     ------
     FileFormatError
-        If the file is damaged or cut short, or of a colour camera.
+        If the file is damaged or truncated, or of a colour camera.
     """
     with path.open("rb") as file:
         header = file.read(_B16_EXTENDED_HEADER)
@@ -62,14 +62,14 @@ def read_b16(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
     _, start, width, height, extended = struct.unpack("<5i", header[4:_B16_HEADER])
     if start < _B16_HEADER:
         raise FileFormatError(
-            f"{path} is damaged: its PCO header claims to have {start} bytes, expected "
-            f"{_B16_HEADER} at least; copy it again"
+            f"{path} is damaged: its PCO header gives its length as {start} bytes, expected at "
+            f"least {_B16_HEADER}; copy it again"
         )
     is_colour = struct.unpack_from("<i", header, 24)[0] == 1 if len(header) >= 28 else False
     if extended == -1 and start >= _B16_EXTENDED_HEADER and is_colour:
         raise FileFormatError(
-            f"{path} comes from a colour camera, whose pixels see different colours: expected a "
-            "monochrome frame; convert it to grey TIFF"
+            f"{path} comes from a colour camera, whose pixels have different colour filters: "
+            "expected a monochrome frame; convert it to a greyscale TIFF"
         )
     return _frame(path, "PCO", start, (height, width), np.dtype("<u2")), {"bits": 16}
 
@@ -92,7 +92,7 @@ def read_spe(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
     Raises
     ------
     FileFormatError
-        If the file is damaged, cut short or no SPE, or holds several frames or regions.
+        If the file is damaged, truncated or no SPE, or holds several frames or regions.
     """
     with path.open("rb") as file:
         header = file.read(_SPE_HEADER)
@@ -102,13 +102,14 @@ def read_spe(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
     dtype = _SPE_TYPES.get(_number(header, "h", 108))
     if dtype is None:
         raise FileFormatError(
-            f"{path} is no SPE file or damaged: its data type is {_number(header, 'h', 108)}, "
-            f"expected one of {', '.join(map(str, _SPE_TYPES))}; export it as TIFF"
+            f"{path} is not an SPE file or is damaged: its data type is "
+            f"{_number(header, 'h', 108)}, expected one of {', '.join(map(str, _SPE_TYPES))}; "
+            "export it as TIFF"
         )
     if frames != 1:
         raise FileFormatError(
-            f"{path} holds {frames} frames: expected one radiograph per file; save the frame that "
-            "you want on its own"
+            f"{path} holds {frames} frames: expected one radiograph per file; save the frame you "
+            "need separately"
         )
     if version >= 3:
         _check_footer(path, _number(header, "Q", 678))
@@ -128,8 +129,8 @@ def _check_footer(path: Path, start: int) -> None:
         regions = len(_SPE_REGION.findall(file.read(_LONGEST_FOOTER)))
     if regions > 1:
         raise FileFormatError(
-            f"{path} holds {regions} regions of the sensor: expected one; export the one that you "
-            "want as TIFF"
+            f"{path} holds {regions} regions of the sensor: expected one; export the region you "
+            "need as TIFF"
         )
 
 
@@ -139,7 +140,7 @@ def _frame(
     height, width = shape
     if min(shape) < 1:
         raise FileFormatError(
-            f"{path} is damaged: its {header} header tells a frame of {height}×{width} pixels; "
+            f"{path} is damaged: its {header} header gives a frame of {height}×{width} pixels; "
             "copy or save it again"
         )
     count = height * width

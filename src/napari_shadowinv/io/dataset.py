@@ -60,17 +60,17 @@ _SITE_VECTORS = ("site", "component")
 # Attribute of Inversion: dimensions, units, long name.
 _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "potential": (_PLANE, "px²", "Normalised deflection potential"),
-    "displacement": (_VECTORS, "px", "Displacement of the ray that starts at each pixel"),
+    "displacement": (_VECTORS, "px", "Displacement of the ray through each pixel"),
     "sites": (_SITE_VECTORS, "px", "Positions of the sites"),
     "weights": (("site",), "px²", "Weights of the power diagram"),
-    "site_mass": (("site",), "flux", "Flux of the source in each site's cell"),
-    "site_flux": (("site",), "flux", "Flux of the image in each site's power cell"),
+    "site_mass": (("site",), "flux", "Source flux in each site's cell"),
+    "site_flux": (("site",), "flux", "Image flux in each site's power cell"),
     "site_displacement": (_SITE_VECTORS, "px", "Centroid of each site's cell minus the site"),
     "image": (_PLANE, "flux/px²", "Image, scaled to the flux of the source"),
     "source": (_PLANE, "flux/px²", "Undisturbed beam"),
-    "reprojection": (_PLANE, "flux/px²", "Image that the displacement makes of the source"),
+    "reprojection": (_PLANE, "flux/px²", "Source as displaced by the retrieved field"),
     "residual": (_PLANE, "flux/px²", "Image minus re-projection"),
-    "caustic": (_PLANE, "1", "The map folds, or its Jacobian is below the threshold"),
+    "caustic": (_PLANE, "1", "The map folds or its Jacobian is below the threshold"),
     "mask": (_PLANE, "1", "Pixels that were used"),
 }
 
@@ -246,7 +246,8 @@ def displacement_from_potential(potential: ArrayLike) -> NDArray[np.float64]:
     plane = np.asarray(potential, dtype=np.float64)
     if plane.ndim != 2 or min(plane.shape) < 3:
         raise InputError(
-            f"potential has shape {plane.shape}: expected (height, width), 3 pixels at least"
+            f"potential has shape {plane.shape}: expected (height, width), at least 3 pixels "
+            "each way"
         )
     return -np.stack([np.gradient(plane, axis=axis, edge_order=2) for axis in (0, 1)])
 
@@ -269,12 +270,12 @@ def _fields(
         vectors["path_integrated_b"] = (
             setup.path_integrated_b,
             "T m",
-            "Path-integrated magnetic field, if it alone deflects",
+            "Path-integrated magnetic field, assuming purely magnetic deflection",
         )
         vectors["path_integrated_e"] = (
             setup.path_integrated_e,
             "V",
-            "Path-integrated electric field, if it alone deflects",
+            "Path-integrated electric field, assuming purely electric deflection",
         )
     else:
         planes["line_integrated_log_index"] = (

@@ -139,7 +139,7 @@ def _describe(head: bytes) -> str:
     for signature, text in _OTHER_SIGNATURES.items():
         if head.startswith(signature):
             return text
-    return "a text file" if _is_text(head) else "not an image that can be recognised"
+    return "a text file" if _is_text(head) else "not in a recognised image format"
 
 
 def _is_text(head: bytes) -> bool:
@@ -241,7 +241,7 @@ def check_output(
             f"{', '.join(sorted(suffixes))}"
         )
     if path.is_dir():
-        raise FileFormatError(f"{path} is a folder: give the name of a file to write")
+        raise FileFormatError(f"{path} is a folder: give a file name")
     if path.exists() and not overwrite:
         raise FileFormatError(
             f"{path} exists: choose another name or allow overwriting (overwrite=True, or "
@@ -320,7 +320,7 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         if error.errno not in _NO_ROOM:
             raise
         raise FileFormatError(
-            f"{path} cannot be written ({error.strerror}): make room on its disk, or choose "
+            f"{path} cannot be written ({error.strerror}): free some disk space, or choose "
             "another folder"
         ) from error
     finally:

@@ -61,6 +61,6 @@ def _columns(path: Path, names: list[str]) -> list[int]:
     if not all(found):
         raise FileFormatError(
             f"{path} has the columns {', '.join(map(repr, names)) or 'none'}: expected one with "
-            "'dose', and others that begin with 'red', 'green' and 'blue'"
+            "'dose', and columns whose names begin with 'red', 'green' and 'blue'"
         )
     return [candidates[0] for candidates in found]

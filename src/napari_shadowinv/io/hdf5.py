@@ -79,7 +79,7 @@ def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
             _refuse(path, name, f"links to {item.id.links.get_val(key)[0].decode()!r}")
         if kind == h5py.h5l.TYPE_SOFT:
             if depth > _MOST_LINKS:
-                raise ValueError(f"the links of {name!r} go round in a circle")
+                raise ValueError(f"the links of {name!r} form a loop")
             item = member(path, item, item.id.links.get_val(key).decode(), depth + 1)
         else:
             item = item[part]
@@ -89,7 +89,7 @@ def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
 def _refuse(path: Path, name: str, found: str) -> None:
     raise FileFormatError(
         f"{path} does not hold {name!r} itself but {found}: expected all data in one file; save "
-        "them as an array of this file"
+        "the data as an array in this file"
     )
 
 

@@ -106,8 +106,8 @@ def _read_tiff(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
     with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
         if len(tiff.pages) != 1:
             raise FileFormatError(
-                f"{path} has {len(tiff.pages)} pages: expected one radiograph per file; "
-                "save the page that you want on its own"
+                f"{path} has {len(tiff.pages)} pages: expected one radiograph per file; save the "
+                "page you need separately"
             )
         return _read_page(path, tiff.pages[0].aspage())
 
@@ -200,8 +200,8 @@ def _decode(path: Path, page: Any) -> NDArray[Any]:
     same = array.dtype == page.dtype.newbyteorder("=") and array.shape == page.shape
     if not same or page.photometric.name not in ("MINISBLACK", "RGB"):
         raise FileFormatError(
-            f"{path} is compressed with {page.compression.name}, which cannot be read here: "
-            "save it without compression, or install the package imagecodecs"
+            f"{path} is compressed with {page.compression.name}, which is not supported: save it "
+            "without compression, or install the package imagecodecs"
         )
     return array
 
@@ -216,7 +216,7 @@ def _check_complete(path: Path, page: Any) -> None:
     ]
     if not ends or max(ends) > size:
         raise FileFormatError(
-            f"{path} is cut short: its TIFF header promises {max(ends, default=0)} bytes, found "
+            f"{path} is truncated: its TIFF header implies {max(ends, default=0)} bytes, found "
             f"{size}; copy it again"
         )
     held = sum(page.databytecounts)
@@ -236,8 +236,8 @@ def _read_png(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
     array = _read_with_pillow(path)
     if bits == 16 and array.dtype.itemsize == 1:
         raise FileFormatError(
-            f"{path} is a colour PNG with 16 bits per channel, which would be cut to 8 bits: "
-            "expected a grey PNG or a TIFF; save it as TIFF"
+            f"{path} is a colour PNG with 16 bits per channel, which would be reduced to 8 bits: "
+            "expected a greyscale PNG or a TIFF; save it as TIFF"
         )
     return array, {"bits": bits}
 

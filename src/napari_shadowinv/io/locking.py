@@ -86,12 +86,12 @@ def _opened(path: Path, lock: Path) -> tuple[BinaryIO, bool]:
 
 
 def _not_writable(path: Path, error: OSError) -> FileFormatError:
-    return FileFormatError(f"{path} cannot be written ({error.strerror}): choose a folder that can")
+    return FileFormatError(f"{path} cannot be written ({error.strerror}): choose a writable folder")
 
 
 def _no_file_of_its_own(path: Path, lock: Path) -> FileFormatError:
     return FileFormatError(
-        f"{path} cannot be written: its lock {lock} is a link or no file at all; remove it"
+        f"{path} cannot be written: its lock {lock} is a link or not a file; remove it"
     )
 
 
@@ -117,7 +117,7 @@ def _take(path: Path, lock: Path, file: BinaryIO, is_new: bool) -> None:
 
 def _held(path: Path, file: BinaryIO) -> FileFormatError:
     return FileFormatError(
-        f"{path} is being written by {_holder(file)}: wait for it, or stop it first"
+        f"{path} is being written by {_holder(file)}: wait for that process, or stop it first"
     )
 
 

@@ -87,7 +87,7 @@ class Radiograph:
         if min(height, width) < 2:
             raise InputError(
                 f"{'image' if self.path is None else self.path} has {height}×{width} pixels: "
-                "expected two rows and two columns at least"
+                "expected at least two rows and two columns"
             )
         if factor < 1 or min(height, width) // factor < 2:
             raise InputError(
@@ -149,9 +149,10 @@ def to_grey(
         return np.ascontiguousarray(colours[..., 0], dtype=np.float64)
     if channel is None:
         raise InputError(
-            f"{where} is a colour image with {colours.shape[-1]} channels: convert a scan of film, "
-            "which darkens with dose, to dose first (napari_shadowinv.film), or choose a channel "
-            'that is linear in fluence, "red", "green", "blue" or "mean", or its number'
+            f"{where} is a colour image with {colours.shape[-1]} channels: if it is a scan of "
+            "film, which darkens with dose, convert it to dose first (napari_shadowinv.film); "
+            'otherwise choose a channel that is linear in fluence, "red", "green", "blue" or '
+            '"mean", or its number'
         )
     if channel == "mean":
         return np.ascontiguousarray(colours.mean(axis=-1, dtype=np.float64))
@@ -191,15 +192,15 @@ def film_warnings(array: NDArray[Any], channel: str | int | None) -> tuple[str, 
     is_colour = array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, ""))
     if is_colour:
         return (
-            f"channel {channel!r} of a colour image was taken as the fluence: a scan of film, "
-            "which darkens with dose, gives a field of the wrong sign unless it is converted to "
-            "dose first (napari_shadowinv.film)",
+            f"channel {channel!r} of a colour image was used as the fluence: film darkens with "
+            "dose, so a scan gives a field of the wrong sign unless it is converted to dose "
+            "first (napari_shadowinv.film)",
         )
     if array.dtype.kind in "iu" and _is_lit_around(grey):
         return (
-            "the rim is as bright as anything in the image and the middle is darker, as on film, "
-            "which darkens with dose: a scan gives a field of the wrong sign unless it is "
-            "converted to dose first (napari_shadowinv.film)",
+            "the rim is as bright as anything in the image and the centre is darker, which "
+            "suggests a film scan: film darkens with dose, so a scan gives a field of the wrong "
+            "sign unless it is converted to dose first (napari_shadowinv.film)",
         )
     return ()
 

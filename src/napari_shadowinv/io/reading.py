@@ -77,8 +77,8 @@ def read(
         return _radiograph(path, kind, *read_mat(path, variable))
     if variable is not None and kind != "hdf5":
         raise InputError(
-            f"{path} is no MATLAB file nor HDF5 (its kind is {kind!r}): variable {variable!r} "
-            "means nothing here; leave it out"
+            f"{path} is neither a MATLAB nor an HDF5 file (its kind is {kind!r}): variable "
+            f"{variable!r} does not apply; leave it out"
         )
     if variable is not None:
         return _named_plane(path, variable)
@@ -138,7 +138,7 @@ def _radiograph(path: Path, kind: str, array: NDArray[Any], metadata: dict[str, 
         )
     if not np.isfinite(array).any():
         raise FileFormatError(
-            f"{path} holds no finite pixel: expected an image; check how it was saved"
+            f"{path} holds no finite pixel: expected an image; check how the file was saved"
         )
     source, mask = metadata.get("source"), metadata.get("mask")
     return Radiograph(
@@ -189,8 +189,7 @@ def read_radiograph(
     content = read(path, channel=channel, variable=variable)
     if not isinstance(content, Radiograph):
         raise FileFormatError(
-            f"{path} is the result of an inversion: expected an image; give the image that it "
-            "was made from"
+            f"{path} is the result of an inversion: expected an image; give the original image"
         )
     return content
 

@@ -37,6 +37,6 @@ def check_promise(path: Path, header: str, promised: int, held: int) -> None:
     """
     if promised > held:
         raise FileFormatError(
-            f"{path} is damaged or cut short: its {header} header promises {promised} bytes, but "
-            f"{held} at most are there; copy it again"
+            f"{path} is damaged or truncated: its {header} header implies {promised} bytes, but "
+            f"at most {held} are present; copy it again"
         )

@@ -51,14 +51,14 @@ FORMAT = "shadowinv stack"
 STORE_SUFFIX = ".shadowinv.zarr"
 # One number for each shot, gathered when a run ends.
 SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
-    "converged": (bool, {"units": "1", "long_name": "The flux residual fell below the tolerance"}),
+    "converged": (bool, {"units": "1", "long_name": "Flux residual is below the tolerance"}),
     "flux_residual": (float, {"units": "1", "long_name": "Largest relative flux error of a cell"}),
     "image_residual": (
         float,
-        {"units": "1", "long_name": "Image minus re-projection, r.m.s. over the mean"},
+        {"units": "1", "long_name": "Image minus re-projection, r.m.s. relative to the mean"},
     ),
-    "iterations": (int, {"units": "1", "long_name": "Solver steps, all levels together"}),
-    "seconds": (float, {"units": "s", "long_name": "Time that its worker spent on the shot"}),
+    "iterations": (int, {"units": "1", "long_name": "Solver iterations, summed over all levels"}),
+    "seconds": (float, {"units": "s", "long_name": "Time its worker spent on the shot"}),
 }
 PENDING, DONE, FAILED = 0, 1, 2
 STATUS_NAMES = ("pending", "done", "failed")
@@ -95,7 +95,7 @@ def check_store_path(path: str | Path) -> Path:
     check_folder_of(path)
     if path.exists() and not is_stack(path):
         raise FileFormatError(
-            f"{path} exists and holds no stack of shots: choose another name, or remove it"
+            f"{path} exists and is not a stack of shots: choose another name, or remove it"
         )
     return path.absolute()
 
@@ -117,8 +117,8 @@ def _attributes(path: Path) -> dict[str, Any]:
 def store_error(path: Path, error: OSError) -> StoreError:
     """Say that a store cannot be written, why, and what to do."""
     return StoreError(
-        f"{path} cannot be written ({error.strerror or error}): make room or see to its folder, "
-        "then run again to resume"
+        f"{path} cannot be written ({error.strerror or error}): free some disk space or check "
+        "the folder's permissions, then run again to resume"
     )
 
 
@@ -168,8 +168,8 @@ class ShotWriter:
     ) -> None:
         if _attributes(self.path).get("store_id") != self.store_id:
             raise StoreError(
-                f"{self.path} is not there or is another store than at the start: every worker "
-                "must see the same file system, and nobody may replace the store meanwhile"
+                f"{self.path} is missing or is not the store the run started with: all workers "
+                "must share one file system, and the store must not be replaced during the run"
             )
         group = self.arrays()
         try:
@@ -194,8 +194,8 @@ def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
     found = arrays["status"].shape[0]
     if found != shots:
         raise StoreError(
-            f"{path} has {found} shots here and {shots} where the run was started: "
-            "wait until the file system shows the same everywhere, then run again to resume"
+            f"{path} has {found} shots here and {shots} where the run was started: wait until "
+            "the file system is in sync on all machines, then run again to resume"
         )
     return arrays
 
@@ -223,7 +223,7 @@ class StackStore:
             )
         self.attributes = _attributes(path)
         if self.attributes.get("format") != FORMAT:
-            raise FileFormatError(f"{path} is no stack of shots: expected name{STORE_SUFFIX}")
+            raise FileFormatError(f"{path} is not a stack of shots: expected name{STORE_SUFFIX}")
         self._arrays = _readable(path)
         self.names = tuple(map(str, self._values("name").tolist()))
         self.statuses()
@@ -290,8 +290,8 @@ def _readable(path: Path) -> dict[str, Any]:
     last = path / "name" / "c" / str((shots - 1) // names.chunks[0])
     if lengths != {shots} or (shots and not last.exists()):
         raise FileFormatError(
-            f"{path} is damaged: it tells of {max(lengths)} shots, but they are not there; copy it "
-            "again, or run it again with overwriting"
+            f"{path} is damaged: it lists {max(lengths)} shots, but they are missing; copy it "
+            "again, or repeat the run with overwriting"
         )
     return arrays
 

@@ -221,11 +221,11 @@ def _own_variables(shots: int) -> dict[str, Variable]:
     """What every store tells of its shots."""
     status = {
         "units": "1",
-        "long_name": "What became of the shot",
+        "long_name": "Status of the shot",
         "flag_values": [PENDING, DONE, FAILED],
         "flag_meanings": " ".join(STATUS_NAMES),
     }
-    report = {"units": "1", "long_name": "How it went, or why it failed (JSON)"}
+    report = {"units": "1", "long_name": "Report, or reason for failure (JSON)"}
     own = {
         "status": Variable(("shot",), np.dtype("int8"), status),
         "report": Variable(("shot",), str, report),

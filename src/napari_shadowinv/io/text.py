@@ -146,9 +146,9 @@ def _check_blocks(path: Path, blocks: dict[str, tuple[int, int]], found: tuple[i
     if len(set(blocks.values())) > 1 or found != (rows, blocks["flux2D"][1]):
         told = ", ".join(f"{name} {shape}" for name, shape in blocks.items())
         raise FileFormatError(
-            f"{path} holds {found[0]} rows of {found[1]} numbers, but its header tells {told}: "
-            "expected blocks of one shape below each other, as many as the header names; write "
-            "it again"
+            f"{path} holds {found[0]} rows of {found[1]} numbers, but its header gives {told}: "
+            "expected blocks of the same shape, one below the other, as listed in the header; "
+            "write the file again"
         )
 
 
@@ -166,7 +166,8 @@ def _split(
     if "mask" in planes:
         if not np.isin(planes["mask"], (0, 1)).all():
             raise FileFormatError(
-                f"{path} has other numbers than 0 (to be used) and 1 in its mask: write it again"
+                f"{path} has numbers other than 0 (use) and 1 (do not use) in its mask: "
+                "write the file again"
             )
         parts["mask"] = planes["mask"] == 0
     elif any(share != (0, 100) for share in selected.values()):
@@ -189,8 +190,8 @@ def _filled(path: Path, height: int, width: int) -> NDArray[np.float64]:
         )
     if min(height, width) < 2:
         raise FileFormatError(
-            f"{path} holds {height} rows of {width} numbers: expected an image with two rows and "
-            "two columns at least; export the image again"
+            f"{path} holds {height} rows of {width} numbers: expected an image with at least two "
+            "rows and two columns; export the image again"
         )
     image = np.empty((height, width))
     rows = ((number, line) for number, line in _lines(path) if line[0] not in "#%")
@@ -208,8 +209,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                 return
             if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
                 raise FileFormatError(
-                    f"{path}, line {number} is longer than {_LONGEST_LINE} bytes: expected one row "
-                    "of pixels per line; break it up"
+                    f"{path}, line {number} is longer than {_LONGEST_LINE} bytes: expected one "
+                    "row of pixels per line; split it"
                 )
             text = _decoded(raw.removeprefix(b"\xef\xbb\xbf") if number == 1 else raw).strip()
             if text:
@@ -228,8 +229,8 @@ def _row(path: Path, number: int, line: str, width: int | None) -> NDArray[np.fl
     words = line.rstrip(",").split("," if "," in line else None)
     if width is not None and len(words) != width:
         raise FileFormatError(
-            f"{path}, line {number} has {len(words)} numbers, the first row {width}: expected rows "
-            "of equal length; export the image again"
+            f"{path}, line {number} has {len(words)} numbers, but the first row has {width}: "
+            "expected rows of equal length; export the image again"
         )
     try:
         return np.fromiter(map(float, words), dtype=np.float64, count=len(words))
@@ -238,7 +239,7 @@ def _row(path: Path, number: int, line: str, width: int | None) -> NDArray[np.fl
         shown = word if len(word) <= 30 else f"{word[:30]}…"
         raise FileFormatError(
             f"{path}, line {number} has {shown!r}: expected numbers with a decimal point, "
-            "separated by spaces or commas; put # before a line of text"
+            "separated by spaces or commas; start lines of text with #"
         ) from None
 
 

@@ -97,9 +97,9 @@ def synthetic_image(
     shape = (field.shape[1], field.shape[2])
     flux = _checked_source(source, shape)
     if rays_per_pixel < 1:
-        raise InputError(f"rays_per_pixel is {rays_per_pixel}: it must be 1 or more")
+        raise InputError(f"rays_per_pixel is {rays_per_pixel}: expected 1 or more")
     if threads is not None and threads < 1:
-        raise InputError(f"threads is {threads}: it must be 1 or more, or None for all cores")
+        raise InputError(f"threads is {threads}: expected 1 or more, or None for all cores")
     tiles = math.isqrt(rays_per_pixel - 1) + 1
 
     coefficients = np.stack([_spline_coefficients(component) for component in field])
@@ -192,7 +192,7 @@ def _checked_source(source: ArrayLike | None, shape: tuple[int, int]) -> FloatAr
     if flux.min() < 0:
         raise InputError(
             f"source has {np.count_nonzero(flux < 0)} negative pixels (lowest {flux.min():g}): "
-            "a flux must be 0 or more; clip them or subtract less background"
+            "the flux must be 0 or more; clip them or subtract less background"
         )
     if flux.max() == 0:
         raise InputError("source is zero everywhere: at least one pixel must have flux")

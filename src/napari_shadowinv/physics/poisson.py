@@ -140,6 +140,6 @@ def _checked_source(source: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     if dark:
         raise InputError(
             f"source has {dark} pixels that are zero or negative: the linear inversion divides "
-            "by it, so raise them to a small positive floor"
+            "by the source, so raise these pixels to a small positive floor"
         )
     return beam

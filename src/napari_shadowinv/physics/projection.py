@@ -239,15 +239,15 @@ def default_deflector(made_with: AnySetup, setup: AnySetup) -> Deflector:
         return "magnetic field"
     if not (isinstance(made_with, OpticalSetup) and isinstance(setup, OpticalSetup)):
         raise InputError(
-            f"the field was measured with a setup of kind {made_with.kind!r} and is to be seen "
-            f"with kind {setup.kind!r}: expected both alike; what bends light does not tell how "
-            "particles fly"
+            f"the field was measured with a setup of kind {made_with.kind!r}, but the image is "
+            f"requested for kind {setup.kind!r}: expected the same kind; the deflection of light "
+            "does not determine that of particles"
         )
     if made_with.wavelength != setup.wavelength:
         raise InputError(
-            f"the wavelengths differ ({made_with.wavelength:g} and {setup.wavelength:g} m) and no "
-            "deflector is told: choose 'plasma' (angles grow with the wavelength squared) or "
-            "'refractive index' (they stay, apart from dispersion)"
+            f"the wavelengths differ ({made_with.wavelength:g} and {setup.wavelength:g} m) but "
+            "no deflector was given: choose 'plasma' (angles scale with the wavelength squared) "
+            "or 'refractive index' (angles are unchanged, apart from dispersion)"
         )
     return "refractive index"
 
@@ -264,7 +264,9 @@ def _angle_ratio(
             f"deflector is {usual!r}: it must be one of {', '.join(get_args(Deflector))}"
         )
     if dispersion != 1 and usual != "refractive index":
-        raise InputError(f"dispersion is {dispersion:g}, but a {usual} has none: leave it out")
+        raise InputError(
+            f"dispersion is {dispersion:g}, but it does not apply to a {usual}: leave it out"
+        )
     if isinstance(made_with, ProtonSetup) and isinstance(setup, ProtonSetup):
         _require(usual, _OF_PARTICLES, "particles")
         ratio = setup.particle.charge / made_with.particle.charge
@@ -292,7 +294,7 @@ def _checked_field(displacement: ArrayLike) -> FloatArray:
     if field.ndim != 3 or field.shape[0] != 2 or min(field.shape[1:]) < _SMALLEST_SIDE:
         raise InputError(
             f"displacement has shape {field.shape}: expected (2, height, width), the y component "
-            f"first, {_SMALLEST_SIDE} pixels at least"
+            f"first, at least {_SMALLEST_SIDE} pixels each way"
         )
     return field
 
@@ -302,8 +304,8 @@ def _shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
     height, width = (math.floor(n / ratio + _SLACK) for n in old)
     if min(height, width) < _SMALLEST_SIDE:
         raise InputError(
-            f"the known field covers {height} × {width} pixels of the other setup: expected "
-            f"{_SMALLEST_SIDE} × {_SMALLEST_SIDE} at least; check the pixel sizes"
+            f"the known field covers {height} × {width} pixels of the other setup: expected at "
+            f"least {_SMALLEST_SIDE} × {_SMALLEST_SIDE}; check the pixel sizes"
         )
     return height, width
 
@@ -313,15 +315,15 @@ def _checked_shape(
 ) -> tuple[int, int]:
     if len(shape) != 2 or min(shape) < _SMALLEST_SIDE:
         raise InputError(
-            f"the other image has shape {tuple(shape)}: expected (height, width), "
-            f"{_SMALLEST_SIDE} pixels at least"
+            f"the other image has shape {tuple(shape)}: expected (height, width), at least "
+            f"{_SMALLEST_SIDE} pixels each way"
         )
     most = _shape(old, ratio)
     if shape[0] > most[0] or shape[1] > most[1]:
         raise InputError(
             f"the other image has shape {tuple(shape)} with pixels of "
-            f"{setup.object_pixel_size * 1e6:.4g} µm at the object, but the field is known on "
-            f"{most} of these only: crop the source or the shape to that"
+            f"{setup.object_pixel_size * 1e6:.4g} µm at the object, but the field is known only "
+            f"on {most} of them: crop the source or reduce the shape to that"
         )
     return int(shape[0]), int(shape[1])
 

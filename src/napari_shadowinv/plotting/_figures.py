@@ -157,7 +157,7 @@ def _footer(inversion: Inversion, field: ShownField, columns: int) -> list[tuple
     report = inversion.report
     facts = [
         f"{report.n_sites:,} sites",
-        f"flux residual {report.residual:.1e} (asked for {report.tolerance:.0e})",
+        f"flux residual {report.residual:.1e} (tolerance {report.tolerance:.0e})",
         f"{report.iterations} steps in {sum(report.seconds.values()):.1f} s",
         field.peak_text,
     ]
@@ -166,7 +166,7 @@ def _footer(inversion: Inversion, field: ShownField, columns: int) -> list[tuple
         facts.append(f"caustics (outlined) {share:.2g} % of the pixels")
     alarms = list(report.warnings)
     if not report.converged and not any("not converged" in alarm for alarm in alarms):
-        alarms.insert(0, "not converged: the field is not to be trusted")
+        alarms.insert(0, "not converged: do not trust the field")
     lines = [(line, _QUIET_COLOUR) for line in textwrap.wrap("  ·  ".join(facts), columns)]
     for alarm in alarms:
         lines += [(line, _ALARM_COLOUR) for line in textwrap.wrap(f"⚠ {alarm}", columns)]

@@ -213,7 +213,7 @@ def write_film(
             return _write_mp4(temporary, frames, rate)
         except _FFmpegFailed as error:
             raise FileFormatError(
-                f"{path} cannot be written (ffmpeg: {error}): make room on its disk, choose "
+                f"{path} cannot be written (ffmpeg: {error}): free some disk space, choose "
                 "another folder, or write a .gif"
             ) from None
 

@@ -127,13 +127,14 @@ def find_shots(
         shapes = {np.shape(item) for item in shots}
         if len(shapes) > 1:
             raise InputError(
-                f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected one for all"
+                f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected the same "
+                "shape for all"
             )
         shots = np.stack([np.asarray(item) for item in shots])
     if not hasattr(shots, "ndim"):
         raise InputError(
             f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "
-            "object, paths, a glob such as 'shots/*.tif', or a TIFF with many pages"
+            "object, paths, a glob such as 'shots/*.tif', or a multi-page TIFF"
         )
     return _from_array(shots)
 
@@ -141,11 +142,13 @@ def find_shots(
 def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shots:
     path = Path(text)
     if path.is_dir():
-        raise InputError(f"{text} is a folder: say which files, such as '{text}/*.tif'")
+        raise InputError(f"{text} is a folder: specify the files, such as '{text}/*.tif'")
     if _MAGIC.search(text) and not path.exists():
         found = in_counting_order(map(Path, glob.glob(text, recursive=True)))
         if not found:
-            raise InputError(f"no file matches {text}: expected shots; check folder and pattern")
+            raise InputError(
+                f"no file matches {text}: expected shots; check the folder and pattern"
+            )
         return _from_files(found, reader, shape)
     pages = _page_count(path) if _knows_pages(reader) else 1
     if pages == 1:
@@ -166,13 +169,13 @@ def _page_count(path: Path) -> int:
 
 def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | None) -> Shots:
     if not paths:
-        raise InputError("shots are an empty list: expected one path at least")
+        raise InputError("shots are an empty list: expected at least one path")
     names = tuple(text_of(path.name) for path in paths)
     if len(set(names)) < len(names):
         names = tuple(text_of(path) for path in paths)
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
-        raise InputError(f"shots name {twice} twice: expected each file once")
+        raise InputError(f"shots contain {twice} twice: expected each file once")
     return _of_files([FileShot(path.absolute(), reader) for path in paths], names, shape)
 
 
@@ -208,7 +211,7 @@ def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
         if len(chosen) != 1:
             raise InputError(
                 f"the dataset has {len(planes)} variables with three dimensions: expected one, "
-                "(shot, y, x), or one that is called 'image'; choose it"
+                "(shot, y, x), or one called 'image'; select it"
             )
         shots = shots[chosen[0]]
     if "shot" in shots.dims:
@@ -221,7 +224,7 @@ def _from_array(shots: Any, coordinate: Any = None) -> Shots:
     da: Any = import_module("dask.array")
     if shots.ndim != 3 or 0 in shots.shape:
         raise InputError(
-            f"shots have shape {shots.shape}, expected (shot, y, x) with one shot at least"
+            f"shots have shape {shots.shape}, expected (shot, y, x) with at least one shot"
         )
     count = shots.shape[0]
     if not np.isfinite(shots.shape).all():

@@ -158,12 +158,12 @@ class _Cluster:
         except KilledWorker as error:
             if str(error.task) in {shared.key for shared in self._shared}:
                 raise EngineError(
-                    f"the workers of {self.name} die before they begin a shot: give them more "
-                    "memory, or look at their logs, then run again to resume"
+                    f"the workers of {self.name} crash before starting a shot: give them more "
+                    "memory, or check their logs, then run again to resume"
                 ) from error
             raise WorkerDied(
-                "the worker died each time it was tried: too little memory for such a shot, or "
-                "the machine went down"
+                "the worker crashed on every attempt: it may have too little memory for this "
+                "shot, or its machine may have gone down"
             ) from error
 
     def check(self) -> None:
@@ -171,7 +171,9 @@ class _Cluster:
             raise self._lost()
 
     def _lost(self) -> EngineError:
-        return EngineError(f"lost {self.name}: start it and run again to resume")
+        return EngineError(
+            f"lost the connection to {self.name}: restart it, then run again to resume"
+        )
 
     @contextmanager
     def _connected_or_lost(self) -> Iterator[None]:
@@ -276,8 +278,8 @@ def _processes(count: int) -> Iterator[Engine]:
             client = opened.enter_context(local_client(count))
         except (OSError, RuntimeError) as error:
             raise EngineError(
-                f"{name} for the shots could not be started ({_last_cause(error)}): where memory "
-                "is short take fewer workers, then run again to resume"
+                f"{name} for the shots could not be started ({_last_cause(error)}): if memory is "
+                "short use fewer workers, then run again to resume"
             ) from error
         yield _Cluster(client, name, count)
 
@@ -298,8 +300,8 @@ def _given(scheduler: Any, should_stop: ShouldStop | None) -> Iterator[Engine]:
         client = _connected(scheduler, should_stop)
     except (OSError, TypeError, ValueError) as error:
         raise EngineError(
-            f"no scheduler answers at {scheduler} ({type(error).__name__}): start it with "
-            "'dask scheduler', and check the address, and for tls:// the keys"
+            f"no scheduler responds at {scheduler} ({type(error).__name__}): start it with 'dask "
+            "scheduler', and check the address and, for tls://, the keys"
         ) from None
     with client:
         yield _Cluster(client, f"the scheduler at {_address(client)}")

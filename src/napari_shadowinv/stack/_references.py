@@ -114,7 +114,10 @@ def _left_out(shot: Radiograph) -> list[str]:
     parts = [name for name in ("source", "mask") if getattr(shot, name) is not None]
     if not parts:
         return []
-    return [f"the file holds its own {' and '.join(parts)}, which a stack leaves out: give it one"]
+    return [
+        f"the file contains its own {' and '.join(parts)}, which a stack ignores: pass one for "
+        "the whole stack"
+    ]
 
 
 def _read(reader: Reader, path: Path, **chosen: int) -> tuple[NDArray[Any], dict[str, Any]]:

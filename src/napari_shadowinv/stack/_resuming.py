@@ -32,7 +32,7 @@ from napari_shadowinv.stack._spec import (
 __all__ = ["append_shots", "contents_of", "resume"]
 
 _APPENDED = "appended_at"  # attribute: where later runs began to append shots
-_INSTEAD = "give the same again, overwrite it, or choose another name"
+_INSTEAD = "use the same, overwrite the store, or choose another name"
 
 
 def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
@@ -153,8 +153,9 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
     for name, value in {**found, "package_version": version("napari-shadowinv")}.items():
         before = str(store.attributes.get(name, ""))
         if before != value:
+            article = "" if name.endswith("s") else "a "
             raise InputError(
-                f"{store.path} was begun with another {name.replace('_', ' ')} "
+                f"{store.path} was started with {article}different {name.replace('_', ' ')} "
                 f"({_difference(before, value)}): {_INSTEAD}"
             )
     for index in np.flatnonzero(store.statuses() == DONE):
@@ -179,7 +180,7 @@ def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
     lost = [name for name in store.names if name not in places]
     if lost or len(places) < len(names):
         missing = f"{count} there, {len(names)} given, without {lost[0]}" if lost else "other order"
-        raise InputError(f"{store.path} was begun with other shots ({missing}): {_INSTEAD}")
+        raise InputError(f"{store.path} was started with different shots ({missing}): {_INSTEAD}")
     known = [places[name] for name in store.names]
     # What came in one run keeps its order; later runs may have brought what sorts before it.
     ends = [0, *store.attributes.get(_APPENDED, []), count]
@@ -187,7 +188,7 @@ def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
         for index in range(first + 1, last):
             if known[index] < known[index - 1]:
                 raise InputError(
-                    f"{store.path} was begun with the shots in another order "
+                    f"{store.path} was started with the shots in a different order "
                     f"({store.names[index - 1]} before {store.names[index]}): {_INSTEAD}"
                 )
     return [*known, *sorted(set(range(len(names))) - set(known))]

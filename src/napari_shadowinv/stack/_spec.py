@@ -161,7 +161,9 @@ def describe_stack(
     """
     options = options or InversionOptions()
     if warm_start < 1:
-        raise InputError(f"warm_start is {warm_start}: expected a number of shots, 1 for no start")
+        raise InputError(
+            f"warm_start is {warm_start}: expected a number of shots, or 1 to disable it"
+        )
     estimate = source if isinstance(source, Estimate) else None
     if isinstance(estimate, UniformEstimate):
         estimate = None
@@ -195,8 +197,8 @@ def describe_stack(
         )
     if beam is None and warm_start > 1:
         raise InputError(
-            f"warm_start is {warm_start} and each shot has a source of its own: the answer to the "
-            "shot before belongs to other sites; leave warm_start out, or give one source for all"
+            f"warm_start is {warm_start} and each shot has its own source: the previous solution "
+            "belongs to different sites; leave warm_start out, or give one source for all shots"
         )
     return Stack(
         found,
@@ -230,9 +232,9 @@ def _checked_variables(
             continue
         hint = " (it needs a setup)" if setup is None else ""
         if name in labels:
-            hint = " (sites differ between shots: a free boundary, and a source for each)"
+            hint = " (sites differ between shots with a free boundary and one source per shot)"
         raise InputError(
-            f"there is no variable {name!r}{hint}: expected some of {', '.join(known)}"
+            f"there is no variable {name!r}{hint}: expected one or more of {', '.join(known)}"
         )
     return known if wanted is None else tuple(wanted)
 

@@ -61,8 +61,8 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
     names = [name for name in _AVERAGED if name in stack and "shot" in stack[name].dims]
     if not names:
         raise InputError(
-            "the dataset has no field of many shots: expected one from invert_stack, run_stack "
-            "or a .shadowinv.zarr store"
+            "the dataset has no fields of a series of shots: expected one from invert_stack, "
+            "run_stack or a .shadowinv.zarr store"
         )
     found: dict[str, Any] = {}
     for name in names:

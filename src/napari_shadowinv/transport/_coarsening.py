@@ -37,8 +37,8 @@ _COARSEST = 60
 _WEAKEST_TIE = 0.2
 _FEW_PAIRS = 0.75
 _NOT_CONNECTED = (
-    "the cells form several groups with no flux between them: "
-    "the weights of one group relative to another are not determined"
+    "the cells form several groups with no flux between them, so the relative weights of the "
+    "groups are undetermined"
 )
 
 
@@ -307,7 +307,7 @@ def _add_level(network: Network, parents: Indices, start: int, stop: int) -> tup
         if count <= _FEW_PAIRS * (stop - start):
             break
     else:
-        raise RuntimeError("the fluxes between cells are not finite, or smaller than numbers go")
+        raise RuntimeError("the fluxes between cells are not finite, or underflow")
     pairs = _empty_network(count, network.starts[stop] - network.starts[start])
     _contract(network, start, stop, parents, pairs, 0, count)
     groups = np.empty(count, np.int32)

@@ -243,8 +243,8 @@ def _blurred_answer(
     residual = sharp.residual(sharp.diagram(weights))
     rounded = float(f"{width:.2g}")
     reason = (
-        f"only the image blurred by {rounded:g} px could be solved, and that answer is kept"
+        f"only the image blurred by {rounded:g} px could be solved; that solution is returned"
         if solved
-        else "not even the blurred image could be solved; the field is left at zero"
+        else "even the blurred image could not be solved; the field is set to zero"
     )
     return Solution(sharp.in_gauge(weights), residual, 0, residual <= tolerance, reason)

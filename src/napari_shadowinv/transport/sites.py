@@ -351,7 +351,7 @@ def plan_levels(
 
     def give_up(step: int, count: int) -> None:
         if abandoned.is_set():
-            raise InversionCancelled("the finest level was given up")
+            raise InversionCancelled("the finest level was abandoned")
 
     # beside the finest level, which takes three times as long; this thread alone reports
     with ThreadPoolExecutor(1) as pool:

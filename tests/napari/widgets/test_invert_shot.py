@@ -306,7 +306,7 @@ def test_cancel_takes_effect_within_a_second(
     tool.panel.runner.progressed.connect(heard.append)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: any(news.stage == "sites" for news in heard), timeout=PATIENCE)
-    qtbot.waitUntil(lambda: "Spreading the sites" in tool.panel.status.text(), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: "Placing the sites" in tool.panel.status.text(), timeout=PATIENCE)
     start, used = time.perf_counter(), time.process_time()
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
@@ -421,7 +421,7 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
     expect("he mask 'labels' has shape (9, 9)")
     tool.masks.layer = None
     tool.source.picker.set_kind("file")
-    expect("o file of the source")
+    expect("o source file")
     tool.source.picker.set_kind("uniform")
     tool.setup.picker.set_kind("proton")
     expect("energy")

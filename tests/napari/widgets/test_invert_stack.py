@@ -272,17 +272,17 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     run(tool)
     before = written(out)
     tool.options.set_values({**FEW, "seed": 7})
-    expect("begun with another options (seed: 0 there, 7 now)")
+    expect("started with different options (seed: 0 there, 7 now)")
     tool.options.set_values(FEW)
     tool.source.picker.set_kind("low_pass")
-    expect("begun with another source")
+    expect("started with a different source")
     tool.source.picker.set_kind("uniform")
     assert written(out) == before
 
     tool.store.edit.setText(str(tmp_path / "results"))
     expect(".shadowinv.zarr")
     tool.store.edit.setText("")
-    expect("o store for the results")
+    expect("o store is selected")
     tool.store.edit.setText(str(tmp_path / "other.shadowinv.zarr"))
     tool.engine.picker.set_kind("scheduler")
     expect("address is ''")
@@ -291,7 +291,7 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     expect("o scheduler answers at tcp://127.0.0.1:9")
     tool.engine.picker.set_kind("threads")
     tool.shots.picker.set_kind("files")
-    expect("o files are given")
+    expect("o files are selected")
     tool.shots.files.edit.setText(str(tmp_path / "*.tif"))
     expect("o file matches")
     tool.shots.picker.set_kind("layer")
@@ -300,7 +300,7 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool.shots.layers.layer = window.add_image(np.ones((*SHAPE, 3)), rgb=True)
     expect("colour image")
     window.layers.clear()
-    expect("no stack of shots")
+    expect("not a stack of shots")
     assert sorted(path.name for path in tmp_path.glob("*.zarr")) == [out.name]
 
 

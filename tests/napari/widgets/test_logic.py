@@ -174,7 +174,7 @@ def test_what_flattens_the_image_fits_no_measured_source(
         StackJob(shot[None], out, beam, cleaning=cleaning),
     )
     for job in jobs:
-        with pytest.raises(InputError, match="takes the beam out of the image"):
+        with pytest.raises(InputError, match="removes the beam from the image"):
             job.run(lambda _: None, lambda: False)
 
 
@@ -494,4 +494,4 @@ def test_the_cost_of_a_large_image_is_told_beforehand() -> None:
     assert sixteen.seconds == pytest.approx(4 * four.seconds, rel=0.05)
     huge = cost_of((100_000, 100_000), few)
     assert huge.is_too_much
-    assert "of this machine: crop the image" in huge.text
+    assert "GB: crop or bin the image" in huge.text

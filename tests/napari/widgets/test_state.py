@@ -223,7 +223,7 @@ def test_no_image_is_its_own_source(
     tool = opened(InvertShot)
     tool.source.picker.set_kind("layer")
     assert tool.source.layers.offered == []
-    with pytest.raises(InputError, match="no layer of the source is chosen"):
+    with pytest.raises(InputError, match="no source layer is selected"):
         tool.request()
     # Which of two unknown images is the beam, nobody but the user can tell.
     reference = viewer.add_image(shot, name="reference")
@@ -361,7 +361,7 @@ def test_a_mask_over_the_object_is_refused(
     tool.masks.layer = tool.source_masks.layer = labels
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(told) and not tool.panel.runner.running, timeout=PATIENCE)
-    words = "the object would be left out of the inversion"
+    words = "the object would be excluded from the inversion"
     assert words in tool.panel.status.text()
 
     # As well if the estimate was made before, in a layer of its own.
@@ -469,7 +469,7 @@ def test_the_report_of_one_run_does_not_stand_beside_another(
     assert tool.report.texts() == {}
     # The notification goes; the sentence stays until something else happens.
     assert told == [tool.panel.status.text()]
-    assert "o file of the source" in tool.panel.status.text()
+    assert "o source file" in tool.panel.status.text()
     tool.image.layer = of_a_file
     assert tool.panel.status.text() == ""
 

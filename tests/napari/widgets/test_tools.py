@@ -160,7 +160,7 @@ def test_only_what_may_be_a_field_is_offered_and_it_says_what_it_is_taken_for(
     assert "counts" in offered
     assert "beam" not in offered
     tool.potential.layer = window.layers["counts"]
-    assert "taken for one in px²" in tool.expected.text()
+    assert "treated as a potential in px²" in tool.expected.text()
     tool.object.set_kind("toroid")
     tool.object.set_kind("layer")
     assert role_of(tool.potential.layer) == "field"

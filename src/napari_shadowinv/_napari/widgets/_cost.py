@@ -54,8 +54,8 @@ class Cost:
         if not self.is_too_much:
             return f"{text}."
         return (
-            f"{text}, more than the {(physical_memory() or 0) / 1e9:.1f} GB of this machine: crop "
-            "the image, bin its pixels or choose fewer sites."
+            f"{text}, more than this machine's {(physical_memory() or 0) / 1e9:.1f} GB: crop or "
+            "bin the image, or choose fewer sites."
         )
 
 

@@ -59,8 +59,8 @@ class Forecast:
         texts = [self.assumed] if self.assumed else []
         if self.caustic_share > 0:
             texts.append(
-                f"Caustics: rays cross, or nearly do, in {self.caustic_share:.2%} of the pixels. "
-                "From there on one image no longer tells the whole field."
+                f"Caustics: rays cross or nearly cross in {self.caustic_share:.2%} of the "
+                "pixels. Once rays cross, one image no longer determines the whole field."
             )
         if self.kept < 0.99:
             texts.append(f"Only {self.kept:.1%} of the flux lands inside the image.")
@@ -154,7 +154,7 @@ class ForwardJob:
             deflector=deflector,
             shape=shape,
         )
-        return moved, f"In another experiment, as if a {deflector} alone deflected."
+        return moved, f"For another setup, assuming that only a {deflector} deflects the beam."
 
     def _displacement(self) -> Image:
         from napari_shadowinv.io.dataset import displacement_from_potential

@@ -362,7 +362,7 @@ def _cropped(image: Image, crop: Crop) -> Image:
     part = image[crop]
     if min(part.shape) < 4:
         raise InputError(
-            f"the crop leaves {part.shape[1]} × {part.shape[0]} pixels of the image, expected "
-            "at least 4 × 4: draw a larger rectangle on it"
+            f"the crop contains {part.shape[1]} × {part.shape[0]} pixels of the image, expected "
+            "at least 4 × 4: draw a larger rectangle"
         )
     return part

@@ -85,9 +85,9 @@ def known_field(layer: Any | None, point: Any, setup: Any) -> KnownField:
     """
     if layer is None:
         raise InputError(
-            "there is no potential or result to start from: invert a shot (Plugins → Invert shot), "
-            "open a .shadowinv file or an image of a potential in px² (File → Open), or choose one "
-            "of the objects"
+            "there is no potential or result to start from: invert a shot (Plugins → Invert "
+            "shot), open a .shadowinv file or an image of a potential in px² (File → Open), or "
+            "choose one of the simulated objects"
         )
     result = result_of(layer)
     if result is not None and role_of(layer) in _FIELDS:
@@ -100,8 +100,8 @@ def known_field(layer: Any | None, point: Any, setup: Any) -> KnownField:
     unit, own = unit_of(layer), setup_of(layer)
     if role_of(layer) != "potential":
         text = (
-            "This image does not say that it is a potential: its values are taken for one in px² "
-            "of the object plane."
+            "This image is not labelled as a potential: its values are treated as a potential "
+            "in px² of the object plane."
         )
         return KnownField(potential, 1.0, own, text)
     if unit in ("", "px²"):
@@ -109,8 +109,8 @@ def known_field(layer: Any | None, point: Any, setup: Any) -> KnownField:
     made_with = own or setup
     if made_with is None:
         raise InputError(
-            f"'{layer.name}' is in {unit}: choose the setup of its experiment, which brings it to "
-            "pixels"
+            f"'{layer.name}' is in {unit}: choose the setup of its experiment, which is needed "
+            "to convert it to pixels"
         )
     to_px2 = float(made_with.normalized_potential(parsed(f"1 {unit}", "m")))
     return KnownField(potential, to_px2, made_with, f"A potential in {unit}.")

@@ -61,8 +61,9 @@ class MaskPicker(QWidget):
         self.painted_is_unusable = QCheckBox("painted = unusable")
         self.painted_is_unusable.setChecked(True)
         self.painted_is_unusable.setToolTip(
-            "<qt>Checked: what is painted is left out (writing, dead pixels). Unchecked: only "
-            "what is painted is used. What stands in the beam belongs into the source.</qt>"
+            "<qt>Checked: painted pixels are excluded (handwriting, dead pixels). Unchecked: "
+            "only painted pixels are used. Set opaque obstacles to zero in the source "
+            "instead.</qt>"
         )
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
@@ -102,7 +103,7 @@ class MaskPicker(QWidget):
         usable = self.usable(image)
         if usable is None or self.layer is None:
             return ""
-        return f"layer '{self.layer.name}', leaves out {1 - usable.mean():.1%} of the pixels"
+        return f"layer '{self.layer.name}', excludes {1 - usable.mean():.1%} of the pixels"
 
     def follow(self, image: Any) -> None:
         """Choose the mask that came with an image's file, if one did."""

@@ -30,7 +30,7 @@ def error_text(error: BaseException | str) -> str:
         text = "there is not enough memory for this"
     elif not isinstance(error, (str, *MISTAKES)):
         first = text.partition("\n")[0]
-        text = f"fault of the program: {type(error).__name__}: {first} (see the notification)"
+        text = f"internal error: {type(error).__name__}: {first} (see the notification)"
     return text[:1].upper() + text[1:]
 
 

@@ -39,11 +39,11 @@ __all__ = ["ReportTable", "RunPanel", "report_rows", "section"]
 _STAGES = {
     "compile": "Compiling",
     "prepare": "Preparing the image",
-    "sites": "Spreading the sites",
+    "sites": "Placing the sites",
     "transport": "Solving the transport",
-    "read-out": "Reading out the field",
+    "read-out": "Computing the field",
     "source": "Estimating the source",
-    "field": "Making the field",
+    "field": "Computing the field",
     "image": "Tracing the rays",
     "shots": "Inverting",
 }
@@ -216,7 +216,7 @@ def report_rows(inversion: Inversion) -> list[tuple[str, str]]:
     stages = [(f"  {stage}", f"{seconds:.2f} s") for stage, seconds in report.seconds.items()]
     return [
         ("Converged", "yes" if report.converged else "NO"),
-        ("Flux residual", f"{report.residual:.2g} (asked for {report.tolerance:.2g})"),
+        ("Flux residual", f"{report.residual:.2g} (tolerance {report.tolerance:.2g})"),
         ("Image residual", f"{100 * report.image_residual:.3g} % of the mean, r.m.s."),
         ("Iterations", f"{report.iterations} on {len(report.levels)} levels"),
         ("Sites", f"{report.n_sites:,}"),

@@ -62,7 +62,7 @@ def _peak(default: float, where: str) -> Any:
     return Field(
         default=default,
         title="Peak field (MG µm)",
-        description=f"Path-integrated field at {where}, in MG µm; negative focuses.",
+        description=f"Path-integrated field at {where}, in MG µm; negative values focus.",
     )
 
 
@@ -72,9 +72,7 @@ class ToroidRecipe(PhantomRecipe):
     title = "toroidal magnetic field"
     probe = "proton"
     peak: float = _peak(97.0, "the radius")
-    radius: float = _metres(
-        30e-6, "Radius", "Radius σ at which the field is largest, in the object plane."
-    )
+    radius: float = _metres(30e-6, "Radius", "Radius σ of maximum field, in the object plane.")
 
     def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
         from napari_shadowinv.physics.phantoms import toroid
@@ -90,7 +88,9 @@ class FourToroidsRecipe(PhantomRecipe):
     strength: float = Field(
         default=1.0,
         title="Strength",
-        description="Factor on the fields, whose largest peak is 135 MG µm; caustics form at 1.",
+        description=(
+            "Scale factor for the fields, whose highest peak is 135 MG µm at 1; caustics form at 1."
+        ),
         json_schema_extra={"slider": [0.05, 3.0]},
     )
 
@@ -106,11 +106,9 @@ class CoaxialRecipe(PhantomRecipe):
     title = "coaxial conductors"
     probe = "proton"
     peak: float = _peak(60.0, "the inner conductor's surface")
-    inner: float = _metres(21e-6, "Inner conductor", "Radius of the conductor on the axis.")
-    outer: float = _metres(
-        66e-6, "Outer conductor from", "Inner radius of the conductor around it."
-    )
-    rim: float = _metres(78e-6, "Outer conductor to", "Outer radius of the conductor around it.")
+    inner: float = _metres(21e-6, "Inner conductor", "Radius of the inner conductor.")
+    outer: float = _metres(66e-6, "Outer conductor, inside", "Inner radius of the outer conductor.")
+    rim: float = _metres(78e-6, "Outer conductor, outside", "Outer radius of the outer conductor.")
 
     def shadow(self, shape: tuple[int, int], setup: Any) -> NDArray[np.bool_]:
         return self._line(shape, setup)[1]
@@ -132,23 +130,23 @@ class WakefieldRecipe(PhantomRecipe):
     amplitude: float = Field(
         default=0.8,
         title="Amplitude Δn/n₀",
-        description="Relative change of the electron density in the middle; below 1.",
+        description="Relative density perturbation at the centre; below 1.",
         json_schema_extra={"slider": [0.0, 1.0]},
     )
     density: float = Field(
         default=1.65e25,
         gt=0,
         title="Density n₀ (m⁻³)",
-        description="Electron density of the undisturbed plasma; it sets the wave's length.",
+        description="Electron density of the undisturbed plasma; it sets the plasma wavelength.",
     )
-    width: float = _metres(6e-6, "Width", "Radius of the wave across its axis.")
+    width: float = _metres(6e-6, "Width", "Radius of the wave perpendicular to its axis.")
     length: float = _metres(14e-6, "Length", "Radius of the wave along its axis.")
     curvature_radius: float = Field(
         default=20e-6,
-        title="Curvature of the fronts (m)",
+        title="Wavefront radius of curvature (m)",
         description=(
-            "Radius of the wavefronts on the axis: positive where they lag behind there, "
-            "negative the other way round, inf for plane ones."
+            "Radius of curvature of the wavefronts on the axis: positive if they lag behind "
+            "there, negative if they lead, inf for plane wavefronts."
         ),
     )
 
@@ -165,7 +163,7 @@ class BlobRecipe(PhantomRecipe):
     amplitude: float = Field(
         default=50.0,
         title="Amplitude (px²)",
-        description="Peak of the normalised potential in px²; negative focuses.",
+        description="Peak of the normalised potential in px²; negative values focus.",
     )
     sigma: float = Field(
         default=20.0,

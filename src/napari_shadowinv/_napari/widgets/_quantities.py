@@ -64,7 +64,7 @@ def parsed(text: str, unit: str) -> float:
         return math.inf
     match = _NUMBER.match(text)
     if match is None:
-        raise InputError(f"{text!r} is no number, expected {_example(unit)}")
+        raise InputError(f"{text!r} is not a number, expected {_example(unit)}")
     number = float(match["number"])
     if match["unit"] in ("", unit):
         return number
@@ -100,7 +100,7 @@ def _converted(number: str, from_unit: str, to_unit: str) -> float:
         factor = registry.Quantity(1.0, from_unit).to(to_unit).magnitude
     except (pint.errors.PintError, AttributeError, ValueError):
         raise InputError(
-            f"{number} {from_unit} is no quantity in {to_unit}, expected {_example(to_unit)}"
+            f"{number} {from_unit} cannot be converted to {to_unit}, expected {_example(to_unit)}"
         ) from None
     power = round(math.log10(factor)) if factor > 0 else 0
     if math.isclose(factor, 10.0**power, rel_tol=1e-9):

@@ -71,7 +71,7 @@ def stack_of(layer: Any | None) -> Any:
     data = _grey(layer, "stack of shots")
     assert layer is not None
     if data.ndim != 3:
-        hint = "use 'Invert shot' for one image, or " if data.ndim == 2 else ""
+        hint = "use 'Invert shot' for a single image, or " if data.ndim == 2 else ""
         raise InputError(
             f"'{layer.name}' has shape {tuple(data.shape)}, expected a stack (shot, y, x): "
             f"{hint}choose another layer, or files"
@@ -109,14 +109,15 @@ def shown_plane(layer: Any, point: Any) -> Any:
 def _grey(layer: Any | None, role: str) -> Any:
     if layer is None:
         raise InputError(
-            f"there is no {role} to work on: open one (File → Open), drop it on the window, or "
-            "take a sample (File → Open Sample)"
+            f"there is no {role} to use: open one (File → Open), drop it on the window, or use a "
+            "sample (File → Open Sample)"
         )
     if getattr(layer, "rgb", False):
         raise InputError(
-            f"'{layer.name}' is a colour image, expected a grey one: convert a scan of film, which "
-            "darkens with dose, to dose first (napari_shadowinv.film), or if it is linear in "
-            "fluence split it (right click on the layer → Split RGB) and choose one channel"
+            f"'{layer.name}' is a colour image, expected a greyscale one: if it is a scan of "
+            "film, which darkens with dose, convert it to dose first (napari_shadowinv.film); "
+            "if it is linear in fluence, split it (right click on the layer → Split RGB) and "
+            "choose one channel"
         )
     return layer.data[0] if getattr(layer, "multiscale", False) else layer.data
 
@@ -170,7 +171,7 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> Mask | 
         if shape is not None and painted.shape != shape:
             raise InputError(
                 f"the mask '{layer.name}' has shape {painted.shape}, the image {shape}: they "
-                "must match; make new labels while the image is the only layer"
+                "must match; create new labels while the image is the only layer"
             )
     else:
         assert shape is not None

@@ -211,8 +211,8 @@ def keep_earlier_box() -> QCheckBox:
     """A check box whether the next result leaves the last one of the same shot as it is."""
     box = QCheckBox("Keep earlier results")
     box.setToolTip(
-        "<qt>Add the next result to those of earlier runs. Else it replaces the last one of the "
-        "same shot.</qt>"
+        "<qt>Keep the layers of earlier runs. Otherwise the next result replaces the previous "
+        "one of the same shot.</qt>"
     )
     return box
 

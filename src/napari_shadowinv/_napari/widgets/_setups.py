@@ -77,8 +77,8 @@ class SetupPicker(QWidget):
             },
         )
         self.picker.choice.setToolTip(
-            "<qt>With the experiment's geometry the results are in SI units; lengths may be "
-            "typed as 1.3 mm or 0.0013.</qt>"
+            "<qt>With a setup the results are in SI units; lengths can be entered as 1.3 mm or "
+            "0.0013.</qt>"
         )
         self.note = wrapping_label()
         self.files = TomlButtons("setup", self._to_save, self._take)

@@ -55,11 +55,11 @@ class SourcePicker(RowPicker):
                 "uniform": ("uniform", uniform),
                 _LAYER: ("a layer", None),
                 _FILE: ("a file", None),
-                _OWN: ("the one that came with the shot", None),
+                _OWN: ("the one supplied with the shot", None),
                 **kinds,
             },
-            "The beam without the object. Best is a measured reference image; without one "
-            "it is uniform, or estimated from the shot itself.",
+            "The beam without the object: ideally a measured reference image, otherwise uniform "
+            "or estimated from the shot itself.",
             {_LAYER: labelled("", self.layers), _FILE: labelled("", self.file)},
         )
         self.layers.picked.connect(self.changed)
@@ -97,13 +97,13 @@ class SourcePicker(RowPicker):
             return image_of(self._chosen(), "source image")
         if kind == _FILE:
             if not self.file.path:
-                raise InputError("no file of the source is given: choose one, or another source")
+                raise InputError("no source file is selected: choose one, or choose another source")
             return Path(self.file.path)
         if kind == _OWN:
             own = source_of(image_layer)
             if own is None:
                 raise InputError(
-                    f"no source came with '{image_layer.name}': choose another kind of source"
+                    f"'{image_layer.name}' has no source of its own: choose another kind of source"
                 )
             return own
         model = self.picker.model()
@@ -113,7 +113,7 @@ class SourcePicker(RowPicker):
     def _chosen(self) -> Any:
         if self.layers.layer is None:
             raise InputError(
-                "no layer of the source is chosen: choose one below 'a layer', or another source"
+                "no source layer is selected: choose one below 'a layer', or choose another source"
             )
         return self.layers.layer
 

@@ -43,8 +43,7 @@ class StoreEdit(PathEdit):
     def __init__(self) -> None:
         super().__init__("Store of the results", f"results{STORE_SUFFIX}")
         self.edit.setToolTip(
-            f"<qt>A folder named …{STORE_SUFFIX}. If it is there, the run goes on where it "
-            "stopped.</qt>"
+            f"<qt>A folder named …{STORE_SUFFIX}. If it exists, the run is resumed.</qt>"
         )
 
     @property
@@ -58,7 +57,8 @@ class StoreEdit(PathEdit):
         """
         if not self.path:
             raise InputError(
-                f"no store for the results is given: choose a folder that ends with {STORE_SUFFIX}"
+                "no store is selected for the results: choose a folder whose name ends with "
+                f"{STORE_SUFFIX}"
             )
         return Path(self.path).expanduser()
 
@@ -92,16 +92,17 @@ class ShotsPicker(RowPicker):
 
     def __init__(self, viewer: Any) -> None:
         self.layers = LayerPicker(viewer, ("image",), suits=may_be_shot)
-        self.layers.setToolTip("Image layer (shot, y, x); one on a disk is read shot by shot.")
+        self.layers.setToolTip(
+            "Image layer (shot, y, x); data on disk are read one shot at a time."
+        )
         self.files = _FilesEdit("Files of the shots", "shots/*.tif")
         self.files.edit.setToolTip(
-            "<qt>A pattern such as shots/*.tif, files with ; between them, or a TIFF with many "
-            "pages.</qt>"
+            "<qt>A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF.</qt>"
         )
         super().__init__(
             "Shots",
             {_LAYER: ("a stack layer", None), _FILES: ("files", None)},
-            "Where the shots are.",
+            "Location of the shots.",
             {_LAYER: labelled("", self.layers), _FILES: labelled("", self.files)},
         )
         self.layers.picked.connect(self.changed)
@@ -132,7 +133,9 @@ class ShotsPicker(RowPicker):
         parts = [part.strip() for part in self.files.path.split(_BETWEEN.strip())]
         paths = [os.path.expanduser(part) for part in parts if part]
         if not paths:
-            raise InputError("no files are given: type a pattern such as shots/*.tif, or choose")
+            raise InputError(
+                "no files are selected: enter a pattern such as shots/*.tif, or choose"
+            )
         return paths[0] if len(paths) == 1 else paths
 
 
@@ -149,17 +152,17 @@ class EnginePicker(RowPicker):
         self.workers = QSpinBox()
         self.workers.setRange(0, 1024)
         self.workers.setSuffix(" at once")
-        self.workers.setSpecialValueText("as many as cores")
-        self.workers.setToolTip("How many shots are inverted at the same time.")
+        self.workers.setSpecialValueText("one per core")
+        self.workers.setToolTip("Number of shots inverted at the same time.")
         self.address = QLineEdit()
         self.address.setPlaceholderText("tcp://host:8786")
-        self.address.setToolTip("What 'dask scheduler' prints when it starts.")
+        self.address.setToolTip("Address printed by 'dask scheduler' when it starts.")
         self.address.setMinimumWidth(60)
         super().__init__(
             "Run on",
             {_HERE: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
-            "The values do not depend on it. Workers of a cluster must see the folders of "
-            "shots and store under the same names.",
+            "This does not affect the results. Cluster workers must be able to access the shots "
+            "and the store at the same paths.",
             {_HERE: labelled("Jobs", self.workers), _SCHEDULER: labelled("Address", self.address)},
         )
         self.workers.valueChanged.connect(lambda _: self.changed.emit())
@@ -179,7 +182,7 @@ class EnginePicker(RowPicker):
         if "://" not in address:
             raise InputError(
                 f"the scheduler's address is '{address}': expected one such as tcp://host:8786, "
-                "which 'dask scheduler' prints"
+                "as printed by 'dask scheduler'"
             )
         return address, None
 

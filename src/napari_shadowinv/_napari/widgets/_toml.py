@@ -80,7 +80,7 @@ class TomlButtons(QWidget):
         self.save_button = QPushButton("Save…")
         self.load_button.setToolTip(f"Read {what} from a TOML file.")
         self.save_button.setToolTip(
-            f"Write {what} to a TOML file, for another day or the command line."
+            f"Write {what} to a TOML file, to reuse here or on the command line."
         )
         for button in (self.load_button, self.save_button):
             row.addWidget(button)

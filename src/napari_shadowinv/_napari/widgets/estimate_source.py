@@ -59,21 +59,23 @@ class EstimateSource(LivePanel):
         super().__init__(
             viewer,
             "estimate-source",
-            RunPanel("Estimate source", "Estimate", "Make an image layer of the beam."),
+            RunPanel(
+                "Estimate source", "Estimate", "Create an image layer with the estimated beam."
+            ),
         )
         self.previewed = ResultLayers(viewer, self)
         self._last = LastResults(viewer, self)
         self.image = LayerPicker(viewer, ("image",), suits=may_be_shot)
-        self.image.setToolTip("The shot: a grey image layer.")
+        self.image.setToolTip("The shot: a greyscale image layer.")
         self.masks = MaskPicker(
             viewer,
             lambda: self.image.layer,
             ("labels", "shapes"),
-            "Labels or shapes that mark what the estimate must not see.",
+            "Labels or shapes marking pixels that the estimate ignores.",
         )
         self.method = ModelPicker("Method", kinds_of(ESTIMATES))
         self.method.set_kind("total_variation")
-        self.live.setToolTip("The estimate follows every change.")
+        self.live.setToolTip("Update the estimate after every change.")
         self.keep_earlier = keep_earlier_box()
         for row in (
             labelled("Image", self.image),

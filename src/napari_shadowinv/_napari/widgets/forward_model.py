@@ -70,28 +70,26 @@ class ForwardModel(ToolPanel):
         self.object = ModelPicker(
             "Object", {**kinds_of(PHANTOMS), _LAYER: ("a result or potential", None)}
         )
-        self.object.choice.setToolTip("What deflects the beam.")
+        self.object.choice.setToolTip("Object that deflects the beam.")
         self.potential = LayerPicker(viewer, ("image",), suits=may_be_a_field)
         self.potential.setToolTip(
-            "<qt>The field or potential of a result, a potential in px² from a file, or of a "
-            "stack the shot in view.</qt>"
+            "<qt>The field or potential of a result, or a potential in px² from a file; for a "
+            "stack, the shot in view.</qt>"
         )
         self.expected = wrapping_label()
         self.deflector = SteadyComboBox()
-        self.deflector.addItem("as usual for the beam", None)
+        self.deflector.addItem("default for the beam", None)
         for name in DEFLECTORS:
             self.deflector.addItem(name, name)
         self.deflector.setToolTip(
-            "<qt>What bends the beam. It matters where the setup is not that of the result: the "
-            "image of the same object in another experiment.</qt>"
+            "<qt>What deflects the beam. This matters only if the setup differs from that of "
+            "the result, to predict the same object's image in another experiment.</qt>"
         )
         self.height_px, self.width_px = _side("Height"), _side("Width")
         self.setup = SetupPicker()
         self.source = LayerPicker(viewer, ("image",), none="uniform", suits=may_be_source)
         self.source.setToolTip("Image layer of the undisturbed beam.")
-        self.panel = RunPanel(
-            "Forward model", "Make the image", "Trace the beam through the object."
-        )
+        self.panel = RunPanel("Forward model", "Simulate", "Trace the beam through the object.")
         self.warning = wrapping_label(style=PROBLEM_STYLE)
         self._potential_rows = (
             labelled("Layer", self.potential),

@@ -98,7 +98,7 @@ class InvertShot(LivePanel):
         super().__init__(
             viewer,
             "invert-shot",
-            RunPanel("Invert shot", "Run", "Invert the image; the result comes as layers."),
+            RunPanel("Invert shot", "Run", "Invert the image and show the result as layers."),
         )
         self._cache, self._estimates = PlanCache(), SourceCache()
         self.previewed = ResultLayers(viewer, self)
@@ -112,30 +112,32 @@ class InvertShot(LivePanel):
     def _build(self) -> None:
         viewer = self.viewer
         self.image = LayerPicker(viewer, ("image",), suits=may_be_shot)
-        self.image.setToolTip("The shot: a grey image layer.")
+        self.image.setToolTip("The shot: a greyscale image layer.")
         self.source = SourcePicker(viewer)
         self.masks = MaskPicker(
             viewer,
             lambda: self.image.layer,
             ("labels", "shapes"),
-            "Labels or shapes that mark pixels of the detector. The inversion looks at no masked "
-            "pixel: what is to be found must not be under it.",
+            "Labels or shapes marking detector pixels. The inversion ignores masked pixels, so "
+            "do not mask the object.",
         )
         self.source_masks = MaskPicker(
             viewer,
             lambda: self.image.layer,
             ("labels", "shapes"),
-            "Labels or shapes that hide the object from the estimate of the source, and from that "
-            "alone: the inversion sees it.",
+            "Labels or shapes that hide the object from the source estimate only; the inversion "
+            "still uses it.",
             "Source mask",
         )
         self.crop = LayerPicker(viewer, ("shapes",), none="none")
-        self.crop.setToolTip("<qt>A rectangle in a shapes layer: only that part is inverted.</qt>")
+        self.crop.setToolTip(
+            "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>"
+        )
         self.setup = SetupPicker()
         self.cleaning = CleaningSection()
         self.options = OptionsForm()
         self.live.setToolTip(
-            f"<qt>The field follows every change, with at most {PREVIEW_SITES:,} sites.</qt>"
+            f"<qt>Update the field after every change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
         self.keep_earlier = keep_earlier_box()
         self.cost, self._pace = wrapping_label(), 1.0
@@ -232,8 +234,7 @@ class InvertShot(LivePanel):
         image = request.image
         if image not in self.viewer.layers and not request.preview:
             tell_warning(
-                f"'{image.name}' was deleted while it was inverted; its result is shown all the "
-                "same"
+                f"'{image.name}' was deleted during its inversion; the result is shown anyway"
             )
         if request.setup is not None:
             place_together(self.viewer, image, request.setup, request.companions)

@@ -52,7 +52,7 @@ class InvertStack(ToolPanel):
         self.panel = RunPanel(
             "Invert stack",
             "Run",
-            "Invert every shot that is not done yet, into the store.",
+            "Invert all shots not yet in the store.",
             patience=math.inf,  # until it has left the store
         )
         self.results = ResultLayers(viewer, self)
@@ -79,25 +79,25 @@ class InvertStack(ToolPanel):
             self.viewer,
             lambda: self.shots.layer,
             ("labels",),
-            "Labels that mark pixels of the detector, in all shots. The inversion looks at no "
-            "masked pixel: what is to be found must not be under it.",
+            "Labels marking detector pixels in all shots. The inversion ignores masked pixels, "
+            "so do not mask the object.",
         )
         self.source_masks = MaskPicker(
             self.viewer,
             lambda: self.shots.layer,
             ("labels",),
-            "Labels that hide the object from the estimates of the sources, and from those alone: "
-            "the inversion sees it.",
+            "Labels that hide the object from the source estimates only; the inversion still "
+            "uses it.",
             "Source mask",
         )
         self.setup = SetupPicker()
         self.cleaning = CleaningSection()
         self.options = OptionsForm()
         self.store = StoreEdit()
-        self.overwrite = QCheckBox("overwrite what the store holds")
-        self.overwrite.setToolTip("<qt>Begin anew. Else the run goes on where it stopped.</qt>")
+        self.overwrite = QCheckBox("overwrite the store")
+        self.overwrite.setToolTip("<qt>Start from scratch. Otherwise the run is resumed.</qt>")
         self.redo_failed = QCheckBox("redo failed shots")
-        self.redo_failed.setToolTip("<qt>Try shots again that failed in an earlier run.</qt>")
+        self.redo_failed.setToolTip("<qt>Retry shots that failed in an earlier run.</qt>")
         self.engine = EnginePicker()
         self.report = ReportTable()
         self.failures_title = QLabel("Failed shots")
@@ -280,7 +280,7 @@ class InvertStack(ToolPanel):
         self._show(request)
         self.report.show_rows(request.origins.rows())
         if outcome.cancelled:
-            self.panel.say(f"Cancelled: {books.text}; Run goes on from there.")
+            self.panel.say(f"Cancelled: {books.text}; press Run to resume.")
         else:
             self.panel.say(f"{books.text}, in {request.job.out.name}")
         self.panel.status.setToolTip(str(request.job.out.absolute()))

@@ -69,29 +69,29 @@ class LineProfile(Docked):
         self.profiles: list[Profile] = []
         self.lines = LayerPicker(viewer, ("shapes",), none="none yet")
         self.lines.setToolTip(
-            "<qt>Shapes layer with the line; of several the selected one counts.</qt>"
+            "<qt>Shapes layer with the line; if it has several, the selected one is used.</qt>"
         )
         self.layers = QListWidget()
-        self.layers.setToolTip("Layers to read.")
+        self.layers.setToolTip("Layers to plot.")
         self.layers.setMaximumHeight(110)
         self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.width_edit = QDoubleSpinBox()
         self.width_edit.setRange(0.0, _WIDEST)
         self.width_edit.setDecimals(2)
-        self.width_edit.setSpecialValueText("0: the line alone")
+        self.width_edit.setSpecialValueText("0: line only")
         self.width_edit.setKeyboardTracking(False)
         self.width_unit = SteadyComboBox()
         self.width_unit.addItem(_PIXELS)
         for widget in (self.width_edit, self.width_unit):
             widget.setToolTip(
-                "<qt>Width of the strip around the line, at right angles to it, over which the "
-                "values are averaged.</qt>"
+                "<qt>Width of the strip, perpendicular to the line, over which values are "
+                "averaged.</qt>"
             )
         self.plot = ProfilePlot()
         self.hint = wrapping_label("Press ✎ and draw a line on the image.")
         self.problem = wrapping_label(style=PROBLEM_STYLE)
         self.export = QPushButton("Export CSV…")
-        self.export.setToolTip("Write what is shown as a table.")
+        self.export.setToolTip("Save the profile as a table.")
         column = QVBoxLayout(self)
         column.setContentsMargins(6, 6, 6, 6)
         column.addWidget(
@@ -263,7 +263,7 @@ class LineProfile(Docked):
         ]
         if not images:
             raise InputError(
-                "there is no image to draw a line on: open one (File → Open) or take a sample "
+                "there is no image to draw a line on: open one (File → Open) or use a sample "
                 "(File → Open Sample)"
             )
         self.lines.layer = new_shapes(self.viewer, images[-1], "profile", "add_line")

@@ -239,7 +239,7 @@ def coaxial_line(
     """
     require_finite(peak=peak)
     if len(radii) != 3 or not (np.isfinite(radii).all() and 0 < radii[0] < radii[1] < radii[2]):
-        raise InputError(f"radii are {radii}: expected three that are positive and increase, in m")
+        raise InputError(f"radii are {radii}: expected three positive, increasing values, in m")
     inner, outer, rim = (radius / setup.object_pixel_size for radius in radii)
     y, x = offsets(shape, center)
     r = np.hypot(y, x)

@@ -105,7 +105,9 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> ProtonS
     True
     """
     if not isinstance(mapping, Mapping):
-        raise InputError(f"{where}: received a {type(mapping).__name__}, expected keys with values")
+        raise InputError(
+            f"{where}: received a {type(mapping).__name__}, expected a table of keys and values"
+        )
     kind = mapping.get("kind")
     if kind is None:
         raise InputError(f"{where}: 'kind' is missing, {_EXPECTED}")

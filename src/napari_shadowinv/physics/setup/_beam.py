@@ -28,7 +28,7 @@ class BeamSetup(BaseModel):
     source_object_distance: float = Field(
         gt=0,
         title="Source to object (m)",
-        description="Distance l from the beam's source to the object, in m; inf if collimated.",
+        description="Distance l from the beam source to the object, in m; inf if collimated.",
     )
     object_image_distance: float = Field(
         gt=0,
@@ -42,7 +42,7 @@ class BeamSetup(BaseModel):
         allow_inf_nan=False,
         title="Pixel size at the object (m)",
         description=(
-            "Side of a pixel in the object plane, in m. Give this or the detector's pixel size."
+            "Pixel size in the object plane, in m. Give either this or the detector pixel size."
         ),
     )
     detector_pixel_size: float | None = Field(
@@ -51,8 +51,8 @@ class BeamSetup(BaseModel):
         allow_inf_nan=False,
         title="Pixel size at the detector (m)",
         description=(
-            "Side of a pixel in the detector plane, in m; the magnification makes it the "
-            "object plane's. Give this or the pixel size at the object."
+            "Pixel size in the detector plane, in m; it is divided by the magnification. Give "
+            "either this or the pixel size at the object."
         ),
     )
 
@@ -188,7 +188,8 @@ class BeamSetup(BaseModel):
         plane = self.normalized_potential(potential)
         if plane.ndim != 2 or min(plane.shape) < 3:
             raise InputError(
-                f"potential has shape {plane.shape}: expected (height, width), 3 pixels at least"
+                f"potential has shape {plane.shape}: expected (height, width), at least 3 "
+                "pixels each way"
             )
         return -np.stack([np.gradient(plane, axis=axis, edge_order=2) for axis in (0, 1)])
 

@@ -43,15 +43,14 @@ class OpticalSetup(BeamSetup):
         gt=0,
         title="Source to object (m)",
         description=(
-            "Distance l from the beam's source to the object, in m. "
-            "Default: inf, a collimated beam."
+            "Distance l from the beam source to the object, in m. Default: inf (collimated beam)."
         ),
     )
     wavelength: float = Field(
         gt=0,
         allow_inf_nan=False,
         title="Wavelength (m)",
-        description="Wavelength of the light in vacuum, in m.",
+        description="Vacuum wavelength of the light, in m.",
     )
 
     @property

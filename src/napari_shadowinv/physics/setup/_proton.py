@@ -87,12 +87,12 @@ class ProtonSetup(BeamSetup):
         gt=0,
         allow_inf_nan=False,
         title="Kinetic energy (MeV)",
-        description="Kinetic energy of a particle (all its nucleons together), in MeV.",
+        description="Kinetic energy per particle (not per nucleon), in MeV.",
     )
     species: Species = Field(
         default="proton",
         title="Species",
-        description="Kind of the beam's particles; electrons bend the other way.",
+        description="Particle species; electrons are deflected the opposite way.",
     )
 
     @property
