@@ -1,7 +1,4 @@
-"""What is handed out: the wheel, the citation, the workflows and the issue templates.
-
-Nothing here needs the network.
-"""
+"""What is handed out: the wheel, its metadata, the citation. Nothing here needs the network."""
 
 from __future__ import annotations
 
@@ -27,9 +24,7 @@ PACKAGE = ROOT / "src" / "napari_shadowinv"
 
 
 def loaded(path: Path) -> Any:
-    # YAML 1.1, which PyYAML reads, takes the key "on" for true.
-    text = re.sub(r"^on:", '"on":', path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    return yaml.safe_load(text)
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
 # The wheel
