@@ -1,6 +1,8 @@
 # make demo   simulate and invert the paper's toroidal shot, write figures to demo/
 # make test   check style and types, then run the whole test suite
 # make gallery make the pictures of docs/gallery.md again
+# make dist   build the source distribution and the wheel in dist/
+# make check-wheel  install the wheel into an empty environment and use it there
 # make format put the code into the project's format
 
 PYTHON ?= python3
@@ -9,7 +11,7 @@ BIN := $(VENV)/bin
 ON_SCREEN := xvfb-run -a -s "-screen 0 2560x1440x24"
 ON_BOTH_CORES := -n 2 --dist loadfile
 
-.PHONY: demo test gallery lint format clean
+.PHONY: demo test gallery lint dist check-wheel format clean
 
 demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
@@ -29,6 +31,13 @@ lint: $(VENV)/installed-dev
 	$(BIN)/mypy
 	$(BIN)/npe2 validate --imports napari.yaml
 
+dist: $(VENV)/installed-dev
+	rm -rf dist
+	$(BIN)/python -m build
+
+check-wheel: dist
+	sh .ci/check-wheel $(BIN)/python
+
 format: $(VENV)/installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -47,4 +56,4 @@ $(BIN)/pip:
 	$(BIN)/pip install --quiet --upgrade pip
 
 clean:
-	rm -rf $(VENV) demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,11 +1,13 @@
 import json
 import os
+import platform
+import re
 import signal
 import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
-from importlib.metadata import version
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +20,16 @@ import xarray as xr
 from scipy.io import savemat
 from typer.testing import CliRunner, Result
 
-from napari_shadowinv import filters, sources
-from napari_shadowinv.cli import app
+from napari_shadowinv import __version__, compilation, filters, sources
+from napari_shadowinv.cli import _report, app
 from napari_shadowinv.cli._choices import Choices
 from napari_shadowinv.cli._inputs import Experiment, experiment_from
+from napari_shadowinv.compilation import code_folder
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.io import inversion_from_dataset, read, setup_from_dataset, write
 from napari_shadowinv.io.files import sha256
+from napari_shadowinv.memory import physical_memory
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -96,7 +100,7 @@ def dataset(path: str | Path) -> xr.Dataset:
 
 
 def test_version_and_help() -> None:
-    assert shadowinv("--version").output.split() == ["shadowinv", version("napari-shadowinv")]
+    assert shadowinv("--version").output.split() == ["shadowinv", __version__]
     text = shadowinv("invert", "--help").output
     for word in ("--source", "--bin", "--clip-negative", "shadowinv invert shot.tif", "energy"):
         assert word in text
@@ -814,6 +818,73 @@ def test_info_tells_what_is_inside(folder: Path) -> None:
     text = " ".join(shadowinv("info", "film.tif").stdout.split())
     assert "TIFF picture, 16 bits" in text
     assert "channels 3" in text
+
+
+def test_info_reports_the_installation() -> None:
+    text = shadowinv("info", "--report").stdout
+    told = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in text.splitlines())
+    assert told["napari-shadowinv"] == __version__
+    assert told["python"].startswith(platform.python_version())
+    for package in ("numpy", "scipy", "numba", "dask", "xarray", "zarr", "h5py"):
+        assert told[package] == metadata.version(package)
+    assert platform.machine() in told["platform"]
+    assert told["cores"].startswith(f"{os.cpu_count()}, ")
+    size = physical_memory()
+    assert told["memory"] == ("not known" if size is None else f"{size / 2**30:.1f} GiB")
+    folder = code_folder()
+    assert folder is not None
+    assert Path(told["compiled code"].rpartition(" (")[0]).expanduser() == folder
+
+
+def test_the_report_tells_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def without_windows(name: str) -> str:
+        if name in ("napari", "npe2", "qtpy", *_report.QT_BINDINGS):
+            raise metadata.PackageNotFoundError(name)
+        return metadata.version(name)
+
+    monkeypatch.setattr(_report, "version", without_windows)
+    told = [line.split(maxsplit=1) for line in shadowinv("info", "--report").stdout.splitlines()]
+    for name in ("napari", "npe2", "qtpy", "Qt"):
+        assert [name, "not installed"] in told
+    only = {"PySide6_Essentials": "6.11.0"}
+    monkeypatch.setattr(_report, "_version", only.get)
+    assert _report._qt_bindings() == ["PySide6_Essentials 6.11.0"]
+
+
+def test_the_report_hides_the_home_folder(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    monkeypatch.setattr(Path, "home", lambda: folder)
+    monkeypatch.setattr(compilation, "code_folder", lambda: folder / "kept")
+    text = shadowinv("info", "--report").stdout
+    assert str(Path("~") / "kept") in text
+    assert str(folder) not in text
+
+
+def test_the_report_survives_a_compiler_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> None:
+        raise ImportError("llvmlite does not\nload")
+
+    monkeypatch.setattr(compilation, "code_folder", broken)
+    last = shadowinv("info", "--report").stdout.splitlines()[-1]
+    assert last.endswith("not known: ImportError: llvmlite does not load")
+
+
+def test_the_report_loads_neither_napari_nor_qt() -> None:
+    script = """
+import sys
+from typer.testing import CliRunner
+from napari_shadowinv.cli import app
+
+assert CliRunner().invoke(app, ["info", "--report"]).exit_code == 0
+print(sorted({"napari", "qtpy", "PyQt6", "PySide6"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_info_wants_a_file_or_a_report(refused: Callable[..., None]) -> None:
+    refused("info", names="--report")
+    refused("info", "shot.npy", "--report", names="no file")
+    refused("info", "--variable", "beam", "--report", names="no file")
 
 
 def test_info_of_a_result_tells_options_and_peak(folder: Path, shot: Path) -> None:

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from napari_shadowinv.progress import Progress
     from napari_shadowinv.stack import invert_stack, run_stack, stack_statistics
 
+__version__ = "0.1.0"
+
 __all__ = [
     "FileFormatError",
     "InputError",
@@ -47,6 +49,7 @@ __all__ = [
     "Radiograph",
     "Report",
     "Uncertainty",
+    "__version__",
     "add_inversion",
     "invert",
     "invert_stack",

@@ -2,6 +2,7 @@
 
 - do it before an inversion that somebody waits for: `ensure_compiled`
 - whether it was done: `is_compiled`
+- where its result is kept: `code_folder`
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 
 from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 
-__all__ = ["ensure_compiled", "is_compiled"]
+__all__ = ["code_folder", "ensure_compiled", "is_compiled"]
 
 _SIDE = 64  # enough sites for every kernel to be used
 
@@ -61,10 +62,21 @@ def is_compiled() -> bool:
         False after an installation, where the cache (``NUMBA_CACHE_DIR``, or a folder
         beside the package) is empty, and where nothing can be kept.
     """
+    kept = code_folder()
+    return kept is not None and any(kept.glob("_flips.build-*.nbi"))
+
+
+def code_folder() -> Path | None:
+    """Return the folder in which the machine code of the triangulation is kept.
+
+    Returns
+    -------
+    Path or None
+        None where nothing can be kept.
+    """
     from napari_shadowinv.geometry._flips import build
     from napari_shadowinv.geometry._kernel import is_kept
 
     if not is_kept():
-        return False
-    kept = Path(build.stats.cache_path)  # type: ignore[attr-defined]
-    return any(kept.glob("_flips.build-*.nbi"))
+        return None
+    return Path(build.stats.cache_path)  # type: ignore[attr-defined]

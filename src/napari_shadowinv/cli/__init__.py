@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from napari_shadowinv import __version__
 from napari_shadowinv.cli import _shot_commands, _stack_commands
 
 __all__ = ["app"]
@@ -28,9 +29,7 @@ app = typer.Typer(
 
 def _show_version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version
-
-        typer.echo(f"shadowinv {version('napari-shadowinv')}")
+        typer.echo(f"shadowinv {__version__}")
         raise typer.Exit
 
 

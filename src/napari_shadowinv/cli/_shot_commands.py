@@ -68,6 +68,7 @@ from napari_shadowinv.cli._outputs import (
     write_all,
 )
 from napari_shadowinv.cli._progress import inverted
+from napari_shadowinv.cli._report import report_text
 from napari_shadowinv.cli._tables import size_text, summary
 from napari_shadowinv.cli._terminal import say
 from napari_shadowinv.errors import InputError
@@ -310,10 +311,23 @@ def forward(
 
 @notify_errors
 def info(
-    file: Annotated[Path, typer.Argument(help="An image or a result.", show_default=False)],
+    file: Annotated[
+        Path | None, typer.Argument(help="An image or a result.", show_default=False)
+    ] = None,
     variable: Variable = None,
+    report: Annotated[
+        bool,
+        typer.Option("--report", help="Print versions and machine instead, for a bug report."),
+    ] = False,
 ) -> None:
     """Describe a file and its contents."""
+    if report:
+        if file is not None or variable is not None:
+            raise InputError("--report describes the installation: it takes no file or variable")
+        typer.echo(report_text())
+        return
+    if file is None:
+        raise InputError("no file given: name an image or a result, or use --report")
     say(described(file, variable))
 
 

@@ -16,13 +16,13 @@ import json
 import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from napari_shadowinv import __version__
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.hdf5 import check_arrays, hdf5_in_memory
@@ -153,7 +153,7 @@ def dataset_from_field(
     if potential is not None:
         variables["potential"] = (_PLANE, potential, _labels(*_VARIABLES["potential"][1:]))
     attrs = {
-        "package_version": version("napari-shadowinv"),
+        "package_version": __version__,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         **(attributes or {}),
     }

@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import json
-from importlib.metadata import version
 from itertools import pairwise
 from textwrap import shorten
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv import __version__
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.dataset import variable_labels
 from napari_shadowinv.io.store import DONE, StackStore
@@ -150,7 +150,7 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
     """
     stack = stack.chosen(_order(store, stack.shots.names))
     found = _identity(stack, dtype, len(store.names))
-    for name, value in {**found, "package_version": version("napari-shadowinv")}.items():
+    for name, value in {**found, "package_version": __version__}.items():
         before = str(store.attributes.get(name, ""))
         if before != value:
             article = "" if name.endswith("s") else "a "

@@ -1,0 +1,166 @@
+"""What is handed out: the wheel, its metadata, the citation. Nothing here needs the network."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from configparser import ConfigParser
+from email import message_from_string
+from email.message import Message
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import pytest
+import yaml
+
+import napari_shadowinv
+from napari_shadowinv import __version__
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "napari_shadowinv"
+
+
+def loaded(path: Path) -> Any:
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+# The wheel
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The files of a freshly built wheel."""
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
+    done = subprocess.run([*command, str(ROOT)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (path,) = folder.iterdir()
+    assert path.name == f"napari_shadowinv-{__version__}-py3-none-any.whl"
+    with ZipFile(path) as archive:
+        return {
+            name: archive.read(name).decode().replace("\r\n", "\n") for name in archive.namelist()
+        }
+
+
+@pytest.fixture(scope="module")
+def about(wheel: dict[str, str]) -> dict[str, str]:
+    """The files beside the package that describe it."""
+    start = f"napari_shadowinv-{__version__}.dist-info/"
+    return {
+        name.removeprefix(start): text for name, text in wheel.items() if name.startswith(start)
+    }
+
+
+@pytest.fixture(scope="module")
+def metadata(about: dict[str, str]) -> Message:
+    return message_from_string(about["METADATA"])
+
+
+def test_the_wheel_holds_the_package_and_nothing_else(wheel: dict[str, str]) -> None:
+    held = {name for name in wheel if ".dist-info/" not in name}
+    sources = {
+        path.relative_to(PACKAGE.parent).as_posix()
+        for path in PACKAGE.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert held == sources
+    assert {"napari_shadowinv/napari.yaml", "napari_shadowinv/py.typed"} <= held
+    assert wheel["napari_shadowinv/napari.yaml"] == (PACKAGE / "napari.yaml").read_text("utf-8")
+
+
+def test_the_wheel_offers_the_command_and_the_plugin(
+    wheel: dict[str, str], about: dict[str, str]
+) -> None:
+    entries = ConfigParser()
+    entries.read_string(about["entry_points.txt"])
+    assert dict(entries["console_scripts"]) == {"shadowinv": "napari_shadowinv.cli:app"}
+    assert dict(entries["napari.manifest"]) == {"napari-shadowinv": "napari_shadowinv:napari.yaml"}
+    assert "\napp = typer.Typer(" in wheel["napari_shadowinv/cli/__init__.py"]
+
+
+def test_the_version_has_one_place(metadata: Message) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert "version" not in project
+    assert "version" in project["dynamic"]
+    assert metadata["Version"] == napari_shadowinv.__version__
+    assert re.fullmatch(r"\d+\.\d+\.\d+((a|b|rc|\.dev)\d+)?", __version__)
+
+
+def test_the_version_is_told_without_heavy_imports() -> None:
+    script = """
+import sys
+import napari_shadowinv
+print(napari_shadowinv.__version__, sorted({"numpy", "numba", "scipy", "dask"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout.strip() == f"{__version__} []", done.stderr
+
+
+def test_the_wheel_describes_itself(about: dict[str, str], metadata: Message) -> None:
+    assert metadata["Name"] == "napari-shadowinv"
+    assert 0 < len(metadata["Summary"]) < 200
+    assert metadata["License-Expression"] == "BSD-3-Clause"
+    assert about["licenses/LICENSE"] == (ROOT / "LICENSE").read_text("utf-8")
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    assert metadata.get_payload() == (ROOT / "README.md").read_text("utf-8")
+    assert metadata["Requires-Python"] == ">=3.11"
+    classifiers = metadata.get_all("Classifier", [])
+    assert "Framework :: napari" in classifiers
+    assert "Typing :: Typed" in classifiers
+    assert not [name for name in classifiers if name.startswith("License ::")]
+
+
+def test_the_classifiers_exist(metadata: Message) -> None:
+    trove_classifiers = pytest.importorskip("trove_classifiers")
+    assert set(metadata.get_all("Classifier", [])) <= trove_classifiers.classifiers
+
+
+def test_napari_is_no_requirement_of_the_core(metadata: Message) -> None:
+    required = [
+        re.split(r"[^\w-]", need)[0].lower()
+        for need in metadata.get_all("Requires-Dist", [])
+        if "extra ==" not in need
+    ]
+    assert "numpy" in required
+    assert not {"napari", "qtpy", "pyqt6", "pyside6", "pytest"} & set(required)
+
+
+# The citation
+
+
+def test_the_citation_follows_its_format() -> None:
+    citation = loaded(ROOT / "CITATION.cff")
+    assert citation["cff-version"] == "1.2.0"
+    assert {"message", "title", "authors"} <= set(citation)
+    assert citation["type"] == "software"
+    assert citation["title"] == "napari-shadowinv"
+    assert citation["version"] == __version__
+    assert citation["license"] == "BSD-3-Clause"
+    assert citation["authors"] == [{"name": "napari-shadowinv contributors"}]
+
+
+def test_the_citation_names_the_paper_and_its_authors() -> None:
+    (paper,) = loaded(ROOT / "CITATION.cff")["references"]
+    assert {"type", "title", "authors"} <= set(paper)
+    for author in paper["authors"]:
+        assert set(author) == {"family-names", "given-names"}
+    names = ", ".join(author["family-names"] for author in paper["authors"])
+    assert names == (
+        "Kasim, Ceurvorst, Ratan, Sadler, Chen, Sävert, Trines, Bingham, Burrows, Kaluza, Norreys"
+    )
+    assert paper["identifiers"][0]["value"] == "arXiv:1607.04179"
+    assert paper["title"].startswith("Quantitative shadowgraphy and proton radiography")
+
+
+# The plugin's page
+
+
+def test_the_manifest_says_where_the_plugin_belongs() -> None:
+    manifest = loaded(PACKAGE / "napari.yaml")
+    assert manifest["visibility"] == "public"
+    schema = pytest.importorskip("npe2.manifest.schema")
+    assert manifest["categories"]
+    assert set(manifest["categories"]) <= {str(category) for category in schema.Category}
