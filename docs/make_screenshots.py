@@ -2,8 +2,9 @@
 
     QT_API=pyqt6 xvfb-run -a -s "-screen 0 2560x1440x24" python docs/make_screenshots.py [NAME ...]
 
-NAME is a window below, such as `toroid` or `first`; all of them without one. Each picture is a window of 1280 × 800 pixels as a user sees it. The burner shadowgrams (see the
-README's credits) are looked for in the data folder and left out where they are absent.
+NAME is a window below, such as `toroid` or `first`; all of them without one. Each picture is of
+1280 × 800 pixels, as a user sees the window. The burner shadowgrams (see the README's credits) are
+looked for in the data folder and left out where they are absent.
 """
 
 from __future__ import annotations

@@ -84,3 +84,28 @@ def test_the_pictures_and_pages_of_a_tutorial_exist(page):
     assert targets
     for target in targets:
         assert (FOLDER / target).exists(), target
+
+
+def test_the_table_of_sources_is_as_the_inversions_say():
+    from napari_shadowinv._napari.samples import four_toroids
+    from napari_shadowinv.physics import phantoms
+    from napari_shadowinv.recipes import ESTIMATES
+
+    (source, *_), (image, *_) = four_toroids()
+    setup = phantoms.paper_setup()
+    truth = phantoms.four_toroids(image.shape, setup, 0.8).displacement
+    assert 1e3 * np.hypot(*setup.path_integrated_b(truth)).max() == pytest.approx(10.8, abs=0.05)
+    rows = re.findall(r"^\| ([a-z].*?) \| ([\d.]+) \| (\d+) \|", text_of("no-reference.md"), re.M)
+    by_title = {f"estimate: {model.title}": model for model in ESTIMATES.values()}
+    by_title["uniform"] = ESTIMATES["uniform"]
+    assert len(rows) == 5
+    for title, peak, error in rows:
+        beam = source if title.startswith("the one") else by_title[title]().source(image, None)
+        found = invert(image, source=beam)
+        strength = 1e3 * np.hypot(*setup.path_integrated_b(found.displacement))
+        assert strength.max() == pytest.approx(float(peak), abs=0.06), title
+        wrong = 100 * np.linalg.norm(found.displacement - truth) / np.linalg.norm(truth)
+        assert wrong == pytest.approx(float(error), abs=0.6), title
+        assert 100 * found.report.image_residual == pytest.approx(4.25, abs=0.1), title
+        warned = any("reaches the image's edge" in text for text in found.report.warnings)
+        assert warned == title.startswith("estimate"), title
