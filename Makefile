@@ -1,5 +1,6 @@
 # make demo   simulate and invert the paper's toroidal shot, write figures to demo/
-# make test   check style and types, then run the whole test suite
+# make test   check style and types, build the site, then run the whole test suite
+# make docs   build the documentation site into build/docs; GALLERY=1 runs the examples for it, too
 # make gallery make the pictures of docs/gallery.md again
 # make dist   build the source distribution and the wheel in dist/
 # make check-wheel  install the wheel into an empty environment and use it there
@@ -11,7 +12,7 @@ BIN := $(VENV)/bin
 ON_SCREEN := xvfb-run -a -s "-screen 0 2560x1440x24"
 ON_BOTH_CORES := -n 2 --dist loadfile
 
-.PHONY: demo test gallery lint dist check-wheel format clean
+.PHONY: demo test docs gallery lint dist check-wheel format clean
 
 demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
@@ -19,7 +20,11 @@ demo: $(VENV)/installed
 gallery: $(VENV)/installed
 	$(BIN)/python docs/make_gallery.py
 
-test: lint
+docs: $(VENV)/installed-dev
+	GALLERY=$(GALLERY) $(BIN)/sphinx-build -W --keep-going -q docs build/docs
+	@echo "open build/docs/index.html"
+
+test: lint docs
 	@sh .ci/need-display
 	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES)
 	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES) -q \
@@ -56,4 +61,4 @@ $(BIN)/pip:
 	$(BIN)/pip install --quiet --upgrade pip
 
 clean:
-	rm -rf $(VENV) demo dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

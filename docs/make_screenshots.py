@@ -1,18 +1,21 @@
-"""Make the pictures of napari's window that the README and docs/batch.md show.
+"""Make the pictures of napari's window that the README, docs/batch.md and the tutorials show.
 
-    xvfb-run -a -s "-screen 0 2560x1440x24" python docs/make_screenshots.py [--data ../shared/data]
+    QT_API=pyqt6 xvfb-run -a -s "-screen 0 2560x1440x24" python docs/make_screenshots.py [NAME ...]
 
-Each is a window of 1280 × 800 pixels as a user sees it. The burner shadowgrams (see the
-README's credits) are looked for in the data folder and left out where they are absent.
+NAME is a window below, such as `toroid` or `first`; all of them without one. Each picture is of
+1280 × 800 pixels, as a user sees the window. The burner shadowgrams (see the README's credits) are
+looked for in the data folder and left out where they are absent.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 import tempfile
 import time
 from contextlib import chdir
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -25,7 +28,15 @@ from napari_shadowinv.stack import read_shot
 
 HERE = Path(__file__).parent / "pictures"
 PLUGIN = "napari-shadowinv"
+LARGEST_FILE = 300_000  # bytes
 FRAMES, SHOWN = 6, 2
+# What the tutorial tells to type.
+PROTON_FIELDS = {
+    "energy": 14.7,
+    "source_object_distance": 1.3e-3,
+    "object_image_distance": 20e-3,
+    "detector_pixel_size": 24.57e-6,
+}
 
 
 def new_window(title: str) -> napari.Viewer:
@@ -43,16 +54,42 @@ def settle(seconds: float = 1.0) -> None:
         time.sleep(0.02)
 
 
-def photograph(viewer: napari.Viewer, name: str) -> None:
+def photograph(viewer: napari.Viewer, name: str, *, close: bool = True) -> None:
     """Save the window as it is seen, and close it."""
     viewer.reset_view()
     settle(3.0)
     pixels = viewer.window.screenshot(canvas_only=False, flash=False)
     path = HERE / name
-    Image.fromarray(pixels[..., :3]).save(path, optimize=True)
+    picture = Image.fromarray(pixels[..., :3])
+    picture.save(path, optimize=True)
+    if path.stat().st_size > LARGEST_FILE:
+        picture.quantize(256).save(path, optimize=True)
     print(f"wrote {path} {pixels.shape[1]}×{pixels.shape[0]}")
-    viewer.close()
+    if close:
+        viewer.close()
+        settle(0.2)
+
+
+def open_widget(viewer: napari.Viewer, name: str) -> Any:
+    """Open a widget of the plugin as its menu does."""
+    _, widget = viewer.window.add_plugin_dock_widget(PLUGIN, name)
+    settle()
+    return widget
+
+
+def press_run(widget: Any) -> None:
+    """Press Run and wait until all layers are there."""
+    widget.panel.button.click()
     settle(0.2)
+    while widget.panel.runner.running or (hasattr(widget, "results") and widget.results.busy):
+        settle(0.2)
+    settle()
+
+
+def show_only(viewer: napari.Viewer, *endings: str) -> None:
+    """Switch on the layers whose names end so, and off all others."""
+    for layer in viewer.layers:
+        layer.visible = layer.name.endswith(endings)
 
 
 def toroid_window() -> None:
@@ -84,21 +121,108 @@ def stack_window(folder: Path) -> None:
         photograph(viewer, "napari-stack.png")
 
 
+def first_windows() -> None:
+    """Tutorial: the sample and its widget, the field, and a line profile through both."""
+    viewer = new_window("first shadowgram")
+    viewer.open_sample(PLUGIN, "toroid")
+    invert_shot = open_widget(viewer, "Invert shot")
+    photograph(viewer, "tutorial-first-shot.png", close=False)
+    press_run(invert_shot)
+    photograph(viewer, "tutorial-first-field.png", close=False)
+    show_only(viewer, "residual (% of mean)")
+    viewer.layers.selection.active = viewer.layers["toroid residual (% of mean)"]
+    photograph(viewer, "tutorial-first-residual.png", close=False)
+    show_only(viewer, "|∫B×dz| (mT·m)")
+    profile = open_widget(viewer, "Line profile")
+    profile._draw()
+    profile.lines.layer.add([[99.5, 5.0], [99.5, 194.0]], shape_type="line")
+    for layer in profile.checked():
+        profile.check(layer, False)
+    profile.check(viewer.layers["toroid |∫B×dz| (mT·m)"])
+    photograph(viewer, "tutorial-first-profile.png")
+
+
+def proton_windows() -> None:
+    """Tutorial: a radiograph from a file, its geometry typed by hand, its caustics."""
+    text = (HERE.parent / "tutorials" / "proton-radiograph.md").read_text(encoding="utf-8")
+    (making,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
+        exec(compile(making, "proton-radiograph.md", "exec"), {})
+        viewer = new_window("proton radiograph")
+        viewer.open("shot.tif")
+        invert_shot = open_widget(viewer, "Invert shot")
+        invert_shot.source.picker.set_kind("file")
+        invert_shot.source.file.edit.setText("reference.tif")
+        invert_shot.setup.picker.set_kind("proton")
+        fields = invert_shot.setup.picker.form
+        fields.set_values(PROTON_FIELDS)
+        invert_shot.setup.picker.changed.emit()
+        photograph(viewer, "tutorial-proton-setup.png", close=False)
+        press_run(invert_shot)
+        viewer.layers["shot caustics"].visible = True
+        photograph(viewer, "tutorial-proton-field.png")
+
+
+def source_windows() -> None:
+    """Tutorial: an estimated beam, and the field that it gives."""
+    viewer = new_window("no reference image")
+    viewer.open_sample(PLUGIN, "four_toroids")
+    estimate = open_widget(viewer, "Estimate source")
+    estimate.method.set_kind("polynomial")
+    press_run(estimate)
+    photograph(viewer, "tutorial-source-estimate.png", close=False)
+    invert_shot = open_widget(viewer, "Invert shot")
+    invert_shot.image.layer = viewer.layers["four toroids"]
+    invert_shot.source.picker.set_kind("polynomial")
+    press_run(invert_shot)
+    print(invert_shot.report.texts())
+    photograph(viewer, "tutorial-source-field.png")
+
+
+def night_window() -> None:
+    """Tutorial: a run of shots, inverted into a store."""
+    viewer = new_window("a night's stack")
+    viewer.open_sample(PLUGIN, "wakefield_run")
+    invert_stack = open_widget(viewer, "Invert stack")
+    with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
+        invert_stack.cleaning.picker.set_kind("high_pass")
+        invert_stack.store.edit.setText("night.shadowinv.zarr")
+        press_run(invert_stack)
+        print(invert_stack.panel.status.text(), [layer.name for layer in viewer.layers])
+        viewer.dims.set_current_step(0, 10)
+        settle(3.0)
+        photograph(viewer, "tutorial-night.png")
+
+
 def frames(folder: Path) -> list[Path]:
     return sorted(folder.glob("Image_2*.bmp"))[:FRAMES]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", help="windows; all of them without a name")
     parser.add_argument("--data", type=Path, default=HERE.parents[2] / "shared" / "data")
-    folder = parser.parse_args().data / "burner" / "data"
+    options = parser.parse_args()
+    folder = options.data / "burner" / "data"
     HERE.mkdir(exist_ok=True)
-    toroid_window()
+    for name, make in WINDOWS.items():
+        if not options.names or name in options.names:
+            make()
+    if options.names and "burner" not in options.names:
+        return
     if frames(folder):
         stack_window(folder)
     else:
         print(f"no burner shadowgrams in {folder}: their picture is left out")
 
+
+WINDOWS = {
+    "toroid": toroid_window,
+    "first": first_windows,
+    "proton": proton_windows,
+    "source": source_windows,
+    "night": night_window,
+}
 
 if __name__ == "__main__":
     main()

@@ -62,7 +62,7 @@ class Report:
     iterations : int
         Solver steps, all levels together.
     residual : float
-        Largest relative flux error of a cell, max |T - S| / S.
+        Largest relative flux error of a cell, max ``|T - S| / S``.
     tolerance : float
         The residual that was asked for.
     n_sites : int

@@ -1,0 +1,258 @@
+"""Pages of the reference that are written when the site is built, so that they are never stale.
+
+- every parameter of filters, source estimates, setups and options, from the pydantic models
+- every command with its options, from the command-line program
+- the public names, from each module's ``__all__``
+"""
+
+from __future__ import annotations
+
+import re
+from enum import Enum
+from importlib import import_module
+from inspect import cleandoc, isclass, unwrap
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from rich.text import Text
+from sphinx.application import Sphinx
+from sphinx.config import Config
+
+FOLDER = Path(__file__).parents[1] / "reference"
+
+_SHAPES: dict[Any, str] = {Path: "PATH", int: "INTEGER", float: "NUMBER", str: "TEXT"}
+
+MODULES = {
+    "recipes": "Filters and source estimates with their parameters",
+    "filters": "Filters as functions",
+    "sources": "Source estimates as functions",
+    "physics.phantoms": "Test objects",
+    "io": "Files",
+}
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Write the pages before Sphinx looks for pages."""
+    app.connect("config-inited", write_pages)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+def write_pages(app: Sphinx, config: Config) -> None:
+    """Write what has changed, and forget the pages of names that are gone."""
+    for name, text in (
+        ("parameters.md", parameters_page()),
+        ("command.md", command_page()),
+        ("api.md", api_page()),
+    ):
+        path = FOLDER / name
+        # An unchanged page is not read again.
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+    for page in (FOLDER / "api").glob("*.rst"):
+        module, _, name = page.stem.rpartition(".")
+        if name not in public_names(module):
+            page.unlink()
+
+
+# Parameters
+
+
+def parameters_page() -> str:
+    from napari_shadowinv import InversionOptions, OpticalSetup, ProtonSetup
+    from napari_shadowinv.recipes import ESTIMATES, FILTERS
+
+    parts = [
+        "# Parameters",
+        "The same parameters appear in napari's forms, in TOML files and in Python. "
+        "Lengths in px are pixels of the image that is inverted, after any binning.",
+        "## Filters",
+        "Chosen under *Filter first* in napari; see [](../filters.md).",
+        *(model_section(model, name) for name, model in FILTERS.items()),
+        "## Source estimates",
+        "Chosen under *Source* in napari; see [](../sources.md).",
+        *(model_section(model, name) for name, model in ESTIMATES.items()),
+        "## Setups",
+        "The geometry of the experiment. In napari under *Setup*; on the command line "
+        "`--setup setup.toml`.",
+        model_section(ProtonSetup, "proton", title="Particles"),
+        model_section(OpticalSetup, "optical", title="Light"),
+        "## Inversion options",
+        "In napari under *Options*; in Python the arguments of "
+        "{py:class}`~napari_shadowinv.InversionOptions`.",
+        model_table(InversionOptions),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def model_section(model: type[BaseModel], name: str, title: str = "") -> str:
+    heading = title or str(model.title)  # type: ignore[attr-defined]
+    summary = cleandoc(model.__doc__ or "").split("\n\n")[0]
+    place = "napari_shadowinv.recipes" if hasattr(model, "function") else "napari_shadowinv"
+    says = f"Named `{name}`; in Python {{py:class}}`~{place}.{model.__name__}`."
+    table = model_table(model) if model.model_fields else "No parameters."
+    return f"### {heading[:1].upper()}{heading[1:]}\n\n{summary} {says}\n\n{table}"
+
+
+def model_table(model: type[BaseModel]) -> str:
+    rows = [
+        "| field | in files and Python | unit | default | range | meaning |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, field in model.model_fields.items():
+        title, unit = title_and_unit(field.title or name)
+        cells = (
+            title,
+            f"`{name}`",
+            unit,
+            default_of(field),
+            range_of(field),
+            field.description or "",
+        )
+        rows.append("| " + " | ".join(escaped(cell) for cell in cells) + " |")
+    return "\n".join(rows)
+
+
+def title_and_unit(title: str) -> tuple[str, str]:
+    match = re.fullmatch(r"(.*\S)\s*\(([^()]+)\)", title)
+    return (match[1], match[2]) if match else (title, "")
+
+
+def default_of(field: FieldInfo) -> str:
+    if field.is_required():
+        return "*required*"
+    default = field.get_default(call_default_factory=True)
+    return "–" if default is None else f"`{default}`"
+
+
+def range_of(field: FieldInfo) -> str:
+    choices = literal_values(field.annotation)
+    if choices:
+        return ", ".join(f"`{choice}`" for choice in choices)
+    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+    limits = []
+    for limit in field.metadata:
+        limits += [
+            f"{sign} {getattr(limit, kind)}" for kind, sign in signs.items() if hasattr(limit, kind)
+        ]
+    return ", ".join(limits)
+
+
+def literal_values(annotation: Any) -> list[str]:
+    if get_origin(annotation) is Literal:
+        return [str(value) for value in get_args(annotation)]
+    return [value for part in get_args(annotation) for value in literal_values(part)]
+
+
+def escaped(text: str) -> str:
+    return text.replace("|", r"\|").replace("\n", " ")
+
+
+# The command
+
+
+def command_page() -> str:
+    from typer.main import get_command
+
+    from napari_shadowinv.cli import app
+
+    group: Any = get_command(app)
+    parts = [
+        "# The command `shadowinv`",
+        plain(group.help) + " `shadowinv COMMAND --help` shows what is below in the terminal.",
+        *(command_section(name, command) for name, command in group.commands.items()),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def command_section(name: str, command: Any) -> str:
+    kinds = get_type_hints(unwrap(command.callback))
+    arguments = [one for one in command.params if one.param_type_name == "argument"]
+    options = [one for one in command.params if one.param_type_name == "option"]
+    usage = " ".join(["shadowinv", name, "[OPTIONS]", *(one.name.upper() for one in arguments)])
+    parts = [f"## shadowinv {name}", f"    {usage}", plain(command.help)]
+    if arguments:
+        parts.append(definitions([(f"`{one.name.upper()}`", one) for one in arguments]))
+    panels: dict[str, list[tuple[str, Any]]] = {}
+    for option in options:
+        panel = getattr(option, "rich_help_panel", None) or "Options"
+        panels.setdefault(panel, []).append((flags(option, kinds.get(option.name)), option))
+    for panel, members in panels.items():
+        parts += [f"**{panel}**", definitions(members)]
+    if command.epilog:
+        parts.append(plain(command.epilog))
+    return "\n\n".join(parts)
+
+
+def definitions(members: list[tuple[str, Any]]) -> str:
+    return "\n\n".join(f"{term}\n: {meaning(one)}" for term, one in members)
+
+
+def meaning(parameter: Any) -> str:
+    text = plain(parameter.help) or "–"
+    default = getattr(parameter.default, "value", parameter.default)
+    is_shown = isinstance(default, str | int | float) and default is not False and default != ""
+    if is_shown and "efault" not in text:
+        text += f" Default: `{default}`."
+    return text
+
+
+def flags(option: Any, kind: Any) -> str:
+    names = ", ".join(f"`{name}`" for name in [*option.opts, *option.secondary_opts])
+    return names if option.is_flag else f"{names} `{option.metavar or shape_of(kind)}`"
+
+
+def shape_of(kind: Any) -> str:
+    """What is to be typed for a value of some type."""
+    for part in (kind, *get_args(kind)):
+        if isclass(part) and issubclass(part, Enum):
+            return "|".join(str(choice.value) for choice in part)
+        if part in _SHAPES:
+            return _SHAPES[part]
+    return "|".join(literal_values(kind)) or "VALUE"
+
+
+def plain(text: str | None) -> str:
+    """The words without rich's markup, a paragraph to a line, safe in Markdown."""
+    paragraphs = cleandoc(text or "").split("\n\n")
+    words = [" ".join(Text.from_markup(part).plain.split()) for part in paragraphs]
+    return "\n\n".join(re.sub(r"([*_<>\[\]|])", r"\\\1", part) for part in words)
+
+
+# Public names
+
+
+def api_page() -> str:
+    parts = [
+        "# Python",
+        "Arrays are `[y, x]`, vectors in axis order (y, x), a pixel's centre is at its integer "
+        "index; lengths are object-plane pixels unless a name or a unit says otherwise.",
+        "## napari_shadowinv",
+        summary("napari_shadowinv"),
+    ]
+    for name, title in MODULES.items():
+        module = f"napari_shadowinv.{name}"
+        parts += [f"## {module}", f"{title}.", summary(module)]
+    return "\n\n".join(parts) + "\n"
+
+
+def public_names(module: str) -> list[str]:
+    """Classes and functions for users that have no page elsewhere."""
+    names = list(import_module("napari_shadowinv").__all__)
+    if module == "napari_shadowinv":
+        return names
+    found = import_module(module)
+    return [
+        name
+        for name in found.__all__
+        if callable(getattr(found, name)) and name not in names and not name.startswith("checked_")
+    ]
+
+
+def summary(module: str) -> str:
+    lines = "\n".join(f"   {name}" for name in public_names(module))
+    return (
+        f"```{{eval-rst}}\n.. currentmodule:: {module}\n\n"
+        f".. autosummary::\n   :toctree: api\n   :nosignatures:\n\n{lines}\n```"
+    )

@@ -1,0 +1,111 @@
+"""What the tutorials show must work as it stands there, with the numbers that they tell."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from napari_shadowinv import InversionOptions, invert, read
+from napari_shadowinv.cli import app
+
+FOLDER = Path(__file__).parents[1] / "docs" / "tutorials"
+
+SETUP = """kind = "proton"
+energy = 14.7
+source_object_distance = 1.3e-3
+object_image_distance = 20e-3
+detector_pixel_size = 24.57e-6
+"""
+
+
+def text_of(page: str) -> str:
+    return (FOLDER / page).read_text(encoding="utf-8")
+
+
+def run_blocks(page: str) -> dict[str, object]:
+    names: dict[str, object] = {}
+    for block in re.findall(r"```python\n(.*?)```", text_of(page), re.DOTALL):
+        exec(compile(block, page, "exec"), names)
+    return names
+
+
+def test_the_script_finds_the_field_that_it_simulates(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = run_blocks("script.md")
+    assert names["report"].converged
+    assert names["report"].warnings == ()
+    assert names["report"].image_residual < 0.05
+    true_peak = names["true_strength"].max()
+    assert true_peak == pytest.approx(97, rel=0.01)
+    assert names["strength"].max() == pytest.approx(true_peak, rel=0.03)
+    assert names["linear_strength"].max() < 0.9 * true_peak
+    assert 0 < names["deviation"][0][names["place"]] < 0.1 * true_peak
+    assert names["peaks"] == pytest.approx([names["peaks"][0]] * 3, rel=0.03)
+    saved = read("toroid.shadowinv")
+    np.testing.assert_allclose(saved.potential, names["inversion"].potential)
+    assert "px²" in capsys.readouterr().out
+
+
+def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_blocks("proton-radiograph.md")
+    (tmp_path / "setup.toml").write_text(SETUP, encoding="utf-8")
+    (tmp_path / "other.toml").write_text(SETUP.replace("14.7", "3.0"), encoding="utf-8")
+    page = text_of("proton-radiograph.md")
+    commands = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
+    assert [line.split()[0] for line in commands] == ["invert", "forward"]
+    for line in commands:
+        result = CliRunner().invoke(app, shlex.split(line))
+        assert result.exit_code == 0, result.output
+    measured = read("shot.shadowinv")
+    assert float(measured.attrs["image_residual"]) == pytest.approx(0.0536, abs=5e-4)
+    from napari_shadowinv.io import setup_from_dataset
+
+    setup = setup_from_dataset(measured)
+
+    def peak(displacement):
+        return 1e3 * np.hypot(*setup.path_integrated_b(displacement)).max()
+
+    assert peak(np.asarray(measured.displacement)) == pytest.approx(15.0, abs=0.1)
+    uniform = invert(read("shot.tif").image, options=InversionOptions())
+    assert peak(uniform.displacement) == pytest.approx(13.7, abs=0.1)
+    assert uniform.report.image_residual == pytest.approx(0.0441, abs=5e-4)
+    assert any("reaches the image's edge" in text for text in uniform.report.warnings)
+
+
+@pytest.mark.parametrize("page", sorted(FOLDER.glob("*.md")), ids=lambda page: page.stem)
+def test_the_pictures_and_pages_of_a_tutorial_exist(page):
+    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8"))
+    assert targets
+    for target in targets:
+        assert (FOLDER / target).exists(), target
+
+
+def test_the_table_of_sources_is_as_the_inversions_say():
+    from napari_shadowinv._napari.samples import four_toroids
+    from napari_shadowinv.physics import phantoms
+    from napari_shadowinv.recipes import ESTIMATES
+
+    (source, *_), (image, *_) = four_toroids()
+    setup = phantoms.paper_setup()
+    truth = phantoms.four_toroids(image.shape, setup, 0.8).displacement
+    assert 1e3 * np.hypot(*setup.path_integrated_b(truth)).max() == pytest.approx(10.8, abs=0.05)
+    rows = re.findall(r"^\| ([a-z].*?) \| ([\d.]+) \| (\d+) \|", text_of("no-reference.md"), re.M)
+    by_title = {f"estimate: {model.title}": model for model in ESTIMATES.values()}
+    by_title["uniform"] = ESTIMATES["uniform"]
+    assert len(rows) == 5
+    for title, peak, error in rows:
+        beam = source if title.startswith("the one") else by_title[title]().source(image, None)
+        found = invert(image, source=beam)
+        strength = 1e3 * np.hypot(*setup.path_integrated_b(found.displacement))
+        assert strength.max() == pytest.approx(float(peak), abs=0.06), title
+        wrong = 100 * np.linalg.norm(found.displacement - truth) / np.linalg.norm(truth)
+        assert wrong == pytest.approx(float(error), abs=0.6), title
+        assert 100 * found.report.image_residual == pytest.approx(4.25, abs=0.1), title
+        warned = any("reaches the image's edge" in text for text in found.report.warnings)
+        assert warned == title.startswith("estimate"), title
