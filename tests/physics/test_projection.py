@@ -171,7 +171,7 @@ def test_what_cannot_be_transferred_is_said(field: np.ndarray) -> None:
         transferred_displacement(field, GREEN, RED, deflector="magnetic field")
     with pytest.raises(InputError, match="deflector is 'gravity': it must be one of magnetic"):
         transferred_displacement(field, FAST, SLOW, deflector="gravity")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="dispersion is 2, but a plasma has none"):
+    with pytest.raises(InputError, match="dispersion is 2, but it does not apply to a plasma"):
         transferred_displacement(field, GREEN, RED, deflector="plasma", dispersion=2.0)
     with pytest.raises(InputError, match="dispersion is nan"):
         transferred_displacement(field, GREEN, RED, dispersion=math.nan)
