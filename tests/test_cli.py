@@ -236,7 +236,7 @@ def test_colour_film_by_channel(folder: Path) -> None:
     image = content["image"].values
     np.testing.assert_allclose(image / image.sum(), red / red.sum())
     warnings = json.loads(content.attrs["report"])["warnings"]
-    assert warnings[-1].startswith("channel 'red' of a colour image was taken as the fluence")
+    assert warnings[-1].startswith("channel 'red' of a colour image was used as the fluence")
 
 
 def test_grey_film_is_told_but_a_linear_image_is_not(folder: Path) -> None:
@@ -460,7 +460,7 @@ def test_forward_to_another_energy(folder: Path, shot: Path) -> None:
     arguments = ["forward", "shot.shadowinv", "--setup", "low.toml", "--out"]
     result = shadowinv(*arguments, "low.npy")
     assert result.exit_code == 0, result.output
-    assert "as if a magnetic field alone deflected" in result.stdout
+    assert "assuming that only a magnetic field deflects the beam" in result.stdout
     assert "3 MeV proton" in result.stdout
     # Momenta in MeV/c, from T (T + 2 m c²).
     ratio = (14.7 * (14.7 + 2 * 938.27209) / (3.0 * (3.0 + 2 * 938.27209))) ** 0.5
@@ -1048,7 +1048,7 @@ def test_neither_result_nor_figure_is_left_on_a_full_disk(
         assert result.exit_code == 2
         (line,) = result.stderr.splitlines()
         assert f"{disk}/a." in line
-        assert "cannot be written (No space left on device): make room" in line
+        assert "cannot be written (No space left on device): free some disk space" in line
         assert [path.name for path in disk.iterdir()] == ["other"]
         assert sorted(content(shot.parent)) == ["shot.npy"]
 

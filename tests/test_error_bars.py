@@ -226,7 +226,7 @@ def test_cancelling_among_the_samples_ends_them(counts, plan):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ({"n": 1}, "n is 1, expected a whole number of samples, 2 at least"),
+        ({"n": 1}, "n is 1, expected a whole number of samples, at least 2"),
         ({"n": 2.5}, "n is 2.5, expected a whole number"),
         ({"noise": "gauss"}, "noise is 'gauss', expected 'poisson', a standard deviation"),
         ({"noise": None}, "noise has values of type object"),

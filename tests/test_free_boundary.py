@@ -169,8 +169,8 @@ def test_choices_that_do_not_go_together_are_refused(options, says):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (CLOSED, "plan was made for a free boundary and options say 'closed'"),
-        (FREE.model_copy(update={"margin": 9}), "margin of 5 px and options ask for 9 px"),
+        (CLOSED, "plan was made for a free boundary but options have 'closed'"),
+        (FREE.model_copy(update={"margin": 9}), "margin of 5 px but options ask for 9 px"),
     ],
 )
 def test_a_plan_for_another_boundary_is_refused(plan, options, says):

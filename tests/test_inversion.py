@@ -287,7 +287,7 @@ def test_a_start_does_not_need_the_very_plan_but_its_sites(image):
     assert again.report.iterations == 0
     other = InversionOptions(seed=1)
     for others in ({"options": other}, {"options": InversionOptions(n_sites=900)}):
-        with pytest.raises(InputError, match="start has 4,800 sites that are not the"):
+        with pytest.raises(InputError, match="start has 4,800 sites that differ from the"):
             invert(image * source, source=source, start=before, **others)
 
 

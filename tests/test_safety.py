@@ -100,7 +100,7 @@ def test_what_unfolds_to_too_much_is_refused_and_told_how_to_allow_it(
     path = tmp_path / name
     LARGE[name](path)
     monkeypatch.setenv(LIMIT_VARIABLE, "1e-5")  # 10 kB, and the image takes 16 in memory
-    with pytest.raises(FileFormatError, match=f"unfolds to 1.6e-05 GB .* {LIMIT_VARIABLE}"):
+    with pytest.raises(FileFormatError, match=f"expands to 1.6e-05 GB .* {LIMIT_VARIABLE}"):
         read(path)
     monkeypatch.setenv(LIMIT_VARIABLE, "1")
     assert read_radiograph(path).image.shape == IMAGE.shape

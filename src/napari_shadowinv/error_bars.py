@@ -1,7 +1,7 @@
-"""How far the noise of an image moves its field.
+"""Error bars: how image noise affects the retrieved field.
 
 - error bars for the potential and the displacement at every pixel: `uncertainty`
-- what comes out: `Uncertainty`
+- result: `Uncertainty`
 
 The noise is added to the image once more, again and again, and each such sample is inverted
 on the same sites, from the weights of the image itself. The scatter of the samples is the
@@ -58,7 +58,7 @@ _BYTES_PER_SITE, _BYTES_PER_PIXEL = 700, 150  # measured peaks of one sample, ro
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """An inversion with the scatter that the noise of its image gives it.
+    """An inversion with its scatter due to image noise.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Uncertainty:
     converged : tuple of bool
         Whether each sample met the tolerance.
     warnings : tuple of str
-        What the user should know before trusting the deviations.
+        Reasons to doubt the deviations.
     """
 
     inversion: Inversion
@@ -130,7 +130,7 @@ def uncertainty(
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Uncertainty:
-    """Find how far the noise of an image can have moved its potential and displacement.
+    """Estimate the uncertainty of potential and displacement due to image noise.
 
     Each of `n` samples is the image with fresh noise on top, inverted like the image. The
     image has its own noise already, so samples are noisier than the image; but all
@@ -144,7 +144,7 @@ def uncertainty(
     image : array_like, shape (H, W)
         The shot, as it was recorded: before filters, which correlate and weaken its noise.
     n : int
-        Samples, two at least.
+        Number of samples, at least two.
     source, mask, options, plan, on_progress, should_stop
         See `invert`. Samples are worked on side by side in as many threads as the options
         allow and memory has room for; the result does not depend on it. Random numbers come

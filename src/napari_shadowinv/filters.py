@@ -90,7 +90,7 @@ def low_pass(image: ArrayLike, width: float) -> FloatArray:
 
 
 def high_pass(image: ArrayLike, width: float, *, keep_mean: bool = True) -> FloatArray:
-    """Take away what a Gaussian blur would keep.
+    """Remove the structures that a Gaussian blur would keep.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def remove_hot_pixels(
     size: int = 3,
     should_stop: ShouldStop | None = None,
 ) -> tuple[FloatArray, BoolArray, BoolArray]:
-    """Replace pixels that stand out of their neighbourhood by its median.
+    """Replace outlying pixels by the median of their neighbourhood.
 
     Parameters
     ----------
@@ -308,13 +308,13 @@ def remove_hot_pixels(
     is fitted to them. The estimate includes the noise of the median itself, some 10 %; in
     a slope of several deviations per pixel, the slope as well.
 
-    Caustics and foci stand out of their surroundings too, but not alone. So a broken pixel
-    must also differ, by half the threshold, from all of its neighbours but as many as could
+    Caustics and foci also stand out, but span several pixels. A broken pixel must therefore
+    also differ, by half the threshold, from all of its neighbours except as many as could
     be broken with it. The peak of a focus or line of less than some 4 px is still replaced,
     if its brightness is many deviations: compare `hot` with the image, raise the threshold.
 
-    A dead pixel stands out of N counts by √N deviations: below threshold² counts it cannot
-    be told from noise.
+    A dead pixel among N counts stands out by √N standard deviations: below threshold² counts
+    it cannot be distinguished from noise.
 
     Examples
     --------
@@ -395,7 +395,7 @@ def fit_polynomial(
     mask: ArrayLike | None = None,
     should_stop: ShouldStop | None = None,
 ) -> FloatArray:
-    """Polynomial in y and x fitted to an image, little moved by what stands out of it.
+    """Fit a polynomial in y and x to an image, robust against outliers.
 
     Parameters
     ----------

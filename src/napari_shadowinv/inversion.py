@@ -1,8 +1,8 @@
-"""The whole way from an image to a deflection potential.
+"""Inversion of an image to its deflection potential.
 
 - invert an image: `invert`
 - prepare the sites once for many images with one source: `plan_sites`; how many: `count_sites`
-- what comes out: `Inversion`, with a `Report` of how it went
+- results: `Inversion`, with a `Report`
 """
 
 from __future__ import annotations
@@ -53,34 +53,34 @@ _READ, _STEPS = 30, 100
 
 @dataclass(frozen=True)
 class Report:
-    """How an inversion went.
+    """Report on an inversion.
 
     Attributes
     ----------
     converged : bool
         Whether the flux residual fell below the tolerance.
     iterations : int
-        Solver steps, all levels together.
+        Solver iterations, summed over all levels.
     residual : float
         Largest relative flux error of a cell, max ``|T - S| / S``.
     tolerance : float
-        The residual that was asked for.
+        The residual required for convergence.
     n_sites : int
         Number of sites.
     floor : float
         Smallest intensity allowed in the image, as a share of its mean.
     floored_pixels : int
-        Pixels that were raised to the floor, clipped ones included.
+        Pixels raised to the floor, including clipped ones.
     clipped_pixels : int
-        Pixels that were negative and set to zero.
+        Negative pixels set to zero.
     levels : tuple of (int, int, float)
         Sites, solver steps and final residual of each level, coarse to fine.
     seconds : dict of str to float
         Time of each stage: prepare, sites, transport, read-out.
     warnings : tuple of str
-        What the user should know before trusting the result.
+        Reasons to doubt the result.
     flux_scale : float
-        What the image was divided by to bring it to the units of the source.
+        Factor by which the image was divided to match the source.
     flux_left, flux_entered : dict of str to float
         With a free boundary the flux that crossed each side of the image (top, bottom, left,
         right), as a share of the source's flux in the image; else empty.
@@ -122,8 +122,8 @@ class Inversion:
     potential : ndarray, shape (H, W)
         Normalised deflection potential in px²; its mean over the image's border is 0.
     displacement : ndarray, shape (2, H, W)
-        Displacement of the ray that starts at each pixel, minus the gradient of the
-        potential, in px.
+        Displacement of the ray through each pixel, minus the gradient of the potential,
+        in px.
     sites : ndarray, shape (n, 2)
         Positions of the sites.
     weights : ndarray, shape (n,)
@@ -136,7 +136,7 @@ class Inversion:
     site_displacement : ndarray, shape (n, 2)
         Centroid of each site's cell in the image minus that in the source, px.
     reprojection : ndarray, shape (H, W)
-        The image that the retrieved displacement makes of the source.
+        The source as displaced by the retrieved field.
     residual : ndarray, shape (H, W)
         ``image - reprojection``.
     caustic : ndarray of bool, shape (H, W)
@@ -144,9 +144,9 @@ class Inversion:
     mask : ndarray of bool, shape (H, W)
         The pixels that were used; image, source, residual and caustic are 0 elsewhere.
     report : Report
-        How it went.
+        Convergence, timing and warnings.
     options : InversionOptions
-        The choices that made it.
+        The options used.
     """
 
     image: Array
@@ -166,12 +166,12 @@ class Inversion:
     options: InversionOptions
 
     def with_warnings(self, texts: Iterable[str]) -> Inversion:
-        """Return the same with more to know before trusting it, such as doubts of its source.
+        """Return the same inversion with additional warnings, such as doubts about its source.
 
         Parameters
         ----------
         texts : iterable of str
-            Sentences that are added to those of the report.
+            Warnings to append to those of the report.
 
         Returns
         -------
@@ -222,7 +222,7 @@ def plan_sites(
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> SitePlan:
-    """Spread the sites over a source, once for all images that share it.
+    """Place the sites over a source, once for all images that share it.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ def plan_sites(
 def count_sites(
     source: ArrayLike, options: InversionOptions, *, mask: ArrayLike | None = None
 ) -> int:
-    """Return how many sites `plan_sites` would spread, which takes no time.
+    """Return the number of sites `plan_sites` would place, without placing them.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def count_sites(
     Returns
     -------
     int
-        With a free boundary those in the margin, too.
+        With a free boundary, including those in the margin.
 
     Raises
     ------
@@ -336,33 +336,33 @@ def invert(
     image : array_like, shape (H, W)
         The shot: counts or any linear measure of fluence.
     source : array_like, shape (H, W), optional
-        The undisturbed beam. Default: uniform. Image and source are brought to the same
-        flux, so their units need not match.
+        The undisturbed beam. Default: uniform. The image is scaled to the flux of the source,
+        so their units need not match.
     mask : array_like of bool, shape (H, W), optional
-        True where a pixel of the detector can be used. Others (written on, saturated, beyond
-        the film) carry no flux on either side; the field there is only a smooth
-        continuation. What stands in the beam belongs into `source`, as zeros, instead: its
-        shadow moves with the rays.
+        True at usable detector pixels. Other pixels (handwriting, saturation, beyond the edge
+        of the film) carry no flux in image or source; the field there is only a smooth
+        continuation. Set opaque obstacles to zero in `source` instead: their shadows move
+        with the rays.
     options : InversionOptions, optional
-        Choices; the default suits most images.
+        Options; the defaults suit most images.
     plan : SitePlan, optional
         Sites prepared by `plan_sites`; its source and mask are used, and `source` and `mask`
         must be left out.
     start : Inversion, optional
-        Of a similar image on the same sites, best made with the same `plan`: the shot before,
-        or this one with another filter. The solver starts from its weights and is done in a few
-        steps where the images are alike; where it does not get on from there it starts afresh.
-        The answer is the same within the tolerance.
+        Inversion of a similar image on the same sites, preferably with the same `plan`: the
+        previous shot, or this one with a different filter. The solver starts from its weights
+        and needs only a few iterations if the images are similar; if it stalls, it restarts
+        from scratch. The result is the same within the tolerance.
     on_progress : callable, optional
-        Receives a `napari_shadowinv.progress.Progress` now and then.
+        Called regularly with a `napari_shadowinv.progress.Progress`.
     should_stop : callable, optional
-        Asked now and then; when it returns true the inversion ends.
+        Called regularly; the inversion is cancelled when it returns true.
 
     Returns
     -------
     Inversion
-        Also where the solver did not converge: `Inversion.report` then says how far
-        it got and why.
+        Returned even if the solver did not converge; `Inversion.report` then gives the
+        residual and the reason.
 
     Raises
     ------

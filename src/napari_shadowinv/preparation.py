@@ -1,7 +1,7 @@
-"""What is done to a shot before its inversion: filters, then a guess of its undisturbed beam.
+"""Preparation of a shot before its inversion: filters, then an estimate of its source.
 
-- all of it, in order: `Preparation`
-- masks that contradict each other: `check_masks`
+- filters and estimate, in order: `Preparation`
+- detect contradictory masks: `check_masks`
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MOST_FALL = 10.0  # times below the dimmest pixel seen
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
-    """Filters, one after the other, and how the source is guessed from what they leave.
+    """Filters to apply in order, and the source estimate to apply to the filtered shot.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Preparation:
     estimate : Estimate, optional
         Likewise. Default: the source is measured, or uniform.
     bare : ndarray of bool, shape (H, W), optional
-        Pixels where the object is not; the estimate looks at no others.
+        Pixels not covered by the object; the estimate uses only these.
     """
 
     filters: tuple[Filter, ...] = ()
@@ -54,7 +54,7 @@ class Preparation:
         return "; ".join(one.described for one in self.filters)
 
     def check(self, *, has_source: bool, mask: Mask | None) -> None:
-        """Refuse what contradicts itself, before any work.
+        """Reject contradictory choices before any work is done.
 
         Parameters
         ----------
@@ -127,7 +127,7 @@ class Preparation:
         *,
         by: Callable[..., Image] | None = None,
     ) -> Image:
-        """Guess the source of a shot that is filtered.
+        """Estimate the source of a filtered shot.
 
         Parameters and errors are those of `filtered`, but for `on_warning`: it receives a
         sentence where the estimate has to be doubted (default: `warnings.warn`); and `by`, what
@@ -153,7 +153,7 @@ def _as_beam(image: NDArray[Any], mask: Mask | None) -> Image:
 
 
 def check_masks(mask: Mask | None, bare: Mask | None) -> None:
-    """Refuse a mask that takes the object, which the source mask tells of, out of the inversion.
+    """Reject a mask that excludes the object, as marked by the source mask, from the inversion.
 
     Parameters
     ----------

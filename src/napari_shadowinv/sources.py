@@ -1,7 +1,7 @@
 """Estimates of the undisturbed beam, from an image that the object has already modulated.
 
 An inversion needs the source: the image that the beam would make without the object. Where
-none was recorded, or the beam changes from shot to shot, it has to be guessed from the shot.
+none was recorded, or the beam changes from shot to shot, it must be estimated from the shot.
 
 - the beam is flat, or nothing is known: `uniform_source`; whether it can be: `uniform_warnings`
 - a point shines evenly in all directions: `isotropic_source`; how far away: `point_distance`
@@ -16,7 +16,7 @@ others (dead areas, handwriting, a shadow) may hold anything, NaN too, and are f
 An estimate that rises there to ten times the brightest pixel it saw is refused.
 Those that take long ask `should_stop` at each of their steps.
 
-What an estimate takes for the beam is lost from the object, and the other way round. The
+Structure that an estimate attributes to the beam is lost from the object, and vice versa. The
 choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179, section V.
 """
 
@@ -423,10 +423,10 @@ def total_variation_source(
     image : array_like, shape (H, W)
         The shot; counts or any linear measure of fluence.
     weight : float, default 2
-        How much is taken away, in px: a disc of radius r px is lowered by 2·weight/r of the
+        Strength of the smoothing, in px: a disc of radius r px is lowered by 2·weight/r of the
         image's mean. So it takes c·r/2 to remove a disc of contrast c.
     iterations : int, default 1000
-        Most steps of the minimisation; an object of radius r px needs about r² of them.
+        Maximum iterations; an object of radius r px needs about r².
     mask : array_like of bool, shape (H, W), optional
         True where a pixel is usable. Default: everywhere. The others are first filled as by
         `interpolated_source`.
@@ -487,8 +487,8 @@ def interpolated_source(
     mask : array_like of bool, shape (H, W)
         True where the image shows the bare beam, False where the object is.
     width : float, default 5
-        Length in px over which the surroundings are smoothed before they are continued, so
-        that noise next to the gap does not spread into it. Wider gaps need wider smoothing.
+        Standard deviation in px of the blur applied to the surroundings before they are
+        extrapolated, so that noise does not spread into the gap. Wider gaps need more blur.
     kind : {"biharmonic", "laplace"}, default "biharmonic"
         "biharmonic" continues slope and curvature of the beam: for gaps inside the image.
         "laplace" never leaves the range of the surroundings: for gaps at the image's edge.

@@ -24,7 +24,7 @@ def test_checksum_is_sha256_of_content(tmp_path: Path) -> None:
         ("größe µm".encode(), "a text file"),
         (b"PK\x03\x04rest", "zip archive"),
         (b"%PDF-1.7", "PDF"),
-        (bytes(range(128, 200)), "not an image"),
+        (bytes(range(128, 200)), "not in a recognised image format"),
     ],
 )
 def test_other_content_is_named(tmp_path: Path, content: bytes, found: str) -> None:

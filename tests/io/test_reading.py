@@ -94,7 +94,9 @@ def test_planar_colour_tiff(tmp_path: Path) -> None:
 def test_colour_needs_a_choice_that_exists(tmp_path: Path) -> None:
     path = tmp_path / "film.png"
     iio.imwrite(path, colours())
-    with pytest.raises(InputError, match=r'3 channels: convert .* dose .* "red", "green", "blue"'):
+    with pytest.raises(
+        InputError, match=r'3 channels: .* convert it to dose .* "red", "green", "blue"'
+    ):
         read(path)
     for channel in ("purple", 3, "-1"):
         with pytest.raises(InputError, match="no channel"):

@@ -138,7 +138,7 @@ def test_pradreader_selects_rows_and_columns_by_their_share(tmp_path: Path) -> N
 def test_other_blocks_than_the_header_tells_are_refused(
     tmp_path: Path, header: tuple[str, ...], blocks: int
 ) -> None:
-    with pytest.raises(FileFormatError, match=r"rows of 7 numbers, but its header tells flux2D"):
+    with pytest.raises(FileFormatError, match=r"rows of 7 numbers, but its header gives flux2D"):
         read_radiograph(pradreader(tmp_path / "input.txt", *header, blocks=blocks))
 
 
@@ -154,7 +154,7 @@ def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (("# a", "1 2 3", "", "4 5"), r"line 4 has 2 numbers, the first row 3"),
+        (("# a", "1 2 3", "", "4 5"), r"line 4 has 2 numbers, but the first row has 3"),
         (("1 2", "3 four"), r"line 2 has 'four'"),
         (("1,2", "3,"), r"line 2 has 1 numbers"),
         (("1,2", ",3"), r"line 2 has ''"),

@@ -154,12 +154,14 @@ def test_source_gives_the_shape_of_the_image() -> None:
     source = np.full((20, 24), 7.0)
     image = project(np.zeros((2, *SHAPE)), FAST, FAST, source=source)
     np.testing.assert_allclose(image, source)
-    with pytest.raises(InputError, match=r"\(60, 24\) .* known on \(48, 56\)"):
+    with pytest.raises(InputError, match=r"\(60, 24\) .* known only on \(48, 56\)"):
         project(np.zeros((2, *SHAPE)), FAST, FAST, source=np.ones((60, 24)))
 
 
 def test_what_cannot_be_transferred_is_said(field: np.ndarray) -> None:
-    with pytest.raises(InputError, match="kind 'proton' and is to be seen with kind 'optical'"):
+    with pytest.raises(
+        InputError, match="kind 'proton', but the image is requested for kind 'optical'"
+    ):
         transferred_displacement(field, FAST, GREEN)
     with pytest.raises(InputError, match=r"wavelengths differ .* choose 'plasma'"):
         transferred_displacement(field, GREEN, RED)
@@ -169,7 +171,7 @@ def test_what_cannot_be_transferred_is_said(field: np.ndarray) -> None:
         transferred_displacement(field, GREEN, RED, deflector="magnetic field")
     with pytest.raises(InputError, match="deflector is 'gravity': it must be one of magnetic"):
         transferred_displacement(field, FAST, SLOW, deflector="gravity")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="dispersion is 2, but a plasma has none"):
+    with pytest.raises(InputError, match="dispersion is 2, but it does not apply to a plasma"):
         transferred_displacement(field, GREEN, RED, deflector="plasma", dispersion=2.0)
     with pytest.raises(InputError, match="dispersion is nan"):
         transferred_displacement(field, GREEN, RED, dispersion=math.nan)

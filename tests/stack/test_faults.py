@@ -355,7 +355,7 @@ def test_the_disk_full_while_writing(make_night, small_disk):
     night = make_night(40)
     folder, resize = small_disk
     out = folder / "night.shadowinv.zarr"
-    with pytest.raises(OSError, match=r"No space left on device\): make room"):
+    with pytest.raises(OSError, match=r"No space left on device\): free some disk space"):
         night.run(out)
     before = read(out)
     done = before.status.values == DONE

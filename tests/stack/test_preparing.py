@@ -117,10 +117,7 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
     night.run(out, **begun)
     assert (night.run(out, **begun).status == DONE).all()
     for change, named in (
-        (
-            {"filters": (LowPassFilter(width=1.5),)},
-            "different filters .low-pass .smooth., width 1.0",
-        ),
+        ({"filters": (LowPassFilter(width=1.5),)}, "different filters .low-pass .smooth., width 1"),
         ({"filters": ()}, "different filters"),
         ({"source": LowPassEstimate(width=7)}, "different source image"),
         ({"source": None, "source_mask": None}, "different source image"),
