@@ -1,6 +1,7 @@
 # make demo   simulate and invert the paper's toroidal shot, write figures to demo/
 # make test   check style and types, build the site, then run the whole test suite
 # make docs   build the documentation site into build/docs; GALLERY=1 runs the examples for it, too
+# make test-oldest  test the core with the lowest versions that pyproject.toml allows
 # make gallery make the pictures of docs/gallery.md again
 # make dist   build the source distribution and the wheel in dist/
 # make check-wheel  install the wheel into an empty environment and use it there
@@ -11,8 +12,15 @@ VENV := .venv
 BIN := $(VENV)/bin
 ON_SCREEN := xvfb-run -a -s "-screen 0 2560x1440x24"
 ON_BOTH_CORES := -n 2 --dist loadfile
+OLDEST := .venv-oldest
+OLDEST_TOOLS := "pytest>=8.2" "pytest-xdist>=3.6" "hypothesis>=6.100" "shapely>=2.0" "pyamg>=5.1" \
+	"pyyaml>=6.0" "threadpoolctl>=3.2"
+CORE_TESTS := tests/geometry tests/transport tests/physics tests/io tests/test_inversion.py \
+	tests/test_free_boundary.py tests/test_cli.py tests/test_filters.py tests/test_sources.py \
+	tests/test_film.py tests/test_plotting.py tests/test_readout.py tests/test_trust.py \
+	tests/stack/test_lazy.py tests/stack/test_run.py tests/stack/test_statistics.py
 
-.PHONY: demo test docs gallery lint dist check-wheel format clean
+.PHONY: demo test test-oldest docs gallery lint dist check-wheel format clean
 
 demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
@@ -29,6 +37,14 @@ test: lint docs
 	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES)
 	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES) -q \
 		tests/napari/widgets/test_tools.py tests/napari/widgets/test_forms.py
+
+# Without pytest-qt its setting is unknown, so the configuration is not strict here.
+test-oldest: $(VENV)/installed-dev
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(OLDEST)
+	$(BIN)/uv pip install --quiet --python $(OLDEST)/bin/python --resolution lowest-direct \
+		--editable . $(OLDEST_TOOLS)
+	NUMBA_CACHE_DIR=$(CURDIR)/$(OLDEST)/numba $(OLDEST)/bin/python -m pytest \
+		-o addopts="--strict-markers --import-mode=importlib" $(ON_BOTH_CORES) -q $(CORE_TESTS)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
@@ -61,4 +77,4 @@ $(BIN)/pip:
 	$(BIN)/pip install --quiet --upgrade pip
 
 clean:
-	rm -rf $(VENV) demo dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLDEST) demo dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
