@@ -23,7 +23,7 @@ def test_an_image_of_the_same_size_lies_on_the_result(
         told.clear()
         other = viewer.add_image(data, name="other")
         assert frame_of(other) == frame
-        assert f"'{other.name}' has as many pixels as 'a |∫B×dz| (mT·m)'" in told[-1]
+        assert f"'{other.name}' has the same size in pixels as 'a |∫B×dz| (mT·m)'" in told[-1]
         assert "1.5 µm" in told[-1]
     np.savetxt(tmp_path / "other.txt", np.ones((40, 52)))
     (opened,) = viewer.open(tmp_path / "other.txt", plugin="napari-shadowinv")

@@ -121,7 +121,7 @@ def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
     before = store.stat().st_mtime_ns
     refused = batch("--setup", "setup.toml")
     assert refused.exit_code == 2
-    assert "exists (6 done, 0 failed, 0 pending): go on with --resume" in flat(refused.output)
+    assert "exists (6 done, 0 failed, 0 pending): use --resume to continue" in flat(refused.output)
     assert batch("--resume", "--overwrite").exit_code == 2
     assert store.stat().st_mtime_ns == before
     resumed = batch("--setup", "setup.toml", "--resume")

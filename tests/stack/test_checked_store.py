@@ -41,7 +41,7 @@ def test_the_count_of_a_report_is_looked_at_first(store):
     chunk.write_bytes(np.uint32(2**31 - 1).tobytes() + chunk.read_bytes()[4:])
     tracemalloc.start()
     start = time.perf_counter()
-    with pytest.raises(FileFormatError, match="promises 2147483647"):
+    with pytest.raises(FileFormatError, match="implies 2147483647"):
         StackStore(store).reports()
     assert time.perf_counter() - start < 2
     assert tracemalloc.get_traced_memory()[1] < 20_000_000
@@ -53,7 +53,7 @@ def test_the_bytes_of_a_packed_chunk_are_looked_at_first(store):
     chunk = store / "potential" / "c" / "0" / "0" / "0"
     head = chunk.read_bytes()
     chunk.write_bytes(head[:4] + np.uint32(2**31 - 1).tobytes() + head[8:])
-    with pytest.raises(FileFormatError, match="promises 2147483647"):
+    with pytest.raises(FileFormatError, match="implies 2147483647"):
         read_stack(store)["potential"][0].load()
 
 

@@ -225,7 +225,7 @@ def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
             return read_radiograph(path), index
         except (FileFormatError, InputError) as error:
             mistakes.append(str(error))
-    raise FileFormatError(f"none of the {len(paths)} files can be read as a shot: {mistakes[0]}")
+    raise FileFormatError(f"none of {len(paths)} files can be read as a shot: {mistakes[0]}")
 
 
 def _plane_of(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -209,7 +209,7 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     tool.panel.button.click()
     assert tool.panel.button.text() == "Cancelling…"
     qtbot.waitUntil(lambda: at_rest(tool), timeout=PATIENCE)
-    assert tool.panel.status.text() == "Cancelled: 2 of 4 done; Run goes on from there."
+    assert tool.panel.status.text() == "Cancelled: 2 of 4 done; press Run to resume."
     assert StackStore(out).statuses().tolist() == [DONE, DONE, PENDING, PENDING]
     before = written(out)
     assert len(before) == 2
@@ -288,7 +288,7 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     expect("address is ''")
     monkeypatch.setattr(_engines, "_CONNECT_SECONDS", 0.3)
     tool.engine.address.setText("tcp://127.0.0.1:9")
-    expect("o scheduler answers at tcp://127.0.0.1:9")
+    expect("o scheduler responds at tcp://127.0.0.1:9")
     tool.engine.picker.set_kind("threads")
     tool.shots.picker.set_kind("files")
     expect("o files are selected")

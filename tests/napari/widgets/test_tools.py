@@ -189,7 +189,7 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
 
     expected = project(solved.displacement, proton_setup, slow)
     np.testing.assert_allclose(image(), expected)
-    assert "magnetic field alone" in tool.warning.text()
+    assert "only a magnetic field deflects the beam" in tool.warning.text()
     tool.deflector.setCurrentText("electric field")
     expected = project(solved.displacement, proton_setup, slow, deflector="electric field")
     np.testing.assert_allclose(image(), expected)
