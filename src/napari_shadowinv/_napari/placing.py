@@ -58,8 +58,8 @@ def _receive(layer: Any, fields: list[Any]) -> None:
     for name, value in frame.keywords(stacked=layer.ndim > 2).items():
         setattr(layer, name, value)
     show_info(
-        f"'{layer.name}' has the same size in pixels as '{alike[-1].name}': it was placed at the same "
-        f"position, with pixels of {frame.scale[-1]:.4g} {alike[-1].units[-1]:~P}"
+        f"'{layer.name}' has the same size in pixels as '{alike[-1].name}': it was placed at the "
+        f"same position, with pixels of {frame.scale[-1]:.4g} {alike[-1].units[-1]:~P}"
     )
 
 
