@@ -300,7 +300,7 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool.shots.layers.layer = window.add_image(np.ones((*SHAPE, 3)), rgb=True)
     expect("colour image")
     window.layers.clear()
-    expect("not a stack of shots")
+    expect("no stack of shots")
     assert sorted(path.name for path in tmp_path.glob("*.zarr")) == [out.name]
 
 
