@@ -243,7 +243,8 @@ class TestRefusals:
 
     def test_a_shot_that_is_not_given_any_more(self, night, out):
         night.path(3).unlink()
-        with pytest.raises(InputError, match=r"different shots \(6 there, 5 given, without shot_3.npy"):
+        told = r"different shots \(6 there, 5 given, without shot_3.npy"
+        with pytest.raises(InputError, match=told):
             night.run(out)
 
     def test_another_order(self, night, out):

@@ -179,7 +179,9 @@ def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
     places = {name: place for place, name in enumerate(names)}
     lost = [name for name in store.names if name not in places]
     if lost or len(places) < len(names):
-        missing = f"{count} there, {len(names)} given, without {lost[0]}" if lost else "different order"
+        missing = (
+            f"{count} there, {len(names)} given, without {lost[0]}" if lost else "different order"
+        )
         raise InputError(f"{store.path} was started with different shots ({missing}): {_INSTEAD}")
     known = [places[name] for name in store.names]
     # What came in one run keeps its order; later runs may have brought what sorts before it.
