@@ -11,7 +11,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_ext"))
 
 project = "napari-shadowinv"
-author = "The napari-shadowinv developers"
+author = "The napari-shadowinv contributors"
 project_copyright = author
 version = release = version_of("napari-shadowinv")
 
