@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib.metadata import version as version_of
 from pathlib import Path
+
+from napari_shadowinv import __version__
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_ext"))
@@ -13,7 +14,7 @@ sys.path.insert(0, str(HERE / "_ext"))
 project = "napari-shadowinv"
 author = "The napari-shadowinv contributors"
 project_copyright = author
-version = release = version_of("napari-shadowinv")
+version = release = __version__
 
 extensions = [
     "myst_parser",
