@@ -15,10 +15,9 @@ ON_BOTH_CORES := -n 2 --dist loadfile
 OLDEST := .venv-oldest
 OLDEST_TOOLS := "pytest>=8.2" "pytest-xdist>=3.6" "hypothesis>=6.100" "shapely>=2.0" "pyamg>=5.1" \
 	"pyyaml>=6.0" "threadpoolctl>=3.2"
-CORE_TESTS := tests/geometry tests/transport tests/physics tests/io tests/test_inversion.py \
-	tests/test_free_boundary.py tests/test_cli.py tests/test_filters.py tests/test_sources.py \
-	tests/test_film.py tests/test_plotting.py tests/test_readout.py tests/test_trust.py \
-	tests/stack/test_lazy.py tests/stack/test_run.py tests/stack/test_statistics.py
+CORE_TESTS := tests/geometry tests/transport tests/physics tests/io tests/inversion tests/preprocessing \
+	tests/test_cli.py tests/test_plotting.py tests/stack/test_lazy.py tests/stack/test_run.py \
+	tests/stack/test_statistics.py
 
 .PHONY: demo test test-oldest docs gallery lint dist check-wheel format clean
 

@@ -216,9 +216,9 @@ def read_whole(path: Path) -> None:
     """Read all that the package reads of a file."""
     from napari_shadowinv.cli._batch import status_tables
     from napari_shadowinv.cli._info import described
-    from napari_shadowinv.film import Calibration
     from napari_shadowinv.io import read, read_toml
     from napari_shadowinv.physics.setup import setup_from_dict
+    from napari_shadowinv.preprocessing.film import Calibration
 
     if path.suffix == ".toml":
         setup_from_dict(read_toml(path), str(path))
@@ -234,7 +234,7 @@ def read_whole(path: Path) -> None:
 
 
 def _load_shots(path: Path, dataset: Any) -> None:
-    from napari_shadowinv.safety import refusing_damage
+    from napari_shadowinv._system.safety import refusing_damage
 
     refusing_damage(lambda _: dataset[["displacement", "caustic"]].load(scheduler="sync"))(path)
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from napari_shadowinv import InversionOptions, invert, plan_sites
-from napari_shadowinv.normalise import prepare
+from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.transport.solvers import solve
 from reference import toroid_case
 

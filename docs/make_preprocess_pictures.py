@@ -21,8 +21,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from napari_shadowinv import filters, invert, read, sources, synthetic_image
+from napari_shadowinv import invert, read, synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.preprocessing import filters, sources
 
 SHOT = "Image_20241017221829851.bmp"
 SHAPE = (160, 200)

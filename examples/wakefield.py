@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from napari_shadowinv import filters, invert, synthetic_image
+from napari_shadowinv import invert, synthetic_image
 from napari_shadowinv.physics.phantoms import plasma_wavelength, wakefield, wakefield_setup
+from napari_shadowinv.preprocessing import filters
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--out", type=Path, default=Path(), help="folder for the picture")

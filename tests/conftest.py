@@ -13,11 +13,11 @@ import pytest
 from hypothesis import settings
 
 from napari_shadowinv.inversion import Inversion, Report
+from napari_shadowinv.inversion.trust import image_residual
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.trust import image_residual
 
 # The same examples in each run: a change is to blame for what fails, not the day.
 settings.register_profile("same each time", derandomize=True)

@@ -20,20 +20,22 @@ import xarray as xr
 from scipy.io import savemat
 from typer.testing import CliRunner, Result
 
-from napari_shadowinv import __version__, compilation, filters, sources
+from napari_shadowinv import __version__
+from napari_shadowinv._system.memory import physical_memory
 from napari_shadowinv.cli import _report, app
 from napari_shadowinv.cli._choices import Choices
 from napari_shadowinv.cli._inputs import Experiment, experiment_from
-from napari_shadowinv.compilation import code_folder
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import Inversion, invert
-from napari_shadowinv.io import inversion_from_dataset, read, setup_from_dataset, write
+from napari_shadowinv.inversion import Inversion, compilation, invert
+from napari_shadowinv.inversion.compilation import code_folder
+from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.io import read, write
 from napari_shadowinv.io.files import sha256
-from napari_shadowinv.memory import physical_memory
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.preprocessing import filters, sources
 
 BLOB = gaussian_blob((24, 32), 6.0, 4.0, (10, 18))
 
@@ -121,7 +123,7 @@ def test_invert_writes_what_the_core_returns(folder: Path, shot: Path) -> None:
     options = InversionOptions(n_sites=300, seed=4)
     expected = invert(np.load(shot), options=options)
     np.testing.assert_array_equal(saved["displacement"], expected.displacement)
-    assert inversion_from_dataset(saved).options == options
+    assert Inversion.from_dataset(saved).options == options
     assert saved.attrs["input_file"] == "shot.npy"
     assert saved.attrs["input_sha256"] == sha256(shot)
     assert iio.imread("shot.png").ndim == 3
@@ -146,7 +148,7 @@ def test_source_setup_and_options_are_used(folder: Path, shot: Path) -> None:
     np.testing.assert_array_equal(saved["source"], source.astype(np.float32))
     assert saved.attrs["source_file"] == "beam.tif"
     # A flag wins over the file.
-    assert inversion_from_dataset(saved).options == InversionOptions(n_sites=200, tolerance=0.01)
+    assert Inversion.from_dataset(saved).options == InversionOptions(n_sites=200, tolerance=0.01)
     assert setup_from_dataset(saved) == ProtonSetup(
         energy=14.7, source_object_distance=0.01, object_image_distance=0.3, pixel_size=1e-5
     )
@@ -164,7 +166,7 @@ def test_a_mask_keeps_unusable_pixels_out(
     image[:6, :8] = 1e4
     np.save(shot, image)
     assert shadowinv("invert", shot, "--mask", folder / "mask.png", "-q").exit_code == 0
-    written = inversion_from_dataset(read(folder / "shot.shadowinv"))
+    written = Inversion.from_dataset(read(folder / "shot.shadowinv"))
     np.testing.assert_array_equal(written.mask, usable > 0)
     np.testing.assert_array_equal(
         written.potential, invert(np.load(shot), mask=usable > 0).potential
@@ -274,7 +276,7 @@ def test_negative_pixels_are_clipped_counted_and_reported(folder: Path) -> None:
     np.save("shot.npy", image)
     result = shadowinv("invert", "shot.npy", "--clip-negative")
     assert result.exit_code == 0, result.output
-    inversion = inversion_from_dataset(dataset("shot.shadowinv"))
+    inversion = Inversion.from_dataset(dataset("shot.shadowinv"))
     assert inversion.report.clipped_pixels == 3
     assert (inversion.image[3, 4:7] == 0).all()
     assert "3 clipped" in " ".join(result.stdout.split())
@@ -285,7 +287,7 @@ def test_free_boundary_is_chosen_reported_and_kept(folder: Path) -> None:
     np.save("shot.npy", large[10:-10, 10:-10])
     result = shadowinv("invert", "shot.npy", "--boundary", "free", "--margin", "6")
     assert result.exit_code == 0, result.output
-    inversion = inversion_from_dataset(dataset("shot.shadowinv"))
+    inversion = Inversion.from_dataset(dataset("shot.shadowinv"))
     assert inversion.options.boundary == "free"
     assert inversion.options.margin == 6
     assert inversion.report.flux_left["left"] > 0.001
@@ -302,7 +304,7 @@ def test_unconverged_result_is_written_with_an_alarm(folder: Path) -> None:
     result = shadowinv("invert", "shot.npy", "--options", "few.toml")
     assert result.exit_code == 3, result.output
     assert "NOT CONVERGED" in result.stderr
-    assert not inversion_from_dataset(dataset("shot.shadowinv")).report.converged
+    assert not Inversion.from_dataset(dataset("shot.shadowinv")).report.converged
 
 
 def test_figure_of_a_png_gets_another_name(folder: Path) -> None:
@@ -676,7 +678,7 @@ def test_filters_are_those_of_the_library(folder: Path) -> None:
     assert shadowinv("invert", "shot.npy", *arguments).exit_code == 0
     again = dataset("shot.shadowinv")
     np.testing.assert_array_equal(again["image"], saved["image"])
-    assert inversion_from_dataset(again).options.n_sites == 300
+    assert Inversion.from_dataset(again).options.n_sites == 300
     # A measured source is blurred as its shot is.
     chosen = Choices(low_pass=2)
     beam = read_experiment("shot.npy", source=Path("beam.npy"), choices=chosen).source
@@ -788,7 +790,7 @@ def test_a_point_source_is_taken_for_one_or_told_of(folder: Path, shot: Path) ->
         result = shadowinv("invert", shot, *flags, *chosen)
         assert result.exit_code == 0, result.output
         assert ("choose the source 'isotropic'" in " ".join(result.stdout.split())) == warned
-        report = inversion_from_dataset(dataset("result.shadowinv")).report
+        report = Inversion.from_dataset(dataset("result.shadowinv")).report
         assert any("'isotropic'" in text for text in report.warnings) == warned
     expected = sources.isotropic_source(np.load(shot), near, centre_y=2)
     np.testing.assert_array_equal(dataset("result.shadowinv")["source"], expected)

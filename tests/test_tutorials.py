@@ -64,7 +64,7 @@ def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch
         assert result.exit_code == 0, result.output
     measured = read("shot.shadowinv")
     assert float(measured.attrs["image_residual"]) == pytest.approx(0.0536, abs=5e-4)
-    from napari_shadowinv.io import setup_from_dataset
+    from napari_shadowinv.inversion.labels import setup_from_dataset
 
     setup = setup_from_dataset(measured)
 
@@ -89,7 +89,7 @@ def test_the_pictures_and_pages_of_a_tutorial_exist(page):
 def test_the_table_of_sources_is_as_the_inversions_say():
     from napari_shadowinv._napari.samples import four_toroids
     from napari_shadowinv.physics import phantoms
-    from napari_shadowinv.recipes import ESTIMATES
+    from napari_shadowinv.preprocessing.recipes import ESTIMATES
 
     (source, *_), (image, *_) = four_toroids()
     setup = phantoms.paper_setup()

@@ -25,9 +25,9 @@ FOLDER = Path(__file__).parents[1] / "reference"
 _SHAPES: dict[Any, str] = {Path: "PATH", int: "INTEGER", float: "NUMBER", str: "TEXT"}
 
 MODULES = {
-    "recipes": "Filters and source estimates with their parameters",
-    "filters": "Filters as functions",
-    "sources": "Source estimates as functions",
+    "preprocessing.recipes": "Filters and source estimates with their parameters",
+    "preprocessing.filters": "Filters as functions",
+    "preprocessing.sources": "Source estimates as functions",
     "physics.phantoms": "Test objects",
     "io": "Files",
 }
@@ -52,7 +52,8 @@ def write_pages(app: Sphinx, config: Config) -> None:
             path.write_text(text, encoding="utf-8")
     for page in (FOLDER / "api").glob("*.rst"):
         module, _, name = page.stem.rpartition(".")
-        if name not in public_names(module):
+        known = {"napari_shadowinv", *(f"napari_shadowinv.{room}" for room in MODULES)}
+        if module not in known or name not in public_names(module):
             page.unlink()
 
 
@@ -61,7 +62,7 @@ def write_pages(app: Sphinx, config: Config) -> None:
 
 def parameters_page() -> str:
     from napari_shadowinv import InversionOptions, OpticalSetup, ProtonSetup
-    from napari_shadowinv.recipes import ESTIMATES, FILTERS
+    from napari_shadowinv.preprocessing.recipes import ESTIMATES, FILTERS
 
     parts = [
         "# Parameters",
@@ -89,7 +90,11 @@ def parameters_page() -> str:
 def model_section(model: type[BaseModel], name: str, title: str = "") -> str:
     heading = title or str(model.title)  # type: ignore[attr-defined]
     summary = cleandoc(model.__doc__ or "").split("\n\n")[0]
-    place = "napari_shadowinv.recipes" if hasattr(model, "function") else "napari_shadowinv"
+    place = (
+        "napari_shadowinv.preprocessing.recipes"
+        if hasattr(model, "function")
+        else "napari_shadowinv"
+    )
     says = f"Named `{name}`; in Python {{py:class}}`~{place}.{model.__name__}`."
     table = model_table(model) if model.model_fields else "No parameters."
     return f"### {heading[:1].upper()}{heading[1:]}\n\n{summary} {says}\n\n{table}"

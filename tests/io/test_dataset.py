@@ -8,15 +8,8 @@ import xarray as xr
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.io import (
-    Radiograph,
-    dataset_from_inversion,
-    inversion_from_dataset,
-    provenance,
-    read,
-    setup_from_dataset,
-    write,
-)
+from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.io import Radiograph, provenance, read, write
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 
@@ -54,11 +47,11 @@ def test_file_gives_back_every_bit(
     write(path, inversion, setup=setups[kind])
     dataset = read(path)
     assert isinstance(dataset, xr.Dataset)
-    assert_same(inversion, inversion_from_dataset(dataset))
+    assert_same(inversion, Inversion.from_dataset(dataset))
     assert setup_from_dataset(dataset) == setups[kind]
     xr.testing.assert_identical(
         dataset.drop_attrs(deep=False),
-        dataset_from_inversion(inversion, setups[kind]).drop_attrs(deep=False),
+        inversion.to_dataset(setups[kind]).drop_attrs(deep=False),
     )
 
 
@@ -70,14 +63,14 @@ def test_not_a_number_and_infinity_survive(tmp_path: Path, inversion: Inversion)
     write(tmp_path / "shot.shadowinv", changed)
     dataset = read(tmp_path / "shot.shadowinv")
     assert isinstance(dataset, xr.Dataset)
-    assert_same(changed, inversion_from_dataset(dataset))
+    assert_same(changed, Inversion.from_dataset(dataset))
 
 
 def test_every_variable_has_units_and_a_name(
     inversion: Inversion, proton_setup: ProtonSetup, optical_setup: OpticalSetup
 ) -> None:
     for setup in (None, proton_setup, optical_setup):
-        dataset = dataset_from_inversion(inversion, setup)
+        dataset = inversion.to_dataset(setup)
         for name, variable in dataset.variables.items():
             assert variable.attrs.get("units"), name
             assert variable.attrs.get("long_name"), name
@@ -123,7 +116,7 @@ def test_attributes_tell_how_and_from_what(tmp_path: Path, inversion: Inversion)
     shot, beam = read(tmp_path / "shot.npy"), read(tmp_path / "beam.npy")
     assert isinstance(shot, Radiograph)
     assert isinstance(beam, Radiograph)
-    dataset = dataset_from_inversion(inversion, attributes=provenance(shot, beam))
+    dataset = inversion.to_dataset(attributes=provenance(shot, beam))
     assert dataset.attrs["input_file"] == "shot.npy"
     assert dataset.attrs["input_sha256"] == shot.metadata["sha256"]
     assert dataset.attrs["source_file"] == "beam.npy"
@@ -136,7 +129,7 @@ def test_attributes_tell_how_and_from_what(tmp_path: Path, inversion: Inversion)
 
 def test_dataset_of_something_else_is_refused() -> None:
     with pytest.raises(InputError, match=r"'potential'.*'options', 'report'"):
-        inversion_from_dataset(xr.Dataset())
+        Inversion.from_dataset(xr.Dataset())
 
 
 def test_damaged_result_is_named(tmp_path: Path, inversion: Inversion) -> None:

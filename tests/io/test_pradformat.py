@@ -7,7 +7,8 @@ import xarray as xr
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.io import Radiograph, read, read_radiograph, setup_from_dataset, write
+from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.io import Radiograph, read, read_radiograph, write
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 IMAGE = np.arange(20.0).reshape(4, 5)

@@ -31,9 +31,9 @@ from napari_shadowinv import (
     invert_stack,
     read,
 )
-from napari_shadowinv.geometry._threads import available_threads
+from napari_shadowinv._system.locking import locked
+from napari_shadowinv._system.threads import available_threads
 from napari_shadowinv.io import locking
-from napari_shadowinv.io.locking import locked
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import _engines
 from napari_shadowinv.stack._engines import engine_for
@@ -407,7 +407,7 @@ class TestLocks:
         code = f"""
             import time
             from pathlib import Path
-            from napari_shadowinv.io.locking import locked
+            from napari_shadowinv._system.locking import locked
             with locked(Path({str(path)!r})):
                 print("locked", flush=True)
                 time.sleep(60)

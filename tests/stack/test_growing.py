@@ -13,7 +13,7 @@ import zarr
 from store_content import content
 
 from napari_shadowinv import FileFormatError, InputError, InversionOptions, read
-from napari_shadowinv.io.locking import locked
+from napari_shadowinv._system.locking import locked
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 
 

@@ -21,9 +21,9 @@ from napari_shadowinv import (
     run_stack,
 )
 from napari_shadowinv.cli import app
-from napari_shadowinv.filters import high_pass, low_pass, remove_hot_pixels
 from napari_shadowinv.io.store import DONE, StackStore, read_stack
-from napari_shadowinv.recipes import (
+from napari_shadowinv.preprocessing.filters import high_pass, low_pass, remove_hot_pixels
+from napari_shadowinv.preprocessing.recipes import (
     GaussianEstimate,
     HighPassFilter,
     HotPixelFilter,
@@ -34,7 +34,7 @@ from napari_shadowinv.recipes import (
     PolynomialEstimate,
     UniformEstimate,
 )
-from napari_shadowinv.sources import isotropic_source, polynomial_source
+from napari_shadowinv.preprocessing.sources import isotropic_source, polynomial_source
 from napari_shadowinv.stack import read_shot
 
 FILTERS = (HotPixelFilter(), LowPassFilter(width=0.8))

@@ -17,11 +17,11 @@ from napari_shadowinv import (
     InputError,
     InversionCancelled,
     InversionOptions,
-    compilation,
     invert_stack,
     read,
     run_stack,
 )
+from napari_shadowinv.inversion import compilation
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import read_shot
 from napari_shadowinv.stack._references import described_reader

@@ -3,12 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.continuation import blurred
 from napari_shadowinv.transport.descent import quasi_newton
 from napari_shadowinv.transport.newton import newton

@@ -64,12 +64,12 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
     list of (data, keywords, layer type)
         The layers as they were saved. Those that were not saved with it are hidden.
     """
-    from napari_shadowinv.io import inversion_from_dataset, setup_from_dataset
+    from napari_shadowinv.inversion.labels import setup_from_dataset
 
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     setup = setup_from_dataset(dataset)
     result = Result(
-        inversion_from_dataset(dataset) if "report" in dataset.attrs else dataset,
+        Inversion.from_dataset(dataset) if "report" in dataset.attrs else dataset,
         setup,
         {key: value for key, value in dataset.attrs.items() if key not in _OWN_ATTRIBUTES},
     )
@@ -105,18 +105,13 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray
     """
     import xarray as xr
 
-    from napari_shadowinv.io.dataset import dataset_from_inversion
-
     content = result.content
     looks = {role_of(layer[1]): _look(layer) for layer in layers}
     kept = {_LOOKS: json.dumps(looks)}
     if isinstance(content, xr.Dataset):
         return content.assign_attrs(kept)
-    return dataset_from_inversion(
-        _with_painted_caustics(content, layers),
-        result.setup,
-        attributes={**result.attributes, **kept},
-    )
+    painted = _with_painted_caustics(content, layers)
+    return painted.to_dataset(result.setup, attributes={**result.attributes, **kept})
 
 
 def _with_painted_caustics(inversion: Inversion, layers: Sequence[FullLayerData]) -> Inversion:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.notifications import notify_errors, show_caution
+from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.safety import refusing_damage
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData

@@ -89,7 +89,7 @@ def _diagram(inversion: Inversion) -> tuple[PowerDiagram, int]:
     from napari_shadowinv.geometry.density import Density
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.geometry.triangulation import RegularTriangulation
-    from napari_shadowinv.normalise import margin_around
+    from napari_shadowinv.inversion.normalise import margin_around
 
     options, shape = inversion.options, inversion.potential.shape
     margin = margin_around(shape, options) if options.boundary == "free" else 0

@@ -26,8 +26,8 @@ from napari_shadowinv._napari.layers import (
     symmetric_limits,
     thinned_arrows,
 )
+from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.safety import refusing_damage
 
 if TYPE_CHECKING:
     import xarray
@@ -95,7 +95,7 @@ class _StoreLayers:
     """Makes the layers of one store."""
 
     def __init__(self, path: Path, dataset: xarray.Dataset, name: str) -> None:
-        from napari_shadowinv.io import setup_from_dataset
+        from napari_shadowinv.inversion.labels import setup_from_dataset
 
         self._path = path
         self._dataset = dataset.transpose(_SHOT, ...)

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interrupted
 from napari_shadowinv.cli._inputs import picture_mask, setup_from
 from napari_shadowinv.cli._tables import Rows, options_text, two_columns
 from napari_shadowinv.cli._terminal import plain, say, say_on_stderr
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.safety import refusing_damage
 
 if TYPE_CHECKING:
     from rich.table import Table

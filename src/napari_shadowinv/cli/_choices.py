@@ -12,9 +12,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import read_toml
-from napari_shadowinv.recipes import (
+from napari_shadowinv.preprocessing.recipes import (
     ESTIMATES,
     BackgroundFilter,
     ButterworthFilter,
@@ -23,7 +24,6 @@ from napari_shadowinv.recipes import (
     HighPassFilter,
     LowPassFilter,
 )
-from napari_shadowinv.validation import validated
 
 __all__ = ["FILTER_CHOICES", "KEYWORDS", "TABLE", "Choices", "choices_from"]
 

@@ -125,7 +125,7 @@ def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[tuple[
 
 
 def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
-    from napari_shadowinv.io import setup_from_dataset
+    from napari_shadowinv.inversion.labels import setup_from_dataset
     from napari_shadowinv.io.pradformat import check_pradformat_setup
 
     check_pradformat_setup(setup_from_dataset(dataset))
@@ -137,7 +137,8 @@ def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
 def _write(path: Path, content: Any, overwrite: bool) -> Path:
     import numpy as np
 
-    from napari_shadowinv.io import setup_from_dataset, write
+    from napari_shadowinv.inversion.labels import setup_from_dataset
+    from napari_shadowinv.io import write
 
     if path.suffix == ".h5":
         return write(path, content.load(), overwrite=overwrite)

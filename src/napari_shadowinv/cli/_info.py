@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli._tables import (
     Rows,
     closing_rows,
@@ -16,7 +17,6 @@ from napari_shadowinv.cli._tables import (
     size_text,
     two_columns,
 )
-from napari_shadowinv.safety import refusing_damage
 
 if TYPE_CHECKING:
     import xarray
@@ -79,8 +79,8 @@ def _matlab_rows(path: Path, variable: str | None) -> Rows:
 
 
 def _picture_rows(path: Path, kind: str) -> Rows:
+    from napari_shadowinv.io.colours import film_warnings
     from napari_shadowinv.io.images import read_picture
-    from napari_shadowinv.io.radiograph import film_warnings
 
     array, metadata = read_picture(path, kind)
     warnings = film_warnings(array, None) if array.ndim == 2 else ()
@@ -138,7 +138,8 @@ def _array_rows(array: NDArray[Any]) -> Rows:
 
 
 def _result_rows(dataset: xarray.Dataset) -> Rows:
-    from napari_shadowinv.io import inversion_from_dataset, setup_from_dataset
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.inversion.labels import setup_from_dataset
 
     setup = setup_from_dataset(dataset)
     displacement = dataset["displacement"].values
@@ -147,7 +148,7 @@ def _result_rows(dataset: xarray.Dataset) -> Rows:
         is_foreign = dataset.attrs.get("format") == "pradformat"
         kind = "pradformat inversion" if is_foreign else "field retrieved by another program"
         return [("kind", kind), *experiment, *peak_rows(displacement, setup)]
-    inversion = inversion_from_dataset(dataset)
+    inversion = Inversion.from_dataset(dataset)
     return [
         ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),

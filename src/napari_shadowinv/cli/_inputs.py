@@ -38,9 +38,9 @@ def options_from(
     other_tables: Collection[str] = (),
 ) -> InversionOptions:
     """Options from a file, with flags on top; `other_tables` of the file are for others to read."""
+    from napari_shadowinv._system.validation import validated
     from napari_shadowinv.io import read_toml
     from napari_shadowinv.options import InversionOptions
-    from napari_shadowinv.validation import validated
 
     content = {} if path is None else read_toml(path)
     chosen = {name: value for name, value in content.items() if name not in other_tables}
@@ -182,7 +182,8 @@ class Field:
 
 def field_from(path: Path, variable: str | None = None) -> Field:
     """Displacement from a result, or from an array of px or px²."""
-    from napari_shadowinv.io import read_dataset, setup_from_dataset
+    from napari_shadowinv.inversion.labels import setup_from_dataset
+    from napari_shadowinv.io import read_dataset
     from napari_shadowinv.io.arrays import read_npy
     from napari_shadowinv.io.files import kind_of
 
@@ -211,7 +212,7 @@ def _named_array(path: Path, variable: str | None) -> NDArray[Any]:
 
 
 def _displacement(path: Path, array: NDArray[Any]) -> NDArray[np.float64]:
-    from napari_shadowinv.io.dataset import displacement_from_potential
+    from napari_shadowinv.inversion.labels import displacement_from_potential
 
     if array.ndim == 2:
         return displacement_from_potential(array)

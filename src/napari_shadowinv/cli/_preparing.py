@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from napari_shadowinv.cli._choices import FILTER_CHOICES, KEYWORDS, Choices
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.filters import remove_hot_pixels
 from napari_shadowinv.io import Radiograph
-from napari_shadowinv.preparation import Preparation
-from napari_shadowinv.recipes import UniformEstimate, without_masked
-from napari_shadowinv.sources import uniform_warnings
+from napari_shadowinv.preprocessing.filters import remove_hot_pixels
+from napari_shadowinv.preprocessing.preparation import Preparation
+from napari_shadowinv.preprocessing.recipes import UniformEstimate, without_masked
+from napari_shadowinv.preprocessing.sources import uniform_warnings
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup

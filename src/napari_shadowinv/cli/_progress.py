@@ -12,16 +12,16 @@ from napari_shadowinv.errors import InputError
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
+    from napari_shadowinv._system.progress import OnProgress, Progress
     from napari_shadowinv.cli._inputs import Experiment
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.options import InversionOptions
-    from napari_shadowinv.progress import OnProgress, Progress
 
 
 def inverted(experiment: Experiment, options: InversionOptions, quiet: bool = False) -> Inversion:
     """Invert an experiment's shot; a mistake in it is told with the file's name."""
-    from napari_shadowinv.compilation import ensure_compiled
     from napari_shadowinv.inversion import invert
+    from napari_shadowinv.inversion.compilation import ensure_compiled
 
     shot, source = experiment.shot, experiment.source
     with nullcontext() if quiet else progress_bars() as show:

@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from napari_shadowinv import __version__
-from napari_shadowinv.memory import physical_memory
+from napari_shadowinv._system.memory import physical_memory
 
 PACKAGES = (
     "numpy",
@@ -81,7 +81,7 @@ def _memory() -> str:
 def _compiled_code() -> str:
     """The folder with the machine code; the home folder is written ~ to hide the user's name."""
     try:
-        from napari_shadowinv.compilation import code_folder, is_compiled
+        from napari_shadowinv.inversion.compilation import code_folder, is_compiled
 
         folder = code_folder()
         if folder is None:

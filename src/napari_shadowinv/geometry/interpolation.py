@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.threads import available_threads, in_ranges
 from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._threads import available_threads, in_ranges
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 __all__ = ["BLOCK", "CloughTocher", "fit_gradients", "locate", "mirrored_across_border"]

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
+from napari_shadowinv._system.threads import available_threads, in_ranges
 from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._threads import available_threads, in_ranges
 from napari_shadowinv.geometry.density import Density, walk_edge
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 

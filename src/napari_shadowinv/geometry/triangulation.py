@@ -28,12 +28,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from napari_shadowinv._system.threads import in_ranges
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import _flips
 from napari_shadowinv.geometry._hilbert import hilbert_permutation
 from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Mesh, neighbors_of
 from napari_shadowinv.geometry._relocation import relocate
-from napari_shadowinv.geometry._threads import in_ranges
 
 __all__ = ["RegularTriangulation", "hilbert_order"]
 

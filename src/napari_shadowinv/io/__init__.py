@@ -3,29 +3,20 @@
 - read an image or a result: `read`; only one of them: `read_radiograph`, `read_dataset`
 - an image with what is known about it: `Radiograph`; sum its pixels: `Radiograph.binned`
 - write a result or an image: `write`; check the path beforehand: `check_output`
-- an inversion as a labelled dataset and back: `dataset_from_inversion`,
-  `inversion_from_dataset`, `setup_from_dataset`
 - results of many shots in one store: `read_stack`; tell it from other folders: `is_stack`
 - write a file of your own, whole or not at all: `replacing`
 """
 
-from napari_shadowinv.io.dataset import (
-    dataset_from_inversion,
-    inversion_from_dataset,
-    provenance,
-    setup_from_dataset,
-)
+from napari_shadowinv.io.dataset import provenance
 from napari_shadowinv.io.files import check_output, replacing
-from napari_shadowinv.io.radiograph import Radiograph
 from napari_shadowinv.io.reading import read, read_dataset, read_radiograph, read_toml
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.io.writing import write
+from napari_shadowinv.preprocessing.radiograph import Radiograph
 
 __all__ = [
     "Radiograph",
     "check_output",
-    "dataset_from_inversion",
-    "inversion_from_dataset",
     "is_stack",
     "provenance",
     "read",
@@ -34,6 +25,5 @@ __all__ = [
     "read_stack",
     "read_toml",
     "replacing",
-    "setup_from_dataset",
     "write",
 ]

@@ -19,9 +19,9 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from napari_shadowinv._system.interrupts import interrupts_put_off
+from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.interrupts import interrupts_put_off
-from napari_shadowinv.safety import check_regular, refusing_damage
 
 __all__ = [
     "READABLE",

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.safety import refusing_damage, small_text
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.safety import refusing_damage, small_text
 
 __all__ = ["read_film_table"]
 

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.safety import check_size, refusing_damage
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.size_checks import DEFLATE_RATIO, check_promise
-from napari_shadowinv.safety import check_size, refusing_damage
 
 __all__ = [
     "check_arrays",

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.safety import check_regular, check_size, refusing_damage
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.camera import read_b16, read_spe
+from napari_shadowinv.io.colours import film_warnings, to_grey
 from napari_shadowinv.io.matlab import read_mat
-from napari_shadowinv.io.radiograph import film_warnings, to_grey
 from napari_shadowinv.io.size_checks import DEFLATE_RATIO, check_promise
 from napari_shadowinv.io.text import read_text
-from napari_shadowinv.safety import check_regular, check_size, refusing_damage
 
 __all__ = ["PICTURES", "read_picture", "read_tiff_page", "tiff_pages", "write_png", "write_tiff"]
 

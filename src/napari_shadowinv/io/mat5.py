@@ -21,8 +21,8 @@ from typing import Any, BinaryIO, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.safety import check_size
 from napari_shadowinv.io.size_checks import DEFLATE_RATIO, check_promise
-from napari_shadowinv.safety import check_size
 
 __all__ = ["Variable", "variables_5"]
 

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.hdf5 import load_dataset, member, members
 from napari_shadowinv.io.mat5 import Variable, variables_5
-from napari_shadowinv.safety import refusing_damage
 
 __all__ = ["is_mat73", "is_other_hdf5", "mat_variables", "read_mat"]
 

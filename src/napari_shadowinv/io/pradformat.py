@@ -21,10 +21,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.dataset import FORMAT, dataset_from_field, displacement_from_potential
+from napari_shadowinv.inversion.labels import (
+    FORMAT,
+    dataset_from_field,
+    displacement_from_potential,
+)
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
-from napari_shadowinv.safety import check_regular, refusing_damage
 
 if TYPE_CHECKING:
     import xarray
@@ -238,8 +242,8 @@ def _check_square(path: Path, attributes: dict[str, Any], width: str) -> None:
 
 
 def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
+    from napari_shadowinv._system.validation import validated
     from napari_shadowinv.physics.setup import ProtonSetup
-    from napari_shadowinv.validation import validated
 
     setup = validated(ProtonSetup, _geometry(path, attributes, "dr"), str(path))
     arrays = _read_datasets(path, ("phi", "defl_ax1", "defl_ax2"))

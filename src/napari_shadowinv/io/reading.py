@@ -15,17 +15,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.safety import refusing_damage, small_text
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.arrays import read_npy
+from napari_shadowinv.io.colours import film_warnings, to_grey
 from napari_shadowinv.io.dataset import read_result
 from napari_shadowinv.io.files import kind_of, sha256
 from napari_shadowinv.io.hdf5 import read_hdf5
 from napari_shadowinv.io.images import PICTURES, read_picture
 from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5, read_mat
 from napari_shadowinv.io.pradformat import is_result, read_pradformat
-from napari_shadowinv.io.radiograph import Radiograph, film_warnings, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
-from napari_shadowinv.safety import refusing_damage, small_text
+from napari_shadowinv.preprocessing.radiograph import Radiograph
 
 if TYPE_CHECKING:
     import xarray
@@ -156,8 +157,8 @@ def _radiograph(path: Path, kind: str, array: NDArray[Any], metadata: dict[str, 
 def _complete_setup(path: Path, geometry: dict[str, Any]) -> ProtonSetup | None:
     if not (geometry.keys() >= _COMPLETE and {"pixel_size", "detector_pixel_size"} & set(geometry)):
         return None
+    from napari_shadowinv._system.validation import validated
     from napari_shadowinv.physics.setup import ProtonSetup
-    from napari_shadowinv.validation import validated
 
     return validated(ProtonSetup, geometry, str(path))
 

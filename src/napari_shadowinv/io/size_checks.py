@@ -1,7 +1,7 @@
 """What a header promises against what its file can hold.
 
 A damaged length must be refused before memory is asked for: `check_promise`. How much may be
-asked for at all is another question: `napari_shadowinv.safety.check_size`.
+asked for at all is another question: `napari_shadowinv._system.safety.check_size`.
 """
 
 from __future__ import annotations

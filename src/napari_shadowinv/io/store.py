@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.safety import refusing_damage, small_text
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.dataset import field_in_si, setup_from_dataset, variable_labels
+from napari_shadowinv.inversion.labels import field_in_si, setup_from_dataset, variable_labels
 from napari_shadowinv.io.files import check_folder_of
-from napari_shadowinv.safety import refusing_damage, small_text
 
 if TYPE_CHECKING:
     import xarray

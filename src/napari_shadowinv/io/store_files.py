@@ -18,8 +18,8 @@ from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore
 
+from napari_shadowinv._system.safety import check_regular, check_size, small_text
 from napari_shadowinv.io.size_checks import check_promise
-from napari_shadowinv.safety import check_regular, check_size, small_text
 
 __all__ = ["CheckedStore"]
 

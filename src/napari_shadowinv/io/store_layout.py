@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.interrupts import interrupts_put_off
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.interrupts import interrupts_put_off
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.io.store import (
     DONE,

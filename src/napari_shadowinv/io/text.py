@@ -35,8 +35,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.safety import check_size
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.safety import check_size
 
 __all__ = ["read_text"]
 

@@ -13,24 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.arrays import write_npy
-from napari_shadowinv.io.dataset import (
-    dataset_from_inversion,
-    dataset_from_uncertainty,
-    provenance,
-    setup_from_dataset,
-    write_result,
-)
+from napari_shadowinv.io.dataset import provenance, write_result
 from napari_shadowinv.io.files import check_output, replacing
 from napari_shadowinv.io.images import write_png, write_tiff
 from napari_shadowinv.io.pradformat import write_pradformat
-from napari_shadowinv.io.radiograph import Radiograph
+from napari_shadowinv.preprocessing.radiograph import Radiograph
 
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.error_bars import Uncertainty
     from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.inversion.error_bars import Uncertainty
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 __all__ = ["IMAGE_SUFFIXES", "RESULT_SUFFIXES", "write"]
@@ -103,15 +98,12 @@ def _dataset(
     shot: Radiograph | None,
     source: Radiograph | None,
 ) -> xarray.Dataset:
-    from napari_shadowinv.error_bars import Uncertainty
-    from napari_shadowinv.inversion import Inversion
+    import xarray as xr
 
     origin = provenance(shot, source)
-    if isinstance(result, Inversion):
-        return dataset_from_inversion(result, setup, attributes=origin)
-    if isinstance(result, Uncertainty):
-        return dataset_from_uncertainty(result, setup, attributes=origin)
-    return result.assign_attrs(origin)
+    if isinstance(result, xr.Dataset):
+        return result.assign_attrs(origin)
+    return result.to_dataset(setup, attributes=origin)
 
 
 def _write_result(path: Path, dataset: xarray.Dataset) -> None:

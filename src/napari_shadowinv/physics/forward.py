@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solveh_banded
 
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 
 __all__ = ["jacobian_determinant", "synthetic_image"]
 
@@ -64,7 +64,7 @@ def synthetic_image(
     threads : int, optional
         Threads to use. Default: all cores. The result does not depend on it.
     on_progress : callable, optional
-        Receives a `napari_shadowinv.progress.Progress` for each band of rows.
+        Receives a `napari_shadowinv._system.progress.Progress` for each band of rows.
     should_stop : callable, optional
         Asked after each band; when it returns true the work ends.
 

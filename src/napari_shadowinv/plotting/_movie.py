@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.interrupts import interrupts_put_off
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.interrupts import interrupts_put_off
-from napari_shadowinv.io.dataset import setup_from_dataset
+from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.plotting._panels import STYLE, choose_grid, new_page
 from napari_shadowinv.plotting._units import _prefix, image_scale

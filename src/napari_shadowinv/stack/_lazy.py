@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.io.dataset import variable_labels
+from napari_shadowinv.inversion.labels import variable_labels
 from napari_shadowinv.io.store import SUMMARY
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._references import Reader, Shot, read_shot
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-    from napari_shadowinv.recipes import Filter
+    from napari_shadowinv.preprocessing.recipes import Filter
 
 __all__ = ["invert_stack"]
 
@@ -59,9 +59,9 @@ def invert_stack(
         a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; or a TIFF with a
         page for each shot. Files are read by the tasks that invert them.
     source : array (y, x), path, Estimate, or as `shots`, optional
-        The undisturbed beam, one for all shots or one for each, or a recipe of
-        `napari_shadowinv.recipes` by which it is guessed from each shot. Default: uniform, and
-        then intensities in the result are relative to each shot's mean.
+        The undisturbed beam, one for all shots or one for each, or an estimate of
+        `napari_shadowinv.preprocessing` by which it is guessed from each shot. Default:
+        uniform, and then intensities in the result are relative to each shot's mean.
     mask : array_like of bool, shape (H, W), optional
         The pixels that can be used, the same in all shots; see `napari_shadowinv.invert`.
     options : InversionOptions, optional
@@ -69,8 +69,9 @@ def invert_stack(
     setup : ProtonSetup or OpticalSetup, optional
         Adds fields in SI units.
     filters : sequence of Filter, optional
-        Recipes of `napari_shadowinv.recipes` for each shot, in their order. A measured source is
-        cleaned and blurred alike; what flattens the image needs a source that is not measured.
+        Filters of `napari_shadowinv.preprocessing` for each shot, in their order. A measured
+        source is cleaned and blurred alike; what flattens the image needs a source that is
+        not measured.
     source_mask : array_like of bool, shape (H, W), optional
         Pixels where the object never is; an estimate of the source looks at no others.
     variables : collection of str, optional

@@ -18,7 +18,7 @@ from multiprocessing import resource_tracker
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from napari_shadowinv.interrupts import interrupts_put_off
+from napari_shadowinv._system.interrupts import interrupts_put_off
 
 __all__ = ["local_client"]
 

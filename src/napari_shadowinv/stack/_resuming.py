@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from napari_shadowinv import __version__
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.dataset import variable_labels
+from napari_shadowinv.inversion.labels import variable_labels
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.io.store_layout import Contents, Variable, grow_store
 from napari_shadowinv.stack._references import checksum

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv.compilation import ensure_compiled
+from napari_shadowinv._system.locking import locked
+from napari_shadowinv._system.progress import Progress, ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.io.locking import locked
+from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io.store import (
     DONE,
     FAILED,
@@ -26,7 +27,6 @@ from napari_shadowinv.io.store import (
 )
 from napari_shadowinv.io.store_layout import create_store
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.progress import Progress, ShouldStop
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
 from napari_shadowinv.stack._references import Reader, read_shot
 from napari_shadowinv.stack._resuming import append_shots, contents_of, resume
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-    from napari_shadowinv.recipes import Filter
+    from napari_shadowinv.preprocessing.recipes import Filter
 
 __all__ = ["STORED", "RunProgress", "ShotOutcome", "run_stack"]
 

@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import count_sites
-from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
+from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
+from napari_shadowinv.inversion.normalise import checked_mask, checked_source
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
-from napari_shadowinv.normalise import checked_mask, checked_source
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preparation import Preparation
-from napari_shadowinv.recipes import Estimate, Filter, UniformEstimate
+from napari_shadowinv.preprocessing.preparation import Preparation
+from napari_shadowinv.preprocessing.recipes import Estimate, Filter, UniformEstimate
 from napari_shadowinv.stack._discovery import Shots, find_shots, find_source
 from napari_shadowinv.stack._references import Reader, Shot, described_reader
 from napari_shadowinv.stack._worker import Beam, Work, shared_plan, threads_here

@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.progress import OnProgress, OnWarning, ShouldStop
+from napari_shadowinv._system.threads import available_threads
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
-from napari_shadowinv.io.dataset import dataset_from_field, variable_labels
+from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preparation import Preparation
-from napari_shadowinv.progress import OnProgress, OnWarning, ShouldStop
-from napari_shadowinv.sources import uniform_warnings
+from napari_shadowinv.preprocessing.preparation import Preparation
+from napari_shadowinv.preprocessing.sources import uniform_warnings
 from napari_shadowinv.stack._references import checksum
 from napari_shadowinv.transport.sites import SitePlan
 

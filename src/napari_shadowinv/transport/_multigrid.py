@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from napari_shadowinv._system.threads import in_ranges
 from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._threads import in_ranges
 from napari_shadowinv.transport._coarsening import Hierarchy, Network, build_hierarchy
 
 __all__ = ["LaplacianSolver"]

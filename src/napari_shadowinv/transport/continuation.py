@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
-from napari_shadowinv.progress import Reporter
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.transport.newton import newton, with_full_cells
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 from napari_shadowinv.transport.sites import Level

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.memory import physical_memory
-from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 
 __all__ = ["lbfgs", "quasi_newton"]

@@ -16,8 +16,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
-from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 
 __all__ = ["SHORTEST_STEP", "newton", "with_full_cells"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
-from napari_shadowinv.geometry._threads import available_threads
+from napari_shadowinv._system.threads import available_threads
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.transport.linear import solve_laplacian
 from napari_shadowinv.transport.margin import Margin

@@ -20,14 +20,14 @@ from threading import Event
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._system.threads import available_threads
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._threads import available_threads
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import mirrored_across_border
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
-from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.margin import Margin
 
 __all__ = ["Level", "SitePlan", "lloyd", "plan_levels", "sample_sites"]

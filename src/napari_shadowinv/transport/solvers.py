@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.progress import Reporter
 from napari_shadowinv.transport.continuation import blurred, sharpen
 from napari_shadowinv.transport.descent import lbfgs, quasi_newton
 from napari_shadowinv.transport.margin import Margin

@@ -17,9 +17,6 @@ from napari_shadowinv import (
     InputError,
     InversionCancelled,
     InversionOptions,
-    compilation,
-    filters,
-    recipes,
 )
 from napari_shadowinv._napari.widgets._cost import cost_of
 from napari_shadowinv._napari.widgets._estimating import quick_source
@@ -38,11 +35,12 @@ from napari_shadowinv._napari.widgets._sampling import (
 from napari_shadowinv._napari.widgets._stacking import StackJob
 from napari_shadowinv.cli._choices import Choices
 from napari_shadowinv.cli._preparing import filtered
-from napari_shadowinv.inversion import Inversion, invert
-from napari_shadowinv.io.radiograph import Radiograph
+from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
-from napari_shadowinv.sources import isotropic_source
+from napari_shadowinv.preprocessing import filters, recipes
+from napari_shadowinv.preprocessing.radiograph import Radiograph
+from napari_shadowinv.preprocessing.sources import isotropic_source
 
 FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]

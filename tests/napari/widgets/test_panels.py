@@ -12,8 +12,8 @@ from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QDockWidget
 
 from napari_shadowinv._napari.widgets._panels import RunPanel
+from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.progress import Progress
 
 PATIENCE = 60_000  # ms
 

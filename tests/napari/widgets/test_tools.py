@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from qtpy.QtWidgets import QFileDialog
 
-from napari_shadowinv import ProtonSetup, sources
+from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import mark, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets.forward_model import DEFLECTORS
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.io.dataset import displacement_from_potential
+from napari_shadowinv.inversion.labels import displacement_from_potential
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import (
     coaxial_line,
@@ -27,6 +27,7 @@ from napari_shadowinv.physics.phantoms import (
     wakefield_setup,
 )
 from napari_shadowinv.physics.projection import Deflector, project
+from napari_shadowinv.preprocessing import sources
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from napari_shadowinv.memory import physical_memory
+from napari_shadowinv._system.memory import physical_memory
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 
 __all__ = ["Cost", "cost_of"]

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.progress import OnWarning, ShouldStop
-from napari_shadowinv.recipes import Estimate
+from napari_shadowinv._system.progress import OnWarning, ShouldStop
+from napari_shadowinv.preprocessing.recipes import Estimate
 
 __all__ = ["SourceCache", "quick_source", "same_array"]
 

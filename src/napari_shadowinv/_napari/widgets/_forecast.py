@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._napari.widgets._jobs import plane_of
 from napari_shadowinv._napari.widgets._phantoms import PhantomRecipe
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.progress import OnProgress, Reporter, ShouldStop
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.projection import Deflector
@@ -157,7 +157,7 @@ class ForwardJob:
         return moved, f"For another setup, assuming that only a {deflector} deflects the beam."
 
     def _displacement(self) -> Image:
-        from napari_shadowinv.io.dataset import displacement_from_potential
+        from napari_shadowinv.inversion.labels import displacement_from_potential
 
         if isinstance(self.field, PhantomRecipe):
             return self.field.phantom(self.shape, self.setup).displacement

@@ -16,8 +16,8 @@ from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QLabel, QSizePolicy, QVBoxL
 
 from napari_shadowinv._napari.widgets._fields import Editor, SteadyComboBox, editor_for
 from napari_shadowinv._napari.widgets._quantities import unit_of_title
+from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.validation import validated
 
 __all__ = [
     "Kinds",

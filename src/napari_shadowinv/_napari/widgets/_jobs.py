@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._napari.widgets._estimating import SourceCache, quick_source, same_array
+from napari_shadowinv._system.progress import OnProgress, OnWarning, Reporter, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preparation import Preparation
-from napari_shadowinv.progress import OnProgress, OnWarning, Reporter, ShouldStop
-from napari_shadowinv.recipes import Estimate, Filter, UniformEstimate
+from napari_shadowinv.preprocessing.preparation import Preparation
+from napari_shadowinv.preprocessing.recipes import Estimate, Filter, UniformEstimate
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
@@ -167,9 +167,9 @@ class ShotJob:
         InversionCancelled
             If `should_stop` returned true.
         """
-        from napari_shadowinv.compilation import ensure_compiled
         from napari_shadowinv.inversion import invert
-        from napari_shadowinv.normalise import number_of_sites, prepare
+        from napari_shadowinv.inversion.compilation import ensure_compiled
+        from napari_shadowinv.inversion.normalise import number_of_sites, prepare
 
         report = Reporter(on_progress, should_stop)
         seconds: dict[str, float] = {}
@@ -254,7 +254,7 @@ class ShotJob:
         return self.source.placed(self.setup, np.shape(self.image), self._corner())
 
     def _doubts_of_uniform(self) -> list[str]:
-        from napari_shadowinv.sources import uniform_warnings
+        from napari_shadowinv.preprocessing.sources import uniform_warnings
 
         if not isinstance(self.source, UniformEstimate):
             return []
@@ -273,7 +273,7 @@ class ShotJob:
         should_stop: ShouldStop | None,
         on_warning: OnWarning,
     ) -> Image:
-        from napari_shadowinv.normalise import checked_source
+        from napari_shadowinv.inversion.normalise import checked_source
 
         if preparation.estimate is not None:
             most_pixels = PREVIEW_PIXELS if self.preview else None

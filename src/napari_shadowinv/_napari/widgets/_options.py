@@ -5,8 +5,8 @@ from __future__ import annotations
 from napari_shadowinv._napari.widgets._forms import ModelForm
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES
 from napari_shadowinv._napari.widgets._toml import TomlButtons
+from napari_shadowinv._system.validation import validated
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.validation import validated
 
 __all__ = ["OptionsForm"]
 

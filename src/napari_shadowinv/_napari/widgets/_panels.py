@@ -29,7 +29,7 @@ from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, wrapping_labe
 from napari_shadowinv._napari.widgets._lifetime import when_destroyed
 from napari_shadowinv._napari.widgets._notifications import error_text, tell_error
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
-from napari_shadowinv.progress import Progress
+from napari_shadowinv._system.progress import Progress
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion

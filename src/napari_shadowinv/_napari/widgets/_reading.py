@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from napari_shadowinv._napari.layer_metadata import mark_of
 from napari_shadowinv._napari.widgets._picking import kind_of
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.radiograph import film_warnings
+from napari_shadowinv.io.colours import film_warnings
 
 __all__ = ["crop_of", "image_of", "mask_of", "shown_plane", "stack_of", "warnings_of"]
 
@@ -115,9 +115,9 @@ def _grey(layer: Any | None, role: str) -> Any:
     if getattr(layer, "rgb", False):
         raise InputError(
             f"'{layer.name}' is a colour image, expected a greyscale one: if it is a scan of "
-            "film, which darkens with dose, convert it to dose first (napari_shadowinv.film); "
-            "if it is linear in fluence, split it (right click on the layer → Split RGB) and "
-            "choose one channel"
+            "film, which darkens with dose, convert it to dose first "
+            "(napari_shadowinv.preprocessing.film); if it is linear in fluence, "
+            "split it (right click on the layer → Split RGB) and choose one channel"
         )
     return layer.data[0] if getattr(layer, "multiscale", False) else layer.data
 

@@ -21,8 +21,8 @@ from qtpy.QtCore import QObject, QTimer, Signal
 
 from napari_shadowinv._napari.widgets._lifetime import when_destroyed
 from napari_shadowinv._napari.widgets._notifications import MISTAKES
+from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InversionCancelled
-from napari_shadowinv.progress import OnProgress, Progress, ShouldStop
 
 __all__ = ["Outcome", "Runner", "Work"]
 

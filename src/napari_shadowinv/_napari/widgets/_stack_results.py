@@ -22,8 +22,8 @@ from napari_shadowinv._napari.widgets._panels import ReportTable
 from napari_shadowinv._napari.widgets._picking import kind_of
 from napari_shadowinv._napari.widgets._results import result_frame
 from napari_shadowinv._napari.widgets._stacking import StackJob
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.progress import OnProgress, ShouldStop
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.progress import OnProgress, Progress, ShouldStop
-from napari_shadowinv.recipes import Estimate, Filter, UniformEstimate
+from napari_shadowinv.preprocessing.recipes import Estimate, Filter, UniformEstimate
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
@@ -110,7 +110,7 @@ class StackJob:
         Parameters
         ----------
         on_progress, should_stop
-            See `napari_shadowinv.progress`.
+            See `napari_shadowinv._system.progress`.
         on_done : callable, optional
             Called before it is told that there are finished shots, with the one that has just
             ended well, if any.

@@ -26,8 +26,8 @@ from napari_shadowinv._napari.widgets._results import (
     ResultLayers,
     keep_earlier_box,
 )
-from napari_shadowinv.progress import OnProgress, ShouldStop
-from napari_shadowinv.recipes import ESTIMATES
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv.preprocessing.recipes import ESTIMATES
 
 if TYPE_CHECKING:
     import napari

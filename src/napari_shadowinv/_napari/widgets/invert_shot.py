@@ -32,9 +32,9 @@ from napari_shadowinv._napari.widgets._results import (
 )
 from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._sources import SourcePicker
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
-from napari_shadowinv.progress import OnProgress, ShouldStop
 
 if TYPE_CHECKING:
     import napari

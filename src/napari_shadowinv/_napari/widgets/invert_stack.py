@@ -28,7 +28,7 @@ from napari_shadowinv._napari.widgets._sources import SourcePicker
 from napari_shadowinv._napari.widgets._stack_inputs import EnginePicker, ShotsPicker, StoreEdit
 from napari_shadowinv._napari.widgets._stack_results import FailureTable, StackRequest, place_on
 from napari_shadowinv._napari.widgets._stacking import StackJob
-from napari_shadowinv.progress import Progress
+from napari_shadowinv._system.progress import Progress
 
 if TYPE_CHECKING:
     import napari

@@ -33,6 +33,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from napari_shadowinv._system.validation import nearest, validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup._beam import BeamSetup
 from napari_shadowinv.physics.setup._optical import OpticalSetup
@@ -43,7 +44,6 @@ from napari_shadowinv.physics.setup._proton import (
     ProtonSetup,
     Species,
 )
-from napari_shadowinv.validation import nearest, validated
 
 __all__ = [
     "SPECIES",

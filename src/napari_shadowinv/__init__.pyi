@@ -1,0 +1,42 @@
+from ._napari.layers import add_inversion
+from ._system.progress import Progress
+from .errors import FileFormatError, InputError, InversionCancelled
+from .inversion import Inversion, Report, invert, plan_sites
+from .inversion.error_bars import Uncertainty, uncertainty
+from .io import Radiograph, read, write
+from .options import InversionOptions
+from .physics.forward import synthetic_image
+from .physics.poisson import poisson_invert
+from .physics.projection import project, project_potential
+from .physics.setup import OpticalSetup, ProtonSetup
+from .stack import invert_stack, run_stack, stack_statistics
+
+__version__: str
+
+__all__ = [
+    "FileFormatError",
+    "InputError",
+    "Inversion",
+    "InversionCancelled",
+    "InversionOptions",
+    "OpticalSetup",
+    "Progress",
+    "ProtonSetup",
+    "Radiograph",
+    "Report",
+    "Uncertainty",
+    "__version__",
+    "add_inversion",
+    "invert",
+    "invert_stack",
+    "plan_sites",
+    "poisson_invert",
+    "project",
+    "project_potential",
+    "read",
+    "run_stack",
+    "stack_statistics",
+    "synthetic_image",
+    "uncertainty",
+    "write",
+]

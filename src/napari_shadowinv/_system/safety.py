@@ -1,0 +1,200 @@
+"""What every reader relies on: no file blocks it, fills the memory or ends it with a traceback.
+
+- whatever a damaged file makes a reader raise is told in one sentence: `refusing_damage`
+- only regular files are opened: `check_regular`
+- a limit on what a file may unfold to in memory: `check_size`, `size_limit`
+- small files of text, such as setups and calibrations: `small_text`
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Concatenate, ParamSpec, TypeVar, cast
+
+from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
+
+__all__ = [
+    "LIMIT_VARIABLE",
+    "check_regular",
+    "check_size",
+    "refusing_damage",
+    "size_limit",
+    "small_text",
+]
+
+LIMIT_VARIABLE = "SHADOWINV_MAX_GB"
+"""Environment variable with the most gigabytes that a file may unfold to."""
+
+# Reading needs a few copies of the image, and other programs some memory too.
+_SHARE_OF_MEMORY = 1 / 8
+_MEMORY_IF_UNKNOWN = 8_000_000_000
+_LARGEST_TEXT = 1_000_000
+
+P = ParamSpec("P")
+Content = TypeVar("Content")
+
+
+def refusing_damage(
+    read: Callable[Concatenate[Path, P], Content],
+) -> Callable[Concatenate[str | Path, P], Content]:
+    """Tell whatever a reader raises as damage to its file, with the reason as the cause.
+
+    Parameters
+    ----------
+    read : callable
+        Takes the path of a file or of a folder first.
+
+    Returns
+    -------
+    callable
+        The same, but it raises nothing else than a `FileFormatError`, an `InputError`, or what
+        ends a program on purpose.
+    """
+
+    @functools.wraps(read)
+    def guarded(path: str | Path, *args: P.args, **kwargs: P.kwargs) -> Content:
+        try:
+            return read(Path(path), *args, **kwargs)
+        except (FileFormatError, InputError, InversionCancelled):
+            raise
+        except MemoryError as error:
+            raise FileFormatError(
+                f"{path} needs more memory than is available: close other programs, or crop or "
+                "bin the image first"
+            ) from error
+        except Exception as error:
+            if isinstance(error, OSError) and error.strerror:
+                raise FileFormatError(
+                    f"{path} cannot be read ({error.strerror}): check its permissions and the disk"
+                ) from error
+            raise FileFormatError(
+                f"{path} is damaged or truncated ({_one_line(error)}): expected a complete file; "
+                "copy or export it again"
+            ) from error
+
+    return cast("Callable[Concatenate[str | Path, P], Content]", guarded)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
+
+
+def check_regular(path: Path, expected: str) -> None:
+    """Refuse what is no regular file, before it is opened: a pipe would block for ever.
+
+    Parameters
+    ----------
+    path : Path
+        What is to be opened; links are followed.
+    expected : str
+        What should be there, for the message.
+
+    Raises
+    ------
+    FileFormatError
+        If there is nothing, or a folder, a pipe, a socket or a device.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        raise FileFormatError(
+            f"{path} does not exist: expected {expected}; check the path"
+        ) from None
+    except OSError as error:
+        raise FileFormatError(
+            f"{path} cannot be opened ({error.strerror}): check its permissions and the path"
+        ) from None
+    if stat.S_ISDIR(mode):
+        raise FileFormatError(f"{path} is a folder: expected {expected}")
+    if not stat.S_ISREG(mode):
+        found = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
+        raise FileFormatError(f"{path} is a {found}: expected {expected}; save it as a file first")
+
+
+def size_limit() -> int:
+    """Return how many bytes a file may unfold to in memory.
+
+    Returns
+    -------
+    int
+        What the environment variable `LIMIT_VARIABLE` says in GB, or an eighth of the memory.
+
+    Raises
+    ------
+    InputError
+        If the variable is no positive number.
+    """
+    text = os.environ.get(LIMIT_VARIABLE)
+    if text is None:
+        return int(_SHARE_OF_MEMORY * (physical_memory() or _MEMORY_IF_UNKNOWN))
+    try:
+        limit = float(text)
+    except ValueError:
+        limit = 0.0
+    if not 0 < limit < float("inf"):
+        raise InputError(f"{LIMIT_VARIABLE} is {text!r}: expected a number of gigabytes above 0")
+    return int(1e9 * limit)
+
+
+def check_size(path: str | Path, promised: int) -> None:
+    """Refuse what would unfold to more than fits well into memory, before it does.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    promised : int
+        Bytes in memory, pixels counted as 64-bit numbers.
+
+    Raises
+    ------
+    FileFormatError
+        If that is more than `size_limit`.
+    """
+    limit = size_limit()
+    if promised > limit:
+        raise FileFormatError(
+            f"{path} expands to {promised / 1e9:.3g} GB in memory, expected at most "
+            f"{limit / 1e9:.3g} GB: crop or bin it, or raise the environment variable "
+            f"{LIMIT_VARIABLE}"
+        )
+
+
+def small_text(path: Path, expected: str, encoding: str = "utf-8") -> str:
+    """Return the text of a file that nobody makes large.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    expected : str
+        What should be in it, for messages.
+    encoding : str
+        How it is written.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    FileFormatError
+        If it is missing, no regular file, larger than 1 MB, or no text.
+    """
+    check_regular(path, expected)
+    with path.open("rb") as file:
+        raw = file.read(_LARGEST_TEXT + 1)
+    if len(raw) > _LARGEST_TEXT:
+        raise FileFormatError(
+            f"{path} is larger than {_LARGEST_TEXT // 1_000_000} MB: expected {expected}; check "
+            "that it is the right file"
+        )
+    try:
+        return raw.decode(encoding)
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path} is not a text file: expected {expected}") from None

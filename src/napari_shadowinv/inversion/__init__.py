@@ -1,0 +1,10 @@
+"""Inversion of an image to its deflection potential.
+
+- invert an image: `invert`
+- prepare the sites once for many images with one source: `plan_sites`; how many: `count_sites`
+- results: `Inversion`, with a `Report`
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,348 @@
+"""An image and a source made ready for the transport.
+
+- check and normalise: `prepare`
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
+
+__all__ = [
+    "Mask",
+    "Prepared",
+    "checked_mask",
+    "checked_source",
+    "margin_around",
+    "masked_source",
+    "number_of_sites",
+    "power_of_two",
+    "prepare",
+]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_SMALLEST_SIDE = 4
+_LEAST_MARGIN = 4
+_MARGIN_SHARE = 0.05  # of the image's shorter side
+_BYTES_PER_SITE = 2000  # measured peak of a whole inversion, rounded up
+_NOTABLE_FLUX_CHANGE = 0.05
+_NOTABLE_MASK = 0.2  # of the pixels
+_DIMMEST, _BRIGHTEST = 1e-301, 1e301  # sums of a whole image stay within double precision
+_ALIKE = 1e-6  # of the mean: what rounding to 32 bits leaves of a difference
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """An image and a source, of the same flux unless the image's is known.
+
+    Attributes
+    ----------
+    image, source : ndarray, shape (H, W)
+        Clipped where asked for, the image scaled to the flux of the source; 0 where masked.
+    floored_image, floored_source : ndarray, shape (H, W)
+        The same as the transport sees them, in units of `unit`: dark pixels of the image raised
+        to the floor, masked pixels of both at the floor.
+    unit : float
+        The source's `power_of_two`.
+    mask : ndarray of bool, shape (H, W)
+        The pixels that are used.
+    clipped_pixels, floored_pixels : int
+        How many pixels were negative, and how many, these included, below the floor.
+    flux_scale : float
+        What the image was divided by.
+    warnings : tuple of str
+        What the user should know.
+    """
+
+    image: Array
+    source: Array
+    floored_image: Array
+    floored_source: Array
+    unit: float
+    mask: Mask
+    clipped_pixels: int
+    floored_pixels: int
+    flux_scale: float
+    warnings: tuple[str, ...]
+
+
+def prepare(
+    image: ArrayLike,
+    source: ArrayLike | None,
+    options: InversionOptions,
+    mask: ArrayLike | None = None,
+    *,
+    flux_scale: float | None = None,
+) -> Prepared:
+    """Check an image and its source, and bring them to the same flux.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; counts or any linear measure of fluence.
+    source : array_like, shape (H, W), optional
+        The undisturbed beam; uniform if None.
+    options : InversionOptions
+        Its `floor`, `negative` and `flux` are used.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel can be used; others carry no flux on either side, and what they
+        hold, even NaN, does not matter.
+    flux_scale : float, optional
+        Divide the image by this. Default: what gives it the flux of the source, or 1 where
+        `options.flux` says that it is known.
+
+    Returns
+    -------
+    Prepared
+
+    Raises
+    ------
+    InputError
+        If an array cannot be an image of a beam: wrong shape, not a number, negative, zero,
+        or so bright or dim that its sums are beyond double precision; or if the source is the
+        image itself.
+    """
+    shape = _plane(image, "image").shape
+    usable = np.ones(shape, bool) if mask is None else checked_mask(mask, shape)
+    values = _finite_image(image, "image", usable)
+    negative = int((values < 0).sum())
+    if negative and options.negative == "refuse":
+        raise InputError(
+            f"image has {negative} negative pixels (lowest {values.min():.4g}), expected none: "
+            "if they result from background subtraction, clip them (negative='clip', or "
+            "--clip-negative on the command line)"
+        )
+    values = np.maximum(values, 0)
+    if not values.any():
+        raise InputError(
+            "image has no positive pixel, expected a beam: check the file and its background"
+        )
+    _check_range(values, "image")
+    if source is None:
+        beam = np.where(usable, values.sum() / usable.sum(), 0.0)
+    else:
+        beam = checked_source(source, usable)
+        _refuse_the_image_itself(beam, values, usable)
+    with np.errstate(over="ignore", under="ignore"):
+        ratio = float(values.sum() / beam.sum())
+    if not _DIMMEST < ratio < _BRIGHTEST:
+        raise InputError(
+            f"image has {values.sum():.3g} units of flux and source {beam.sum():.3g}: expected a "
+            "ratio that double precision can hold; divide each by its mean"
+        )
+    conserved = flux_scale is None and options.flux != "known"
+    if flux_scale is None:
+        flux_scale = ratio if conserved else 1.0
+    values = values / flux_scale
+    least = options.floor * values.sum() / usable.sum()
+    floored = np.maximum(values, least)
+    floored_source = masked_source(beam, usable, options)
+    if conserved:
+        # The floor has added to both, not alike.
+        floored *= floored_source.sum() / floored.sum()
+    below = int((values[usable] < least).sum())
+    unit = power_of_two(beam)
+    return Prepared(
+        image=values,
+        source=beam,
+        floored_image=floored / unit,
+        floored_source=floored_source / unit,
+        unit=unit,
+        mask=usable,
+        clipped_pixels=negative,
+        floored_pixels=below,
+        flux_scale=flux_scale,
+        warnings=(
+            *_warnings(ratio if conserved else 1.0, negative, below, int(usable.sum())),
+            *_large_mask(usable),
+            *_few_sites(values.size, options),
+        ),
+    )
+
+
+def power_of_two(source: Array) -> float:
+    """Return the power of two next below the brightest pixel: dividing by it rounds nothing."""
+    return float(2.0 ** np.floor(np.log2(source.max())))
+
+
+def _refuse_the_image_itself(beam: Array, image: Array, mask: Mask) -> None:
+    """Refuse a source that is proportional to the image, unless both are uniform."""
+    ones, others = (values[mask] / values[mask].mean() for values in (beam, image))
+    if np.abs(ones - others).max() <= _ALIKE and np.ptp(ones) > 2 * _ALIKE:
+        raise InputError(
+            "the source is the image itself, so the deflection would be zero: give an image of "
+            "the beam without the object, or an estimate of it"
+        )
+
+
+def masked_source(source: Array, mask: Mask, options: InversionOptions) -> Array:
+    """Return a source with its masked pixels at the floor, so that cells fill the image."""
+    return np.where(mask, source, options.floor * source[mask].mean())
+
+
+def _large_mask(usable: Mask) -> tuple[str, ...]:
+    share = 1 - float(usable.mean())
+    if share < _NOTABLE_MASK:
+        return ()
+    return (
+        f"the mask excludes {share:.1%} of the pixels: the field there is only a smooth "
+        "continuation. To hide the object from a source estimate, use a source mask instead",
+    )
+
+
+def _warnings(ratio: float, clipped: int, floored: int, size: int) -> tuple[str, ...]:
+    warnings = []
+    if abs(ratio - 1) > _NOTABLE_FLUX_CHANGE:
+        warnings.append(
+            f"the image's flux is {ratio:.3g} times the source's; it was scaled to match"
+        )
+    if clipped:
+        warnings.append(f"negative pixels set to zero: {clipped} ({clipped / size:.2%})")
+    dark = floored - clipped
+    if dark > 0:
+        warnings.append(
+            f"dark pixels raised to the floor: {dark} ({dark / size:.2%}); "
+            "the field inside dark areas is not reliable"
+        )
+    return tuple(warnings)
+
+
+def _few_sites(pixels: int, options: InversionOptions) -> tuple[str, ...]:
+    if options.n_sites is not None or pixels <= MAX_DEFAULT_SITES:
+        return ()
+    return (
+        f"{MAX_DEFAULT_SITES:,} sites for {pixels:,} pixels, the default maximum: n_sites = "
+        f"{pixels:,} resolves single pixels but needs more time and memory",
+    )
+
+
+def checked_source(source: ArrayLike, mask: Mask | None = None) -> Array:
+    """Return a source as floats, 0 where masked, or raise an `InputError` that says what is wrong.
+
+    Parameters
+    ----------
+    source : array_like, shape (H, W)
+        The undisturbed beam.
+    mask : ndarray of bool, shape (H, W), optional
+        The pixels that are used, of the image's shape.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+
+    Raises
+    ------
+    InputError
+        If the source is of another shape, not a number, negative or zero everywhere.
+    """
+    found = _plane(source, "source").shape
+    if mask is not None and found != mask.shape:
+        raise InputError(f"source has shape {found}, image {mask.shape}: they must match")
+    beam = _finite_image(source, "source", np.ones(found, bool) if mask is None else mask)
+    if (beam < 0).any():
+        raise InputError(
+            f"source has {int((beam < 0).sum())} negative pixels, expected none: "
+            "clip or smooth it first"
+        )
+    if not beam.any():
+        raise InputError("source is zero everywhere, expected the undisturbed beam")
+    _check_range(beam, "source")
+    return beam
+
+
+def _check_range(values: Array, name: str) -> None:
+    peak = float(values.max())
+    if not _DIMMEST < peak < _BRIGHTEST:
+        raise InputError(
+            f"{name} has a brightest pixel of {peak:.3g}, expected one between {_DIMMEST:g} and "
+            f"{_BRIGHTEST:g}: divide it by its mean"
+        )
+
+
+def checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Mask:
+    """Return a mask as booleans, or raise an `InputError` that says what is wrong with it."""
+    usable = np.asarray(mask)
+    if usable.shape != shape:
+        raise InputError(f"mask has shape {usable.shape}, image {shape}: they must match")
+    if usable.dtype != bool:
+        raise InputError(
+            f"mask has values of type {usable.dtype}, expected booleans, true where a pixel is "
+            "usable: compare it with a number, as in mask > 0"
+        )
+    if not usable.any():
+        raise InputError("mask is false everywhere, expected true where a pixel is usable")
+    return usable
+
+
+def _plane(values: ArrayLike, name: str) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.ndim != 2:
+        raise InputError(
+            f"{name} has shape {array.shape}, expected two dimensions (y, x): "
+            "choose one channel or one shot"
+        )
+    if min(array.shape) < _SMALLEST_SIDE:
+        raise InputError(
+            f"{name} has shape {array.shape}, expected at least "
+            f"{_SMALLEST_SIDE} × {_SMALLEST_SIDE} pixels"
+        )
+    if array.dtype.kind not in "buif":
+        raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
+    return array
+
+
+def _finite_image(values: ArrayLike, name: str, mask: Mask) -> Array:
+    array = np.where(mask, _plane(values, name), 0.0).astype(np.float64)
+    bad = int((~np.isfinite(array)).sum())
+    if bad:
+        raise InputError(
+            f"{name} has {bad} pixels that are NaN or infinite, expected none: mask them, or "
+            "replace them, for example by the median of their neighbours"
+        )
+    return array
+
+
+def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
+    """Return the pixels beyond each edge that sites cover where the boundary is free.
+
+    Raises
+    ------
+    InputError
+        If it is wider than the image.
+    """
+    if options.margin is None:
+        return max(_LEAST_MARGIN, round(_MARGIN_SHARE * min(shape)))
+    if options.margin > max(shape):
+        raise InputError(
+            f"margin is {options.margin:,} px for an image of {shape[0]} × {shape[1]} px, "
+            f"expected at most {max(shape)} px: make it about as wide as the object"
+        )
+    return options.margin
+
+
+def number_of_sites(shape: tuple[int, int], options: InversionOptions) -> int:
+    """Return the sites to use for an image, or say why there cannot be so many.
+
+    Raises
+    ------
+    InputError
+        If they would not fit in memory.
+    """
+    wanted = options.n_sites
+    n_sites = min(shape[0] * shape[1], MAX_DEFAULT_SITES) if wanted is None else wanted
+    memory = physical_memory()
+    if memory is not None and n_sites * _BYTES_PER_SITE > memory:
+        raise InputError(
+            f"{n_sites:,} sites need about {n_sites * _BYTES_PER_SITE / 1e9:.3g} GB, this "
+            f"machine has {memory / 1e9:.3g} GB: use at most {memory // _BYTES_PER_SITE:,} sites"
+        )
+    return n_sites

@@ -1,0 +1,233 @@
+"""The result of an inversion: `Inversion`, with a `Report`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.labels import FORMAT, VARIABLES, dataset_from_field, label
+from napari_shadowinv.inversion.trust import image_residual
+from napari_shadowinv.options import InversionOptions
+
+if TYPE_CHECKING:
+    import xarray
+
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+__all__ = ["Inversion", "Report"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Report:
+    """Report on an inversion.
+
+    Attributes
+    ----------
+    converged : bool
+        Whether the flux residual fell below the tolerance.
+    iterations : int
+        Solver iterations, summed over all levels.
+    residual : float
+        Largest relative flux error of a cell, max ``|T - S| / S``.
+    tolerance : float
+        The residual required for convergence.
+    n_sites : int
+        Number of sites.
+    floor : float
+        Smallest intensity allowed in the image, as a share of its mean.
+    floored_pixels : int
+        Pixels raised to the floor, including clipped ones.
+    clipped_pixels : int
+        Negative pixels set to zero.
+    levels : tuple of (int, int, float)
+        Sites, solver steps and final residual of each level, coarse to fine.
+    seconds : dict of str to float
+        Time of each stage: prepare, sites, transport, read-out.
+    warnings : tuple of str
+        Reasons to doubt the result.
+    flux_scale : float
+        Factor by which the image was divided to match the source.
+    flux_left, flux_entered : dict of str to float
+        With a free boundary the flux that crossed each side of the image (top, bottom, left,
+        right), as a share of the source's flux in the image; else empty.
+    image_residual : float
+        How far the re-projection is from the image: r.m.s. difference over the used pixels,
+        as a share of the image's mean there. NaN in reports of older versions.
+    """
+
+    converged: bool
+    iterations: int
+    residual: float
+    tolerance: float
+    n_sites: int
+    floor: float
+    floored_pixels: int
+    clipped_pixels: int
+    levels: tuple[tuple[int, int, float], ...]
+    seconds: dict[str, float]
+    warnings: tuple[str, ...]
+    flux_scale: float = 1.0
+    flux_left: dict[str, float] = field(default_factory=dict)
+    flux_entered: dict[str, float] = field(default_factory=dict)
+    image_residual: float = math.nan
+
+
+@dataclass(frozen=True)
+class Inversion:
+    """The deflection potential of one shot, and how far it can be trusted.
+
+    Lengths are object-plane pixels; arrays are ``[y, x]``, vectors in axis order
+    (y, x); a pixel's centre is at its integer index.
+
+    Attributes
+    ----------
+    image : ndarray, shape (H, W)
+        The image that was inverted, after clipping, scaled to the flux of the source.
+    source : ndarray, shape (H, W)
+        The undisturbed beam.
+    potential : ndarray, shape (H, W)
+        Normalised deflection potential in px²; its mean over the image's border is 0.
+    displacement : ndarray, shape (2, H, W)
+        Displacement of the ray through each pixel, minus the gradient of the potential,
+        in px.
+    sites : ndarray, shape (n, 2)
+        Positions of the sites.
+    weights : ndarray, shape (n,)
+        Weights of the power diagram, px².
+    site_mass : ndarray, shape (n,)
+        Flux of the source in each site's cell.
+    site_flux : ndarray, shape (n,)
+        Flux of the image in each site's power cell: that of the source but for the residual,
+        ``max(abs(site_flux / site_mass - 1))``.
+    site_displacement : ndarray, shape (n, 2)
+        Centroid of each site's cell in the image minus that in the source, px.
+    reprojection : ndarray, shape (H, W)
+        The source as displaced by the retrieved field.
+    residual : ndarray, shape (H, W)
+        ``image - reprojection``.
+    caustic : ndarray of bool, shape (H, W)
+        Where the map folds or its Jacobian is below the threshold.
+    mask : ndarray of bool, shape (H, W)
+        The pixels that were used; image, source, residual and caustic are 0 elsewhere.
+    report : Report
+        Convergence, timing and warnings.
+    options : InversionOptions
+        The options used.
+    """
+
+    image: Array
+    source: Array
+    potential: Array
+    displacement: Array
+    sites: Array
+    weights: Array
+    site_mass: Array
+    site_flux: Array
+    site_displacement: Array
+    reprojection: Array
+    residual: Array
+    caustic: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
+    report: Report
+    options: InversionOptions
+
+    def with_warnings(self, texts: Iterable[str]) -> Inversion:
+        """Return the same inversion with additional warnings, such as doubts about its source.
+
+        Parameters
+        ----------
+        texts : iterable of str
+            Warnings to append to those of the report.
+
+        Returns
+        -------
+        Inversion
+        """
+        warnings = (*self.report.warnings, *texts)
+        return replace(self, report=replace(self.report, warnings=warnings))
+
+    def to_dataset(
+        self,
+        setup: ProtonSetup | OpticalSetup | None = None,
+        *,
+        attributes: Mapping[str, str] | None = None,
+    ) -> xarray.Dataset:
+        """Return everything as one labelled dataset, with units.
+
+        Parameters
+        ----------
+        setup : ProtonSetup or OpticalSetup, optional
+            Adds the potential and the line-integrated fields in SI units, and coordinates in
+            metres.
+        attributes : mapping of str to str, optional
+            Further attributes.
+
+        Returns
+        -------
+        xarray.Dataset
+            Dimensions y, x, component ("y", "x") and site. Each variable has ``units`` and
+            ``long_name``; options, report and setup are JSON texts in the attributes.
+        """
+        history = {
+            "format": FORMAT,
+            "options": self.options.model_dump_json(),
+            "report": json.dumps(dataclasses.asdict(self.report)),
+            "image_residual": self.report.image_residual,
+        }
+        dataset = dataset_from_field(
+            self.displacement, self.potential, setup, attributes=history | dict(attributes or {})
+        )
+        return dataset.assign(
+            {
+                name: (dims, getattr(self, name), label(units, long_name))
+                for name, (dims, units, long_name) in VARIABLES.items()
+                if name not in dataset
+            }
+        )
+
+    @classmethod
+    def from_dataset(cls, dataset: xarray.Dataset) -> Inversion:
+        """Rebuild an inversion from what `to_dataset` returned.
+
+        Raises
+        ------
+        InputError
+            If a variable or attribute is missing.
+        """
+        missing = [name for name in VARIABLES if name not in dataset.variables]
+        missing += [name for name in ("options", "report") if name not in dataset.attrs]
+        if missing:
+            raise InputError(
+                f"dataset has no {', '.join(map(repr, missing))}: expected the result of an "
+                "inversion"
+            )
+        arrays = {name: np.ascontiguousarray(dataset[name].values) for name in VARIABLES}
+        report = _report(json.loads(dataset.attrs["report"]))
+        if math.isnan(report.image_residual):  # a file of an older version
+            told = image_residual(arrays["image"], arrays["reprojection"], arrays["mask"])
+            report = replace(report, image_residual=told)
+        return cls(
+            **arrays,
+            report=report,
+            options=InversionOptions.model_validate_json(dataset.attrs["options"]),
+        )
+
+
+def _report(content: dict[str, Any]) -> Report:
+    known = {field.name for field in dataclasses.fields(Report)}
+    return Report(**{name: _tuples(value) for name, value in content.items() if name in known})
+
+
+def _tuples(value: Any) -> Any:
+    # JSON knows lists only.
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value

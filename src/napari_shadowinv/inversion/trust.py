@@ -1,0 +1,321 @@
+"""Signs in an answer that it must not be trusted, though the solver converged.
+
+- how far the re-projection is from the image: `image_residual`
+- what the user should know, in sentences: `doubts`
+
+Each sign was chosen to stay away from images whose field is known to come out well and to appear
+where it does not; `docs/trust.md` lists them with what to do. The limits, and what was
+measured on either side of them (200 × 200 px and the reference images):
+
+- **The picture does not fit.** Away from bright lines, where pixels are too coarse for any
+  re-projection, the residual of a noisy image has no pattern: its correlation between pixels up
+  to four apart is 0.09 to 0.28 (Gaussian noise of 1 to 50 %, counts of 1 to 1000 per pixel).
+  Chequerboards and stripes of 1 to 4 pixels (2:1 to 1000:1) have 0.8 to 1.0, too few sites for
+  an image 0.6 to 0.7; the limit is 0.5. Clean images can pass it with residuals of a few
+  tenths of a per cent, so a residual of at least 5 % is asked for, too: those images have 0.1 to
+  3 %, patterns 14 to 100 %. Dark and bright pixels at random are not told from noise.
+- **No deflection.** White noise of relative deviation s displaces by ∇∇⁻² of itself: the mean
+  square is s² Σ 1/k² / N over all N - 1 waves of the image. Pure noise gave 0.83 to 1.24 times
+  that displacement, as it should with the scatter of so few long waves; fields whose own
+  displacement is twice the noise's gave 2.0 to 2.2 times. The limit is five deviations of the
+  mean square: 1.4 times on a square image, more on a long one.
+- **Deep folds.** The answer squeezes what lies between two caustics into a strip. At its rim the
+  Jacobian grows smoothly where caustics have only just formed and jumps where the fold is deep.
+  The share of the strip's pixels below 0.7 that are below 0.4 is at most 0.70 up to 1.1 times the
+  strength at which caustics begin (0.47 to 0.66 for the phantoms, the toroid of 194 MG µm and the
+  donut; 0.73 for a radius of 10 px); 0.76 to 0.80 for rings at 1.2, 0.79 to 0.93 at 1.3 to 1.5;
+  0.69 to 0.72 for focusing spots at 1.2, 0.72 at 1.3 and 0.74 to 0.90 beyond. At twice the
+  strength the jump of a ring is at 0.6 to 1, hence the same with 0.85 and 0.6. A crescent has
+  shallow tips: around its widest place, within twice the half-width, the shares are up to 0.79
+  and 0.83 without deep folds, 0.86 to 0.95 and 0.87 to 0.98 with.
+- **The field goes on beyond a closed edge.** What a closed edge keeps from leaving must turn
+  back. A twentieth of the side inside the edge the mean displacement towards it or away from it
+  is 0.08 to 0.20 of the r.m.s. displacement for fields that fall like 1/r or r^-½ or not at all,
+  on all sides or two. The lesser of mean and median of the sides is at most 0.05 for contained
+  fields and 0.055 for real plumes; with noise, 8 and more times its noise against 3. An object
+  that the edge cuts in half has 0.87 to 1 of its peak along the edge, real plumes up to 0.72; a
+  jet is as strong at the edge as elsewhere, but nothing crosses the edge. A dipole's field, and
+  an object of which the edge cuts off less than half, are not told from a plume.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+if TYPE_CHECKING:
+    from napari_shadowinv.inversion.normalise import Prepared
+    from napari_shadowinv.options import InversionOptions
+
+__all__ = ["doubts", "image_residual"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_BRIGHT = 3.0  # times the source: there a bright line is, which pixels are too coarse for
+_LAGS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 4), (4, 0))
+_PATTERN = 0.5
+_NOTABLE_RESIDUAL = 0.05
+
+_CLIPPED_AT = 4.0  # in standard deviations of normal noise
+_NORMAL_MAD = 1.4826
+_NOISE_DEVIATIONS = 5.0
+_ROUNDING = 1e-6  # px, where image and source are the same
+
+_CAUSTIC = 0.2  # Jacobian; not the option, which is the user's taste
+# Two Jacobians, and what share may be below the first: of all strips, where one is widest.
+_STRIPS = ((0.4, 0.7, 0.72, 0.84), (0.6, 0.85, 0.8, 0.87))
+_LEAST_STRIP = 0.003  # of the pixels
+_LEAST_CAUSTIC = 0.01  # of a strip
+_ENOUGH_PIXELS = 300  # of a side, to see how wide a strip is
+
+_INSIDE = 0.05  # of the shorter side
+_TURNED_BACK = 0.07  # of the r.m.s. displacement
+_BAND_DEVIATIONS = 5.0
+_AT_EDGE = 0.8  # of the peak
+_CROSSING = 0.1  # of the displacement along the edge
+_MASKED_EDGE = 0.2  # of a side
+
+
+def image_residual(image: Array, reprojection: Array, mask: Mask) -> float:
+    """How far a re-projection is from its image: r.m.s. difference over mean intensity.
+
+    Parameters
+    ----------
+    image, reprojection : ndarray, shape (H, W)
+        In the same units.
+    mask : ndarray of bool, shape (H, W)
+        The pixels that count.
+
+    Returns
+    -------
+    float
+        As a share of the image's mean.
+
+    Examples
+    --------
+    >>> image_residual(np.array([[2.0, 4.0]]), np.array([[2.3, 3.7]]), np.array([[True, True]]))
+    0.1
+    """
+    difference = (image - reprojection)[mask]
+    return float(np.sqrt(np.mean(difference**2)) / image[mask].mean())
+
+
+def doubts(
+    prepared: Prepared,
+    displacement: Array,
+    reprojection: Array,
+    jacobian: Array,
+    n_sites: int,
+    options: InversionOptions,
+) -> tuple[str, ...]:
+    """Say in plain sentences why a converged answer must not be trusted.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        Image, source and mask.
+    displacement : ndarray, shape (2, H, W)
+        The answer, px.
+    reprojection : ndarray, shape (H, W)
+        The source as displaced by it.
+    jacobian : ndarray, shape (H, W)
+        Its Jacobian determinant.
+    n_sites : int
+        Number of sites.
+    options : InversionOptions
+        Its `boundary` is used.
+
+    Returns
+    -------
+    tuple of str
+        Empty where nothing speaks against the answer.
+    """
+    noise = _Noise(prepared)
+    square = np.einsum("cyx,cyx->yx", displacement, displacement)
+    rms = float(np.sqrt(square[prepared.mask].mean()))
+    misfit = _misfit(prepared, reprojection, n_sites)
+    # Where the finest structure is a pattern, it is no measure of noise.
+    nothing = "" if misfit else _nothing_found(noise, rms)
+    if nothing:
+        return (nothing,)
+    found = [
+        misfit,
+        _deep_folds(jacobian, prepared.mask),
+        "" if options.boundary == "free" else _cut_off(displacement, prepared.mask, noise, rms),
+    ]
+    return tuple(sentence for sentence in found if sentence)
+
+
+def _misfit(prepared: Prepared, reprojection: Array, n_sites: int) -> str:
+    """The re-projection misses a pattern in the image."""
+    mask, mean = prepared.mask, prepared.source[prepared.mask].mean()
+    bright = ndimage.uniform_filter(prepared.image, 3) > _BRIGHT * np.maximum(prepared.source, mean)
+    counted = mask & ~bright
+    residual = np.where(counted, prepared.image - reprojection, 0.0)
+    share = float(np.sqrt((residual**2).sum() / max(counted.sum(), 1)) / mean)
+    if share < _NOTABLE_RESIDUAL:
+        return ""
+    # A few hot pixels are no pattern.
+    np.clip(residual, -5 * share * mean, 5 * share * mean, out=residual)
+    if max(abs(_correlation(residual, *lag)) for lag in _LAGS) < _PATTERN:
+        return ""
+    advice = (
+        "use more sites"
+        if n_sites < mask.sum()
+        else (
+            "the image has structure on the scale of its pixels, so smooth it or record it "
+            "with smaller pixels"
+        )
+    )
+    return (
+        "the picture does not fit: the re-projection misses a pattern in the image, by "
+        f"{share:.0%} of the mean (r.m.s.); do not trust the field: {advice}"
+    )
+
+
+def _correlation(values: Array, down: int, right: int) -> float:
+    """Correlation of pixels with those so many rows and columns further."""
+    height, width = values.shape
+    left = max(-right, 0)
+    first = values[: height - down, left : width - max(right, 0)]
+    second = values[down:, left + right : width - max(right, 0) + right]
+    # Not by BLAS, whose threads are not ours to start.
+    return float((first * second).sum() / (values**2).sum())
+
+
+class _Noise:
+    """The relative noise of an image, from differences between neighbouring pixels."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        mask = prepared.mask
+        self.shape = mask.shape[0], mask.shape[1]
+        excess = (prepared.image - prepared.source) / prepared.source[mask].mean()
+        finest = (excess[1:, 1:] - excess[1:, :-1] - excess[:-1, 1:] + excess[:-1, :-1]) / 2
+        used = mask[1:, 1:] & mask[1:, :-1] & mask[:-1, 1:] & mask[:-1, :-1]
+        differences = np.abs(finest[used]) if used.any() else np.zeros(1)
+        self.largest = float(np.sqrt(np.mean(differences**2)))
+        """With hot pixels and the finest structure."""
+        limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(differences))
+        self.typical = self.largest
+        if limit > 0:
+            self.typical = float(np.sqrt(np.mean(np.minimum(differences, limit) ** 2)))
+
+    def displacements(self, level: float) -> tuple[float, float]:
+        """R.m.s. displacement of so much noise, px, and the most that chance leaves likely."""
+        mean, deviation = _response(self.shape)
+        return level * math.sqrt(mean), level * math.sqrt(mean + _NOISE_DEVIATIONS * deviation)
+
+
+@lru_cache(maxsize=8)
+def _response(shape: tuple[int, int]) -> tuple[float, float]:
+    """Mean and standard deviation of the mean square displacement by white noise of 1, px²."""
+    wave_y, wave_x = (np.pi * np.arange(length) / length for length in shape)
+    square = wave_y[:, None] ** 2 + wave_x**2
+    square[0, 0] = np.inf
+    power = 1 / square
+    return float(power.mean()), float(np.sqrt(2 * (power**2).sum()) / power.size)
+
+
+def _nothing_found(noise: _Noise, rms: float) -> str:
+    """Noise alone would have displaced as much."""
+    usual, most = noise.displacements(noise.typical)
+    if rms > max(most, _ROUNDING):
+        return ""
+    return (
+        f"no deflection found: the displacement of {rms:.2g} px (r.m.s.) is no larger than the "
+        f"{usual:.2g} px expected from the image's noise of {noise.typical:.1%} per pixel; "
+        "average shots, or bin or smooth the image, before interpreting the field"
+    )
+
+
+def _deep_folds(jacobian: Array, mask: Mask) -> str:
+    """Caustics far beyond their beginning, told by the rim of the strip between them."""
+    if not (jacobian < _CAUSTIC)[mask].any():
+        return ""
+    step = max(1, min(mask.shape) // _ENOUGH_PIXELS)
+    used = mask[::step, ::step]
+    jacobian = np.where(used, jacobian[::step, ::step], np.inf)
+    least = _LEAST_STRIP * float(used.sum())
+    if not any(
+        _share_of_strips(jacobian, inner, outer, least) > of_all
+        or _share_where_widest(jacobian, inner, outer, least) > of_widest
+        for inner, outer, of_all, of_widest in _STRIPS
+    ):
+        return ""
+    return (
+        "rays cross: folds look deeper than 10 % beyond the first caustic, where the field comes "
+        "out too weak: 3–5 % off (L2) at 1.2 times the strength at which caustics begin, 9–14 % "
+        "at 1.5, 20–29 % at 2; see docs/trust.md"
+    )
+
+
+def _strips(jacobian: Array, outer: float, least: float) -> tuple[NDArray[np.int32], NDArray[Any]]:
+    """Label where the Jacobian is below `outer`; say which labels are strips with caustics."""
+    labels, count = ndimage.label(jacobian < outer)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    caustics = np.bincount(labels[jacobian < _CAUSTIC], minlength=count + 1)
+    return labels, np.flatnonzero((sizes >= least) & (caustics >= _LEAST_CAUSTIC * sizes))
+
+
+def _share_of_strips(jacobian: Array, inner: float, outer: float, least: float) -> float:
+    """Of all strips: pixels below `inner` among those below `outer`."""
+    labels, found = _strips(jacobian, outer, least)
+    strips = jacobian[np.isin(labels, found)]
+    return float((strips < inner).sum() / max(strips.size, 1))
+
+
+def _share_where_widest(jacobian: Array, inner: float, outer: float, least: float) -> float:
+    """The same around the widest place of a strip: the tips of a crescent are shallow."""
+    labels, found = _strips(jacobian, inner, least)
+    boxes = ndimage.find_objects(labels)
+    largest = 0.0
+    for label in found:
+        box = boxes[label - 1]
+        depth = ndimage.distance_transform_edt(np.pad(labels[box] == label, 1))
+        row, column = np.unravel_index(depth.argmax(), depth.shape)
+        y = np.arange(jacobian.shape[0])[:, None] - (box[0].start + row - 1)
+        x = np.arange(jacobian.shape[1]) - (box[1].start + column - 1)
+        near = jacobian[y**2 + x**2 <= (2 * depth.max()) ** 2]
+        largest = max(largest, float((near < inner).sum() / (near < outer).sum()))
+    return largest
+
+
+def _cut_off(displacement: Array, mask: Mask, noise: _Noise, rms: float) -> str:
+    """The field does not end at the closed edge."""
+    depth = max(2, round(_INSIDE * min(mask.shape)))
+    y, x = np.where(mask, displacement, np.nan)
+    outwards = -y[depth], y[-1 - depth], -x[:, depth], x[:, -1 - depth]
+    along = x[0], x[-1], y[:, 0], y[:, -1]
+    if any(np.isnan(side).mean() > _MASKED_EDGE for side in (*outwards, *along)):
+        return ""  # the used part of the image ends elsewhere
+    sides = [float(np.nanmean(side)) for side in outwards]
+    turned = min(abs(float(np.mean(sides))), abs(float(np.median(sides))))
+    by_noise = noise.largest * np.sqrt(depth / sum(side.size for side in outwards))
+    if turned > max(_TURNED_BACK * rms, _BAND_DEVIATIONS * by_noise):
+        how = (
+            f"near the edge it displaces rays by {turned:.2g} px towards or away from the edge "
+            "on all sides"
+        )
+    elif rms > 2 * noise.displacements(noise.largest)[1] and _is_strongest_at_edge(
+        np.concatenate(outwards), np.concatenate(along), float(np.nanmax(np.hypot(y, x)))
+    ):
+        how = "it is strongest at the edge"
+    else:
+        return ""
+    return (
+        f"the field reaches the image's edge, which is closed: {how}, and truncating it there "
+        "distorts the field everywhere; try a free boundary (--boundary free), see "
+        "docs/boundary.md, or record a larger field of view"
+    )
+
+
+def _is_strongest_at_edge(outwards: Array, along: Array, peak: float) -> bool:
+    """Whether it is, and not just the same all the way to the edge, as that of a jet."""
+    crossing = np.nanmean(outwards**2) > _CROSSING**2 * np.nanmean(along**2)
+    return bool(crossing and np.nanmax(np.abs(along)) > _AT_EDGE * peak)

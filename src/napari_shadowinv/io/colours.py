@@ -1,0 +1,119 @@
+"""Pictures in colour: one plane of them (`to_grey`), and signs of a film scan (`film_warnings`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError
+
+__all__ = ["CHANNELS", "film_warnings", "to_grey"]
+
+CHANNELS = ("red", "green", "blue", "mean")
+
+# Of a picture of film that is exposed in its middle: the rim's width over the shorter side, its
+# least brightness over the brightest, and the middle's greatest over the rim's.
+_RIM, _AS_BRIGHT, _DARKER = 0.05, 0.9, 0.8
+
+
+def to_grey(
+    array: NDArray[Any], channel: str | int | None, where: str | Path
+) -> NDArray[np.float64]:
+    """Reduce an image with channels to one plane, as the user says.
+
+    Parameters
+    ----------
+    array : ndarray, shape (H, W) or (H, W, C)
+        Grey, grey and alpha (C = 2), RGB (3) or RGBA (4) image. Alpha counts as no channel.
+    channel : {"red", "green", "blue", "mean"} or int or None
+        What to take of a colour image; a grey one is taken as it is.
+    where : str or Path
+        Name of the image in messages.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The plane.
+
+    Raises
+    ------
+    InputError
+        If the channels differ and none was chosen, or there is no such channel.
+    """
+    if array.ndim == 2:
+        return np.ascontiguousarray(array, dtype=np.float64)
+    colours = array[..., : {2: 1, 4: 3}.get(array.shape[-1], array.shape[-1])]
+    if (colours == colours[..., :1]).all():
+        return np.ascontiguousarray(colours[..., 0], dtype=np.float64)
+    if channel is None:
+        raise InputError(
+            f"{where} is a colour image with {colours.shape[-1]} channels: if it is a scan of "
+            "film, which darkens with dose, convert it to dose first "
+            "(napari_shadowinv.preprocessing.film); "
+            'otherwise choose a channel that is linear in fluence, "red", "green", "blue" or '
+            '"mean", or its number'
+        )
+    if channel == "mean":
+        return np.ascontiguousarray(colours.mean(axis=-1, dtype=np.float64))
+    index = _channel_index(channel, colours.shape[-1], where)
+    return np.ascontiguousarray(colours[..., index], dtype=np.float64)
+
+
+def _channel_index(channel: str | int, count: int, where: str | Path) -> int:
+    text = str(channel)
+    index = CHANNELS.index(text) if text in CHANNELS else int(text) if text.isdecimal() else -1
+    if not 0 <= index < count:
+        raise InputError(
+            f"{where} has no channel {text!r}: expected "
+            f'"red", "green", "blue", "mean" or a number from 0 to {count - 1}'
+        )
+    return index
+
+
+def film_warnings(array: NDArray[Any], channel: str | int | None) -> tuple[str, ...]:
+    """Warn of a picture that may be a scan of film, whose grey levels fall with dose.
+
+    Parameters
+    ----------
+    array : ndarray, shape (H, W) or (H, W, C)
+        The picture as it is stored.
+    channel : {"red", "green", "blue", "mean"} or int or None
+        What is taken of a colour image.
+
+    Returns
+    -------
+    tuple of str
+        A sentence if it is a colour image, or if its rim is as bright as anything in it and the
+        middle clearly darker, as where only the middle of a film was exposed; else none. Light
+        or particles that are deflected out of the middle make something else brighter.
+    """
+    grey = to_grey(array, "mean", "")
+    is_colour = array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, ""))
+    if is_colour:
+        return (
+            f"channel {channel!r} of a colour image was used as the fluence: film darkens with "
+            "dose, so a scan gives a field of the wrong sign unless it is converted to dose "
+            "first (napari_shadowinv.preprocessing.film)",
+        )
+    if array.dtype.kind in "iu" and _is_lit_around(grey):
+        return (
+            "the rim is as bright as anything in the image and the centre is darker, which "
+            "suggests a film scan: film darkens with dose, so a scan gives a field of the wrong "
+            "sign unless it is converted to dose first (napari_shadowinv.preprocessing.film)",
+        )
+    return ()
+
+
+def _is_lit_around(image: NDArray[np.float64]) -> bool:
+    """Whether all four sides are as bright as the brightest part, and the middle is darker."""
+    height, width = image.shape
+    rim = max(1, round(_RIM * min(height, width)))
+    sides = (image[:rim], image[-rim:], image[:, :rim], image[:, -rim:])
+    dimmest = min(float(np.median(side)) for side in sides)
+    middle = image[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    return bool(
+        np.median(middle) < _DARKER * dimmest and _AS_BRIGHT * np.percentile(image, 99) < dimmest
+    )

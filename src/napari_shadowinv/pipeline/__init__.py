@@ -1,0 +1,1 @@
+"""From a shot to its result, for every face of the package."""

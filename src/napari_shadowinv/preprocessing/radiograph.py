@@ -1,0 +1,112 @@
+"""An image as it was measured, with what is known about it: `Radiograph`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import InputError
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+__all__ = ["Radiograph"]
+
+
+@dataclass(frozen=True, eq=False)
+class Radiograph:
+    """One image, ready to be inverted.
+
+    Attributes
+    ----------
+    image : ndarray of float64, shape (H, W)
+        Intensity or counts, ``[y, x]``, as stored.
+    setup : ProtonSetup or OpticalSetup or None
+        The geometry, where the file tells all of it.
+    path : Path or None
+        The file it comes from.
+    metadata : mapping
+        What else the file says: ``kind``, ``dtype``, ``bits``, ``sha256``, and for pradformat
+        ``geometry``, the part of the setup that the file knows.
+    source : ndarray, shape (H, W), or None
+        The undisturbed beam.
+    mask : ndarray of bool, shape (H, W), or None
+        True where a pixel can be used.
+    warnings : tuple of str
+        What the user should know before trusting what the file says.
+    """
+
+    image: NDArray[np.float64]
+    setup: ProtonSetup | OpticalSetup | None = None
+    path: Path | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    source: NDArray[np.float64] | None = None
+    mask: NDArray[np.bool_] | None = None
+    warnings: tuple[str, ...] = ()
+
+    def binned(self, factor: int) -> Radiograph:
+        """Sum blocks of pixels; the setup's pixel grows with them.
+
+        Parameters
+        ----------
+        factor : int
+            Side of a block in pixels. Rows and columns that fill no block are cut off at
+            the end.
+
+        Returns
+        -------
+        Radiograph
+            A smaller one, with ``bin`` and ``cropped`` (rows, columns) in its metadata. A
+            block can be used if all its pixels can.
+
+        Raises
+        ------
+        InputError
+            If `factor` is less than 1 or leaves less than 2×2 blocks, or there are none.
+
+        Examples
+        --------
+        >>> Radiograph(np.ones((5, 6))).binned(2).image
+        array([[4., 4., 4.],
+               [4., 4., 4.]])
+        """
+        from napari_shadowinv.physics.setup import binned_setup
+
+        height, width = self.image.shape
+        if min(height, width) < 2:
+            raise InputError(
+                f"{'image' if self.path is None else self.path} has {height}×{width} pixels: "
+                "expected at least two rows and two columns"
+            )
+        if factor < 1 or min(height, width) // factor < 2:
+            raise InputError(
+                f"cannot bin {height}×{width} pixels by {factor}: expected a whole number from "
+                f"1 to {min(height, width) // 2}"
+            )
+        if factor == 1:
+            return self
+        return replace(
+            self,
+            image=_blocks(self.image, factor).sum(axis=(1, 3)),
+            source=None if self.source is None else _blocks(self.source, factor).sum(axis=(1, 3)),
+            mask=None
+            if self.mask is None
+            else np.asarray(_blocks(self.mask, factor).all(axis=(1, 3))),
+            setup=None if self.setup is None else binned_setup(self.setup, factor),
+            metadata={
+                **self.metadata,
+                "bin": factor * int(self.metadata.get("bin", 1)),
+                "cropped": (height % factor, width % factor),
+            },
+        )
+
+
+def _blocks(array: NDArray[Any], factor: int) -> NDArray[Any]:
+    rows, columns = (n // factor for n in array.shape)
+    cropped = array[: rows * factor, : columns * factor]
+    return cropped.reshape(rows, factor, columns, factor)

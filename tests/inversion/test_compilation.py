@@ -1,0 +1,151 @@
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from napari_shadowinv import InversionCancelled
+from napari_shadowinv.inversion import compilation
+from napari_shadowinv.inversion.compilation import ensure_compiled, is_compiled
+
+# Root may write everywhere, unless it does without its privileges.
+WITHOUT_PRIVILEGES = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"]
+
+
+def test_an_empty_cache_means_to_compile(tmp_path):
+    script = "from napari_shadowinv.inversion.compilation import is_compiled; print(is_compiled())"
+    printed = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert printed.stdout.strip() == "False"
+
+
+def test_it_is_told_and_can_be_cancelled_and_is_done_once(monkeypatch):
+    told = []
+    monkeypatch.setattr(compilation, "is_compiled", lambda: False)
+    ensure_compiled(told.append)
+    assert [news.stage for news in told] == ["compile"]
+    with pytest.raises(InversionCancelled):
+        ensure_compiled(should_stop=lambda: True)
+    monkeypatch.undo()
+    assert is_compiled()
+    ensure_compiled(told.append)
+    assert len(told) == 1
+
+
+def test_it_leaves_nothing_to_compile_for_an_inversion():
+    script = """
+import sys
+import numpy as np
+from napari_shadowinv import invert
+from napari_shadowinv.inversion import compilation
+
+compilation.is_compiled = lambda: False
+compilation.ensure_compiled()
+kernels = {
+    function
+    for name, module in list(sys.modules.items()) if name.startswith("napari_shadowinv")
+    for function in vars(module).values() if hasattr(function, "signatures")
+}
+compiled = {kernel: len(kernel.signatures) for kernel in kernels}
+assert sum(compiled.values()) > 10
+y, x = np.indices((40, 60)) / 60
+invert(1 + y * x, source=1 + x)
+print([kernel.py_func.__name__ for kernel in kernels if len(kernel.signatures) > compiled[kernel]])
+"""
+    printed = subprocess.run(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, check=True
+    )
+    assert printed.stdout.strip() == "[]"
+
+
+ONE_KERNEL = """
+import numpy as np
+from napari_shadowinv.preprocessing._total_variation import _smooth_row as kernel
+from napari_shadowinv.geometry._kernel import is_kept
+
+image = np.ones((3, 4))
+smooth = np.empty(4)
+kernel(image, 0 * image, 0 * image, 1, smooth)
+assert (smooth == 1).all()
+print(is_kept(), sum(kernel.stats.cache_hits.values()), kernel.stats.cache_path)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of another kind")
+class TestReadOnlyInstallation:
+    """Neither the package nor the home can be written."""
+
+    @pytest.fixture
+    def printed(self, tmp_path):
+        """Run a script with another folder for temporary files."""
+        if os.getuid() == 0 and not shutil.which("setpriv"):
+            pytest.skip("root may write everywhere")
+        import napari_shadowinv
+
+        exec(ONE_KERNEL, {})
+
+        place = tmp_path / "installed"
+        package = Path(napari_shadowinv.__file__).parent
+        shutil.copytree(package, place / package.name)
+        for folder in (place, *place.rglob("*")):
+            folder.chmod(0o555)
+
+        def run(temporary: Path) -> list[str]:
+            done = subprocess.run(
+                [
+                    *(WITHOUT_PRIVILEGES if os.getuid() == 0 else []),
+                    sys.executable,
+                    "-c",
+                    ONE_KERNEL,
+                ],
+                cwd=place,
+                env={
+                    "PYTHONPATH": str(place),
+                    "TMPDIR": str(temporary),
+                    "HOME": str(place / "home"),
+                },
+                capture_output=True,
+                text=True,
+            )
+            assert done.returncode == 0, done.stderr
+            return done.stdout.split()
+
+        yield run
+        for folder in (place, *place.rglob("*")):
+            folder.chmod(0o755)
+
+    @pytest.fixture
+    def temporary(self, tmp_path: Path) -> Path:
+        folder = tmp_path / "tmp"
+        folder.mkdir()
+        return folder
+
+    def test_compiled_code_of_the_package_is_used(self, printed, temporary):
+        kept, hits, folder = printed(temporary)
+        own = temporary / f"napari-shadowinv-{os.getuid()}"
+        assert (kept, hits) == ("True", "1")
+        assert Path(folder).parent == own
+        assert stat.S_IMODE(own.stat().st_mode) == 0o700
+
+    def test_a_folder_that_is_a_link_is_not_used(self, printed, temporary):
+        own, other = temporary / f"napari-shadowinv-{os.getuid()}", temporary / "other"
+        other.mkdir(mode=0o700)
+        own.symlink_to(other)
+        # Compiled anew, which ends as well.
+        assert printed(temporary) == ["False", "0", "None"]
+        assert list(other.iterdir()) == []
+
+    def test_a_folder_that_others_can_write_to_is_not_used(self, printed, temporary):
+        own = temporary / f"napari-shadowinv-{os.getuid()}"
+        own.mkdir()
+        own.chmod(0o770)
+        assert printed(temporary) == ["False", "0", "None"]
+        assert list(own.iterdir()) == []

@@ -1,0 +1,306 @@
+from __future__ import annotations
+
+import json
+import re
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import (
+    InputError,
+    InversionCancelled,
+    InversionOptions,
+    OpticalSetup,
+    ProtonSetup,
+    invert,
+    plan_sites,
+    read,
+    synthetic_image,
+    uncertainty,
+    write,
+)
+from napari_shadowinv.inversion import error_bars
+from napari_shadowinv.inversion.error_bars import _RunningMoments
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.poisson import border_mean
+
+SHAPE = (40, 48)
+COUNTS = 20.0
+OPTIONS = InversionOptions(negative="clip")
+
+
+@pytest.fixture(scope="module")
+def phantom():
+    return gaussian_blob(SHAPE, 20.0, (5.0, 7.0), (18.3, 26.8), 0.4)
+
+
+@pytest.fixture(scope="module")
+def clean(phantom):
+    return synthetic_image(phantom.displacement)
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return plan_sites(np.ones(SHAPE), OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def counts(clean):
+    return np.random.default_rng(5).poisson(200 * clean)
+
+
+def poisson_shot(clean, rng):
+    return rng.poisson(COUNTS * clean)
+
+
+def gaussian_shot(clean, rng):
+    return clean + 0.15 * rng.normal(size=clean.shape)
+
+
+@pytest.mark.parametrize(
+    ("shot", "noise"),
+    [(poisson_shot, "poisson"), (gaussian_shot, 0.15)],
+    ids=["Poisson", "Gaussian"],
+)
+def test_error_bars_of_one_shot_are_the_scatter_of_many(phantom, clean, plan, shot, noise):
+    """And about two thirds of them hold the truth, as one standard deviation should."""
+    rng = np.random.default_rng(11)
+    shots = [shot(clean, rng) for _ in range(30)]
+    found = uncertainty(shots[0], plan=plan, noise=noise, options=OPTIONS)
+    others = [invert(other, plan=plan, options=OPTIONS) for other in shots]
+    true = phantom.potential - border_mean(phantom.potential)
+    for std, fields, truth in (
+        (found.potential_std, [other.potential for other in others], true),
+        (found.displacement_std, [other.displacement for other in others], phantom.displacement),
+    ):
+        assert np.median(std / np.std(fields, axis=0, ddof=1)) == pytest.approx(1, abs=0.25)
+        covered = np.mean([np.abs(field - truth) < std for field in fields])
+        assert covered == pytest.approx(0.683, abs=0.08)
+
+
+def test_the_inversion_is_that_of_the_image(counts, plan):
+    found = uncertainty(counts, 2, plan=plan)
+    alone = invert(counts, plan=plan)
+    np.testing.assert_array_equal(found.inversion.potential, alone.potential)
+    without_plan = uncertainty(counts, 2)
+    np.testing.assert_array_equal(without_plan.inversion.potential, invert(counts).potential)
+
+
+def test_small_noise_twice_as_large_gives_error_bars_twice_as_large(clean, plan):
+    small, large = (
+        uncertainty(clean, 4, plan=plan, noise=noise, options=OPTIONS) for noise in (0.01, 0.02)
+    )
+    ratio = large.potential_std / small.potential_std
+    assert np.median(ratio) == pytest.approx(2, rel=0.01)
+    np.testing.assert_allclose(ratio, 2, rtol=0.1)
+
+
+def test_gain_says_how_many_units_a_quantum_makes(counts, plan):
+    as_counts = uncertainty(counts, 3, plan=plan)
+    as_units = uncertainty(8.0 * counts, 3, plan=plan, gain=8.0)
+    np.testing.assert_allclose(as_units.displacement_std, as_counts.displacement_std, rtol=1e-6)
+    mistaken = uncertainty(8.0 * counts, 3, plan=plan)
+    ratio = mistaken.displacement_std / as_counts.displacement_std
+    assert np.median(ratio) == pytest.approx(8**-0.5, rel=0.25)
+
+
+def test_an_array_gives_each_pixel_its_own_noise(clean, plan):
+    everywhere = np.full(SHAPE, 0.05)
+    found = uncertainty(clean, 3, plan=plan, noise=everywhere, options=OPTIONS)
+    same = uncertainty(clean, 3, plan=plan, noise=0.05, options=OPTIONS)
+    np.testing.assert_array_equal(found.potential_std, same.potential_std)
+    right_only = np.where(np.arange(SHAPE[1]) < 24, 0.0, everywhere)
+    lopsided = uncertainty(clean, 3, plan=plan, noise=right_only, options=OPTIONS)
+    left, right = lopsided.displacement_std[:, :, :16], lopsided.displacement_std[:, :, 32:]
+    assert np.median(left) < 0.5 * np.median(right)
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.2])
+def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, clean, plan, noise):
+    loose = uncertainty(clean, 6, plan=plan, noise=noise, options=OPTIONS)
+    monkeypatch.setattr(error_bars, "_SAMPLE_SHARE", 0.0)
+    exact = uncertainty(
+        clean, 6, plan=plan, noise=noise, options=OPTIONS.model_copy(update={"tolerance": 1e-6})
+    )
+    assert loose.tolerance > 1e-3 > exact.tolerance
+    assert sum(loose.iterations) < sum(exact.iterations)
+    for name in ("potential_std", "displacement_std"):
+        ratio = getattr(loose, name) / getattr(exact, name)
+        assert np.median(ratio) == pytest.approx(1, abs=2e-3)
+        assert np.percentile(np.abs(ratio - 1), 99) < 0.03
+
+
+def test_samples_start_from_the_images_weights(counts, plan):
+    found = uncertainty(counts, 5, plan=plan)
+    assert all(found.converged)
+    assert max(found.iterations) < found.inversion.report.iterations
+
+
+def test_neither_threads_nor_later_samples_change_a_bit(counts, plan):
+    one, three = (
+        uncertainty(counts, 5, plan=plan, options=InversionOptions(threads=threads))
+        for threads in (1, 3)
+    )
+    for name in ("potential_mean", "potential_std", "displacement_mean", "displacement_std"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+    fewer = uncertainty(counts, 3, plan=plan)
+    assert fewer.residuals == one.residuals[:3]
+    other = uncertainty(counts, 3, plan=plan, options=InversionOptions(seed=1))
+    assert not np.allclose(other.potential_std, fewer.potential_std, rtol=1e-3)
+
+
+def test_running_moments_are_those_of_all_values_at_once():
+    values = 1e7 + np.random.default_rng(0).normal(size=(50, 3, 4))
+    moments = _RunningMoments()
+    for plane in values:
+        moments.add(plane)
+    np.testing.assert_allclose(moments.mean, values.mean(axis=0), rtol=1e-14)
+    np.testing.assert_allclose(moments.std, values.std(axis=0, ddof=1), rtol=1e-6)
+
+
+def test_each_sample_is_zero_in_the_mean_over_the_border(counts, plan):
+    assert border_mean(uncertainty(counts, 3, plan=plan).potential_mean) == pytest.approx(
+        0, abs=1e-10
+    )
+
+
+def test_what_masked_pixels_hold_does_not_matter(counts):
+    mask = np.ones(SHAPE, bool)
+    mask[:8, :9] = False
+    first, second = (
+        uncertainty(np.where(mask, counts, value), 2, mask=mask, gain=1.0)
+        for value in (np.nan, 1e30)
+    )
+    np.testing.assert_array_equal(first.potential_std, second.potential_std)
+    assert np.isfinite(first.potential_std).all()
+
+
+def test_samples_below_zero_are_clipped_but_such_an_image_is_refused(clean):
+    found = uncertainty(clean, 2, noise=0.5)
+    assert all(found.converged)
+    with pytest.raises(InputError, match="negative pixels"):
+        uncertainty(clean - 1.0, 2, noise=0.5)
+
+
+def test_samples_that_do_not_converge_are_counted(clean):
+    options = InversionOptions(max_iterations=1, negative="clip")
+    found = uncertainty(clean, 2, noise=0.5, options=options)
+    assert found.converged == (False, False)
+    assert found.warnings[0].startswith("2 of 2 samples did not converge")
+
+
+def test_progress_comes_from_the_callers_thread_and_counts_the_samples(counts):
+    seen, threads = [], set()
+
+    def listen(progress):
+        seen.append(progress)
+        threads.add(threading.get_ident())
+
+    uncertainty(counts, 3, on_progress=listen)
+    stages = list(dict.fromkeys(progress.stage for progress in seen))
+    assert stages == ["sites", "prepare", "transport", "read-out", "samples"]
+    assert threads == {threading.get_ident()}
+    assert (seen[-1].step, seen[-1].total) == (3, 3)
+
+
+def test_cancelling_among_the_samples_ends_them(counts, plan):
+    steps = []
+
+    def listen(progress):
+        if progress.stage == "samples":
+            steps.append(progress.step)
+
+    with pytest.raises(InversionCancelled, match="samples"):
+        uncertainty(
+            counts,
+            500,
+            plan=plan,
+            on_progress=listen,
+            should_stop=lambda: max(steps, default=0) > 1,
+        )
+    assert max(steps) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"n": 1}, "n is 1, expected a whole number of samples, at least 2"),
+        ({"n": 2.5}, "n is 2.5, expected a whole number"),
+        ({"noise": "gauss"}, "noise is 'gauss', expected 'poisson', a standard deviation"),
+        ({"noise": None}, "noise has values of type object"),
+        ({"noise": 0.0}, "noise is zero everywhere"),
+        ({"noise": -1.0}, "negative or not finite"),
+        ({"noise": np.full(SHAPE, np.nan)}, "negative or not finite"),
+        ({"noise": np.ones((3, 4))}, r"noise has shape \(3, 4\), image \(40, 48\)"),
+        ({"noise": 1.0, "gain": 2.0}, "gain belongs to noise='poisson'"),
+        ({"gain": 0.0}, "gain is 0.0, expected a positive number"),
+        ({"gain": 1e-30}, "more than 1e\\+18 quanta in a pixel"),
+    ],
+)
+def test_bad_arguments_are_one_clear_sentence(counts, arguments, says):
+    with pytest.raises(InputError, match=says):
+        uncertainty(counts, **arguments)
+
+
+def test_an_image_that_is_not_counts_needs_a_gain(clean):
+    with pytest.raises(InputError, match=r"not whole numbers.*give the gain"):
+        uncertainty(clean)
+
+
+@pytest.fixture(scope="module")
+def found(counts, plan):
+    return uncertainty(counts, 3, plan=plan)
+
+
+def test_dataset_has_a_deviation_beside_each_field(
+    found, proton_setup: ProtonSetup, optical_setup: OpticalSetup
+):
+    for setup in (None, proton_setup, optical_setup):
+        dataset = found.to_dataset(setup)
+        fields = set(found.inversion.to_dataset(setup).data_vars)
+        np.testing.assert_array_equal(dataset["potential_std"], found.potential_std)
+        np.testing.assert_array_equal(dataset["displacement_mean"], found.displacement_mean)
+        deviations = {str(name) for name in dataset.data_vars if str(name).endswith("_std")}
+        assert {name.removesuffix("_std") for name in deviations} < fields
+        for name in deviations:
+            field = dataset[name.removesuffix("_std")]
+            assert dataset[name].attrs["units"] == field.attrs["units"]
+            assert "standard deviation" in dataset[name].attrs["long_name"]
+            assert dataset[name].dims == field.dims
+            assert (dataset[name] >= 0).all()
+    assert "line_integrated_density_std" in dataset
+    assert json.loads(dataset.attrs["uncertainty"])["n"] == 3
+
+
+def test_deviations_of_si_fields_belong_to_their_components(found, proton_setup: ProtonSetup):
+    """Protons deflected along y have met a field along x."""
+    dataset = found.to_dataset(proton_setup)
+    of_one_pixel = np.abs(proton_setup.path_integrated_b(np.array([1.0, 0.0])[:, None, None]))
+    along_x = float(of_one_pixel[1, 0, 0])
+    np.testing.assert_allclose(
+        dataset["path_integrated_b_std"], along_x * found.displacement_std[::-1], rtol=1e-12
+    )
+
+
+def test_a_file_keeps_the_error_bars(tmp_path: Path, found, optical_setup: OpticalSetup):
+    write(tmp_path / "shot.shadowinv", found, setup=optical_setup)
+    dataset = read(tmp_path / "shot.shadowinv")
+    np.testing.assert_array_equal(dataset["displacement_std"], found.displacement_std)
+    np.testing.assert_array_equal(dataset["potential"], found.inversion.potential)
+    assert json.loads(dataset.attrs["uncertainty"])["noise"] == "Poisson, gain 1"
+
+
+def test_the_page_about_error_bars_works_as_it_stands_there(tmp_path: Path, monkeypatch):
+    page = Path(__file__).parents[2] / "docs" / "uncertainty.md"
+    text = page.read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(block, page.name, "exec"), names)
+    assert (tmp_path / "shot.shadowinv").exists()
+    middle = names["found"].potential_std[24:40, 24:40]  # type: ignore[attr-defined]
+    assert 0.3 * middle.mean() < names["error_bar"] < 1.5 * middle.mean()  # type: ignore[operator]
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        assert (page.parent / target).exists(), target

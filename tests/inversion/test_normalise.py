@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.normalise import number_of_sites, prepare
+from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
+
+
+def test_image_source_and_floored_image_have_one_flux():
+    rng = np.random.default_rng(0)
+    image, source = 1 + 1000 * rng.random((20, 30)), rng.random((20, 30))
+    image[:3] = 0
+    prepared = prepare(image, source, InversionOptions())
+    for values in (prepared.image, prepared.floored_image * prepared.unit):
+        assert values.sum() == pytest.approx(source.sum(), rel=1e-12)
+    assert prepared.floored_pixels == (image < 1e-3 * image.mean()).sum() == 90
+    floor = prepared.floored_image.min() / prepared.floored_image.mean()
+    assert floor == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_without_a_source_it_is_uniform_and_keeps_the_images_units():
+    image = np.random.default_rng(1).random((10, 10)) * 500
+    prepared = prepare(image, None, InversionOptions())
+    np.testing.assert_allclose(prepared.source, image.mean())
+    np.testing.assert_allclose(prepared.image, image, rtol=1e-14)
+
+
+def test_clipping_counts_and_keeps_the_input():
+    image = np.ones((10, 10))
+    image[0, :4] = -5
+    kept = image.copy()
+    prepared = prepare(image, None, InversionOptions(negative="clip"))
+    assert prepared.clipped_pixels == 4
+    assert prepared.image.min() == 0
+    np.testing.assert_array_equal(image, kept)
+
+
+def test_integer_images_are_taken_as_they_are():
+    image = np.arange(100, dtype=np.uint8).reshape(10, 10)
+    prepared = prepare(image, None, InversionOptions())
+    np.testing.assert_allclose(prepared.image, image.astype(float), rtol=1e-14)
+
+
+def test_sites_default_to_the_pixels_up_to_a_limit():
+    assert number_of_sites((20, 30), InversionOptions()) == 600
+    assert number_of_sites((5000, 5000), InversionOptions()) == MAX_DEFAULT_SITES
+    assert number_of_sites((20, 30), InversionOptions(n_sites=77)) == 77
+    with pytest.raises(InputError, match="use at most"):
+        number_of_sites((20, 30), InversionOptions(n_sites=10**13))
+
+
+def test_fewer_sites_than_pixels_are_told_of():
+    image = np.ones((1000, 1001))
+    (warning,) = prepare(image, None, InversionOptions()).warnings
+    assert "1,000,000 sites for 1,001,000 pixels" in warning
+    assert "n_sites = 1,001,000" in warning
+    assert prepare(image, None, InversionOptions(n_sites=5000)).warnings == ()
+    assert prepare(image[:, 1:], None, InversionOptions()).warnings == ()
+
+
+@pytest.mark.parametrize(("rows", "said"), [(3, False), (5, True)])
+def test_a_mask_over_much_of_the_image_is_told(rows, said):
+    mask = np.ones((20, 30), bool)
+    mask[:rows] = False
+    warnings = prepare(np.ones((20, 30)), None, InversionOptions(), mask).warnings
+    assert [text.startswith("the mask excludes 25.0% of the pixels") for text in warnings] == (
+        [True] if said else []
+    )

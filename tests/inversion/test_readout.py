@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.geometry.interpolation import BLOCK
+from napari_shadowinv.inversion.readout import read_centroids, read_dual
+from napari_shadowinv.transport.sites import plan_levels
+
+SHAPE = (40, 50)
+
+
+@pytest.fixture(scope="module")
+def level():
+    return plan_levels(np.ones(SHAPE), 1500, lloyd_iterations=20).levels[-1]
+
+
+def standing_wave(points):
+    """A potential that is level across the borders, as that of a closed image must be."""
+    y, x = ((points + 0.5) / SHAPE).T
+    return 10 * np.cos(2 * np.pi * y) * np.cos(np.pi * x)
+
+
+def gradient(points):
+    step = 1e-5
+    return np.column_stack(
+        [
+            (standing_wave(points + shift) - standing_wave(points - shift)) / (2 * step)
+            for shift in step * np.eye(2)
+        ]
+    )
+
+
+def test_the_potential_is_half_the_weights_up_to_the_border(level):
+    potential, displacement = read_dual(
+        level, 2 * standing_wave(level.sites), -gradient(level.sites), SHAPE
+    )
+    pixels = np.indices(SHAPE).reshape(2, -1).T.astype(float)
+    expected = standing_wave(pixels).reshape(SHAPE)
+    difference = potential - expected
+    assert np.ptp(difference) < 0.0025 * np.ptp(expected)
+    true = -gradient(pixels).T.reshape(2, *SHAPE)
+    np.testing.assert_allclose(displacement, true, atol=0.03)
+
+
+def test_a_constant_displacement_integrates_to_a_plane(level):
+    drift = np.tile([0.5, -0.25], (len(level.sites), 1))
+    potential, displacement = read_centroids(level, drift, SHAPE)
+    y, x = np.indices(SHAPE)
+    plane = -0.5 * y + 0.25 * x
+    np.testing.assert_allclose(potential - potential.mean(), plane - plane.mean(), atol=1e-9)
+    np.testing.assert_allclose(displacement[0], 0.5, atol=1e-12)
+    np.testing.assert_allclose(displacement[1], -0.25, atol=1e-12)
+
+
+def test_the_mean_integration_lies_between_the_two_orders(level):
+    rng = np.random.default_rng(0)
+    turning = rng.normal(size=level.sites.shape)  # not curl-free: the orders disagree
+    by_order = {
+        order: read_centroids(level, turning, SHAPE, integration=order)[0]
+        for order in ("y", "x", "mean")
+    }
+    assert np.ptp(by_order["y"] - by_order["x"]) > 0.1
+    np.testing.assert_allclose(by_order["mean"], (by_order["y"] + by_order["x"]) / 2, atol=1e-12)
+
+
+def test_reading_in_parts_changes_no_bit(level, monkeypatch):
+    shape = (120, 90)
+    given = (level, 2 * standing_wave(level.sites), -gradient(level.sites), shape)
+    at_once, shares = read_dual(*given), []
+    monkeypatch.setattr("napari_shadowinv.inversion.readout._PART", 2 * BLOCK)
+    in_parts = read_dual(*given, on_share=shares.append)
+    assert shares == [2 * BLOCK / 10800, 4 * BLOCK / 10800, 1.0]
+    for one, other in zip(at_once, in_parts, strict=True):
+        np.testing.assert_array_equal(one, other)

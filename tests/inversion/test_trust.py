@@ -1,0 +1,334 @@
+"""Warnings where a converged answer is wrong, and none where it is right.
+
+Images are made from rays that are traced here, not by the package's forward model; they are small
+so that an inversion takes a few tenths of a second.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from napari_shadowinv.cli._tables import inversion_rows
+from napari_shadowinv.inversion import Inversion, Report, invert
+from napari_shadowinv.inversion.trust import image_residual
+from napari_shadowinv.io import read
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics import phantoms
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.plotting import report_figure
+
+Array = NDArray[np.float64]
+Field = Callable[[Array, Array], tuple[Array, Array]]
+
+SIDE = 100
+RAYS = 12
+ONSET = np.exp(1.5) / 2
+"""Strength of an outward Gaussian field, in units of its radius, at which caustics begin."""
+
+MISFIT, NOTHING = "the picture does not fit", "no deflection found"
+FOLDS, CUT_OFF = "rays cross", "the field reaches the image's edge"
+
+
+def traced(field: Field, beyond: int = 0) -> Array:
+    """Count rays, 144 from each pixel, where they land; they come from beyond the edge, too."""
+    rng = np.random.default_rng(0)
+    total = SIDE + 2 * beyond
+    cells = np.indices((RAYS * total, RAYS * total))
+    y, x = (cells + rng.random(cells.shape)) / RAYS - 0.5
+    dy, dx = field(y - beyond, x - beyond)
+    found, _, _ = np.histogram2d(
+        (y + dy - beyond).ravel(),
+        (x + dx - beyond).ravel(),
+        bins=SIDE,
+        range=[(-0.5, SIDE - 0.5)] * 2,
+    )
+    return found / RAYS**2
+
+
+def gaussian(strength: float, height: float = 10.0, width: float = 10.0) -> Field:
+    """Outwards, caustics begin at a strength of 1; inwards at -1."""
+    slope = strength * (ONSET if strength > 0 else 1.0)
+
+    def field(y: Array, x: Array) -> tuple[Array, Array]:
+        v, u = y - 48.0, x - 51.0
+        falling = slope * np.exp(-((v / height) ** 2 + (u / width) ** 2) / 2)
+        return falling * v * (width / height) ** 2, falling * u
+
+    return field
+
+
+def long_range(peak: float, core: float, y0: float = 49.5, x0: float = 49.5) -> Field:
+    """Falls like 1/r beyond its core."""
+
+    def field(y: Array, x: Array) -> tuple[Array, Array]:
+        v, u = y - y0, x - x0
+        falling = 2 * peak * core / (v**2 + u**2 + core**2)
+        return falling * v, falling * u
+
+    return field
+
+
+def sheet(y: Array, x: Array) -> tuple[Array, Array]:
+    """Does not fall at all, on two sides."""
+    return 0 * y, 2 * np.tanh((x - 50) / 8)
+
+
+def jet(y: Array, x: Array) -> tuple[Array, Array]:
+    """The same all along y, through two edges."""
+    u = x - 50
+    return 0 * y, 3 * u / 6 * np.exp(0.5 - (u / 6) ** 2 / 2)
+
+
+def signs(image: Array, **options: object) -> list[str]:
+    """The warnings of this module that an image gets, without their numbers."""
+    choices = {"negative": "clip", **options}
+    report = invert(image, options=InversionOptions.model_validate(choices)).report
+    assert report.converged
+    known = (MISFIT, NOTHING, FOLDS, CUT_OFF)
+    return [sign for sign in known for text in report.warnings if text.startswith(sign)]
+
+
+def noisy(image: Array, share: float, seed: int = 1) -> Array:
+    return image + share * np.random.default_rng(seed).normal(size=image.shape)
+
+
+# One definition of the image residual
+
+
+def test_the_residual_is_the_rms_over_the_used_pixels_relative_to_their_mean():
+    image = np.array([[4.0, 4.0], [8.0, 1e6]])
+    off = np.array([[1.0, -1.0], [2.0, 1e9]])
+    mask = np.array([[True, True], [True, False]])
+    expected = np.sqrt((1 + 1 + 4) / 3) / (16 / 3)
+    assert image_residual(image, image - off, mask) == pytest.approx(expected)
+
+
+def test_the_report_tells_the_residual_of_the_pixels_that_were_used():
+    image = noisy(traced(gaussian(0.3)), 0.05)
+    mask = np.ones(image.shape, dtype=bool)
+    mask[:30] = False
+    inversion = invert(image, mask=mask)
+    off = (inversion.image - inversion.reprojection)[30:]
+    expected = np.sqrt((off**2).mean()) / inversion.image[30:].mean()
+    assert inversion.report.image_residual == pytest.approx(expected)
+    assert inversion.to_dataset().attrs["image_residual"] == pytest.approx(expected)
+    told = f"{100 * expected:.3g} %"
+    assert dict(inversion_rows(inversion, None))["image residual"].startswith(f"{told} of the mean")
+    titles = [
+        axes.get_title(loc) for axes in report_figure(inversion).axes for loc in ("left", "center")
+    ]
+    assert f"Residual: {told} rms" in titles
+
+
+def test_a_file_that_does_not_tell_the_residual_is_still_read(inversion: Inversion):
+    dataset = inversion.to_dataset()
+    report = json.loads(dataset.attrs["report"])
+    del report["image_residual"], dataset.attrs["image_residual"]
+    old = Inversion.from_dataset(dataset.assign_attrs(report=json.dumps(report)))
+    assert old.report == inversion.report
+
+
+def test_a_report_of_an_older_version_has_no_residual(inversion: Inversion):
+    facts = dataclasses.asdict(inversion.report)
+    del facts["image_residual"]
+    assert np.isnan(Report(**facts).image_residual)
+
+
+# The picture does not fit
+
+
+@pytest.mark.parametrize("contrast", [2, 1000])
+@pytest.mark.parametrize("pattern", ["chequerboard", "stripes", "wide chequerboard"])
+def test_a_pattern_as_fine_as_the_pixels_does_not_fit(pattern, contrast):
+    y, x = np.indices((80, 80))
+    odd = {
+        "chequerboard": (y + x) % 2,
+        "stripes": x % 2,
+        "wide chequerboard": (y // 2 + x // 2) % 2,
+    }[pattern]
+    found = invert(np.where(odd == 1, float(contrast), 1.0))
+    assert found.report.converged
+    assert found.report.image_residual > 0.15
+    assert found.report.warnings[0].startswith(MISFIT)
+    assert NOTHING not in " ".join(found.report.warnings)
+
+
+def test_too_few_sites_do_not_fit_and_the_advice_is_more():
+    image = traced(gaussian(0.6))
+    found = invert(image, options=InversionOptions(n_sites=100)).report
+    assert found.warnings[0].startswith(MISFIT)
+    assert "use more sites" in found.warnings[0]
+    assert signs(image, n_sites=5000) == []
+
+
+@pytest.mark.parametrize("counts", [4, 25, 250])
+def test_counts_are_no_pattern_even_with_empty_pixels(counts):
+    image = np.random.default_rng(2).poisson(counts * traced(gaussian(0.5))).astype(float)
+    if counts == 4:
+        assert (image == 0).any()
+    assert signs(image) == []
+
+
+# No deflection found
+
+
+@pytest.mark.parametrize(("share", "seed"), [(0.01, 1), (0.1, 2), (0.3, 3)])
+def test_pure_noise_has_no_deflection(share, seed):
+    assert signs(noisy(np.ones((SIDE, SIDE)), share, seed)) == [NOTHING]
+
+
+@pytest.mark.parametrize("shape", [(60, 60), (40, 300)])
+@pytest.mark.parametrize("boundary", ["closed", "free"])
+def test_counts_of_a_uniform_beam_have_no_deflection(shape, boundary):
+    image = np.random.default_rng(3).poisson(25, size=shape).astype(float)
+    assert signs(image, boundary=boundary) == [NOTHING]
+
+
+def test_noise_of_the_source_counts_too():
+    rng = np.random.default_rng(4)
+    y, x = np.indices((SIDE, SIDE))
+    beam = 0.3 + np.exp(-((y - 40) ** 2 + (x - 60) ** 2) / 2 / 30**2)
+    image, source = rng.poisson(100 * beam), rng.poisson(100 * beam)
+    assert invert(image, source=source).report.warnings[0].startswith(NOTHING)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_field_of_twice_the_noise_is_found(seed):
+    share = 0.1
+    wave_y, wave_x = np.meshgrid(*[np.pi * np.arange(SIDE) / SIDE] * 2)
+    with np.errstate(divide="ignore"):
+        power = 1 / (wave_y**2 + wave_x**2)
+    by_noise = share * np.sqrt(power[np.isfinite(power)].sum() / SIDE**2)
+    weak = phantoms.gaussian_blob((SIDE, SIDE), 1.0, 14.0, (48, 51)).displacement
+    weak *= 2 * by_noise / np.sqrt((weak**2).sum(axis=0).mean())
+    assert signs(noisy(synthetic_image(weak), share, seed)) == []
+
+
+# Deep folds
+
+
+@pytest.mark.parametrize(
+    ("strength", "shape"),
+    [(1.0, (10, 10)), (1.05, (10, 10)), (-1.1, (10, 10)), (1.1, (16, 8))],
+    ids=["ring at the onset", "ring", "spot", "two sides"],
+)
+def test_caustics_that_have_just_formed_are_right_and_get_no_warning(strength, shape):
+    field = gaussian(strength, *shape)
+    image = traced(field)
+    found = invert(image)
+    true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
+    assert found.caustic.mean() > 0.01
+    assert np.linalg.norm(found.displacement - true) < 0.05 * np.linalg.norm(true)
+    assert found.report.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("strength", "shape", "share"),
+    [
+        (1.3, (10, 10), 0.0),
+        (1.5, (10, 10), 0.1),
+        (2.0, (10, 10), 0.0),
+        (-1.6, (10, 10), 0.1),
+        (1.5, (16, 8), 0.0),
+    ],
+    ids=["ring 1.3", "ring 1.5", "ring 2", "spot", "two sides"],
+)
+def test_deep_folds_are_wrong_and_get_a_warning(strength, shape, share):
+    field = gaussian(strength, *shape)
+    found = invert(noisy(traced(field), share), options=InversionOptions(negative="clip"))
+    true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
+    assert np.linalg.norm(found.displacement - true) > 0.07 * np.linalg.norm(true)
+    assert found.report.warnings[0].startswith(FOLDS)
+
+
+def test_hot_pixels_are_no_folds():
+    image = noisy(np.ones((SIDE, SIDE)), 0.05)
+    image[np.random.default_rng(5).random(image.shape) < 5e-4] = 20
+    assert FOLDS not in signs(image)
+
+
+# The field goes on beyond a closed edge
+
+
+@pytest.mark.parametrize(
+    ("field", "share"),
+    [
+        (long_range(3, 10), 0.05),
+        (long_range(3, 8, 40, 60), 0.0),
+        (long_range(-2, 10, 30, 30), 0.05),
+        (sheet, 0.0),
+    ],
+    ids=["centred", "off centre", "near a corner, inwards", "sheet"],
+)
+def test_a_field_that_goes_on_beyond_the_edge_gets_a_warning(field, share):
+    image = noisy(traced(field, beyond=30), share)
+    found = invert(image, options=InversionOptions(negative="clip"))
+    true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
+    assert np.linalg.norm(found.displacement - true) > 0.3 * np.linalg.norm(true)
+    assert any(text.startswith(CUT_OFF) for text in found.report.warnings)
+
+
+def test_an_object_that_the_edge_cuts_in_half_gets_a_warning():
+    def field(y: Array, x: Array) -> tuple[Array, Array]:
+        return gaussian(0.5)(y, x + 43)
+
+    assert signs(traced(field, beyond=30)) == [CUT_OFF]
+
+
+@pytest.mark.parametrize(
+    ("field", "share"),
+    [(gaussian(0.6), 0.0), (gaussian(-0.6), 0.1), (jet, 0.0), (jet, 0.1)],
+    ids=["out", "in", "jet", "jet with noise"],
+)
+def test_a_field_that_ends_inside_the_image_or_runs_along_gets_none(field, share):
+    assert signs(noisy(traced(field, beyond=30), share)) == []
+
+
+def test_where_flux_may_cross_the_edge_or_the_edge_is_masked_nothing_is_said():
+    image = traced(long_range(3, 10), beyond=30)
+    assert signs(image, boundary="free") == []
+    mask = np.zeros(image.shape, dtype=bool)
+    mask[10:-10, 10:-10] = True
+    assert not any(text.startswith(CUT_OFF) for text in invert(image, mask=mask).report.warnings)
+
+
+# Good images
+
+
+@pytest.mark.parametrize("name", ["dm024", "dm097", "dm194"])
+@pytest.mark.parametrize("noise", ["", "_noise"])
+def test_the_papers_toroid_gets_no_doubts(shared_data: Path, name: str, noise: str):
+    assert signs(np.load(shared_data / "toroid" / f"{name}{noise}.npy")) == []
+
+
+def test_other_reference_images_get_no_doubts(shared_data: Path):
+    assert signs(np.load(shared_data / "donut" / "intensity.npy")) == []
+    assert signs(np.loadtxt(shared_data / "prns" / "target-example.txt")) == []
+    for path in sorted((shared_data / "pradformat").glob("*.h5")):
+        assert signs(read(path).image) == []
+
+
+@pytest.mark.parametrize("number", [0, 4, 5])
+def test_a_real_plume_gets_no_doubts(shared_data: Path, number: int):
+    folder = shared_data / "burner" / "data"
+    shot = sorted(folder.glob("Image_2*.bmp"))[number]
+    reference = read(folder / "Image_00000.bmp").binned(4).image
+    assert invert(read(shot).binned(4).image, source=reference).report.warnings == ()
+
+
+@pytest.mark.parametrize(
+    "scene", ["four_toroids", "cosine_ellipses", "focusing_pair", "opposite_pair"]
+)
+def test_phantoms_get_no_doubts(scene: str):
+    shape = (SIDE, SIDE)
+    field = getattr(phantoms, scene)(shape, phantoms.paper_setup()).displacement / 2
+    image = synthetic_image(field)
+    assert signs(image) == []
+    assert signs(np.random.default_rng(6).poisson(100 * image).astype(float)) == []

@@ -1,0 +1,80 @@
+"""What is done before an inversion: masks that make sense together, and what is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.preprocessing.preparation import Preparation
+from napari_shadowinv.preprocessing.recipes import InterpolatedEstimate, PolynomialEstimate
+
+SHAPE = (120, 160)
+
+
+def outside(radius: float, centre: tuple[float, float] = (60, 80)) -> np.ndarray:
+    """A mask that hides a disc."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    return np.hypot(y - centre[0], x - centre[1]) > radius
+
+
+OBJECT = outside(25)
+DEAD = outside(9, (20, 20)) & outside(4, (100, 150))
+FILM = ~outside(75)  # round, and with much beyond it
+SMALL = outside(3, (40, 70))
+STRAY = outside(1, (5, 5))  # a slip of the brush
+
+
+@pytest.mark.parametrize(
+    ("mask", "source_mask"),
+    [
+        (OBJECT, OBJECT),
+        (OBJECT & DEAD, OBJECT),
+        (OBJECT & DEAD, OBJECT & DEAD),
+        (outside(24), OBJECT),  # drawn by hand, or binned
+        (outside(25, (61, 80)), OBJECT),
+        (SMALL & FILM, SMALL),
+        (OBJECT, OBJECT & STRAY),
+    ],
+)
+def test_a_mask_that_hides_the_object_too_is_refused(
+    mask: np.ndarray, source_mask: np.ndarray
+) -> None:
+    for estimate in (PolynomialEstimate(), InterpolatedEstimate()):
+        with pytest.raises(InputError, match="the object would be excluded from the inversion"):
+            Preparation((), estimate, source_mask).check(has_source=False, mask=mask)
+
+
+@pytest.mark.parametrize(
+    ("mask", "source_mask"),
+    [
+        (None, OBJECT),
+        (DEAD, OBJECT),
+        (DEAD, OBJECT & DEAD),
+        (FILM, OBJECT & FILM),
+        (FILM, SMALL & FILM),  # little of what is hidden is the object
+        (outside(15), OBJECT),  # its opaque core
+        (OBJECT, None),
+    ],
+)
+def test_masks_that_share_dead_pixels_are_fine(
+    mask: np.ndarray | None, source_mask: np.ndarray | None
+) -> None:
+    Preparation((), PolynomialEstimate(), source_mask).check(has_source=False, mask=mask)
+
+
+def test_what_is_filled_in_must_be_inverted() -> None:
+    with pytest.raises(InputError, match="without a source mask"):
+        Preparation((), InterpolatedEstimate()).check(has_source=False, mask=OBJECT)
+
+
+def test_a_source_that_is_dark_behind_the_source_mask_is_told_of() -> None:
+    """A straight line that falls from 120 to 21 where it is seen, and below zero where not."""
+    x = np.mgrid[: SHAPE[0], : SHAPE[1]][1]
+    for image, count in ((np.maximum(120.0 - x, 15), 1), (np.full(SHAPE, 100.0), 0)):
+        told: list[str] = []
+        preparation = Preparation((), PolynomialEstimate(degree=1), x < 100)
+        preparation.estimated(image, DEAD, on_warning=told.append)
+        assert len(told) == count
+        # Nor where nothing of it is inverted.
+        Preparation((), PolynomialEstimate(degree=1)).estimated(image, x < 100)

@@ -1,0 +1,139 @@
+"""No file blocks a reader, fills the memory or ends it with a traceback."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from scipy.io import savemat
+
+from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.safety import LIMIT_VARIABLE, refusing_damage, size_limit
+from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
+from napari_shadowinv.io import read, read_toml
+from napari_shadowinv.io.reading import read_radiograph
+from napari_shadowinv.preprocessing.film import Calibration
+
+IMAGE = np.random.default_rng(0).poisson(300, (40, 50)).astype(np.uint16)
+
+
+@pytest.mark.parametrize("reader", [read, read_toml, Calibration.from_csv])
+@pytest.mark.parametrize("name", ["shot.tif", "shot.npy", "shot.h5", "shot.txt"])
+@pytest.mark.skipif(sys.platform != "linux", reason="needs pipes and devices")
+def test_what_is_no_regular_file_is_refused_at_once(
+    tmp_path: Path, name: str, reader: Callable[[Path], object]
+) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "device").symlink_to("/dev/zero")
+    # The name of a socket must be short.
+    before = Path.cwd()
+    os.chdir(tmp_path)
+    with socket.socket(socket.AF_UNIX) as end:
+        end.bind("socket")
+    os.chdir(before)
+    for kind in ("pipe", "socket", "device"):
+        path = tmp_path / f"{kind}-{name}"
+        path.symlink_to(tmp_path / kind)
+        start = time.perf_counter()
+        with pytest.raises(FileFormatError, match=f"{name} is a {kind}: expected"):
+            reader(path)
+        assert time.perf_counter() - start < 1
+
+
+def test_whatever_a_reader_raises_is_one_error_with_its_reason(tmp_path: Path) -> None:
+    @refusing_damage
+    def broken(path: Path, error: BaseException) -> None:
+        raise error
+
+    for reason in (KeyError("x"), SystemError("odd"), RecursionError("deep"), OSError("h5")):
+        with pytest.raises(FileFormatError, match=r"a\.tif is damaged or truncated") as told:
+            broken(tmp_path / "a.tif", reason)
+        assert told.value.__cause__ is reason
+    with pytest.raises(FileFormatError, match="more memory than is available"):
+        broken("a.tif", MemoryError())
+    with pytest.raises(FileFormatError, match="Permission denied"):
+        broken("a.tif", PermissionError(13, "Permission denied"))
+    for own in (InputError("mine"), FileFormatError("mine"), InversionCancelled()):
+        with pytest.raises(type(own)) as told:
+            broken("a.tif", own)
+        assert told.value is own
+    with pytest.raises(KeyboardInterrupt):
+        broken("a.tif", KeyboardInterrupt())
+
+
+def write_hdf5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file.create_dataset("image", data=IMAGE, compression="gzip")
+        file.attrs["object_type"] = "radiograph"
+
+
+LARGE: dict[str, Callable[[Path], object]] = {
+    "shot.tif": lambda path: tifffile.imwrite(path, IMAGE, compression="zlib"),
+    "shot.png": lambda path: write_picture(path),
+    "shot.bmp": lambda path: write_picture(path),
+    "shot.npy": lambda path: np.save(path, IMAGE),
+    "shot.txt": lambda path: np.savetxt(path, IMAGE, fmt="%d"),
+    "five.mat": lambda path: savemat(path, {"shot": IMAGE}),
+    "packed.mat": lambda path: savemat(path, {"shot": IMAGE}, do_compression=True),
+    "shot.h5": write_hdf5,
+}
+
+
+def write_picture(path: Path) -> None:
+    import imageio.v3 as iio
+
+    iio.imwrite(path, (IMAGE // 4).astype(np.uint8))
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_what_unfolds_to_too_much_is_refused_and_told_how_to_allow_it(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / name
+    LARGE[name](path)
+    monkeypatch.setenv(LIMIT_VARIABLE, "1e-5")  # 10 kB, and the image takes 16 in memory
+    with pytest.raises(FileFormatError, match=f"expands to 1.6e-05 GB .* {LIMIT_VARIABLE}"):
+        read(path)
+    monkeypatch.setenv(LIMIT_VARIABLE, "1")
+    assert read_radiograph(path).image.shape == IMAGE.shape
+
+
+def test_a_chunk_larger_than_its_array_counts(tmp_path: Path) -> None:
+    path = tmp_path / "shot.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset(
+            "image", (4, 4), maxshape=(None, None), chunks=(60_000, 60_000), dtype="u1"
+        )
+        file.attrs["object_type"] = "radiograph"
+    with pytest.raises(FileFormatError, match=LIMIT_VARIABLE):
+        read(path)
+
+
+def test_the_limit_is_a_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = physical_memory()
+    assert memory is None or size_limit() == memory // 8
+    monkeypatch.setenv(LIMIT_VARIABLE, "2.5")
+    assert size_limit() == 2_500_000_000
+    for nonsense in ("much", "0", "-1", "nan", "inf"):
+        monkeypatch.setenv(LIMIT_VARIABLE, nonsense)
+        with pytest.raises(InputError, match=f"{LIMIT_VARIABLE} is {nonsense!r}"):
+            size_limit()
+
+
+@pytest.mark.parametrize("reader", [read_toml, Calibration.from_csv])
+def test_small_files_of_text_are_small(tmp_path: Path, reader: Callable[[Path], object]) -> None:
+    path = tmp_path / "setup.toml"
+    path.write_bytes(b"# x\n" * 250_001)
+    with pytest.raises(FileFormatError, match="larger than 1 MB"):
+        reader(path)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(FileFormatError, match="is not a text file"):
+        reader(path)
