@@ -62,7 +62,7 @@ def write_pages(app: Sphinx, config: Config) -> None:
 
 def parameters_page() -> str:
     from napari_shadowinv import InversionOptions, OpticalSetup, ProtonSetup
-    from napari_shadowinv.preprocessing.recipes import ESTIMATES, FILTERS
+    from napari_shadowinv.preprocessing import ESTIMATES, FILTERS
 
     parts = [
         "# Parameters",

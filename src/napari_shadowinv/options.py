@@ -14,6 +14,9 @@ __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
 
 MAX_DEFAULT_SITES = 1_000_000
 
+_MOVES_SITES: Any = {"moves_sites": True}
+_BOUNDARY: Any = {"panel": "Flux across the image edge (docs/boundary.md)"}
+
 
 class InversionOptions(BaseModel):
     """Choices of an inversion; all have a default that suits most images.
@@ -39,6 +42,7 @@ class InversionOptions(BaseModel):
             "Number of sites placed over the source. Default: one per pixel, at most "
             f"{MAX_DEFAULT_SITES:,}."
         ),
+        json_schema_extra=_MOVES_SITES,
     )
     floor: float = Field(
         default=1e-3,
@@ -49,6 +53,7 @@ class InversionOptions(BaseModel):
             "Minimum image intensity as a fraction of the mean: darker pixels are raised to it. "
             "This keeps the transport solvable; values below 1e-3 rarely converge."
         ),
+        json_schema_extra=_MOVES_SITES,
     )
     tolerance: float = Field(
         default=1e-3,
@@ -63,6 +68,7 @@ class InversionOptions(BaseModel):
         le=1000,
         title="Lloyd iterations",
         description="Maximum Lloyd iterations, which space the sites evenly.",
+        json_schema_extra=_MOVES_SITES,
     )
     lloyd_tolerance: float = Field(
         default=0.1,
@@ -72,6 +78,7 @@ class InversionOptions(BaseModel):
             "Lloyd relaxation stops once the r.m.s. movement of the sites falls below this "
             "fraction of their mean spacing."
         ),
+        json_schema_extra=_MOVES_SITES,
     )
     readout: Literal["dual", "centroid"] = Field(
         default="dual",
@@ -128,6 +135,7 @@ class InversionOptions(BaseModel):
             "'closed': no flux crosses the image edge, as in the paper. 'free': flux may leave "
             "and enter, and the object's potential decays beyond the edge."
         ),
+        json_schema_extra={**_MOVES_SITES, **_BOUNDARY},
     )
     margin: int | None = Field(
         default=None,
@@ -137,6 +145,7 @@ class InversionOptions(BaseModel):
             "Free boundary only: width of the strip beyond each edge from which flux may enter; "
             "it has its own sites. Default: a twentieth of the image's shorter side."
         ),
+        json_schema_extra={**_MOVES_SITES, **_BOUNDARY},
     )
     decay_length: float | None = Field(
         default=None,
@@ -146,6 +155,7 @@ class InversionOptions(BaseModel):
             "Free boundary only: distance over which the potential decays beyond the edge; use "
             "roughly the size of the object there. Default: the margin."
         ),
+        json_schema_extra=_BOUNDARY,
     )
     flux: Literal["conserve", "known", "fit"] = Field(
         default="conserve",
@@ -155,6 +165,7 @@ class InversionOptions(BaseModel):
             "have different units. 'known': image and source have the same exposure and units. "
             "'fit': find the exposure that minimises the movement of flux at the edge."
         ),
+        json_schema_extra=_BOUNDARY,
     )
     caustic_jacobian: float = Field(
         default=0.2,
@@ -170,6 +181,7 @@ class InversionOptions(BaseModel):
         ge=0,
         title="Seed",
         description="Random seed for the site positions; the same seed gives the same result.",
+        json_schema_extra=_MOVES_SITES,
     )
     threads: int | None = Field(
         default=None,
@@ -191,6 +203,15 @@ class InversionOptions(BaseModel):
                 "other solvers support closed boundaries only"
             )
         return self
+
+    def site_key(self) -> str:
+        """Return what of the options determines where sites are placed."""
+        moving = {
+            name
+            for name, field in type(self).model_fields.items()
+            if isinstance(extra := field.json_schema_extra, dict) and extra.get("moves_sites")
+        }
+        return self.model_dump_json(include=moving)
 
     @classmethod
     def paper(cls, **changes: Any) -> InversionOptions:

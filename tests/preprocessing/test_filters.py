@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.preprocessing.filters import (
+from napari_shadowinv.preprocessing import (
     butterworth,
     fit_polynomial,
     high_pass,

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.preprocessing.preparation import Preparation
-from napari_shadowinv.preprocessing.recipes import InterpolatedEstimate, PolynomialEstimate
+from napari_shadowinv.preprocessing import InterpolatedEstimate, PolynomialEstimate, Preparation
 
 SHAPE = (120, 160)
 

@@ -13,19 +13,20 @@ from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair, gaussian_blob, paper_setup
-from napari_shadowinv.preprocessing._total_variation import least_variation
-from napari_shadowinv.preprocessing.filters import remove_background, remove_hot_pixels
-from napari_shadowinv.preprocessing.sources import (
+from napari_shadowinv.preprocessing import (
     gaussian_source,
     interpolated_source,
     isotropic_source,
     low_pass_source,
     point_distance,
     polynomial_source,
+    remove_background,
+    remove_hot_pixels,
     total_variation_source,
     uniform_source,
     uniform_warnings,
 )
+from napari_shadowinv.preprocessing._total_variation import least_variation
 
 SHAPE = (48, 60)
 # 200 px from the source to the detector.

@@ -22,8 +22,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE, StackStore, read_stack
-from napari_shadowinv.preprocessing.filters import high_pass, low_pass, remove_hot_pixels
-from napari_shadowinv.preprocessing.recipes import (
+from napari_shadowinv.preprocessing import (
     GaussianEstimate,
     HighPassFilter,
     HotPixelFilter,
@@ -33,8 +32,12 @@ from napari_shadowinv.preprocessing.recipes import (
     LowPassFilter,
     PolynomialEstimate,
     UniformEstimate,
+    high_pass,
+    isotropic_source,
+    low_pass,
+    polynomial_source,
+    remove_hot_pixels,
 )
-from napari_shadowinv.preprocessing.sources import isotropic_source, polynomial_source
 from napari_shadowinv.stack import read_shot
 
 FILTERS = (HotPixelFilter(), LowPassFilter(width=0.8))

@@ -240,21 +240,21 @@ def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
 
 
 def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
-    from napari_shadowinv.preprocessing.filters import remove_hot_pixels as remove
+    from napari_shadowinv.preprocessing import remove_hot_pixels as remove
 
     image, hot, dead = remove(picked.image, should_stop=should_stop)
     return [_filtered(picked, image, f"without {int((hot | dead).sum())} hot or dead pixels")]
 
 
 def _high_passed(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
-    from napari_shadowinv.preprocessing.filters import high_pass as remove_large
+    from napari_shadowinv.preprocessing import high_pass as remove_large
 
     width = _HIGH_PASS_SHARE * min(picked.image.shape)
     return [_filtered(picked, remove_large(picked.image, width), f"high-pass σ={width:.3g} px")]
 
 
 def _beam(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
-    from napari_shadowinv.preprocessing.sources import total_variation_source
+    from napari_shadowinv.preprocessing import total_variation_source
 
     source = total_variation_source(picked.image, should_stop=should_stop)
     return [_filtered(replace(picked, role=SOURCE), source, "source by total variation")]

@@ -1,33 +1,29 @@
 """Arguments and options that commands share, each with its name and help.
 
-- what is read: `ImageFile`, `SourceFile`, `MaskFile`, `SetupFile`, `OptionsFile`, `StoreFolder`
-- which part of it: `Channel`, `Variable`, `SourceVariable`, `Bin`, `ChosenShots`
-- the inversion: `SiteCount`, `ClipNegative`, `Threads`, `Seed`, `Boundary`, `Margin`, `Flux`
-- filters before it: `HotPixels`, `BackgroundDegree`, `HighPass`, `LowPass`, `Butterworth`,
-  `ButterworthOrder`, `ButterworthKind`
-- a source estimated from the image: `SourceFrom`, `SourceCentreY`, `SourceCentreX`,
-  `SourceDegree`, `SourceWeight`, `SourceWidth`, `SourceMask`
-- what is written: `Result`, `Figure`, `Overwrite`, `Quiet`, `QuietInversion`
-
-`given` tells which of them a user gave.
+- written here: what is read and written, such as `ImageFile`, `SetupFile`, `Result`
+- made from the models: `takes_recipe` gives a command a flag for every parameter of a step, of an
+  estimate of the source, and of the options; `recipe_of` makes a recipe of those that were given
 """
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args, get_origin
 
+from pydantic.fields import FieldInfo
 from typer import Argument, Option
 
-_FILTERS = "Filters before the inversion"
-_BOUNDARY = "Flux across the image edge (docs/boundary.md)"
+from napari_shadowinv._system.validation import nearest, validated
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocessing import ESTIMATES, STEPS, Recipe, Step
+
+_STEPS = "Steps before the inversion, in this order"
 _ESTIMATES = "Source estimated from the image (docs/sources.md)"
-
-
-def given(**flags: Any) -> dict[str, Any]:
-    """Flags that the user gave, by name."""
-    return {name: value for name, value in flags.items() if value is not None}
-
+_OPTIONS = "Options of the inversion"
 
 ImageFile = Annotated[
     Path,
@@ -49,6 +45,17 @@ SourceFile = Annotated[
 MaskFile = Annotated[
     Path | None,
     Option("--mask", help="Image of the same size, 0 at unusable pixels."),
+]
+RecipeFile = Annotated[
+    Path | None,
+    Option(
+        "--recipe",
+        help="TOML file with everything that is done to a shot; flags override what it says.",
+    ),
+]
+SaveRecipe = Annotated[
+    Path | None,
+    Option("--save-recipe", help="Write what was done as a TOML file for --recipe, or napari."),
 ]
 SetupFile = Annotated[
     Path | None,
@@ -77,7 +84,6 @@ SourceVariable = Annotated[
         ),
     ),
 ]
-Bin = Annotated[int, Option("--bin", metavar="N", help="Bin N×N pixels first.")]
 ChosenShots = Annotated[
     str | None,
     Option(
@@ -89,163 +95,6 @@ ChosenShots = Annotated[
 SiteCount = Annotated[int | None, Option(help="Number of sites. Default: one per pixel.")]
 ClipNegative = Annotated[
     bool, Option("--clip-negative", help="Set negative pixels to zero and count them.")
-]
-Threads = Annotated[int | None, Option(help="Number of threads. Default: all cores.")]
-Seed = Annotated[int | None, Option(help="Random seed for the site positions.")]
-Boundary = Annotated[
-    str | None,
-    Option(
-        help="'closed': no flux crosses the edge. 'free': flux may leave and enter.",
-        rich_help_panel=_BOUNDARY,
-    ),
-]
-Margin = Annotated[
-    int | None,
-    Option(
-        metavar="PX",
-        help="Free boundary: width of the strip beyond each edge from which flux may enter.",
-        rich_help_panel=_BOUNDARY,
-    ),
-]
-Flux = Annotated[
-    str | None,
-    Option(
-        help=(
-            "Free boundary: 'conserve' (units of image and source may differ), 'known' (same "
-            "exposure) or 'fit'."
-        ),
-        rich_help_panel=_BOUNDARY,
-    ),
-]
-
-HotPixels = Annotated[
-    float | None,
-    Option(
-        metavar="DEVIATIONS",
-        help=(
-            "Replace hot and dead pixels that differ from the median of their neighbours by "
-            "more than this many standard deviations of the noise; 6 suits most images. Applied "
-            "before --bin."
-        ),
-        rich_help_panel=_FILTERS,
-    ),
-]
-BackgroundDegree = Annotated[
-    int | None,
-    Option(
-        metavar="DEGREE",
-        help="Divide the image by a polynomial fitted to it, total degree 0 to 10.",
-        rich_help_panel=_FILTERS,
-    ),
-]
-HighPass = Annotated[
-    float | None,
-    Option(
-        metavar="PX",
-        help="Remove structures much larger than this width in px (after --bin).",
-        rich_help_panel=_FILTERS,
-    ),
-]
-LowPass = Annotated[
-    float | None,
-    Option(
-        metavar="PX",
-        help=(
-            "Blur image and source with a Gaussian of this standard deviation in px (after --bin)."
-        ),
-        rich_help_panel=_FILTERS,
-    ),
-]
-Butterworth = Annotated[
-    float | None,
-    Option(
-        metavar="PX",
-        help=(
-            "Remove structures larger than this wavelength in px (after --bin), with a sharp "
-            "cutoff."
-        ),
-        rich_help_panel=_FILTERS,
-    ),
-]
-ButterworthOrder = Annotated[
-    int | None,
-    Option(
-        metavar="N",
-        help=(
-            "Order of --butterworth: the amplitude falls as this power of the wavelength. "
-            "Default: 2."
-        ),
-        rich_help_panel=_FILTERS,
-    ),
-]
-ButterworthKind = Annotated[
-    str | None,
-    Option(
-        help=(
-            "Kind of --butterworth: 'high' removes larger structures (default), 'low' removes "
-            "smaller ones, in both image and source."
-        ),
-        rich_help_panel=_FILTERS,
-    ),
-]
-
-SourceFrom = Annotated[
-    str | None,
-    Option(
-        metavar="ESTIMATE",
-        help=(
-            "Estimate the undisturbed beam from the (filtered) image: uniform, isotropic (a "
-            "point source, needs --setup), gaussian, polynomial, low-pass, total-variation or "
-            "interpolated."
-        ),
-        rich_help_panel=_ESTIMATES,
-    ),
-]
-SourceCentreY = Annotated[
-    float | None,
-    Option(
-        metavar="PX",
-        help=(
-            "For isotropic: row (after --bin) at which the detector faces the point source. "
-            "Default: the image centre."
-        ),
-        rich_help_panel=_ESTIMATES,
-    ),
-]
-SourceCentreX = Annotated[
-    float | None,
-    Option(
-        metavar="PX",
-        help=("For isotropic: column (after --bin) at which the detector faces the point source."),
-        rich_help_panel=_ESTIMATES,
-    ),
-]
-SourceDegree = Annotated[
-    int | None,
-    Option(
-        help="For polynomial: total degree in y and x, 0 to 10. Default: 2.",
-        rich_help_panel=_ESTIMATES,
-    ),
-]
-SourceWeight = Annotated[
-    float | None,
-    Option(
-        help=(
-            "For total-variation: strength in px (after --bin); c·r/2 removes a disc of "
-            "contrast c and radius r px. Default: 2."
-        ),
-        rich_help_panel=_ESTIMATES,
-    ),
-]
-SourceWidth = Annotated[
-    float | None,
-    Option(
-        help=(
-            "For low-pass and interpolated: standard deviation of the blur in px (after --bin). "
-            "Default for interpolated: 5."
-        ),
-        rich_help_panel=_ESTIMATES,
-    ),
 ]
 SourceMask = Annotated[
     Path | None,
@@ -271,3 +120,180 @@ Figure = Annotated[
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]
 QuietInversion = Annotated[bool, Option("--quiet", "-q", help="Print errors and warnings only.")]
+
+
+def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
+    """Type of a flag, and what stands for its value in the help."""
+    annotation: Any = field.annotation
+    kinds = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
+    if get_origin(annotation) is Literal:
+        return str, "|".join(get_args(annotation))
+    if len(kinds) == 1 and kinds[0] in (int, float):
+        unit = (field.title or "").rpartition("(")[2].rstrip(")")
+        return kinds[0], unit.upper() if "(" in (field.title or "") and unit else None
+    return str, "FIRST:LAST"
+
+
+def _flag(
+    flag: str, field: FieldInfo, panel: str, help_: str | None = None
+) -> tuple[str, inspect.Parameter]:
+    kind, metavar = _type_of(field)
+    default = field.default
+    told = help_ or field.description or ""
+    if default not in (None, (0, None)) and "efault" not in told:
+        told = (
+            f"{told.rstrip('.')}. Default: {default:g}."
+            if isinstance(default, float)
+            else f"{told.rstrip('.')}. Default: {default}."
+        )
+    option = Option(f"--{flag}", help=told, metavar=metavar, rich_help_panel=panel)
+    name = flag.replace("-", "_")
+    return name, inspect.Parameter(
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=None,
+        annotation=Annotated[kind | None, option],
+    )
+
+
+def _step_flag(step: type[Step], parameter: str) -> str:
+    return step.name() if parameter == step.primary else f"{step.name()}-{parameter}"
+
+
+def _all_flags() -> dict[str, inspect.Parameter]:
+    flags = [
+        _flag(_step_flag(step, name), field, _STEPS, _step_help(step, name, field))
+        for step in STEPS.values()
+        for name, field in step.parameters().items()
+    ]
+    method = FieldInfo(
+        annotation=str | None,
+        default=None,
+        title="Source",
+        description=f"How to estimate the undisturbed beam: {', '.join(ESTIMATES)}.",
+    )
+    flags.append(_flag("source-from", method, _ESTIMATES))
+    for name in dict.fromkeys(n for one in ESTIMATES.values() for n in one.parameters()):
+        users = {key: one.parameters()[name] for key, one in _users(name).items()}
+        told = " ".join(f"For {key}: {_lower(str(f.description))}" for key, f in users.items())
+        flags.append(
+            _flag(f"source-{name.replace('_', '-')}", next(iter(users.values())), _ESTIMATES, told)
+        )
+    for name, field in InversionOptions.model_fields.items():
+        extra = field.json_schema_extra
+        panel = extra.get("panel", _OPTIONS) if isinstance(extra, dict) else _OPTIONS
+        flags.append(_flag(name.replace("_", "-"), field, str(panel)))
+    return dict(flags)
+
+
+def _users(parameter: str) -> dict[str, Any]:
+    """Estimates that have a parameter."""
+    return {key: one for key, one in ESTIMATES.items() if parameter in one.parameters()}
+
+
+def _step_help(step: type[Step], name: str, field: FieldInfo) -> str:
+    told = str(field.description)
+    if name == step.primary or (not step.primary and name == next(iter(step.parameters()))):
+        summary = (step.__doc__ or "").split("\n")[0].rstrip(".")
+        return f"{summary}. {told}"
+    return f"For --{_step_flag(step, step.primary)}: {_lower(told)}" if step.primary else told
+
+
+def _lower(text: str) -> str:
+    return text if text[1:2].isupper() else text[:1].lower() + text[1:]
+
+
+def takes_recipe(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command, which takes `flags`, one for each parameter of a recipe."""
+    signature = inspect.signature(command, eval_str=True)
+    own = [one for one in signature.parameters.values() if one.name != "flags"]
+    made = _all_flags()
+
+    @functools.wraps(command)
+    def with_flags(**given: Any) -> None:
+        flags = {name: given.pop(name) for name in made}
+        command(**given, flags={name: one for name, one in flags.items() if one is not None})
+
+    parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own]
+    with_flags.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=[*parameters, *made.values()]
+    )
+    with_flags.__annotations__ = {}
+    return with_flags
+
+
+def recipe_of(
+    flags: Mapping[str, Any], base: Recipe, options: Mapping[str, Any], where: str = "options"
+) -> Recipe:
+    """Put flags on top of a recipe; `options` are those of an options file, named `where`.
+
+    Raises
+    ------
+    InputError
+        If a value cannot be used, or a flag needs another one.
+    """
+    chosen = {**base.options.model_dump(exclude_unset=True), **options}
+    chosen |= {name: flags[name] for name in InversionOptions.model_fields if name in flags}
+    if "margin" in flags and chosen.get("boundary") != "free":
+        raise InputError("received --margin: it needs --boundary free")
+    return base.model_copy(
+        update={
+            "steps": _steps(flags, base.steps),
+            "source": _estimate(flags, base),
+            "options": validated(InversionOptions, chosen, where),
+        }
+    )
+
+
+def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...]:
+    """Steps of a recipe with those that flags ask for in place, or where they belong."""
+    order = list(STEPS)
+    found = list(steps)
+    for key, step in STEPS.items():
+        given = {}
+        for name in step.parameters():
+            flag = _step_flag(step, name)
+            if (dest := flag.replace("-", "_")) in flags:
+                given[name] = flags[dest]
+        if not given:
+            continue
+        there = next((i for i, one in enumerate(found) if isinstance(one, step)), None)
+        if there is None and step.primary and step.primary not in given:
+            flag = _step_flag(step, next(iter(given)))
+            raise InputError(f"received --{flag}: it needs --{key}")
+        before = {} if there is None else found[there].values()
+        made = validated(step, {**before, **given}, f"--{key}")
+        if there is None:
+            later = [i for i, one in enumerate(found) if order.index(one.name()) > order.index(key)]
+            found.insert(later[0] if later else len(found), made)
+        else:
+            found[there] = made
+    return tuple(found)
+
+
+def _estimate(flags: Mapping[str, Any], base: Recipe) -> Any:
+    """Source that flags ask for, or that of the recipe with other parameters."""
+    given = {
+        name: flags[f"source_{name}"]
+        for one in ESTIMATES.values()
+        for name in one.parameters()
+        if f"source_{name}" in flags
+    }
+    method = flags.get("source_from")
+    if method is None and not given:
+        return base.source
+    if method is None and base.estimate is None:
+        method = ""
+    elif method is None:
+        method = base.estimate.name()  # type: ignore[union-attr]
+    elif method not in ESTIMATES:
+        meant = nearest(method, list(ESTIMATES))
+        hint = f"did you mean '{meant}'?" if meant else f"expected one of {', '.join(ESTIMATES)}"
+        raise InputError(f"--source-from is '{method}': {hint}")
+    for name in given:
+        users = _users(name)
+        if method not in users:
+            wanted = " or ".join(f"--source-from {user}" for user in users)
+            raise InputError(f"received --source-{name.replace('_', '-')}: it needs {wanted}")
+    kept = base.estimate.values() if base.estimate and base.estimate.name() == method else {}
+    return validated(ESTIMATES[method], {**kept, **given}, f"--source-from {method}")

@@ -13,6 +13,7 @@ from napari_shadowinv.cli._tables import (
     inversion_rows,
     options_text,
     peak_rows,
+    provenance_rows,
     setup_text,
     size_text,
     two_columns,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv.io import Radiograph
+    from napari_shadowinv.preprocessing import Provenance
 
 
 def described(path: Path, variable: str | None = None) -> Table:
@@ -152,20 +154,21 @@ def _result_rows(dataset: xarray.Dataset) -> Rows:
     return [
         ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
-        *[
-            (name.replace("_", " "), str(dataset.attrs[name]))
-            for name in (
-                "input_file",
-                "input_sha256",
-                "input_preparation",
-                "source_file",
-                "source_sha256",
-                "source_preparation",
-            )
-            if name in dataset.attrs
-        ],
+        *_origin_rows(inversion.provenance),
         *experiment,
         *inversion_rows(inversion, setup),
         *closing_rows(inversion.report),
         ("options", options_text(inversion.options.model_dump())),
     ]
+
+
+def _origin_rows(provenance: Provenance | None) -> Rows:
+    """Files that a result was made from, and what was done to them."""
+    if provenance is None:
+        return []
+    origins = {"image": provenance.image, "source": provenance.source}
+    rows: Rows = []
+    for name, origin in origins.items():
+        if origin is not None and origin.file:
+            rows += [(f"{name} file", origin.file), (f"{name} sha256", origin.sha256)]
+    return rows + provenance_rows(provenance)

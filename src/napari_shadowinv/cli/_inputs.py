@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,137 +13,81 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from napari_shadowinv.cli._choices import Choices
-    from napari_shadowinv.io import Radiograph
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 
-@dataclass(frozen=True)
-class Experiment:
-    """A shot with what it takes to understand it; without a source, the beam is uniform."""
-
-    shot: Radiograph
-    source: Radiograph | None = None
-    setup: Setup | None = None
-    doubts: tuple[str, ...] = ()
-    """Of a source that was not measured."""
-
-
-def options_from(
-    path: Path | None,
+def recipe_from(
     flags: Mapping[str, Any],
+    recipe: Path | None,
+    options: Path | None,
+    *,
     clip_negative: bool,
-    *,
-    other_tables: Collection[str] = (),
-) -> InversionOptions:
-    """Options from a file, with flags on top; `other_tables` of the file are for others to read."""
-    from napari_shadowinv._system.validation import validated
-    from napari_shadowinv.io import read_toml
-    from napari_shadowinv.options import InversionOptions
-
-    content = {} if path is None else read_toml(path)
-    chosen = {name: value for name, value in content.items() if name not in other_tables}
-    chosen |= flags
-    if clip_negative:
-        chosen["negative"] = "clip"
-    return validated(InversionOptions, chosen, "options" if path is None else str(path))
-
-
-def check_margin(margin: int | None, options: InversionOptions) -> None:
-    """Refuse --margin where the boundary is closed: it would do nothing."""
-    if margin is not None and options.boundary != "free":
-        raise InputError("received --margin: it needs --boundary free")
-
-
-def experiment_from(
-    image: Path,
-    source: Path | None,
-    setup: Path | None,
-    channel: str | None,
-    factor: int,
-    mask: Path | None = None,
-    *,
-    variable: str | None = None,
+    source: Path | None = None,
     source_variable: str | None = None,
-    choices: Choices | None = None,
+    mask: Path | None = None,
     source_mask: Path | None = None,
-) -> Experiment:
-    """Read what is to be inverted, binned alike and prepared as asked for."""
-    from napari_shadowinv.cli._choices import Choices
-    from napari_shadowinv.io import read_radiograph, read_toml
-    from napari_shadowinv.physics.setup import binned_setup
+) -> Recipe:
+    """Recipe from a file, with an options file and flags on top."""
+    from napari_shadowinv.cli._flags import recipe_of
+    from napari_shadowinv.io import read_toml
+    from napari_shadowinv.pipeline import read_recipe
+    from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 
-    entries = None if setup is None else read_toml(setup)
-    shot = read_radiograph(image, channel=channel, variable=variable)
-    if mask is not None:
-        shot = replace(shot, mask=_mask_of(mask, shot, "mask"))
-    geometry = shot.setup
-    if entries is not None:
-        geometry = _setup(entries, shot.metadata.get("geometry", {}), str(setup))
-    if geometry is not None:
-        geometry = binned_setup(geometry, factor)
-    beam: Radiograph | None
-    if source is not None or source_variable is not None:
-        beam = read_radiograph(source or image, channel=channel, variable=source_variable)
-    else:
-        beam = _own_source(image, shot, choices)
-    bare = None if source_mask is None else _mask_of(source_mask, shot, "source mask")
-    shot, beam, doubts = _prepared(shot, beam, factor, choices or Choices(), bare, geometry)
-    return Experiment(shot, beam, geometry, doubts)
-
-
-def _own_source(path: Path, shot: Radiograph, choices: Choices | None) -> Radiograph | None:
-    """Source from the shot's own file: some hold the image with and without the object."""
-    if shot.source is None or (choices is not None and choices.source_from is not None):
-        return None
-    if choices is not None and choices.flattens:
+    base = Recipe() if recipe is None else read_recipe(recipe)
+    content = {} if options is None else read_toml(options)
+    if "prepare" in content:
         raise InputError(
-            f"{path} contains its own source, but a filter would flatten the image: leave the "
-            "filter out, or replace the source with --source-from uniform"
+            f"{options} has a table [prepare], which recipes replace: write steps and source "
+            "into a file for --recipe (--save-recipe shows how)"
         )
-    return replace(shot, image=shot.source, source=None, mask=None)
+    if clip_negative:
+        flags = {"negative": "clip", **flags}
+    files = {"mask": mask, "source_mask": source_mask}
+    chosen = recipe_of(flags, base, content, "options" if options is None else str(options))
+    chosen = chosen.model_copy(update={name: file for name, file in files.items() if file})
+    if source is None and source_variable is None:
+        return chosen
+    if "source_from" in flags:
+        raise InputError(
+            f"received --source and --source-from {flags['source_from']}: choose one of them"
+        )
+    measured = MeasuredSource(file=source, variable=source_variable)
+    return chosen.model_copy(update={"source": measured})
 
 
-def _prepared(
-    shot: Radiograph,
-    beam: Radiograph | None,
-    factor: int,
-    choices: Choices,
-    bare: NDArray[np.bool_] | None,
-    setup: Setup | None,
-) -> tuple[Radiograph, Radiograph | None, tuple[str, ...]]:
-    """Filter a shot and its source, broken pixels before they are summed and the rest after."""
-    from napari_shadowinv.cli._preparing import estimated, filtered, repaired
-
-    whole = bare
-    if bare is not None:
-        whole = replace(shot, mask=bare).binned(factor).mask
-    if beam is not None and beam.mask is None and beam.image.shape == shot.image.shape:
-        # A broken pixel is broken in both.
-        beam = replace(beam, mask=shot.mask)
-    shot = filtered(repaired(shot, choices).binned(factor), choices)
-    if beam is None:
-        return shot, *estimated(shot, choices, whole, setup)
-    return shot, filtered(repaired(beam, choices).binned(factor), choices), ()
+def options_from(flags: Mapping[str, Any], clip_negative: bool) -> InversionOptions:
+    """Options from flags alone."""
+    return recipe_from(flags, None, None, clip_negative=clip_negative).options
 
 
-def picture_mask(path: Path) -> NDArray[np.bool_]:
-    """Mask from a picture, in which what must not be looked at is 0."""
+def read_shot(path: Path, channel: str | None, variable: str | None) -> Radiograph:
+    """Read an image, and note which part of its file it is."""
     from napari_shadowinv.io import read_radiograph
 
-    mask: NDArray[np.bool_] = read_radiograph(path, channel="mean").image != 0
-    return mask
+    shot = read_radiograph(path, channel=channel, variable=variable)
+    part = {name: one for name, one in (("channel", channel), ("variable", variable)) if one}
+    return replace(shot, metadata={**shot.metadata, **part})
 
 
-def _mask_of(path: Path, shot: Radiograph, name: str) -> NDArray[np.bool_]:
-    """Mask from a picture that must be of the shot's size."""
-    usable = picture_mask(path)
-    if usable.shape != shot.image.shape:
-        raise InputError(
-            f"{path}: {name} has shape {usable.shape}, image {shot.image.shape}: they must match"
-        )
-    return usable
+def source_from(recipe: Recipe, image: Path, channel: str | None) -> Radiograph | None:
+    """Read the measured source that a recipe names; one without a file is in the image's."""
+    from napari_shadowinv.preprocessing import MeasuredSource
+
+    measured = recipe.source
+    if not isinstance(measured, MeasuredSource) or measured == MeasuredSource():
+        return None
+    return read_shot(measured.file or image, channel, measured.variable)
+
+
+def setup_for(path: Path | None, shot: Radiograph, recipe: Recipe) -> Setup | None:
+    """Setup from a file, completed by the geometry that the image's file knows."""
+    from napari_shadowinv.io import read_toml
+
+    if path is None:
+        return recipe.setup or shot.setup
+    return _setup(read_toml(path), shot.metadata.get("geometry", {}), str(path))
 
 
 def setup_from(path: Path) -> Setup:

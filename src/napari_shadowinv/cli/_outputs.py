@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from napari_shadowinv.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
-    from napari_shadowinv.cli._inputs import Experiment
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.preprocessing import Radiograph
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -77,7 +77,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_all(
-    inversion: Inversion, experiment: Experiment, out: Path, report: Path, overwrite: bool
+    inversion: Inversion, shot: Radiograph, out: Path, report: Path, overwrite: bool
 ) -> None:
     """Write result and figure, both or none of them."""
     from napari_shadowinv.io import replacing, write
@@ -85,9 +85,8 @@ def write_all(
     from napari_shadowinv.plotting import report_figure
     from napari_shadowinv.plotting._figures import DOTS_PER_INCH
 
-    shot, setup = experiment.shot, experiment.setup
     title = "" if shot.path is None else text_of(shot.path.name)
-    figure = report_figure(inversion, setup, title=title)
+    figure = report_figure(inversion, inversion.setup, title=title)
     with replacing(report, overwrite) as drawn:
         figure.savefig(drawn, dpi=DOTS_PER_INCH)
-        write(out, inversion, setup=setup, shot=shot, source=experiment.source, overwrite=overwrite)
+        write(out, inversion, overwrite=overwrite)

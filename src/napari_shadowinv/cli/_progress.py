@@ -13,33 +13,21 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from napari_shadowinv._system.progress import OnProgress, Progress
-    from napari_shadowinv.cli._inputs import Experiment
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.options import InversionOptions
+    from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 
-def inverted(experiment: Experiment, options: InversionOptions, quiet: bool = False) -> Inversion:
-    """Invert an experiment's shot; a mistake in it is told with the file's name."""
-    from napari_shadowinv.inversion import invert
-    from napari_shadowinv.inversion.compilation import ensure_compiled
+def inverted(
+    recipe: Recipe, shot: Radiograph, source: Radiograph | None = None, quiet: bool = False
+) -> Inversion:
+    """Apply a recipe to a shot; a mistake is told with the file's name."""
+    from napari_shadowinv.pipeline import run
 
-    shot, source = experiment.shot, experiment.source
     with nullcontext() if quiet else progress_bars() as show:
-        ensure_compiled(show, interrupted)
         try:
-            inversion = invert(
-                shot.image,
-                source=None if source is None else source.image,
-                mask=shot.mask,
-                options=options,
-                on_progress=show,
-                should_stop=interrupted,
-            )
+            return run(recipe, shot, source=source, on_progress=show, should_stop=interrupted)
         except InputError as error:
             raise InputError(f"{shot.path}: {error}" if shot.path else str(error)) from error
-    told = (*experiment.doubts, *shot.warnings, *(() if source is None else source.warnings))
-    # Image and source may come from one file.
-    return inversion.with_warnings(dict.fromkeys(told))
 
 
 @contextmanager

@@ -4,59 +4,42 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from napari_shadowinv.cli._demo import compared_fields, demo_table, simulated_shot, write_demo
 from napari_shadowinv.cli._flags import (
-    BackgroundDegree,
-    Bin,
-    Boundary,
-    Butterworth,
-    ButterworthKind,
-    ButterworthOrder,
     Channel,
     ClipNegative,
     Figure,
-    Flux,
-    HighPass,
-    HotPixels,
     ImageFile,
-    LowPass,
-    Margin,
     MaskFile,
     OptionsFile,
     Overwrite,
     Quiet,
     QuietInversion,
+    RecipeFile,
     Result,
-    Seed,
+    SaveRecipe,
     SetupFile,
-    SiteCount,
-    SourceCentreX,
-    SourceCentreY,
-    SourceDegree,
     SourceFile,
-    SourceFrom,
     SourceMask,
     SourceVariable,
-    SourceWeight,
-    SourceWidth,
-    Threads,
     Variable,
-    given,
+    takes_recipe,
 )
 from napari_shadowinv.cli._forward import predicted, seen_with
 from napari_shadowinv.cli._guard import alarm_unless_converged, notify_errors
 from napari_shadowinv.cli._info import described
 from napari_shadowinv.cli._inputs import (
-    Experiment,
-    check_margin,
-    experiment_from,
     field_from,
     options_from,
+    read_shot,
+    recipe_from,
+    setup_for,
     setup_from,
+    source_from,
 )
 from napari_shadowinv.cli._outputs import (
     FIGURE_SUFFIXES,
@@ -93,10 +76,17 @@ detector_pixel_size = 145e-6     # m; or pixel_size at the object
 n_sites = 100000
 tolerance = 1e-4
 floor = 1e-3
-\[prepare]                        # the filters and estimates above, with _ instead of -
-hot_pixels = 6                   # standard deviations
-source_from = "total-variation"
-source_weight = 2                # px
+
+[bold]recipe.toml[/bold] (all of it in one file: try --save-recipe)
+\[\[steps]]                        # in this order
+step = "hot-pixels"
+threshold = 6                    # standard deviations
+\[\[steps]]
+step = "bin"
+factor = 4
+\[source]
+method = "total-variation"
+weight = 2                       # px
 
 [bold]Exit codes[/bold]
 0 success; 2 invalid input, nothing written;
@@ -105,14 +95,16 @@ source_weight = 2                # px
 
 
 @notify_errors
+@takes_recipe
 def invert(
     image: ImageFile,
     source: SourceFile = None,
     mask: MaskFile = None,
+    source_mask: SourceMask = None,
     setup: SetupFile = None,
+    recipe: RecipeFile = None,
+    save_recipe: SaveRecipe = None,
     options: OptionsFile = None,
-    n_sites: SiteCount = None,
-    bin_: Bin = 1,
     channel: Channel = None,
     variable: Variable = None,
     source_variable: SourceVariable = None,
@@ -120,79 +112,44 @@ def invert(
     out: Result = None,
     report: Figure = None,
     overwrite: Overwrite = False,
-    threads: Threads = None,
-    seed: Seed = None,
     quiet: QuietInversion = False,
-    boundary: Boundary = None,
-    margin: Margin = None,
-    flux: Flux = None,
-    source_from: SourceFrom = None,
-    source_centre_y: SourceCentreY = None,
-    source_centre_x: SourceCentreX = None,
-    source_degree: SourceDegree = None,
-    source_weight: SourceWeight = None,
-    source_width: SourceWidth = None,
-    source_mask: SourceMask = None,
-    hot_pixels: HotPixels = None,
-    background_degree: BackgroundDegree = None,
-    high_pass: HighPass = None,
-    low_pass: LowPass = None,
-    butterworth: Butterworth = None,
-    butterworth_order: ButterworthOrder = None,
-    butterworth_kind: ButterworthKind = None,
+    *,
+    flags: dict[str, Any],
 ) -> None:
     """Retrieve the deflection potential of one image.
 
     Writes potential, displacement, re-projection, residual and all options to one file,
     and a figure next to it.
     """
-    from napari_shadowinv.cli._choices import TABLE, choices_from
     from napari_shadowinv.io.writing import RESULT_SUFFIXES
+    from napari_shadowinv.pipeline import write_recipe
 
     result, figure = result_and_figure(image, out, report)
-    check_outputs({result: RESULT_SUFFIXES, figure: FIGURE_SUFFIXES}, overwrite)
-    protect([result, figure], [image, source, mask, setup, options, source_mask])
-    transport = given(n_sites=n_sites, threads=threads, seed=seed)
-    edge = given(boundary=boundary, margin=margin, flux=flux)
-    chosen = options_from(options, transport | edge, clip_negative, other_tables=(TABLE,))
-    check_margin(margin, chosen)
-    preparing = given(
-        hot_pixels=hot_pixels,
-        background_degree=background_degree,
-        high_pass=high_pass,
-        low_pass=low_pass,
-        butterworth=butterworth,
-        butterworth_order=butterworth_order,
-        butterworth_kind=butterworth_kind,
-        source_from=source_from,
-        source_centre_y=source_centre_y,
-        source_centre_x=source_centre_x,
-        source_degree=source_degree,
-        source_weight=source_weight,
-        source_width=source_width,
-    )
-    experiment = experiment_from(
-        image,
-        source,
-        setup,
-        channel,
-        bin_,
-        mask,
-        variable=variable,
+    outputs = {result: RESULT_SUFFIXES, figure: FIGURE_SUFFIXES}
+    if save_recipe is not None:
+        outputs[save_recipe] = (".toml",)
+    check_outputs(outputs, overwrite)
+    protect(list(outputs), [image, source, mask, setup, options, source_mask])
+    chosen = recipe_from(
+        flags,
+        recipe,
+        options,
+        clip_negative=clip_negative,
+        source=source,
         source_variable=source_variable,
-        choices=choices_from(
-            options,
-            preparing,
-            has_source=source is not None or source_variable is not None,
-            has_source_mask=source_mask is not None,
-        ),
+        mask=mask,
         source_mask=source_mask,
     )
-    check_setup(result, experiment.setup)
-    inversion = inverted(experiment, chosen, quiet)
-    write_all(inversion, experiment, result, figure, overwrite)
+    shot = read_shot(image, channel, variable)
+    chosen = chosen.model_copy(update={"setup": setup_for(setup, shot, chosen)})
+    check_setup(result, chosen.setup)
+    inversion = inverted(chosen, shot, source_from(chosen, image, channel), quiet)
+    write_all(inversion, shot, result, figure, overwrite)
+    if save_recipe is not None:
+        write_recipe(save_recipe, chosen, overwrite=overwrite)
     if not quiet:
-        say(summary(inversion, experiment, [result, figure]))
+        written = [path for path in outputs if path.exists()]
+        say(summary(inversion, shot, written))
     alarm_unless_converged(inversion.report, result)
 
 
@@ -336,7 +293,9 @@ def demo(
     out: Annotated[Path, typer.Option(help="Output folder.")] = Path("demo"),
     dm: Annotated[float, typer.Option(help="Peak path-integrated field in MG·µm.")] = 97.0,
     noise: Annotated[float, typer.Option(help="Noise, as a fraction of the mean.")] = 0.1,
-    n_sites: SiteCount = None,
+    n_sites: Annotated[
+        int | None, typer.Option(help="Number of sites. Default: one per pixel.")
+    ] = None,
 ) -> None:
     """Simulate a proton radiograph of a toroidal field, invert it and compare with the truth.
 
@@ -347,14 +306,14 @@ def demo(
         raise InputError(f"noise is {noise:g}: it must be 0 or more, as a fraction of the mean")
     if not math.isfinite(dm):
         raise InputError(f"dm is {dm:g}: it must be a finite number, in MG·µm")
-    chosen = options_from(None, given(n_sites=n_sites), clip_negative=True)
+    chosen = options_from({} if n_sites is None else {"n_sites": n_sites}, clip_negative=True)
     make_folder(out)
-    from napari_shadowinv.io import Radiograph
     from napari_shadowinv.physics.phantoms import paper_setup
+    from napari_shadowinv.preprocessing import Radiograph, Recipe
 
     setup = paper_setup()
     image, truth = simulated_shot(setup, dm, noise)
-    inversion = inverted(Experiment(Radiograph(image), setup=setup), chosen)
+    inversion = inverted(Recipe(setup=setup, options=chosen), Radiograph(image))
     fields = compared_fields(image, truth, inversion)
     written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
     say(demo_table(inversion, setup, fields, written))

@@ -18,10 +18,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.table import Table
 
-    from napari_shadowinv.cli._inputs import Experiment
     from napari_shadowinv.inversion import Inversion, Report
-    from napari_shadowinv.io import Radiograph
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.preprocessing import Provenance, Radiograph
 
 Rows = list[tuple[str, str]]
 
@@ -39,18 +38,33 @@ def two_columns(title: str, rows: Rows) -> Table:
     return table
 
 
-def summary(inversion: Inversion, experiment: Experiment, written: list[Path]) -> Table:
+def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Table:
     """Tell what was inverted, how well it went, and where the answer is."""
-    shot, source, setup = experiment.shot, experiment.source, experiment.setup
+    setup = inversion.setup
     rows = [
-        ("image", f"{shot.path}, {size_text(inversion.image)}{_binning_text(shot)}"),
-        *[("prepared", note) for note in shot.metadata.get("notes", ())],
-        ("source", _source_text(source)),
+        ("image", f"{shot.path}, {size_text(inversion.image)}"),
+        *provenance_rows(inversion.provenance),
         ("setup", setup_text(setup, shot)),
         *inversion_rows(inversion, setup),
         *closing_rows(inversion.report, written),
     ]
     return two_columns("Inversion", rows)
+
+
+def provenance_rows(provenance: Provenance | None) -> Rows:
+    """What was done before the inversion, and where the source came from."""
+    if provenance is None:
+        return []
+    source, estimate = provenance.source, provenance.recipe.estimate
+    if source is not None:
+        told = source.file or "an array"
+    else:
+        told = "uniform" if estimate is None else estimate.described
+    rows = [*[("prepared", note) for note in provenance.notes], ("source", told)]
+    for name, mask in (("mask", provenance.mask), ("source mask", provenance.source_mask)):
+        if mask is not None:
+            rows.append((name, mask.file or "drawn"))
+    return rows
 
 
 def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
@@ -149,24 +163,6 @@ def options_text(options: Mapping[str, Any]) -> str:
 def size_text(array: NDArray[Any]) -> str:
     """Height and width are given as people do, width first."""
     return f"{array.shape[1]} × {array.shape[0]} px (width × height)"
-
-
-def _source_text(source: Radiograph | None) -> str:
-    if source is None:
-        return "uniform"
-    notes = "; ".join(source.metadata.get("notes", ()))
-    if source.path is None:
-        return f"estimated from the image: {notes}"
-    return f"{source.path}, {notes}" if notes else str(source.path)
-
-
-def _binning_text(shot: Radiograph) -> str:
-    factor = shot.metadata.get("bin", 1)
-    if factor == 1:
-        return ""
-    rows, columns = shot.metadata["cropped"]
-    cut = f", {rows} rows and {columns} columns cut off" if rows or columns else ""
-    return f", binned {factor} × {factor}{cut}"
 
 
 def _times_text(seconds: Mapping[str, float]) -> str:

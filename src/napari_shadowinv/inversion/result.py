@@ -11,18 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import FORMAT, VARIABLES, dataset_from_field, label
 from napari_shadowinv.inversion.trust import image_residual
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocessing import Provenance
 
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Inversion", "Report"]
+__all__ = ["Inversion", "Report", "provenance_of"]
 
 Array = NDArray[np.float64]
 
@@ -123,6 +125,8 @@ class Inversion:
         Convergence, timing and warnings.
     options : InversionOptions
         The options used.
+    provenance : Provenance or None
+        How it was made and from what, if by a recipe.
     """
 
     image: Array
@@ -140,6 +144,12 @@ class Inversion:
     mask: NDArray[np.bool_]
     report: Report
     options: InversionOptions
+    provenance: Provenance | None = None
+
+    @property
+    def setup(self) -> Setup | None:
+        """The geometry of its pixels, as far as the provenance tells."""
+        return None if self.provenance is None else self.provenance.setup
 
     def with_warnings(self, texts: Iterable[str]) -> Inversion:
         """Return the same inversion with additional warnings, such as doubts about its source.
@@ -158,7 +168,7 @@ class Inversion:
 
     def to_dataset(
         self,
-        setup: ProtonSetup | OpticalSetup | None = None,
+        setup: Setup | None = None,
         *,
         attributes: Mapping[str, str] | None = None,
     ) -> xarray.Dataset:
@@ -166,9 +176,9 @@ class Inversion:
 
         Parameters
         ----------
-        setup : ProtonSetup or OpticalSetup, optional
+        setup : Setup, optional
             Adds the potential and the line-integrated fields in SI units, and coordinates in
-            metres.
+            metres. Default: that of the provenance.
         attributes : mapping of str to str, optional
             Further attributes.
 
@@ -184,6 +194,9 @@ class Inversion:
             "report": json.dumps(dataclasses.asdict(self.report)),
             "image_residual": self.report.image_residual,
         }
+        if self.provenance is not None:
+            history["provenance"] = self.provenance.model_dump_json(exclude_none=True)
+            setup = self.setup if setup is None else setup
         dataset = dataset_from_field(
             self.displacement, self.potential, setup, attributes=history | dict(attributes or {})
         )
@@ -220,7 +233,16 @@ class Inversion:
             **arrays,
             report=report,
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
+            provenance=provenance_of(dataset),
         )
+
+
+def provenance_of(dataset: xarray.Dataset) -> Provenance | None:
+    """Return how a dataset was made; None if it does not say, or in words of another version."""
+    try:
+        return Provenance.model_validate_json(dataset.attrs.get("provenance", ""))
+    except ValidationError:
+        return None
 
 
 def _report(content: dict[str, Any]) -> Report:

@@ -7,18 +7,16 @@
 - write a file of your own, whole or not at all: `replacing`
 """
 
-from napari_shadowinv.io.dataset import provenance
 from napari_shadowinv.io.files import check_output, replacing
 from napari_shadowinv.io.reading import read, read_dataset, read_radiograph, read_toml
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.io.writing import write
-from napari_shadowinv.preprocessing.radiograph import Radiograph
+from napari_shadowinv.preprocessing import Radiograph
 
 __all__ = [
     "Radiograph",
     "check_output",
     "is_stack",
-    "provenance",
     "read",
     "read_dataset",
     "read_radiograph",

@@ -1,53 +1,21 @@
 """A result's dataset as one NetCDF4 file, ``.shadowinv``.
 
 - write and read: `write_result`, `read_result`
-- say which files it was made from: `provenance`
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.inversion.labels import FORMAT
-from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.hdf5 import check_arrays, hdf5_in_memory
-from napari_shadowinv.preprocessing.radiograph import Radiograph
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["provenance", "read_result", "write_result"]
-
-
-def provenance(shot: Radiograph | None, source: Radiograph | None = None) -> dict[str, str]:
-    """Say which files a result was made from.
-
-    Parameters
-    ----------
-    shot : Radiograph or None
-        The image.
-    source : Radiograph or None
-        The undisturbed beam.
-
-    Returns
-    -------
-    dict of str to str
-        ``input_file``, ``input_sha256``, ``source_file``, ``source_sha256``, as far as known, and
-        what was done before the inversion as JSON, ``input_preparation`` and
-        ``source_preparation``.
-    """
-    found: dict[str, str] = {}
-    for role, radiograph in (("input", shot), ("source", source)):
-        if radiograph is not None and radiograph.metadata.get("preparation"):
-            found[f"{role}_preparation"] = json.dumps(radiograph.metadata["preparation"])
-        if radiograph is not None and radiograph.path is not None:
-            found[f"{role}_file"] = text_of(radiograph.path.name)
-            if "sha256" in radiograph.metadata:
-                found[f"{role}_sha256"] = str(radiograph.metadata["sha256"])
-    return found
+__all__ = ["read_result", "write_result"]
 
 
 def write_result(path: Path, dataset: xarray.Dataset) -> None:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup, Species
+    from napari_shadowinv.preprocessing import Provenance
 
 __all__ = [
     "VERSION",
@@ -128,6 +129,7 @@ _ATTRIBUTES = (
     "experiment_date",
     "file_date",
     "radiograph_filename",
+    "provenance",
 )
 
 
@@ -266,7 +268,7 @@ def write_pradformat(
     potential: ArrayLike,
     setup: ProtonSetup | OpticalSetup | None,
     *,
-    radiograph_filename: str = "",
+    provenance: Provenance | None = None,
 ) -> None:
     """Write a potential and its deflection angles as a pradformat "simple inversion".
 
@@ -280,8 +282,8 @@ def write_pradformat(
         Normalised potential in px².
     setup : ProtonSetup
         The experiment; the format needs all of it.
-    radiograph_filename : str
-        Name of the file that was inverted.
+    provenance : Provenance, optional
+        How the result was made.
 
     Raises
     ------
@@ -296,7 +298,7 @@ def write_pradformat(
     with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
         for name, values in datasets.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
-        file.attrs.update(_inversion_attributes(particles, radiograph_filename))
+        file.attrs.update(_inversion_attributes(particles, provenance))
 
 
 def check_pradformat_setup(setup: ProtonSetup | OpticalSetup | None) -> ProtonSetup:
@@ -328,7 +330,7 @@ def check_pradformat_setup(setup: ProtonSetup | OpticalSetup | None) -> ProtonSe
     return setup
 
 
-def _inversion_attributes(setup: ProtonSetup, radiograph_filename: str) -> dict[str, Any]:
+def _inversion_attributes(setup: ProtonSetup, provenance: Provenance | None) -> dict[str, Any]:
     attributes: dict[str, Any] = {
         "object_type": "inversion",
         "inversion_type": "simple",
@@ -343,6 +345,8 @@ def _inversion_attributes(setup: ProtonSetup, radiograph_filename: str) -> dict[
         "file_date": datetime.now(UTC).date().isoformat(),
         "description": "Power-diagram inversion by napari-shadowinv",
     }
-    if radiograph_filename:
-        attributes["radiograph_filename"] = radiograph_filename
+    if provenance is not None:
+        attributes["provenance"] = provenance.model_dump_json(exclude_none=True)
+        if provenance.image.file:
+            attributes["radiograph_filename"] = provenance.image.file
     return attributes

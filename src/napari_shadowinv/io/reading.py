@@ -26,7 +26,7 @@ from napari_shadowinv.io.images import PICTURES, read_picture
 from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5, read_mat
 from napari_shadowinv.io.pradformat import is_result, read_pradformat
 from napari_shadowinv.io.store import is_stack, read_stack
-from napari_shadowinv.preprocessing.radiograph import Radiograph
+from napari_shadowinv.preprocessing import Radiograph
 
 if TYPE_CHECKING:
     import xarray

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.result import provenance_of
 from napari_shadowinv.io.arrays import write_npy
-from napari_shadowinv.io.dataset import provenance, write_result
+from napari_shadowinv.io.dataset import write_result
 from napari_shadowinv.io.files import check_output, replacing
 from napari_shadowinv.io.images import write_png, write_tiff
 from napari_shadowinv.io.pradformat import write_pradformat
-from napari_shadowinv.preprocessing.radiograph import Radiograph
 
 if TYPE_CHECKING:
     import xarray
@@ -41,8 +41,6 @@ def write(
     result: Inversion | Uncertainty | xarray.Dataset | NDArray[Any],
     *,
     setup: ProtonSetup | OpticalSetup | None = None,
-    shot: Radiograph | None = None,
-    source: Radiograph | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write a result or an image in the format that the path's ending names.
@@ -57,8 +55,6 @@ def write(
         What to write.
     setup : ProtonSetup or OpticalSetup, optional
         Adds SI units; pradformat needs it. A dataset brings its own.
-    shot, source : Radiograph, optional
-        What the result was made from; their files' names and checksums are kept with it.
     overwrite : bool
         Whether an existing file may be replaced.
 
@@ -88,22 +84,17 @@ def write(
         if isinstance(result, np.ndarray):
             _write_image(temporary, result, setup)
         else:
-            _write_result(temporary, _dataset(result, setup, shot, source))
+            _write_result(temporary, _dataset(result, setup))
     return Path(path)
 
 
 def _dataset(
     result: Inversion | Uncertainty | xarray.Dataset,
     setup: ProtonSetup | OpticalSetup | None,
-    shot: Radiograph | None,
-    source: Radiograph | None,
 ) -> xarray.Dataset:
     import xarray as xr
 
-    origin = provenance(shot, source)
-    if isinstance(result, xr.Dataset):
-        return result.assign_attrs(origin)
-    return result.to_dataset(setup, attributes=origin)
+    return result if isinstance(result, xr.Dataset) else result.to_dataset(setup)
 
 
 def _write_result(path: Path, dataset: xarray.Dataset) -> None:
@@ -118,7 +109,7 @@ def _write_result(path: Path, dataset: xarray.Dataset) -> None:
             dataset["displacement"].values,
             dataset["potential"].values,
             setup_from_dataset(dataset),
-            radiograph_filename=dataset.attrs.get("input_file", ""),
+            provenance=provenance_of(dataset),
         )
 
 

@@ -1,1 +1,10 @@
-"""From a shot to its result, for every face of the package."""
+"""The one way from a shot to its result, for every face of the package.
+
+- apply a recipe to a shot: `run`; what a window keeps between runs: `Cache`
+- the same in two parts, for stacks: `gathered`, `run_prepared`
+- recipes as files: `read_recipe`, `write_recipe`
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

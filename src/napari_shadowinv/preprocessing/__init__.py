@@ -1,1 +1,14 @@
-"""What is done to a shot before its inversion: filters, estimates of its source."""
+"""What is done to a shot before its inversion, and the recipe that says so.
+
+- the shot: `Radiograph`; the recipe: `Recipe`; what it was applied to: `Provenance`
+- steps: `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,
+  `high_pass`, `butterworth`, `remove_background`, `remove_hot_pixels`
+- estimates of the source by name in `ESTIMATES`; as functions `uniform_source`,
+  `isotropic_source`, `gaussian_source`, `polynomial_source`, `low_pass_source`,
+  `total_variation_source`, `interpolated_source`
+- film: `napari_shadowinv.preprocessing.film`
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

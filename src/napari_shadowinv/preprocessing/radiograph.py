@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,17 +37,49 @@ class Radiograph:
         The undisturbed beam.
     mask : ndarray of bool, shape (H, W), or None
         True where a pixel can be used.
+    source_mask : ndarray of bool, shape (H, W), or None
+        True where the object is not; an estimate of the source looks at no other pixels.
     warnings : tuple of str
         What the user should know before trusting what the file says.
     """
 
-    image: NDArray[np.float64]
+    image: FloatArray
     setup: ProtonSetup | OpticalSetup | None = None
     path: Path | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
-    source: NDArray[np.float64] | None = None
-    mask: NDArray[np.bool_] | None = None
+    source: FloatArray | None = None
+    mask: BoolArray | None = None
+    source_mask: BoolArray | None = None
     warnings: tuple[str, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (H, W) of the image."""
+        height, width = self.image.shape
+        return height, width
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was done to it so far, for people."""
+        return tuple(self.metadata.get("notes", ()))
+
+    def noted(self, *notes: str) -> Radiograph:
+        """Return the same with word of what was done to it."""
+        return replace(self, metadata={**self.metadata, "notes": (*self.notes, *notes)})
+
+    def mapped(
+        self,
+        values: Callable[[FloatArray], FloatArray],
+        masks: Callable[[BoolArray], BoolArray],
+    ) -> Radiograph:
+        """Return the same with a function applied to image and source, another to the masks."""
+        return replace(
+            self,
+            image=values(self.image),
+            source=None if self.source is None else values(self.source),
+            mask=None if self.mask is None else masks(self.mask),
+            source_mask=None if self.source_mask is None else masks(self.source_mask),
+        )
 
     def binned(self, factor: int) -> Radiograph:
         """Sum blocks of pixels; the setup's pixel grows with them.
@@ -61,8 +93,8 @@ class Radiograph:
         Returns
         -------
         Radiograph
-            A smaller one, with ``bin`` and ``cropped`` (rows, columns) in its metadata. A
-            block can be used if all its pixels can.
+            A smaller one, with ``bin`` in its metadata. A block can be used if all its
+            pixels can.
 
         Raises
         ------
@@ -90,23 +122,20 @@ class Radiograph:
             )
         if factor == 1:
             return self
-        return replace(
-            self,
-            image=_blocks(self.image, factor).sum(axis=(1, 3)),
-            source=None if self.source is None else _blocks(self.source, factor).sum(axis=(1, 3)),
-            mask=None
-            if self.mask is None
-            else np.asarray(_blocks(self.mask, factor).all(axis=(1, 3))),
+        binned = replace(
+            self.mapped(
+                lambda plane: _blocks(plane, factor).sum(axis=(1, 3)),
+                lambda mask: np.asarray(_blocks(mask, factor).all(axis=(1, 3))),
+            ),
             setup=None if self.setup is None else binned_setup(self.setup, factor),
-            metadata={
-                **self.metadata,
-                "bin": factor * int(self.metadata.get("bin", 1)),
-                "cropped": (height % factor, width % factor),
-            },
+            metadata={**self.metadata, "bin": factor * int(self.metadata.get("bin", 1))},
         )
+        rows, columns = height % factor, width % factor
+        cut = f", {rows} rows and {columns} columns cut off" if rows or columns else ""
+        return binned.noted(f"binned {factor} × {factor}{cut}")
 
 
-def _blocks(array: NDArray[Any], factor: int) -> NDArray[Any]:
+def _blocks(array: AnyArray, factor: int) -> AnyArray:
     rows, columns = (n // factor for n in array.shape)
     cropped = array[: rows * factor, : columns * factor]
     return cropped.reshape(rows, factor, columns, factor)

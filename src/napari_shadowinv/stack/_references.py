@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
-    from napari_shadowinv.preprocessing.radiograph import Radiograph
+    from napari_shadowinv.preprocessing import Radiograph
 
 __all__ = [
     "ArrayShot",
@@ -93,7 +93,7 @@ def read_shot(
     """
     from napari_shadowinv.io.images import read_tiff_page
     from napari_shadowinv.io.reading import read_radiograph
-    from napari_shadowinv.preprocessing.radiograph import Radiograph
+    from napari_shadowinv.preprocessing import Radiograph
 
     if page is None:
         shot = read_radiograph(path, channel=channel, variable=variable)
@@ -103,7 +103,7 @@ def read_shot(
     if warnings is not None:
         warnings += [*shot.warnings, *_left_out(shot)]
     if hot_pixels is not None:
-        from napari_shadowinv.preprocessing.filters import remove_hot_pixels
+        from napari_shadowinv.preprocessing import remove_hot_pixels
 
         shot = replace(shot, image=remove_hot_pixels(shot.image, threshold=hot_pixels)[0])
     return shot.binned(factor).image

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-    from napari_shadowinv.preprocessing.recipes import Filter
+    from napari_shadowinv.preprocessing import Filter
 
 __all__ = ["STORED", "RunProgress", "ShotOutcome", "run_stack"]
 

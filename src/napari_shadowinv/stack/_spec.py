@@ -23,8 +23,7 @@ from napari_shadowinv.inversion.normalise import checked_mask, checked_source
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing.preparation import Preparation
-from napari_shadowinv.preprocessing.recipes import Estimate, Filter, UniformEstimate
+from napari_shadowinv.preprocessing import Estimate, Filter, Preparation, UniformEstimate
 from napari_shadowinv.stack._discovery import Shots, find_shots, find_source
 from napari_shadowinv.stack._references import Reader, Shot, described_reader
 from napari_shadowinv.stack._worker import Beam, Work, shared_plan, threads_here

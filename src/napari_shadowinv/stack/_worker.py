@@ -29,8 +29,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing.preparation import Preparation
-from napari_shadowinv.preprocessing.sources import uniform_warnings
+from napari_shadowinv.preprocessing import Preparation, uniform_warnings
 from napari_shadowinv.stack._references import checksum
 from napari_shadowinv.transport.sites import SitePlan
 

@@ -13,7 +13,7 @@ from napari_shadowinv._napari.widgets._jobs import ShotJob
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.preprocessing.recipes import UniformEstimate
+from napari_shadowinv.preprocessing import UniformEstimate
 
 
 @pytest.fixture(autouse=True)

@@ -15,7 +15,7 @@ from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._state import StateKeeper
 from napari_shadowinv._napari.widgets._toml import dump_toml, load_toml
 from napari_shadowinv.cli._inputs import options_from, setup_from
-from napari_shadowinv.preprocessing.recipes import ESTIMATES
+from napari_shadowinv.preprocessing import ESTIMATES
 
 CHANGED = {
     "n_sites": 1234,

@@ -18,7 +18,7 @@ from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.preprocessing.recipes import LowPassEstimate, LowPassFilter
+from napari_shadowinv.preprocessing import LowPassEstimate, LowPassFilter
 from napari_shadowinv.stack import _engines, _worker
 
 Array = np.ndarray[Any, Any]

@@ -38,9 +38,7 @@ from napari_shadowinv.cli._preparing import filtered
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
-from napari_shadowinv.preprocessing import filters, recipes
-from napari_shadowinv.preprocessing.radiograph import Radiograph
-from napari_shadowinv.preprocessing.sources import isotropic_source
+from napari_shadowinv.preprocessing import Radiograph, filters, isotropic_source, recipes
 
 FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]

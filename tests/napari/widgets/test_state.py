@@ -34,7 +34,7 @@ from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
-from napari_shadowinv.preprocessing.recipes import PolynomialEstimate
+from napari_shadowinv.preprocessing import PolynomialEstimate
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms

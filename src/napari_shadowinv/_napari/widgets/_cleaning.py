@@ -10,7 +10,7 @@ from qtpy.QtWidgets import QVBoxLayout, QWidget
 
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of
 from napari_shadowinv._napari.widgets._panels import section
-from napari_shadowinv.preprocessing.recipes import FILTERS, Filter
+from napari_shadowinv.preprocessing import FILTERS, Filter
 
 __all__ = ["CleaningSection"]
 

@@ -23,8 +23,7 @@ from napari_shadowinv._system.progress import OnProgress, OnWarning, Reporter, S
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing.preparation import Preparation
-from napari_shadowinv.preprocessing.recipes import Estimate, Filter, UniformEstimate
+from napari_shadowinv.preprocessing import Estimate, Filter, Preparation, UniformEstimate
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
@@ -254,7 +253,7 @@ class ShotJob:
         return self.source.placed(self.setup, np.shape(self.image), self._corner())
 
     def _doubts_of_uniform(self) -> list[str]:
-        from napari_shadowinv.preprocessing.sources import uniform_warnings
+        from napari_shadowinv.preprocessing import uniform_warnings
 
         if not isinstance(self.source, UniformEstimate):
             return []

@@ -22,8 +22,7 @@ from napari_shadowinv._napari.widgets._forms import RowPicker, kinds_of, labelle
 from napari_shadowinv._napari.widgets._picking import LayerPicker
 from napari_shadowinv._napari.widgets._reading import image_of
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.preprocessing.preparation import check_masks
-from napari_shadowinv.preprocessing.recipes import ESTIMATES, Estimate
+from napari_shadowinv.preprocessing import ESTIMATES, Estimate, check_masks
 
 __all__ = ["SourcePicker"]
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing.recipes import Estimate, Filter, UniformEstimate
+from napari_shadowinv.preprocessing import Estimate, Filter, UniformEstimate
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup

@@ -27,7 +27,7 @@ from napari_shadowinv._napari.widgets._results import (
     keep_earlier_box,
 )
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
-from napari_shadowinv.preprocessing.recipes import ESTIMATES
+from napari_shadowinv.preprocessing import ESTIMATES
 
 if TYPE_CHECKING:
     import napari

@@ -1,0 +1,13 @@
+from .cache import Cache
+from .files import read_recipe, write_recipe
+from .run import Inputs, gathered, run, run_prepared
+
+__all__ = [
+    "Cache",
+    "Inputs",
+    "gathered",
+    "read_recipe",
+    "run",
+    "run_prepared",
+    "write_recipe",
+]

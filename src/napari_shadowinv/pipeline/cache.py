@@ -1,0 +1,143 @@
+"""What a window keeps between runs: sites and sources that need not be made again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from napari_shadowinv._system.progress import OnProgress, OnWarning, ShouldStop
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.inversion import Inversion, plan_sites
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocessing import Estimate
+from napari_shadowinv.transport.sites import SitePlan
+
+__all__ = ["Cache", "quick_source", "same_array"]
+
+
+@dataclass
+class Cache:
+    """Sites and estimated source of the last run, for the next one with the same beam or image.
+
+    Attributes
+    ----------
+    hits : int
+        How often sites were used again.
+    """
+
+    hits: int = 0
+    _plan: tuple[str, FloatArray, BoolArray | None, SitePlan] | None = field(
+        default=None, repr=False
+    )
+    _solved: tuple[SitePlan, Inversion] | None = field(default=None, repr=False)
+    _estimated: (
+        tuple[tuple[Estimate, bool], FloatArray, BoolArray | None, FloatArray, list[str]] | None
+    ) = field(default=None, repr=False)
+
+    def plan(
+        self,
+        source: FloatArray,
+        mask: BoolArray | None,
+        options: InversionOptions,
+        on_progress: OnProgress | None = None,
+        should_stop: ShouldStop | None = None,
+    ) -> SitePlan:
+        """Return the sites for a source, made anew only if anything about them changed."""
+        key = options.site_key()
+        if self._plan is not None:
+            last_key, last_source, last_mask, plan = self._plan
+            if key == last_key and _alike(source, last_source) and same_array(mask, last_mask):
+                self.hits += 1
+                return plan
+        plan = plan_sites(
+            source, options, mask=mask, on_progress=on_progress, should_stop=should_stop
+        )
+        # At once: a run that was cancelled may still be about to do the same.
+        self._plan = key, source, mask, plan
+        return plan
+
+    def solved(self, plan: SitePlan) -> Inversion | None:
+        """Return what `keep` was last given, if it was made with these sites."""
+        solved = self._solved
+        return solved[1] if solved is not None and solved[0] is plan else None
+
+    def keep(self, plan: SitePlan, inversion: Inversion) -> None:
+        """Remember an inversion made with these sites, to start the next one from."""
+        self._solved = plan, inversion
+
+    def source(
+        self,
+        estimate: Estimate,
+        image: FloatArray,
+        mask: BoolArray | None,
+        most_pixels: int | None = None,
+        should_stop: ShouldStop | None = None,
+        on_warning: OnWarning | None = None,
+    ) -> FloatArray:
+        """Return an estimated source; with `most_pixels`, quickly, from merged pixels."""
+        key = (estimate, most_pixels is not None)
+        source, doubts = None, []
+        if self._estimated is not None:
+            last_key, last_image, last_mask, last_source, last_doubts = self._estimated
+            same = same_array(image, last_image) and same_array(mask, last_mask)
+            if key == last_key and same:
+                source, doubts = last_source, last_doubts
+        if source is None:
+            if most_pixels is None:
+                source = estimate.source(image, mask, should_stop, doubts.append)
+            else:
+                source = quick_source(
+                    estimate, image, mask, most_pixels, should_stop, doubts.append
+                )
+            self._estimated = key, image, mask, source, doubts
+        if on_warning is not None:
+            for doubt in doubts:
+                on_warning(doubt)
+        return source
+
+
+def quick_source(
+    estimate: Estimate,
+    image: FloatArray,
+    mask: BoolArray | None,
+    most_pixels: int,
+    should_stop: ShouldStop | None = None,
+    on_warning: OnWarning | None = None,
+) -> FloatArray:
+    """Estimate a source from an image whose pixels are merged until there are few enough.
+
+    It is linear between the middles of the merged pixels; its flux is that of the image.
+    """
+    factor = int(np.ceil(np.sqrt(image.size / most_pixels)))
+    if factor == 1 or min(image.shape) < 8 * factor:
+        return estimate.source(image, mask, should_stop, on_warning)
+    from scipy.ndimage import map_coordinates
+    from skimage.transform import downscale_local_mean
+
+    # It comes without types.
+    merged: Callable[..., FloatArray] = downscale_local_mean
+    usable = np.ones(image.shape, bool) if mask is None else mask
+    share = merged(usable.astype(float), (factor, factor))
+    sums = merged(np.where(usable, image, 0.0), (factor, factor))
+    known = share > 0
+    coarse = np.where(known, sums / np.where(known, share, 1.0), 0.0)
+    coarser = estimate.coarser(factor)
+    beam = coarser.source(coarse, None if known.all() else known, should_stop, on_warning)
+    middle = (factor - 1) / 2
+    places = np.meshgrid(*((np.arange(n) - middle) / factor for n in image.shape), indexing="ij")
+    fine = map_coordinates(beam, places, order=1, mode="nearest")
+    return np.asarray(fine * (image[usable].sum() / fine[usable].sum()))
+
+
+def same_array(one: AnyArray | None, other: AnyArray | None) -> bool:
+    """Whether two arrays hold the same, or both are none."""
+    if one is None or other is None:
+        return one is other
+    return one is other or np.array_equal(one, other)
+
+
+def _alike(one: FloatArray, other: FloatArray) -> bool:
+    # A filter keeps the mean of a uniform source to rounding only.
+    return one.shape == other.shape and bool(np.allclose(one, other, rtol=1e-9, atol=0))

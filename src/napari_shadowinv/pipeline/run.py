@@ -1,0 +1,369 @@
+"""From a shot to its field by a recipe: `run`.
+
+- what a recipe is applied to, complete: `gathered`
+- the inversion of a shot whose steps were done: `run_prepared`
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from napari_shadowinv import __version__
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion import Inversion, invert
+from napari_shadowinv.inversion.compilation import ensure_compiled
+from napari_shadowinv.inversion.normalise import checked_source, number_of_sites, prepare
+from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io.files import text_of
+from napari_shadowinv.pipeline.cache import Cache
+from napari_shadowinv.preprocessing import (
+    MeasuredSource,
+    Origin,
+    Provenance,
+    Radiograph,
+    Recipe,
+    UniformEstimate,
+    estimated_source,
+    uniform_warnings,
+)
+from napari_shadowinv.preprocessing.isotropic import centre_within
+
+__all__ = ["PREVIEW_SITES", "Inputs", "gathered", "run", "run_prepared"]
+
+PREVIEW_SITES = 5_000
+_PREVIEW_PIXELS = 10_000
+
+Shot = Radiograph | ArrayLike | str | Path
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What a recipe is applied to.
+
+    Attributes
+    ----------
+    recipe : Recipe
+        With the setup and the kind of source of this shot.
+    shot : Radiograph
+        The shot as recorded, with its source and masks.
+    provenance : Provenance
+        Where all of it came from.
+    """
+
+    recipe: Recipe
+    shot: Radiograph
+    provenance: Provenance
+
+    def prepared(self, should_stop: ShouldStop | None = None) -> Radiograph:
+        """Return the shot after the recipe's steps; see `Recipe.prepared`."""
+        return self.recipe.prepared(self.shot, should_stop)
+
+
+def run(
+    recipe: Recipe,
+    shot: Shot,
+    *,
+    source: Shot | None = None,
+    mask: ArrayLike | None = None,
+    source_mask: ArrayLike | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+    cache: Cache | None = None,
+    preview: bool = False,
+) -> Inversion:
+    """Apply a recipe to a shot.
+
+    Parameters
+    ----------
+    recipe : Recipe
+        What is to be done.
+    shot : Radiograph, array_like of shape (H, W), or path
+        The image, with what is known about it.
+    source : Radiograph, array_like of shape (H, W), or path, optional
+        The undisturbed beam. Default: what the recipe says, or the shot's file holds.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel of the shot can be used. Default: as for `source`.
+    source_mask : array_like of bool, shape (H, W), optional
+        True where the object is not. Default: what the recipe says.
+    on_progress, should_stop : callable, optional
+        See `napari_shadowinv.invert`.
+    cache : Cache, optional
+        Sites and estimates of earlier runs.
+    preview : bool, default False
+        Be quick rather than exact: few sites, and an estimate from merged pixels.
+
+    Returns
+    -------
+    Inversion
+        With its `provenance`, by which it can be made again.
+
+    Raises
+    ------
+    InputError
+        If recipe and shot do not fit together, or the shot cannot be inverted.
+    FileFormatError
+        If a file cannot be read.
+    InversionCancelled
+        If `should_stop` returned true.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from napari_shadowinv.preprocessing import Bin, Recipe
+    >>> inversion = run(Recipe(steps=(Bin(factor=2),)), np.ones((16, 16)))
+    >>> inversion.image.shape
+    (8, 8)
+    """
+    report = Reporter(on_progress, should_stop)
+    clock = time.perf_counter()
+    report("prepare", 0, None, "image and source")
+    inputs = gathered(recipe, shot, source=source, mask=mask, source_mask=source_mask)
+    inputs.recipe.check(inputs.shot)
+    ready = inputs.prepared(should_stop)
+    inversion = run_prepared(
+        inputs,
+        ready,
+        on_progress=on_progress,
+        should_stop=should_stop,
+        cache=cache,
+        preview=preview,
+        began=clock,
+    )
+    return inversion.with_warnings(dict.fromkeys(ready.warnings))
+
+
+def run_prepared(
+    inputs: Inputs,
+    shot: Radiograph,
+    *,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+    cache: Cache | None = None,
+    preview: bool = False,
+    start: Inversion | None = None,
+    began: float | None = None,
+) -> Inversion:
+    """Invert a shot whose steps were done.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        The shot as recorded and its recipe.
+    shot : Radiograph
+        The shot after the recipe's steps.
+    on_progress, should_stop, cache, preview
+        See `run`.
+    start : Inversion, optional
+        See `napari_shadowinv.invert`.
+    began : float, optional
+        Value of `time.perf_counter` when the work began. Default: now.
+
+    Returns
+    -------
+    Inversion
+    """
+    report = Reporter(on_progress, should_stop)
+    cache = Cache() if cache is None else cache
+    options = inputs.recipe.options
+    if preview:
+        fewer = min(options.n_sites or PREVIEW_SITES, PREVIEW_SITES)
+        options = options.model_copy(update={"n_sites": fewer})
+    seconds: dict[str, float] = {}
+    clock = time.perf_counter() if began is None else began
+    report("prepare", 0, None)
+    # Before the sites are spread: a mistake is told at once.
+    prepare(shot.image, None, options, shot.mask)
+    doubts: list[str] = []
+    source = _source(inputs, shot, report, should_stop, cache, doubts, preview=preview)
+    report("prepare", 0, None)
+    prepare(shot.image, source, options, shot.mask)
+    seconds["source"] = time.perf_counter() - clock
+    ensure_compiled(on_progress, should_stop)
+    clock = time.perf_counter()
+    counted = options.model_copy(update={"n_sites": number_of_sites(shot.shape, options)})
+    plan = cache.plan(source, shot.mask, counted, on_progress, should_stop)
+    seconds["sites"] = time.perf_counter() - clock
+    inversion = invert(
+        shot.image,
+        plan=plan,
+        options=options,
+        # What is kept must not depend on what was tried before it.
+        start=cache.solved(plan) if preview else start,
+        on_progress=on_progress,
+        should_stop=should_stop,
+    )
+    if preview:
+        cache.keep(plan, inversion)
+    spent = inversion.report.seconds
+    seconds |= {stage: spent[stage] + seconds.get(stage, 0.0) for stage in spent}
+    provenance = inputs.provenance.model_copy(update={"setup": shot.setup, "notes": shot.notes})
+    inversion = replace(
+        inversion, report=replace(inversion.report, seconds=seconds), provenance=provenance
+    )
+    return inversion.with_warnings(doubts)
+
+
+def _source(
+    inputs: Inputs,
+    shot: Radiograph,
+    report: Reporter,
+    should_stop: ShouldStop | None,
+    cache: Cache,
+    doubts: list[str],
+    *,
+    preview: bool,
+) -> FloatArray:
+    """The undisturbed beam of a shot after its steps."""
+    if shot.source is not None:
+        usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask
+        return checked_source(shot.source, usable)
+    recorded = inputs.shot.shape
+    matrix = inputs.recipe.matrix(recorded)
+    estimate = inputs.recipe.estimate
+    assert estimate is not None
+    if isinstance(estimate, UniformEstimate):
+        centre = centre_within(recorded, matrix)
+        doubts.extend(uniform_warnings(shot.shape, shot.setup, centre=centre))
+    estimate = estimate.placed(shot.setup, recorded, matrix)
+    report("source", 0, None, estimate.title)
+    kept = partial(cache.source, estimate, most_pixels=_PREVIEW_PIXELS if preview else None)
+    return estimated_source(estimate, shot, should_stop, doubts.append, by=kept)
+
+
+def gathered(
+    recipe: Recipe,
+    shot: Shot,
+    *,
+    source: Shot | None = None,
+    mask: ArrayLike | None = None,
+    source_mask: ArrayLike | None = None,
+) -> Inputs:
+    """Bring together what a recipe is applied to: files are read, defaults of the shot filled in.
+
+    Parameters
+    ----------
+    recipe, shot, source, mask, source_mask
+        See `run`.
+
+    Returns
+    -------
+    Inputs
+    """
+    whole = _radiograph(shot, "the image")
+    beam, wanted = None, recipe.source
+    if source is not None:
+        beam = _radiograph(source, "the source")
+    elif isinstance(wanted, MeasuredSource) and wanted.file is not None:
+        beam = read_radiograph(wanted.file, variable=wanted.variable)
+    elif whole.source is not None and recipe.estimate is None:
+        beam = replace(whole, image=whole.source, source=None, mask=None)
+        if any(step.flattens for step in recipe.steps):
+            raise InputError(
+                f"{whole.path or 'the shot'} contains its own source, but a filter would flatten "
+                "the image: leave the filter out, or choose the source 'uniform'"
+            )
+    usable = _mask(mask, recipe.mask, "mask") or _Mask(whole.mask, None)
+    bare = _mask(source_mask, recipe.source_mask, "source mask") or _Mask(whole.source_mask, None)
+    if wanted is None:
+        wanted = UniformEstimate() if beam is None else MeasuredSource()
+    elif isinstance(wanted, MeasuredSource):
+        wanted = MeasuredSource()
+    resolved = recipe.model_copy(
+        update={
+            "source": wanted,
+            "mask": None,
+            "source_mask": None,
+            "setup": whole.setup if recipe.setup is None else recipe.setup,
+        }
+    )
+    provenance = Provenance(
+        version=__version__,
+        recipe=resolved,
+        image=_origin(whole),
+        source=None if beam is None else _origin(beam),
+        mask=usable.origin,
+        source_mask=bare.origin,
+    )
+    complete = replace(
+        whole,
+        source=None if beam is None else beam.image,
+        setup=resolved.setup,
+        warnings=(*whole.warnings, *(() if beam is None else beam.warnings)),
+        mask=usable.pixels,
+        source_mask=bare.pixels,
+    )
+    return Inputs(resolved, complete, provenance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Mask:
+    pixels: BoolArray | None
+    file: Path | None
+
+    @property
+    def origin(self) -> Origin | None:
+        if self.pixels is None:
+            return None
+        packed = Origin.of_mask(self.pixels)
+        if self.file is None:
+            return packed
+        return packed.model_copy(update={"file": text_of(self.file.name)})
+
+
+def _mask(given: ArrayLike | None, file: Path | None, name: str) -> _Mask | None:
+    if given is not None:
+        pixels = np.asarray(given)
+        if pixels.dtype != np.bool_:
+            raise InputError(
+                f"{name} has values of type {pixels.dtype}, expected booleans: compare it with "
+                "a number, as in mask > 0"
+            )
+        return _Mask(pixels, None)
+    return None if file is None else _Mask(picture_mask(file), file)
+
+
+def picture_mask(path: Path) -> BoolArray:
+    """Read a mask from a picture that is 0 where a pixel is not to be used."""
+    mask: BoolArray = read_radiograph(path, channel="mean").image != 0
+    return mask
+
+
+def _radiograph(given: Shot, name: str) -> Radiograph:
+    if isinstance(given, Radiograph):
+        return given
+    if isinstance(given, (str, Path)):
+        return read_radiograph(Path(given))
+    return Radiograph(plane_of(given, name))
+
+
+def plane_of(values: Any, name: str) -> FloatArray:
+    """Return one image as floats, or say why it is none."""
+    array = np.asarray(values)
+    if array.ndim != 2:
+        raise InputError(
+            f"{name} has shape {array.shape}, expected two dimensions (y, x): choose one shot or "
+            "one channel"
+        )
+    if array.dtype.kind not in "buif":
+        raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
+    return array.astype(np.float64)
+
+
+def _origin(image: Radiograph) -> Origin:
+    told = image.metadata
+    return Origin(
+        file="" if image.path is None else text_of(image.path.name),
+        sha256=str(told.get("sha256", "")),
+        variable=told.get("variable"),
+        channel=told.get("channel"),
+        shape=image.shape,
+    )

@@ -1,0 +1,241 @@
+"""A Gaussian beam fitted to the shot: `gaussian_source`; in a recipe: `GaussianEstimate`."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
+
+from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.preprocessing.estimate import Estimate
+from napari_shadowinv.preprocessing.estimates import uniform_source
+from napari_shadowinv.preprocessing.pixels import (
+    MOST_EXTRAPOLATION,
+    NORMAL_MAD,
+    beam_pixels,
+    block_means,
+    with_flux_of,
+)
+
+__all__ = ["GaussianEstimate", "gaussian_source"]
+
+_MOST_FITTED_PIXELS = 2**16
+_MOST_FITS = 10
+_NOTABLE_EXTRAPOLATION = 1.5  # times the brightest pixel seen
+# Of a fitted Gaussian: height over the image's mean, and sides from the image's middle.
+_HIGHEST, _FARTHEST = 1e3, 3.0
+
+
+class GaussianEstimate(Estimate):
+    """A fitted elliptical spot."""
+
+    title = "fitted Gaussian"
+    method: Literal["gaussian"] = "gaussian"
+
+    def _source(
+        self,
+        image: FloatArray,
+        mask: BoolArray | None,
+        should_stop: ShouldStop | None,
+        on_warning: OnWarning | None,
+    ) -> FloatArray:
+        return gaussian_source(image, mask=mask, should_stop=should_stop, on_warning=on_warning)
+
+
+def gaussian_source(
+    image: ArrayLike,
+    *,
+    mask: ArrayLike | None = None,
+    should_stop: ShouldStop | None = None,
+    on_warning: OnWarning | None = None,
+) -> FloatArray:
+    """Elliptical Gaussian plus a constant, fitted to the image.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; counts or any linear measure of fluence.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel is usable. Default: everywhere.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the estimate ends.
+    on_warning : callable, optional
+        Receives a sentence where the fit has to be doubted. Default: `warnings.warn`.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The fitted beam, in the unit of `image`; the same everywhere if the fit rises, where
+        nothing is seen, to ten times what is seen.
+
+    Raises
+    ------
+    InputError
+        If image and mask cannot be used, or the image has no flux.
+    InversionCancelled
+        If `should_stop` returned true.
+
+    Notes
+    -----
+    Least squares with the soft L1 loss, whose unit is the median absolute deviation of the
+    residuals, found by fitting again until it stays: modulation stronger than that counts
+    in proportion, not squared. Centre, both widths, tilt, height and constant are free; the
+    last two are not negative. Large images are averaged in blocks for the fit. A Gaussian
+    narrower than 1/256 of the image, higher than 1000 times the mean, or more than three sides
+    away from the middle of what is seen is not considered.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:40, :50]
+    >>> beam = 3 + 7 * np.exp(-((y - 18) ** 2) / 200 - (x - 30) ** 2 / 300)
+    >>> float(abs(gaussian_source(beam) / beam - 1).max()) < 1e-4
+    True
+    """
+    values, usable = beam_pixels(image, mask)
+    side, mean = max(values.shape), values[usable].mean()
+    y, x, sample = _samples(values / mean, usable)
+    report = Reporter(None, should_stop)
+    parameters = _fitted_gaussian(y / side, x / side, sample, report)
+    rows, columns = (np.arange(n) / side for n in values.shape)
+    beam = _gaussian(parameters, rows[:, None], columns)
+    rise = float(beam.max() / sample.max())
+    tell = on_warning or partial(warnings.warn, stacklevel=2)
+    if rise > MOST_EXTRAPOLATION:
+        tell(
+            "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
+            "uniform: mask less, or choose another estimate"
+        )
+        return uniform_source(image, mask=mask)
+    if rise > _NOTABLE_EXTRAPOLATION:
+        tell(
+            f"the Gaussian beam rises to {rise:.2g} times the fitted data under the mask: "
+            "compare it with another estimate, or mask less"
+        )
+    return with_flux_of(mean * beam, values, usable)
+
+
+def _samples(values: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Positions y, x and means of blocks of usable pixels, few enough for a fit."""
+    block = int(np.ceil(np.sqrt(values.size / _MOST_FITTED_PIXELS)))
+    share = block_means(usable.astype(np.float64), block)
+    means = block_means(np.where(usable, values, 0.0), block)
+    # A block is taken only if it is whole: the middle of a part of it lies elsewhere.
+    # A mask so fine that no block is whole leaves the fullest.
+    y, x = np.nonzero(share >= share.max())
+    middle = (block - 1) / 2
+    rows, columns = (np.asarray(axis * block + middle, dtype=np.float64) for axis in (y, x))
+    return rows, columns, np.asarray(means[y, x] / share[y, x])
+
+
+def _fitted_gaussian(
+    y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter
+) -> FloatArray:
+    """Parameters of `_gaussian` that fit samples, by repeated robust least squares."""
+    bounds = _bounds(y, x)
+    parameters = np.clip(_first_gaussian(y, x, sample), *bounds)
+    # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
+    parameters = _refitted(parameters, y, x, sample, report, bounds, loss="linear", scale=1.0)
+    scale = 0.0
+    for _ in range(_MOST_FITS):
+        residual = _gaussian(parameters, y, x) - sample
+        previous, scale = scale, max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
+        if abs(scale - previous) < 1e-2 * scale:
+            break
+        parameters = _refitted(
+            parameters, y, x, sample, report, bounds, loss="soft_l1", scale=scale
+        )
+    return parameters
+
+
+def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least and greatest parameters of `_gaussian`: without them it may hide behind a mask."""
+    steepest = math.sqrt(_MOST_FITTED_PIXELS)  # one over the width of a block of pixels
+    ranges = [
+        (0, _HIGHEST),
+        (0, _HIGHEST),
+        *((axis.mean() - _FARTHEST, axis.mean() + _FARTHEST) for axis in (y, x)),
+        *[(-steepest, steepest)] * 3,
+    ]
+    least, most = np.transpose(ranges)
+    return least, most
+
+
+def _refitted(
+    parameters: FloatArray,
+    y: FloatArray,
+    x: FloatArray,
+    sample: FloatArray,
+    report: Reporter,
+    bounds: tuple[FloatArray, FloatArray],
+    *,
+    loss: Literal["linear", "soft_l1"],
+    scale: float,
+) -> FloatArray:
+    """Parameters of `_gaussian` nearest to samples, in the sense of a loss of some scale."""
+
+    def excess(p: FloatArray) -> FloatArray:
+        report("source", 0)
+        return _gaussian(p, y, x) - sample
+
+    fit = least_squares(
+        excess,
+        parameters,
+        jac=lambda p: _gaussian_slopes(p, y, x),
+        bounds=bounds,
+        loss=loss,
+        f_scale=scale,
+        x_scale="jac",
+        max_nfev=200,
+    )
+    return np.asarray(fit.x)
+
+
+def _first_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
+    """Parameters of `_gaussian` from the moments of what rises above the dark corners."""
+    constant, peak = (float(level) for level in np.percentile(sample, [2, 98]))
+    weights = np.maximum(sample - constant, 0) + 1e-9
+    centre_y, centre_x = np.average(y, weights=weights), np.average(x, weights=weights)
+    widths = [
+        max(float(np.sqrt(np.average((axis - centre) ** 2, weights=weights))), 1e-3)
+        for axis, centre in ((y, centre_y), (x, centre_x))
+    ]
+    height = max(peak - constant, 1e-3)
+    return np.array(
+        [height, max(constant, 1e-3), centre_y, centre_x, 1 / widths[0], 0.0, 1 / widths[1]]
+    )
+
+
+def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
+    """Height · exp(-½(u² + v²)) + constant, with u = a·dy + b·dx and v = c·dx.
+
+    The factors of the inverse covariance, unlike its entries, may take any value.
+    """
+    height, constant, centre_y, centre_x, a, b, c = parameters
+    u = a * (y - centre_y) + b * (x - centre_x)
+    v = c * (x - centre_x)
+    return np.asarray(height * np.exp(-0.5 * (u**2 + v**2)) + constant)
+
+
+def _gaussian_slopes(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
+    """Derivatives of `_gaussian` with respect to its parameters, shape (samples, 7)."""
+    height, _, centre_y, centre_x, a, b, c = parameters
+    dy, dx = y - centre_y, x - centre_x
+    u, v = a * dy + b * dx, c * dx
+    bell = np.exp(-0.5 * (u**2 + v**2))
+    slopes = [
+        bell,
+        np.ones_like(bell),
+        height * bell * u * a,
+        height * bell * (u * b + v * c),
+        -height * bell * u * dy,
+        -height * bell * u * dx,
+        -height * bell * v * dx,
+    ]
+    return np.stack(slopes, axis=1)

@@ -1,0 +1,271 @@
+"""Images as numbers: checks of what was given, and a robust polynomial fit.
+
+- values and usable pixels of an image: `checked_pixels`; of a beam, which has flux: `beam_pixels`
+- one number or integer: `checked_number`, `checked_integer`
+- fit a polynomial: `fit_polynomial`
+"""
+
+from __future__ import annotations
+
+import operator
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from numpy.typing import ArrayLike
+
+from napari_shadowinv._system.progress import Reporter, ShouldStop
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+
+__all__ = [
+    "beam_pixels",
+    "block_means",
+    "checked_integer",
+    "checked_number",
+    "checked_pixels",
+    "fit_polynomial",
+    "with_flux_of",
+]
+
+_HIGHEST_DEGREE = 10
+_MOST_REWEIGHTINGS = 50
+NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal noise
+# As a share of the mean: the floor to which an inversion raises an image's dark pixels.
+_FLOOR = 1e-3
+MOST_EXTRAPOLATION = 10.0  # times the brightest pixel seen
+
+
+def checked_pixels(
+    image: ArrayLike, mask: ArrayLike | None = None, *, name: str = "image"
+) -> tuple[FloatArray, BoolArray]:
+    """Return an image as floats and its usable pixels, or say what is wrong with them.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        An image or a potential.
+    mask : array_like of bool, shape (H, W), optional
+        True where a pixel is usable. Default: everywhere.
+    name : str, optional
+        What the error messages call the image.
+
+    Returns
+    -------
+    values : ndarray of float64, shape (H, W)
+        A copy; masked pixels, which may be NaN, are set to the mean of the usable ones.
+    usable : ndarray of bool, shape (H, W)
+        The mask.
+
+    Raises
+    ------
+    InputError
+        If the image is not two-dimensional, has no pixels, is not real, or a usable pixel is
+        not finite; if the mask has another shape, is not boolean, or leaves no pixel.
+
+    Examples
+    --------
+    >>> checked_pixels([[1.0, 3.0]], [[True, False]])[0]
+    array([[1., 1.]])
+    """
+    array = np.asarray(image)
+    if array.ndim != 2 or array.size == 0:
+        raise InputError(
+            f"{name} has shape {array.shape}, expected two dimensions (y, x): "
+            "choose one channel or one shot"
+        )
+    if array.dtype.kind not in "buif":
+        raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
+    values = np.array(array, dtype=np.float64)
+    usable = _checked_mask(mask, values.shape, name)
+    bad = int((~np.isfinite(values[usable])).sum())
+    if bad:
+        raise InputError(
+            f"{name} has {bad} usable pixels that are NaN or infinite, expected none: replace or "
+            "mask them"
+        )
+    values[~usable] = values[usable].mean()
+    return values, usable
+
+
+def _checked_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str) -> BoolArray:
+    if mask is None:
+        return np.ones(shape, dtype=np.bool_)
+    usable = np.asarray(mask)
+    if usable.dtype != np.bool_:
+        raise InputError(
+            f"mask has values of type {usable.dtype}, expected booleans that are True where "
+            "a pixel is usable: compare it with a number, as in mask > 0"
+        )
+    if usable.shape != shape:
+        raise InputError(f"mask has shape {usable.shape}, {name} {shape}: they must match")
+    if not usable.any():
+        raise InputError("mask leaves no usable pixel, expected True where a pixel is usable")
+    return usable
+
+
+def checked_number(name: str, value: float, *, above: float, unit: str) -> float:
+    """Return a finite number above a limit, or say what was received instead.
+
+    Raises
+    ------
+    InputError
+        If the value is no finite number above the limit.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not (np.isfinite(number) and number > above):
+        raise InputError(f"{name} is {value!r}, expected a number of {unit} above {above:g}")
+    return number
+
+
+def checked_integer(name: str, value: int, *, least: int, most: int | None = None) -> int:
+    """Return an integer within limits, or say what was received instead.
+
+    Raises
+    ------
+    InputError
+        If the value is no integer or out of range.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = least - 1
+    if number < least or (most is not None and number > most):
+        wanted = f"at least {least}" if most is None else f"from {least} to {most}"
+        raise InputError(f"{name} is {value!r}, expected an integer {wanted}")
+    return number
+
+
+def beam_pixels(image: ArrayLike, mask: ArrayLike | None) -> tuple[FloatArray, BoolArray]:
+    """Values and usable pixels of an image that has flux."""
+    values, usable = checked_pixels(image, mask)
+    flux = values[usable].sum()
+    if flux <= 0:
+        raise InputError(
+            f"image has a flux of {flux:.4g} over its usable pixels, expected a positive one: "
+            "check the file and its background"
+        )
+    return values, usable
+
+
+def with_flux_of(beam: FloatArray, values: FloatArray, usable: BoolArray) -> FloatArray:
+    """A beam made positive and given the flux of an image over its usable pixels."""
+    mean = values[usable].mean()
+    positive = np.maximum(beam, _FLOOR * mean)
+    source = np.asarray(positive * (mean / positive[usable].mean()))
+    seen = float(values[usable].max())
+    if not source.max() <= MOST_EXTRAPOLATION * seen:
+        raise InputError(
+            f"the estimated source rises to {source.max():.3g} under the mask, while the image "
+            f"is at most {seen:.3g} elsewhere: mask less, or choose another estimate"
+        )
+    return source
+
+
+def block_means(values: FloatArray, block: int) -> FloatArray:
+    """Means over square blocks; incomplete ones at the far edges are padded by mirroring."""
+    padding = [(0, -side % block) for side in values.shape]
+    padded = np.pad(values, padding, mode="symmetric")
+    height, width = padded.shape
+    blocks = padded.reshape(height // block, block, width // block, block)
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def fit_polynomial(
+    image: ArrayLike,
+    degree: int,
+    *,
+    mask: ArrayLike | None = None,
+    should_stop: ShouldStop | None = None,
+) -> FloatArray:
+    """Fit a polynomial in y and x to an image, robust against outliers.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        An image or a potential, any unit.
+    degree : int
+        Total degree of the polynomial, from 0 to 10.
+    mask : array_like of bool, shape (H, W), optional
+        True where the fit may look. Default: everywhere.
+    should_stop : callable, optional
+        Asked at each step; when it returns true the fit ends.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        The polynomial at all pixels, also where the mask is false.
+
+    Raises
+    ------
+    InputError
+        If image and mask cannot be used, the degree is out of range, or there are fewer
+        usable pixels than coefficients.
+    InversionCancelled
+        If `should_stop` returned true.
+
+    Notes
+    -----
+    Iteratively reweighted least squares of the soft L1 loss: residuals count squared within
+    the noise (the median absolute deviation of the residuals), in proportion beyond.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> image = np.linspace(1, 3, 50) * np.ones((50, 1))
+    >>> image[20:30, 20:30] *= 5
+    >>> float(abs(fit_polynomial(image, 1)[0] - image[0]).max()) < 1e-3
+    True
+    """
+    values, usable = checked_pixels(image, mask)
+    degree = checked_integer("degree", degree, least=0, most=_HIGHEST_DEGREE)
+    terms = (degree + 1) * (degree + 2) // 2
+    if usable.sum() < terms:
+        raise InputError(
+            f"degree {degree} has {terms} coefficients, image has {int(usable.sum())} usable "
+            "pixels: use a lower degree or mask fewer pixels"
+        )
+    rows, columns = (_basis(side, degree) for side in values.shape)
+    fit = _weighted_fit(values, usable.astype(np.float64), rows, columns)
+    rounding = 1e-12 * float(np.abs(values).max())
+    report = Reporter(None, should_stop)
+    for step in range(_MOST_REWEIGHTINGS):
+        report("fit", step)
+        residual = values - fit
+        scale = NORMAL_MAD * float(np.median(np.abs(residual[usable])))
+        if scale <= rounding:
+            break
+        weights = usable / np.sqrt(1 + (residual / scale) ** 2)
+        previous, fit = fit, _weighted_fit(values, weights, rows, columns)
+        if np.abs(fit - previous).max() < 1e-6 * scale:
+            break
+    return fit
+
+
+def _basis(side: int, degree: int) -> FloatArray:
+    """Legendre polynomials along an axis, shape (side, degree + 1)."""
+    return np.asarray(legvander(np.linspace(-1, 1, side), degree), dtype=np.float64)
+
+
+def _weighted_fit(
+    values: FloatArray, weights: FloatArray, rows: FloatArray, columns: FloatArray
+) -> FloatArray:
+    """Polynomial of least weighted squares, from bases along y and x.
+
+    The normal equations need sums of the weights over products of the bases only; those
+    separate into y and x, so no matrix of pixels × coefficients is formed.
+    """
+    n = rows.shape[1]
+    pairs = [
+        (basis[:, :, None] * basis[:, None, :]).reshape(-1, n * n) for basis in (rows, columns)
+    ]
+    gram = (pairs[0].T @ weights @ pairs[1]).reshape(n, n, n, n).transpose(0, 2, 1, 3)
+    moments = (rows.T @ (weights * values) @ columns).ravel()
+    kept = np.flatnonzero(np.add.outer(np.arange(n), np.arange(n)) < n)
+    coefficients = np.zeros(n * n)
+    square = gram.reshape(n * n, n * n)[np.ix_(kept, kept)]
+    coefficients[kept] = np.linalg.lstsq(square, moments[kept], rcond=None)[0]
+    fit: FloatArray = rows @ coefficients.reshape(n, n) @ columns.T
+    return fit

@@ -1,0 +1,410 @@
+"""Everything that is done to a shot, as one model: `Recipe`.
+
+- the steps there are, by name: `STEPS`; those that filter: `FILTERS`; estimates of the source:
+  `ESTIMATES`
+- a recipe with what it was applied to, kept with a result: `Provenance`, `Origin`
+"""
+
+from __future__ import annotations
+
+import base64
+import warnings
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.preprocessing.estimate import Estimate
+from napari_shadowinv.preprocessing.estimates import (
+    InterpolatedEstimate,
+    LowPassEstimate,
+    PolynomialEstimate,
+    TotalVariationEstimate,
+    UniformEstimate,
+)
+from napari_shadowinv.preprocessing.filters import (
+    BackgroundFilter,
+    ButterworthFilter,
+    Filter,
+    HighPassFilter,
+    LowPassFilter,
+)
+from napari_shadowinv.preprocessing.gaussian import GaussianEstimate
+from napari_shadowinv.preprocessing.hot_pixels import HotPixelFilter
+from napari_shadowinv.preprocessing.isotropic import IsotropicEstimate
+from napari_shadowinv.preprocessing.radiograph import Radiograph
+from napari_shadowinv.preprocessing.steps import Bin, Choice, Crop, Rotate, Step
+
+if TYPE_CHECKING:
+    from napari_shadowinv._system.progress import OnWarning, ShouldStop
+
+__all__ = [
+    "ESTIMATES",
+    "FILTERS",
+    "STEPS",
+    "MeasuredSource",
+    "Origin",
+    "Provenance",
+    "Recipe",
+    "check_masks",
+]
+
+_LEAST_VISIBLE = 0.1  # of what the source mask hides in one place, for the inversion to see it
+_LEAST_OBJECT = 10  # pixels
+_MOST_FALL = 10.0  # times below the dimmest pixel seen
+_LONGEST_MASK = 48_000  # characters: HDF5 keeps no longer attributes
+
+
+class MeasuredSource(Choice):
+    """An image of the beam without the object."""
+
+    title = "measured"
+    key = "method"
+    method: Literal["measured"] = "measured"
+    file: Path | None = Field(
+        default=None, title="File", description="Image of the undisturbed beam."
+    )
+    variable: str | None = Field(
+        default=None,
+        title="Variable",
+        description="Name of the array in a file with several.",
+    )
+
+
+# In the order in which the command applies them.
+AnyStep = (
+    Rotate
+    | Crop
+    | HotPixelFilter
+    | Bin
+    | BackgroundFilter
+    | HighPassFilter
+    | ButterworthFilter
+    | LowPassFilter
+)
+AnySource = (
+    MeasuredSource
+    | UniformEstimate
+    | IsotropicEstimate
+    | GaussianEstimate
+    | PolynomialEstimate
+    | LowPassEstimate
+    | TotalVariationEstimate
+    | InterpolatedEstimate
+)
+
+STEPS: dict[str, type[Step]] = {step.name(): step for step in get_args(AnyStep)}
+FILTERS: dict[str, type[Filter]] = {
+    name: step for name, step in STEPS.items() if issubclass(step, Filter)
+}
+ESTIMATES: dict[str, type[Estimate]] = {
+    source.name(): source for source in get_args(AnySource) if issubclass(source, Estimate)
+}
+
+
+class Recipe(BaseModel):
+    """Everything that is done to a shot, from its image to the field.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        (a `ValueError`) if a value is out of range or a name is unknown.
+
+    Examples
+    --------
+    >>> recipe = Recipe(steps=(Bin(factor=2), LowPassFilter(width=1.5)))
+    >>> Recipe.model_validate_json(recipe.model_dump_json()) == recipe
+    True
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    steps: tuple[Annotated[AnyStep, Field(discriminator="step")], ...] = Field(
+        default=(), title="Steps", description="What is done to the image first, in this order."
+    )
+    source: Annotated[AnySource, Field(discriminator="method")] | None = Field(
+        default=None,
+        title="Source",
+        description="The undisturbed beam. Default: as measured if there is one, else uniform.",
+    )
+    source_mask: Path | None = Field(
+        default=None,
+        title="Source mask",
+        description="Image of the same size, 0 where the object covers the beam.",
+    )
+    mask: Path | None = Field(
+        default=None,
+        title="Mask",
+        description="Image of the same size, 0 at unusable pixels.",
+    )
+    setup: Setup | None = Field(
+        default=None,
+        title="Setup",
+        description="The experimental geometry, for results in SI units.",
+    )
+    options: InversionOptions = Field(
+        default=InversionOptions(), title="Options", description="Options of the inversion."
+    )
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """How the source is estimated; None if it is measured, or uniform by default."""
+        return self.source if isinstance(self.source, Estimate) else None
+
+    def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """Return the shape of what is inverted, for an image of a shape."""
+        for step in self.steps:
+            shape = step.shape_after(shape)
+        return shape
+
+    def matrix(self, shape: tuple[int, int]) -> FloatArray:
+        """Return what takes (y, x, 1) in what is inverted to (y, x, 1) in an image of a shape."""
+        matrix = np.eye(3)
+        for step in self.steps:
+            matrix = matrix @ step.matrix(shape)
+            shape = step.shape_after(shape)
+        return matrix
+
+    def setup_after(self) -> Setup | None:
+        """Return the setup of what is inverted, whose pixels may be larger."""
+        shot = Radiograph(np.ones((2, 2)), setup=self.setup)
+        for step in self.steps:
+            if isinstance(step, Bin):
+                shot = replace(shot, image=np.ones((2 * step.factor, 2 * step.factor)))
+                shot = step.applied(shot)
+        return shot.setup
+
+    def check(self, shot: Radiograph) -> None:
+        """Reject choices that contradict each other, or the shot, before any work is done.
+
+        Parameters
+        ----------
+        shot : Radiograph
+            The shot with its source and masks.
+
+        Raises
+        ------
+        InputError
+            If arrays differ in shape, there is a source though the image is flattened or the
+            source estimated, no source mask for an estimate that needs one, or the mask hides
+            the object, too.
+        """
+        for name in ("source", "mask", "source_mask"):
+            array = getattr(shot, name)
+            if array is not None and array.shape != shot.shape:
+                raise InputError(
+                    f"{name.replace('_', ' ')} has shape {array.shape}, image {shot.shape}: they "
+                    "must match"
+                )
+        if shot.source is not None:
+            if self.estimate is not None:
+                raise InputError(
+                    f"got a measured source and the estimate '{self.estimate.title}': choose one "
+                    "of them"
+                )
+            for step in self.steps:
+                if step.flattens:
+                    raise InputError(
+                        f"got a source and the filter {step.described}, which removes the beam "
+                        "from the image but not from the source: use only one of them"
+                    )
+        elif isinstance(self.source, MeasuredSource):
+            raise InputError("the recipe asks for a measured source, but none is given: give one")
+        if self.estimate is not None:
+            if self.estimate.needs_mask and shot.source_mask is None:
+                raise InputError(
+                    f"got the estimate '{self.estimate.title}' without a source mask, which "
+                    "hides the object from the estimate but not from the inversion: give one"
+                )
+            check_masks(shot.mask, shot.source_mask)
+        elif shot.source_mask is not None:
+            raise InputError(
+                "got a source mask but no source estimate to use it: leave the mask out, or "
+                "choose an estimate"
+            )
+
+    def prepared(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+        """Return a shot, with its source and masks, after all steps.
+
+        Parameters
+        ----------
+        shot : Radiograph
+            The shot as recorded.
+        should_stop : callable, optional
+            Asked now and then.
+
+        Raises
+        ------
+        InputError
+            If a step cannot be done.
+        InversionCancelled
+            If `should_stop` returned true.
+        """
+        for step in self.steps:
+            shot = step.applied(shot, should_stop)
+        return shot
+
+
+def check_masks(mask: BoolArray | None, bare: BoolArray | None) -> None:
+    """Reject a mask that excludes the object, as marked by the source mask, from the inversion.
+
+    Parameters
+    ----------
+    mask, bare : ndarray of bool, shape (H, W), or None
+        The pixels that can be used, and those where the object is not.
+
+    Raises
+    ------
+    InputError
+        If next to nothing of the object is left.
+    """
+    if mask is None or bare is None or bare.all():
+        return
+    from scipy.ndimage import label
+
+    # Place by place: a source mask may hide a wide border of unusable pixels, too.
+    places, count = label(~bare, np.ones((3, 3)))
+    hidden = np.bincount(places.ravel(), minlength=count + 1)[1:]
+    visible = np.bincount(places[mask], minlength=count + 1)[1:]
+    # Stray pixels are no object, unless there is nothing else.
+    objects = hidden >= min(_LEAST_OBJECT, hidden.max())
+    hidden, visible = hidden[objects], visible[objects]
+    if (visible < _LEAST_VISIBLE * hidden).all():
+        raise InputError(
+            f"the mask hides {1 - visible.sum() / hidden.sum():.0%} of what the source mask "
+            "hides, so the object would be excluded from the inversion: use the mask for "
+            "unusable pixels only and the source mask for the object; if the object itself is "
+            "unusable, leave the source mask out, as estimates ignore masked pixels anyway"
+        )
+
+
+def estimated_source(
+    estimate: Estimate,
+    shot: Radiograph,
+    should_stop: ShouldStop | None = None,
+    on_warning: OnWarning | None = None,
+    *,
+    by: Callable[..., FloatArray] | None = None,
+) -> FloatArray:
+    """Estimate the source of a shot after its steps, from what neither mask hides.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        How, placed for the shot.
+    shot : Radiograph
+        The shot.
+    should_stop, on_warning : callable, optional
+        See `Estimate.source`.
+    by : callable, optional
+        Called in place of `Estimate.source`, such as one that remembers.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+    """
+    masks = [mask for mask in (shot.mask, shot.source_mask) if mask is not None]
+    usable = np.logical_and.reduce(masks) if masks else None
+    # An estimate shall see no negative pixels, and 0 where they are masked.
+    beam = np.maximum(shot.image if shot.mask is None else np.where(shot.mask, shot.image, 0), 0)
+    estimated = estimate.source if by is None else by
+    source = estimated(beam, usable, should_stop=should_stop, on_warning=on_warning)
+    _check_fall(source, beam, shot.mask, shot.source_mask, on_warning)
+    return source
+
+
+def _check_fall(
+    source: FloatArray,
+    image: FloatArray,
+    mask: BoolArray | None,
+    bare: BoolArray | None,
+    warn: OnWarning | None,
+) -> None:
+    """Tell of a source that is much darker behind the source mask than anywhere around it."""
+    if bare is None:
+        return
+    seen, object_ = (bare, ~bare) if mask is None else (bare & mask, ~bare & mask)
+    if object_.any() and source[object_].min() < image[seen].min() / _MOST_FALL:
+        (warnings.warn if warn is None else warn)(
+            f"the estimated source falls to {source[object_].min():.3g} under the source mask, "
+            f"while the image is at least {image[seen].min():.3g} elsewhere: compare it with "
+            "another estimate"
+        )
+
+
+class Origin(BaseModel):
+    """Where an image came from.
+
+    Attributes
+    ----------
+    file : str
+        Name of the file, without its folder; "" if it was an array.
+    sha256 : str
+        Checksum of the file; of the array's values if it was no file.
+    variable, channel : str or int or None
+        What of the file was taken.
+    pixels : str or None
+        A mask that was drawn, packed.
+    shape : tuple of int or None
+        Its shape.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    file: str = ""
+    sha256: str = ""
+    variable: str | None = None
+    channel: str | int | None = None
+    pixels: str | None = None
+    shape: tuple[int, int] | None = None
+
+    @classmethod
+    def of_mask(cls, mask: BoolArray) -> Origin:
+        """Pack a mask, unless it is too complicated to be kept."""
+        packed = base64.b85encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode()
+        height, width = mask.shape
+        return cls(pixels=packed if len(packed) <= _LONGEST_MASK else None, shape=(height, width))
+
+    def mask(self) -> BoolArray | None:
+        """Unpack a mask."""
+        if self.pixels is None or self.shape is None:
+            return None
+        size = self.shape[0] * self.shape[1]
+        bits = zlib.decompressobj().decompress(base64.b85decode(self.pixels), size // 8 + 8)
+        packed = np.frombuffer(bits, np.uint8)
+        return np.unpackbits(packed, count=size).reshape(self.shape).astype(bool)
+
+
+class Provenance(BaseModel):
+    """How a result was made, so that it can be made again.
+
+    Attributes
+    ----------
+    version : str
+        Of the package.
+    recipe : Recipe
+        What was done; with the setup and the kind of source that came with the image's file.
+    image, source, mask, source_mask : Origin or None
+        What it was done to.
+    setup : Setup or None
+        Of the result's pixels.
+    notes : tuple of str
+        What the steps found and did, for people.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    version: str
+    recipe: Recipe
+    image: Origin = Origin()
+    source: Origin | None = None
+    mask: Origin | None = None
+    source_mask: Origin | None = None
+    setup: Setup | None = None
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,300 @@
+"""Steps of a recipe that move pixels: `Rotate`, `Crop`, `Bin`; what all steps share: `Step`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic.fields import FieldInfo
+
+from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.errors import InputError
+
+if TYPE_CHECKING:
+    from napari_shadowinv._system.progress import ShouldStop
+    from napari_shadowinv.preprocessing.radiograph import Radiograph
+
+__all__ = ["Bin", "Choice", "Crop", "Rotate", "Step", "degree_field", "width_field"]
+
+_SMALLEST_SIDE = 4  # px of a crop
+_WHOLE = 0.999  # share of a rotated pixel that must be known
+
+
+class Choice(BaseModel):
+    """One of several ways to do something, with its parameters.
+
+    Attributes
+    ----------
+    title : str
+        What the forms call it.
+    key : str
+        The field that names it in files, ``"step"`` or ``"method"``.
+    primary : str
+        The parameter that the command's flag of the same name sets; "" if each has its own flag.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    title: ClassVar[str]
+    key: ClassVar[str]
+    primary: ClassVar[str] = ""
+
+    @classmethod
+    def name(cls) -> str:
+        """Return its name in files, such as ``"low-pass"``."""
+        return str(cls.model_fields[cls.key].default)
+
+    @classmethod
+    def parameters(cls) -> dict[str, FieldInfo]:
+        """Return its fields, without the one that names it."""
+        return {name: field for name, field in cls.model_fields.items() if name != cls.key}
+
+    def values(self) -> dict[str, Any]:
+        """Return the values of its parameters."""
+        return {name: getattr(self, name) for name in self.parameters()}
+
+    @property
+    def described(self) -> str:
+        """Title and parameters, the same for the same choices."""
+        return ", ".join(
+            [self.title, *(f"{name} {value}" for name, value in self.values().items())]
+        )
+
+
+def degree_field(description: str) -> Any:
+    """Return the field of a polynomial's degree."""
+    return Field(
+        default=2,
+        ge=0,
+        le=10,
+        title="Degree",
+        description=f"Total degree of the polynomial{description}",
+        json_schema_extra={"slider": [0, 10]},
+    )
+
+
+def width_field(default: float, description: str, least: float, most: float) -> Any:
+    """Return the field of a Gaussian's width, with the range of its slider."""
+    return Field(
+        default=default,
+        gt=0,
+        allow_inf_nan=False,
+        title="Width (px)",
+        description=description,
+        json_schema_extra={"slider": [least, most]},
+    )
+
+
+class Step(Choice):
+    """Something done to a shot before its inversion."""
+
+    key = "step"
+
+    @property
+    def flattens(self) -> bool:
+        """Whether it removes the beam from the image, so that a measured source no longer fits."""
+        return False
+
+    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+        """Return the shot with this done to image, source, masks and setup.
+
+        Parameters
+        ----------
+        shot : Radiograph
+            The shot.
+        should_stop : callable, optional
+            Asked now and then by steps that take long.
+
+        Raises
+        ------
+        InputError
+            If it cannot be done to this image.
+        InversionCancelled
+            If `should_stop` returned true.
+        """
+        raise NotImplementedError
+
+    def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """Return the shape of an image after this step."""
+        return shape
+
+    def matrix(self, shape: tuple[int, int]) -> FloatArray:
+        """Return the matrix that takes (y, x, 1) after this step to (y, x, 1) before it."""
+        return np.eye(3)
+
+
+def _turned(array: AnyArray, turns: int) -> Any:
+    return np.ascontiguousarray(np.rot90(array, turns))
+
+
+class Rotate(Step):
+    """Rotate about the image centre; exact for multiples of 90°.
+
+    Other angles interpolate linearly between pixels and keep the image's size; corners that
+    are not known then are masked.
+    """
+
+    title = "rotate"
+    primary = "angle"
+    step: Literal["rotate"] = "rotate"
+    angle: float = Field(
+        default=90.0,
+        ge=-360,
+        le=360,
+        allow_inf_nan=False,
+        title="Angle (°)",
+        description="Counter-clockwise rotation in degrees, about the image centre.",
+    )
+
+    @property
+    def _turns(self) -> int | None:
+        turns, rest = divmod(self.angle, 90)
+        return None if rest else int(turns) % 4
+
+    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+        turns = self._turns
+        if turns is None:
+            rotated = self._interpolated(shot)
+        else:
+            rotated = shot.mapped(partial(_turned, turns=turns), partial(_turned, turns=turns))
+        return rotated.noted(f"rotated by {self.angle:g}°")
+
+    def _interpolated(self, shot: Radiograph) -> Radiograph:
+        usable = np.isfinite(shot.image) if shot.mask is None else shot.mask
+        share = self._moved(usable.astype(np.float64))
+        mask = share > _WHOLE
+
+        def values(image: FloatArray) -> FloatArray:
+            moved = self._moved(np.where(usable, image, 0.0))
+            return np.where(mask, moved / np.maximum(share, _WHOLE), 0.0)
+
+        rotated = shot.mapped(values, lambda bare: self._moved(bare.astype(float)) > 0.5)
+        return replace(rotated, mask=mask)
+
+    def _moved(self, plane: FloatArray) -> FloatArray:
+        from scipy.ndimage import affine_transform
+
+        height, width = plane.shape
+        matrix = self.matrix((height, width))
+        moved: FloatArray = affine_transform(plane, matrix[:2, :2], matrix[:2, 2], order=1)
+        return moved
+
+    def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
+        return shape[::-1] if self._turns in (1, 3) else shape
+
+    def matrix(self, shape: tuple[int, int]) -> FloatArray:
+        angle = math.radians(self.angle)
+        cos, sin = math.cos(angle), math.sin(angle)
+        if self._turns is not None:
+            cos, sin = round(cos), round(sin)
+        before, after = ((np.array(sides) - 1) / 2 for sides in (shape, self.shape_after(shape)))
+        turn = np.array([[cos, sin], [-sin, cos]])
+        matrix = np.eye(3)
+        matrix[:2, :2], matrix[:2, 2] = turn, before - turn @ after
+        return matrix
+
+
+def _as_range(value: Any) -> Any:
+    """Read ``"10:200"``, as typed on a command line."""
+    if not isinstance(value, str):
+        return value
+    first, colon, last = value.partition(":")
+    try:
+        return (int(first or 0), int(last) if last else None) if colon else value
+    except ValueError:
+        return value
+
+
+Range = Annotated[
+    tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)] | None],
+    BeforeValidator(_as_range),
+]
+"""First pixel, and the one after the last; None for the end of the image."""
+
+
+class Crop(Step):
+    """Keep a rectangle of the image."""
+
+    title = "crop"
+    step: Literal["crop"] = "crop"
+    y: Range = Field(
+        default=(0, None),
+        title="Rows (px)",
+        description="First row and the row after the last, such as 10:200. Default: all.",
+    )
+    x: Range = Field(
+        default=(0, None),
+        title="Columns (px)",
+        description="First column and the column after the last, such as 10:200. Default: all.",
+    )
+
+    def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:
+        """Return the rows and columns that are kept of an image.
+
+        Raises
+        ------
+        InputError
+            If fewer than 4 × 4 pixels would be left.
+        """
+        rows, columns = (
+            slice(*slice(*part).indices(side))
+            for part, side in zip((self.y, self.x), shape, strict=True)
+        )
+        height, width = rows.stop - rows.start, columns.stop - columns.start
+        if min(height, width) < _SMALLEST_SIDE:
+            raise InputError(
+                f"the crop contains {max(width, 0)} × {max(height, 0)} pixels of the image, "
+                f"expected at least {_SMALLEST_SIDE} × {_SMALLEST_SIDE}: choose a larger rectangle"
+            )
+        return rows, columns
+
+    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+        part = self.slices(shot.shape)
+        rows, columns = part
+
+        def cut(array: AnyArray) -> Any:
+            return np.ascontiguousarray(array[part])
+
+        return shot.mapped(cut, cut).noted(
+            f"cropped to rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
+        )
+
+    def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
+        rows, columns = self.slices(shape)
+        return rows.stop - rows.start, columns.stop - columns.start
+
+    def matrix(self, shape: tuple[int, int]) -> FloatArray:
+        matrix = np.eye(3)
+        matrix[:2, 2] = [part.start for part in self.slices(shape)]
+        return matrix
+
+
+class Bin(Step):
+    """Sum blocks of pixels."""
+
+    title = "bin"
+    primary = "factor"
+    step: Literal["bin"] = "bin"
+    factor: int = Field(
+        default=2,
+        ge=1,
+        le=1000,
+        title="Factor",
+        description="Sum blocks of N×N pixels; the setup's pixel size grows with them.",
+        json_schema_extra={"metavar": "N"},
+    )
+
+    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+        return shot.binned(self.factor)
+
+    def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
+        height, width = shape
+        return height // self.factor, width // self.factor
+
+    def matrix(self, shape: tuple[int, int]) -> FloatArray:
+        matrix = np.diag([self.factor, self.factor, 1.0])
+        matrix[:2, 2] = (self.factor - 1) / 2
+        return matrix
