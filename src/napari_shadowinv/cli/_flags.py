@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -129,31 +130,18 @@ def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
     if get_origin(annotation) is Literal:
         return str, "|".join(get_args(annotation))
     if len(kinds) == 1 and kinds[0] in (int, float):
-        unit = (field.title or "").rpartition("(")[2].rstrip(")")
-        return kinds[0], unit.upper() if "(" in (field.title or "") and unit else None
-    return str, "FIRST:LAST"
+        unit = re.search(r"\((.*)\)$", field.title or "")
+        return kinds[0], unit[1].upper() if unit else None
+    return str, "FIRST:LAST" if kinds[0] is not str else None
 
 
-def _flag(
-    flag: str, field: FieldInfo, panel: str, help_: str | None = None
-) -> tuple[str, inspect.Parameter]:
+def _flag(flag: str, field: FieldInfo, panel: str, told: str) -> tuple[str, inspect.Parameter]:
     kind, metavar = _type_of(field)
-    default = field.default
-    told = help_ or field.description or ""
-    if default not in (None, (0, None)) and "efault" not in told:
-        told = (
-            f"{told.rstrip('.')}. Default: {default:g}."
-            if isinstance(default, float)
-            else f"{told.rstrip('.')}. Default: {default}."
-        )
     option = Option(f"--{flag}", help=told, metavar=metavar, rich_help_panel=panel)
     name = flag.replace("-", "_")
-    return name, inspect.Parameter(
-        name,
-        inspect.Parameter.KEYWORD_ONLY,
-        default=None,
-        annotation=Annotated[kind | None, option],
-    )
+    annotation = Annotated[kind | None, option]
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    return name, inspect.Parameter(name, keyword, default=None, annotation=annotation)
 
 
 def _step_flag(step: type[Step], parameter: str) -> str:
@@ -166,24 +154,26 @@ def _all_flags() -> dict[str, inspect.Parameter]:
         for step in STEPS.values()
         for name, field in step.parameters().items()
     ]
-    method = FieldInfo(
-        annotation=str | None,
-        default=None,
-        title="Source",
-        description=f"How to estimate the undisturbed beam: {', '.join(ESTIMATES)}.",
-    )
-    flags.append(_flag("source-from", method, _ESTIMATES))
+    method = FieldInfo(annotation=str | None, title="Source")  # type: ignore[arg-type]
+    told = f"How to estimate the undisturbed beam: {', '.join(ESTIMATES)}."
+    flags.append(_flag("source-from", method, _ESTIMATES, told))
     for name in dict.fromkeys(n for one in ESTIMATES.values() for n in one.parameters()):
         users = {key: one.parameters()[name] for key, one in _users(name).items()}
-        told = " ".join(f"For {key}: {_lower(str(f.description))}" for key, f in users.items())
-        flags.append(
-            _flag(f"source-{name.replace('_', '-')}", next(iter(users.values())), _ESTIMATES, told)
+        told = " ".join(
+            f"For {key}: {_lower(_with_default(field))}" for key, field in users.items()
         )
+        field = next(iter(users.values()))
+        flags.append(_flag(f"source-{name.replace('_', '-')}", field, _ESTIMATES, told))
     for name, field in InversionOptions.model_fields.items():
         extra = field.json_schema_extra
         panel = extra.get("panel", _OPTIONS) if isinstance(extra, dict) else _OPTIONS
-        flags.append(_flag(name.replace("_", "-"), field, str(panel)))
+        flags.append(_flag(name.replace("_", "-"), field, str(panel), _with_default(field)))
     return dict(flags)
+
+
+def _with_default(field: FieldInfo) -> str:
+    told = str(field.description)
+    return told if field.default is None else f"{told} Default: {_shown(field)}."
 
 
 def _users(parameter: str) -> dict[str, Any]:
@@ -192,11 +182,14 @@ def _users(parameter: str) -> dict[str, Any]:
 
 
 def _step_help(step: type[Step], name: str, field: FieldInfo) -> str:
-    told = str(field.description)
-    if name == step.primary or (not step.primary and name == next(iter(step.parameters()))):
-        summary = (step.__doc__ or "").split("\n")[0].rstrip(".")
-        return f"{summary}. {told}"
-    return f"For --{_step_flag(step, step.primary)}: {_lower(told)}" if step.primary else told
+    title = f"{step.title[:1].upper()}{step.title[1:]}"
+    if not step.primary or name == step.primary:
+        return f"{title}: {_lower(str(field.description))}"
+    return f"For --{step.name()}: {_lower(str(field.description))} Default: {_shown(field)}."
+
+
+def _shown(field: FieldInfo) -> str:
+    return f"{field.default:g}" if isinstance(field.default, float) else str(field.default)
 
 
 def _lower(text: str) -> str:

@@ -3,43 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from napari_shadowinv.cli._flags import (
-    BackgroundDegree,
-    Bin,
-    Boundary,
-    Butterworth,
-    ButterworthKind,
-    ButterworthOrder,
     Channel,
     ChosenShots,
     ClipNegative,
-    Flux,
-    HighPass,
-    HotPixels,
-    LowPass,
-    Margin,
+    MaskFile,
     OptionsFile,
     Overwrite,
     Quiet,
+    RecipeFile,
+    SaveRecipe,
     SetupFile,
-    SiteCount,
-    SourceCentreX,
-    SourceCentreY,
-    SourceDegree,
-    SourceFrom,
     SourceMask,
-    SourceWeight,
-    SourceWidth,
     StoreFolder,
     Variable,
-    given,
+    takes_recipe,
 )
 from napari_shadowinv.cli._guard import notify_errors
-from napari_shadowinv.cli._inputs import check_margin, options_from
+from napari_shadowinv.cli._inputs import recipe_from, setup_from
 from napari_shadowinv.cli._terminal import say
 
 BATCH_EPILOG = """
@@ -56,6 +41,7 @@ shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
 
 
 @notify_errors
+@takes_recipe
 def batch(
     shots: Annotated[
         list[str],
@@ -75,14 +61,12 @@ def batch(
             ),
         ),
     ] = None,
-    mask: Annotated[
-        Path | None,
-        typer.Option("--mask", help="Image of the same size, 0 at unusable pixels."),
-    ] = None,
+    mask: MaskFile = None,
+    source_mask: SourceMask = None,
+    recipe: RecipeFile = None,
+    save_recipe: SaveRecipe = None,
     setup: SetupFile = None,
     options: OptionsFile = None,
-    n_sites: SiteCount = None,
-    bin_: Bin = 1,
     channel: Channel = None,
     variable: Variable = None,
     clip_negative: ClipNegative = False,
@@ -118,61 +102,30 @@ def batch(
         bool, typer.Option("--redo-failed", help="Resume, and retry failed shots.")
     ] = False,
     quiet: Quiet = False,
-    boundary: Boundary = None,
-    margin: Margin = None,
-    flux: Flux = None,
-    source_from: SourceFrom = None,
-    source_centre_y: SourceCentreY = None,
-    source_centre_x: SourceCentreX = None,
-    source_degree: SourceDegree = None,
-    source_weight: SourceWeight = None,
-    source_width: SourceWidth = None,
-    source_mask: SourceMask = None,
-    hot_pixels: HotPixels = None,
-    background_degree: BackgroundDegree = None,
-    high_pass: HighPass = None,
-    low_pass: LowPass = None,
-    butterworth: Butterworth = None,
-    butterworth_order: ButterworthOrder = None,
-    butterworth_kind: ButterworthKind = None,
+    *,
+    flags: dict[str, Any],
 ) -> None:
     """Invert many shots into one store, which can be resumed after a crash."""
     from napari_shadowinv.cli._batch import run_batch
-    from napari_shadowinv.cli._choices import TABLE, choices_from
+    from napari_shadowinv.pipeline import write_recipe
 
-    transport = given(n_sites=n_sites, boundary=boundary, margin=margin, flux=flux)
-    chosen = options_from(options, transport, clip_negative, other_tables=(TABLE,))
-    check_margin(margin, chosen)
-    preparing = given(
-        hot_pixels=hot_pixels,
-        background_degree=background_degree,
-        high_pass=high_pass,
-        low_pass=low_pass,
-        butterworth=butterworth,
-        butterworth_order=butterworth_order,
-        butterworth_kind=butterworth_kind,
-        source_from=source_from,
-        source_centre_y=source_centre_y,
-        source_centre_x=source_centre_x,
-        source_degree=source_degree,
-        source_weight=source_weight,
-        source_width=source_width,
+    chosen = recipe_from(
+        flags,
+        recipe,
+        options,
+        clip_negative=clip_negative,
+        source=None if source is None else Path(source),
+        mask=mask,
+        source_mask=source_mask,
     )
+    if setup is not None:
+        chosen = chosen.model_copy(update={"setup": setup_from(setup)})
+    if save_recipe is not None:
+        write_recipe(save_recipe, chosen, overwrite=overwrite)
     run_batch(
         shots,
         out,
-        source=source,
-        mask=mask,
-        setup=setup,
-        options=chosen,
-        choices=choices_from(
-            options,
-            preparing,
-            has_source=source is not None,
-            has_source_mask=source_mask is not None,
-        ),
-        source_mask=source_mask,
-        factor=bin_,
+        recipe=chosen,
         channel=channel,
         variable=variable,
         variables=variables,

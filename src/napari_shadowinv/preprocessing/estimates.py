@@ -25,13 +25,12 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field
-from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.preprocessing._total_variation import least_variation
 from napari_shadowinv.preprocessing.estimate import Estimate
 from napari_shadowinv.preprocessing.filling import FILL_WIDTH, filled, interpolated_source
 from napari_shadowinv.preprocessing.filters import low_pass
@@ -251,7 +250,7 @@ def _masked_blur(
 def _blurred(values: FloatArray, width: float) -> FloatArray:
     """Gaussian blur with a mirrored border."""
     if width < _NARROWEST_WAVES:
-        return np.asarray(gaussian_filter(values, width, mode="reflect"))
+        return np.asarray(scipy.ndimage.gaussian_filter(values, width, mode="reflect"))
     # Takes no longer for a wide Gaussian than for a narrow one.
     return low_pass(values, width)
 
@@ -308,6 +307,8 @@ def total_variation_source(
     >>> bool(abs(beam[10:14, 10:14] - 2).max() < 0.1), bool(beam[40, 30] - beam[40, 29] > 1.8)
     (True, True)
     """
+    from napari_shadowinv.preprocessing._total_variation import least_variation
+
     values, usable = beam_pixels(image, mask)
     weight = checked_number("weight", weight, above=0, unit="px")
     iterations = checked_integer("iterations", iterations, least=1)

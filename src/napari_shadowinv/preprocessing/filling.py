@@ -9,9 +9,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.fft import dctn, idctn
-from scipy.sparse.linalg import LinearOperator, cg
 
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -128,21 +127,23 @@ def _spline(
     def stiffness(flat: FloatArray) -> FloatArray:
         report("source", 0)
         u = flat.reshape(known.shape)
-        bent = idctn(roughness * dctn(u, norm="ortho"), norm="ortho")
+        bent = scipy.fft.idctn(roughness * scipy.fft.dctn(u, norm="ortho"), norm="ortho")
         return np.asarray(share * u + bent).ravel()
 
     typical = float(share.mean())
 
     def nearly_inverse(flat: FloatArray) -> FloatArray:
-        coefficients = dctn(flat.reshape(known.shape), norm="ortho") / (typical + roughness)
-        return np.asarray(idctn(coefficients, norm="ortho")).ravel()
+        coefficients = scipy.fft.dctn(flat.reshape(known.shape), norm="ortho") / (
+            typical + roughness
+        )
+        return np.asarray(scipy.fft.idctn(coefficients, norm="ortho")).ravel()
 
     shape = (known.size, known.size)
-    solution, _ = cg(
-        LinearOperator(shape, matvec=stiffness, dtype=np.float64),
+    solution, _ = scipy.sparse.linalg.cg(
+        scipy.sparse.linalg.LinearOperator(shape, matvec=stiffness, dtype=np.float64),
         known.ravel(),
         x0=_coarse_spline(known, share, width, power, report).ravel(),
-        M=LinearOperator(shape, matvec=nearly_inverse, dtype=np.float64),
+        M=scipy.sparse.linalg.LinearOperator(shape, matvec=nearly_inverse, dtype=np.float64),
         rtol=_TOLERANCE,
         maxiter=500,
     )

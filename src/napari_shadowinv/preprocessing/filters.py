@@ -20,10 +20,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field
-from scipy.fft import dctn, idctn
-from scipy.special import expit
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -272,7 +271,7 @@ def butterworth(
     octaves = np.full(wave_numbers.shape, -np.inf)
     np.log(wave_numbers * (cutoff / (2 * np.pi)), out=octaves, where=wave_numbers > 0)
     # The logistic function gives 1 / (1 + x^2n) for any order without overflow.
-    gain = np.sqrt(expit(2 * order * (octaves if kind == "high" else -octaves)))
+    gain = np.sqrt(scipy.special.expit(2 * order * (octaves if kind == "high" else -octaves)))
     if kind == "high" and keep_mean:
         gain[0, 0] = 1.0
     return _filtered(values, gain)
@@ -415,4 +414,4 @@ def _wave_numbers(shape: tuple[int, ...]) -> FloatArray:
 
 
 def _filtered(values: FloatArray, gain: FloatArray) -> FloatArray:
-    return np.asarray(idctn(gain * dctn(values, norm="ortho"), norm="ortho"))
+    return np.asarray(scipy.fft.idctn(gain * scipy.fft.dctn(values, norm="ortho"), norm="ortho"))

@@ -8,8 +8,8 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -184,7 +184,7 @@ def _refitted(
         report("source", 0)
         return _gaussian(p, y, x) - sample
 
-    fit = least_squares(
+    fit = scipy.optimize.least_squares(
         excess,
         parameters,
         jac=lambda p: _gaussian_slopes(p, y, x),

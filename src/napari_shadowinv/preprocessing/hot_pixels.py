@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field
-from scipy.ndimage import rank_filter
-from scipy.optimize import nnls
 
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -151,7 +150,7 @@ def _neighbours(
 
     def ranked(rank: int, mode: Literal["mirror", "reflect"]) -> FloatArray:
         report("hot pixels", 0)
-        return np.asarray(rank_filter(values, rank, footprint=footprint, mode=mode))
+        return np.asarray(scipy.ndimage.rank_filter(values, rank, footprint=footprint, mode=mode))
 
     # 'reflect' lets no neighbour of a corner pixel fill half of its neighbourhood; 'mirror'
     # does not make a pixel at the border its own peer.
@@ -173,7 +172,7 @@ def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
     share = 1 / np.maximum(variance, 1e-3 * variance.max())
     unit, scale = variance.mean(), levels.mean() or 1.0
     columns = np.stack([np.ones_like(levels), levels / scale], axis=1) * unit
-    constant, slope = nnls(columns * share[:, None], variance * share)[0] * unit
+    constant, slope = scipy.optimize.nnls(columns * share[:, None], variance * share)[0] * unit
     fitted: FloatArray = np.sqrt(constant + slope * np.maximum(brightness, 0) / scale)
     return fitted
 
