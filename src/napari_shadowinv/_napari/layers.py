@@ -25,7 +25,7 @@ from napari_shadowinv.plotting import ShownField, shown_fields, shown_potential
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "FullLayerData",
@@ -65,7 +65,7 @@ _LARGEST_INTENSITY = 3.5
 
 def inversion_layers(
     inversion: Inversion,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     *,
     name: str = "",
     scale: Sequence[float] | None = None,
@@ -80,7 +80,7 @@ def inversion_layers(
     ----------
     inversion : Inversion
         The result.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Gives the pixel size and the field in SI units; pixels without.
     name : str
         Name of the shot; the layers' names begin with it.
@@ -112,7 +112,7 @@ def inversion_layers(
 def add_inversion(
     viewer: Any,
     inversion: Inversion,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     *,
     name: str = "",
     **keywords: Any,
@@ -125,7 +125,7 @@ def add_inversion(
         Where to add them; a `ViewerModel` needs neither a window nor a display.
     inversion : Inversion
         The result.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         The experiment.
     name : str
         Name of the shot; the layers' names begin with it.

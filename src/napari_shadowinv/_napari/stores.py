@@ -32,9 +32,8 @@ from napari_shadowinv.errors import FileFormatError
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
-    Setup = ProtonSetup | OpticalSetup
 
 __all__ = ["at_shot", "opened_store", "store_layers"]
 

@@ -22,7 +22,7 @@ from napari_shadowinv.errors import InputError
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "FORMAT",
@@ -62,7 +62,7 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
 def dataset_from_field(
     displacement: NDArray[np.float64],
     potential: NDArray[np.float64] | None,
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
     *,
     attributes: Mapping[str, Any] | None = None,
 ) -> xarray.Dataset:
@@ -74,7 +74,7 @@ def dataset_from_field(
         Displacement in px, axis order (y, x).
     potential : ndarray, shape (H, W), or None
         Normalised potential in px², where it is known.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         Adds the fields in SI units, and coordinates in metres.
     attributes : mapping of str to str, optional
         More attributes.
@@ -104,13 +104,13 @@ def dataset_from_field(
 
 
 def variable_labels(
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
 ) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
     """Name every variable of a result, with its dimensions and labels.
 
     Parameters
     ----------
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Adds the fields in SI units.
 
     Returns
@@ -134,9 +134,7 @@ def variable_labels(
     return labels
 
 
-def field_in_si(
-    name: str, values: NDArray[Any], setup: ProtonSetup | OpticalSetup
-) -> NDArray[np.float64]:
+def field_in_si(name: str, values: NDArray[Any], setup: Setup) -> NDArray[np.float64]:
     """Return a field in SI units by its name in a dataset.
 
     Parameters
@@ -145,7 +143,7 @@ def field_in_si(
         One of those that `variable_labels` adds for a setup.
     values : ndarray, shape (2, H, W) or (H, W)
         The displacement (px) for vectors, the normalised potential (px²) for planes.
-    setup : ProtonSetup or OpticalSetup
+    setup : Setup
         The geometry.
 
     Returns
@@ -159,7 +157,7 @@ def field_in_si(
     return field
 
 
-def setup_from_dataset(dataset: xarray.Dataset) -> ProtonSetup | OpticalSetup | None:
+def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:
     """Return the setup that a dataset was made with.
 
     Parameters
@@ -169,7 +167,7 @@ def setup_from_dataset(dataset: xarray.Dataset) -> ProtonSetup | OpticalSetup | 
 
     Returns
     -------
-    ProtonSetup or OpticalSetup or None
+    Setup or None
         None if it was made without.
     """
     from napari_shadowinv.physics.setup import setup_from_dict
@@ -219,7 +217,7 @@ def label(units: str, long_name: str) -> dict[str, str]:
 def _fields(
     displacement: NDArray[np.float64],
     potential: NDArray[np.float64] | None,
-    setup: ProtonSetup | OpticalSetup,
+    setup: Setup,
 ) -> dict[str, Any]:
     """Variables that need the experiment's geometry."""
     from napari_shadowinv.physics.setup import ProtonSetup
@@ -258,9 +256,7 @@ def _fields(
     return fields
 
 
-def _coordinates(
-    height: int, width: int, setup: ProtonSetup | OpticalSetup | None
-) -> dict[str, Any]:
+def _coordinates(height: int, width: int, setup: Setup | None) -> dict[str, Any]:
     """Pixel indices, and metres where the pixel's size is known."""
     coords: dict[str, Any] = {
         "component": ("component", ["y", "x"], label("1", "Component of a vector"))

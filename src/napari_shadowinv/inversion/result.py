@@ -20,7 +20,7 @@ from napari_shadowinv.options import InversionOptions
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["Inversion", "Report"]
 
@@ -158,7 +158,7 @@ class Inversion:
 
     def to_dataset(
         self,
-        setup: ProtonSetup | OpticalSetup | None = None,
+        setup: Setup | None = None,
         *,
         attributes: Mapping[str, str] | None = None,
     ) -> xarray.Dataset:
@@ -166,7 +166,7 @@ class Inversion:
 
         Parameters
         ----------
-        setup : ProtonSetup or OpticalSetup, optional
+        setup : Setup, optional
             Adds the potential and the line-integrated fields in SI units, and coordinates in
             metres.
         attributes : mapping of str to str, optional

@@ -33,7 +33,7 @@ from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, 
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup, Species
+    from napari_shadowinv.physics.setup import ProtonSetup, Setup, Species
 
 __all__ = [
     "VERSION",
@@ -264,7 +264,7 @@ def write_pradformat(
     path: Path,
     displacement: ArrayLike,
     potential: ArrayLike,
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
     *,
     radiograph_filename: str = "",
 ) -> None:
@@ -299,12 +299,12 @@ def write_pradformat(
         file.attrs.update(_inversion_attributes(particles, radiograph_filename))
 
 
-def check_pradformat_setup(setup: ProtonSetup | OpticalSetup | None) -> ProtonSetup:
+def check_pradformat_setup(setup: Setup | None) -> ProtonSetup:
     """Refuse a setup that a pradformat inversion cannot be written with.
 
     Parameters
     ----------
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         What is known of the experiment.
 
     Returns

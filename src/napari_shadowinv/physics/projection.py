@@ -32,7 +32,7 @@ from scipy.interpolate import make_interp_spline
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup, Setup
 
 __all__ = [
     "Deflector",
@@ -43,7 +43,6 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-AnySetup = ProtonSetup | OpticalSetup
 
 Deflector = Literal["magnetic field", "electric field", "plasma", "refractive index"]
 
@@ -59,8 +58,8 @@ _SAME = 1e-9
 
 def project(
     displacement: ArrayLike,
-    made_with: AnySetup,
-    setup: AnySetup,
+    made_with: Setup,
+    setup: Setup,
     *,
     deflector: Deflector | None = None,
     dispersion: float = 1.0,
@@ -75,7 +74,7 @@ def project(
     ----------
     displacement : array_like, shape (2, H, W)
         Displacement in px of `made_with`, axis order (y, x), such as `Inversion.displacement`.
-    made_with, setup : ProtonSetup or OpticalSetup
+    made_with, setup : Setup
         The experiment that the displacement belongs to, and the one to predict.
     deflector, dispersion, shape
         See `transferred_displacement`.
@@ -125,8 +124,8 @@ class _Keywords(TypedDict, total=False):
 
 def project_potential(
     potential: ArrayLike,
-    made_with: AnySetup,
-    setup: AnySetup,
+    made_with: Setup,
+    setup: Setup,
     **keywords: Unpack[_Keywords],
 ) -> FloatArray:
     """Image that a potential in SI units makes, in its own or in another experiment.
@@ -136,7 +135,7 @@ def project_potential(
     potential : array_like, shape (H, W)
         Potential Φ in m at the centres of the pixels of `made_with`, as its `potential` gives
         it; `displacement_from_potential` takes the gradient.
-    made_with, setup : ProtonSetup or OpticalSetup
+    made_with, setup : Setup
         The experiment that the potential belongs to, and the one to predict.
     deflector, dispersion, source, shape, rays_per_pixel, threads
         See `project`.
@@ -157,8 +156,8 @@ def project_potential(
 
 def transferred_displacement(
     displacement: ArrayLike,
-    made_with: AnySetup,
-    setup: AnySetup,
+    made_with: Setup,
+    setup: Setup,
     *,
     deflector: Deflector | None = None,
     dispersion: float = 1.0,
@@ -170,7 +169,7 @@ def transferred_displacement(
     ----------
     displacement : array_like, shape (2, H, W)
         Displacement in px of `made_with`, axis order (y, x).
-    made_with, setup : ProtonSetup or OpticalSetup
+    made_with, setup : Setup
         The experiment that the displacement belongs to, and the other one.
     deflector : {"magnetic field", "electric field", "plasma", "refractive index"}, optional
         What bends the beam. Default: see `default_deflector`.
@@ -215,12 +214,12 @@ def transferred_displacement(
     return factor * _resampled(field, size, ratio)
 
 
-def default_deflector(made_with: AnySetup, setup: AnySetup) -> Deflector:
+def default_deflector(made_with: Setup, setup: Setup) -> Deflector:
     """What is taken to bend the beam if nobody says so.
 
     Parameters
     ----------
-    made_with, setup : ProtonSetup or OpticalSetup
+    made_with, setup : Setup
         Two experiments.
 
     Returns
@@ -253,7 +252,7 @@ def default_deflector(made_with: AnySetup, setup: AnySetup) -> Deflector:
 
 
 def _angle_ratio(
-    made_with: AnySetup, setup: AnySetup, deflector: Deflector | None, dispersion: float
+    made_with: Setup, setup: Setup, deflector: Deflector | None, dispersion: float
 ) -> float:
     """Deflection angle in the new experiment over that in the old one."""
     if not (math.isfinite(dispersion) and dispersion != 0):
@@ -311,7 +310,7 @@ def _shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
 
 
 def _checked_shape(
-    shape: tuple[int, int], old: tuple[int, int], ratio: float, setup: AnySetup
+    shape: tuple[int, int], old: tuple[int, int], ratio: float, setup: Setup
 ) -> tuple[int, int]:
     if len(shape) != 2 or min(shape) < _SMALLEST_SIDE:
         raise InputError(

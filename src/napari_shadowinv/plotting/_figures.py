@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 DOTS_PER_INCH = 160  # of a figure's file
 _ALARM_COLOUR = "#b00020"
@@ -36,7 +36,7 @@ _QUIET_COLOUR = "0.3"
 
 def report_figure(
     inversion: Inversion,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     *,
     title: str | None = None,
 ) -> Figure:
@@ -50,7 +50,7 @@ def report_figure(
     ----------
     inversion : Inversion
         The result.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Gives axes in metres and the field in SI units; pixels without.
     title : str, optional
         A heading, such as the shot's name.
@@ -81,7 +81,7 @@ def report_figure(
 
 def comparison_figure(
     fields: Mapping[str, ArrayLike],
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     *,
     title: str | None = None,
     caption: str = "",
@@ -92,7 +92,7 @@ def comparison_figure(
     ----------
     fields : mapping of str to array_like, shape (2, H, W)
         Displacements in px by name; the first is the reference.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Gives axes in metres and the field in SI units; pixels without.
     title : str, optional
         A heading.

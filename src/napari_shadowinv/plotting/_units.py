@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup, Setup
+    from napari_shadowinv.physics.setup import Setup
 
 FloatArray = NDArray[np.float64]
 
@@ -91,16 +91,14 @@ class ShownField:
         return f"{text} ({largest * 10.0**power / 1e-4:.3g} MG·µm)"
 
 
-def shown_fields(
-    displacements: Collection[FloatArray], setup: ProtonSetup | OpticalSetup | None
-) -> list[ShownField]:
+def shown_fields(displacements: Collection[FloatArray], setup: Setup | None) -> list[ShownField]:
     """Turn displacements into what an experimenter asks for, in one unit for all.
 
     Parameters
     ----------
     displacements : collection of ndarray, shape (2, H, W)
         Displacements in px.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         With it, the path-integrated magnetic field of particles, or the deflection angle of
         light; without, the displacement in px.
 

@@ -27,7 +27,7 @@ from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
     from napari_shadowinv._system.progress import OnWarning, ShouldStop
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "ESTIMATES",
@@ -101,7 +101,7 @@ class Estimate(_Recipe):
 
     def placed(
         self,
-        setup: ProtonSetup | OpticalSetup | None,
+        setup: Setup | None,
         shape: tuple[int, ...],
         corner: tuple[int, int] = (0, 0),
     ) -> Estimate:
@@ -109,7 +109,7 @@ class Estimate(_Recipe):
 
         Parameters
         ----------
-        setup : ProtonSetup or OpticalSetup or None
+        setup : Setup or None
             The experiment, None if it is not known.
         shape : tuple of int
             Shape (H, W) of the whole image.
@@ -296,7 +296,7 @@ class IsotropicEstimate(Estimate):
 
     def placed(
         self,
-        setup: ProtonSetup | OpticalSetup | None,
+        setup: Setup | None,
         shape: tuple[int, ...],
         corner: tuple[int, int] = (0, 0),
     ) -> Estimate:
@@ -331,7 +331,7 @@ class IsotropicEstimate(Estimate):
         y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
         return self._at(y, x, binned_setup(self._setup, factor))
 
-    def _at(self, y: float, x: float, setup: ProtonSetup | OpticalSetup) -> Self:
+    def _at(self, y: float, x: float, setup: Setup) -> Self:
         placed = self.model_copy(update={"centre_y": y, "centre_x": x})
         placed._setup = setup
         return placed

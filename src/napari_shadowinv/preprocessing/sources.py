@@ -45,7 +45,7 @@ from napari_shadowinv.preprocessing.filters import (
 )
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "gaussian_source",
@@ -110,7 +110,7 @@ def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatA
 
 def uniform_warnings(
     shape: tuple[int, int],
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
     *,
     centre: tuple[float, float] | None = None,
 ) -> tuple[str, ...]:
@@ -120,7 +120,7 @@ def uniform_warnings(
     ----------
     shape : tuple of int
         Height and width of the image.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         The experiment. Default: not known, and nothing is said.
     centre : tuple of float, optional
         See `isotropic_source`, there `centre_y` and `centre_x`.
@@ -157,7 +157,7 @@ def uniform_warnings(
 
 def isotropic_source(
     image: ArrayLike,
-    setup: ProtonSetup | OpticalSetup,
+    setup: Setup,
     *,
     centre_y: float | None = None,
     centre_x: float | None = None,
@@ -169,7 +169,7 @@ def isotropic_source(
     ----------
     image : array_like, shape (H, W)
         The shot; only its flux is used.
-    setup : ProtonSetup or OpticalSetup
+    setup : Setup
         The experiment: distance of the point, and side of a pixel.
     centre_y, centre_x : float, optional
         Pixel in which the detector faces the point. Default: the middle of the image.
@@ -212,7 +212,7 @@ def isotropic_source(
     return np.asarray(beam * (values[usable].mean() / beam[usable].mean()))
 
 
-def point_distance(setup: ProtonSetup | OpticalSetup) -> float:
+def point_distance(setup: Setup) -> float:
     """Return how far the point source is from the detector, in px of the detector.
 
     Raises

@@ -17,7 +17,7 @@ from napari_shadowinv._napari.widgets._toml import TomlButtons
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["SetupPicker"]
 
@@ -89,7 +89,7 @@ class SetupPicker(QWidget):
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
 
-    def setup(self) -> ProtonSetup | OpticalSetup | None:
+    def setup(self) -> Setup | None:
         """The validated setup.
 
         Raises
@@ -154,12 +154,12 @@ class SetupPicker(QWidget):
             self._show(_NONE)
             self.changed.emit()
 
-    def suggest(self, setup: ProtonSetup | OpticalSetup, origin: str) -> None:
+    def suggest(self, setup: Setup, origin: str) -> None:
         """Show a setup that is not the user's own, until he changes it.
 
         Parameters
         ----------
-        setup : ProtonSetup or OpticalSetup
+        setup : Setup
             The setup.
         origin : str
             Where it comes from.
