@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing
+from napari_shadowinv.physics.units import ShownField, shown_fields
 from napari_shadowinv.plotting._drawing import (
     draw_cuts,
     draw_field,
@@ -20,8 +21,13 @@ from napari_shadowinv.plotting._drawing import (
     draw_residual,
     draw_side_by_side,
 )
-from napari_shadowinv.plotting._panels import STYLE, choose_grid, new_page, write_footer
-from napari_shadowinv.plotting._units import ShownField, image_scale, shown_fields
+from napari_shadowinv.plotting._panels import (
+    STYLE,
+    choose_grid,
+    image_scale,
+    new_page,
+    write_footer,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,8 +17,7 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.options import InversionOptions
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.projection import Deflector
-    from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.physics.setup import Deflector, Setup
 
 __all__ = ["Forecast", "ForwardJob"]
 
@@ -157,7 +156,7 @@ class ForwardJob:
         return moved, f"For another setup, assuming that only a {deflector} deflects the beam."
 
     def _displacement(self) -> Image:
-        from napari_shadowinv.inversion.labels import displacement_from_potential
+        from napari_shadowinv.physics.setup import displacement_from_potential
 
         if isinstance(self.field, PhantomRecipe):
             return self.field.phantom(self.shape, self.setup).displacement
