@@ -16,10 +16,11 @@ import numpy as np
 
 from napari_shadowinv import __version__
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.physics.setup import Setup, SIField, setup_from_dict
 
 if TYPE_CHECKING:
     import xarray
+
+    from napari_shadowinv.physics.setup import Setup, SIField
 
 __all__ = [
     "FORMAT",
@@ -142,6 +143,8 @@ def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:
     Setup or None
         None if it was made without.
     """
+    from napari_shadowinv.physics.setup import setup_from_dict
+
     if "setup" not in dataset.attrs:
         return None
     return setup_from_dict(json.loads(dataset.attrs["setup"]), "the dataset's setup")
