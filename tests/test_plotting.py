@@ -12,12 +12,7 @@ from matplotlib.figure import Figure
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.plotting import (
-    comparison_figure,
-    report_figure,
-    save_figure,
-    shown_fields,
-)
+from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
 
 Make = Callable[..., Inversion]
 
@@ -91,14 +86,6 @@ def test_field_is_shown_in_si(inversion: Inversion, proton_setup: ProtonSetup) -
     left, right, bottom, top = axes.images[0].get_extent()
     assert (left, right) == pytest.approx((-0.5 * 1.5, 31.5 * 1.5))
     assert (top, bottom) == pytest.approx((-0.5 * 1.5, 23.5 * 1.5))
-
-
-def test_peak_is_told_in_both_units(proton_setup: ProtonSetup) -> None:
-    displacement = proton_setup.displacement_from_path_integrated_b(
-        np.array([97.0, 0.0]).reshape(2, 1, 1), "MG um"
-    )
-    (field,) = shown_fields([displacement], proton_setup)
-    assert field.peak_text == "peak |∫B×dz| 9.7 mT·m (97 MG·µm)"
 
 
 def test_residual_limits_are_symmetric_in_percent(inversion: Inversion) -> None:

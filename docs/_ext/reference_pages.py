@@ -61,7 +61,8 @@ def write_pages(app: Sphinx, config: Config) -> None:
 
 
 def parameters_page() -> str:
-    from napari_shadowinv import InversionOptions, OpticalSetup, ProtonSetup
+    from napari_shadowinv import InversionOptions
+    from napari_shadowinv.physics.setup import SETUPS
     from napari_shadowinv.preprocessing import ESTIMATES, FILTERS
 
     parts = [
@@ -77,8 +78,7 @@ def parameters_page() -> str:
         "## Setups",
         "The geometry of the experiment. In napari under *Setup*; on the command line "
         "`--setup setup.toml`.",
-        model_section(ProtonSetup, "proton", title="Particles"),
-        model_section(OpticalSetup, "optical", title="Light"),
+        *(model_section(model, kind, title=model.beam) for kind, model in SETUPS.items()),
         "## Inversion options",
         "In napari under *Options*; in Python the arguments of "
         "{py:class}`~napari_shadowinv.InversionOptions`.",

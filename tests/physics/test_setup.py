@@ -4,22 +4,35 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import tomllib
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import pytest
 import tomli_w
 from pydantic import TypeAdapter, ValidationError
 
+import napari_shadowinv
+from napari_shadowinv.cli._tables import setup_text
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.labels import dataset_from_field
+from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.physics.phantoms import paper_setup
+from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import (
+    SETUPS,
     SPECIES,
+    BeamSetup,
+    MainField,
     OpticalSetup,
     ProtonSetup,
     Setup,
+    SIField,
     setup_from_dict,
 )
+from napari_shadowinv.physics.units import shown_fields
 
 PROTON = {
     "kind": "proton",
@@ -86,7 +99,7 @@ def test_angle_is_minus_the_gradient_of_the_potential(proton: ProtonSetup) -> No
 
 
 @pytest.mark.parametrize("setup", [ProtonSetup(**PROTON), OpticalSetup(**OPTICAL)])
-def test_round_trips_of_angle_and_potential(setup: ProtonSetup | OpticalSetup) -> None:
+def test_round_trips_of_angle_and_potential(setup: Setup) -> None:
     values = np.linspace(-3, 5, 24).reshape(2, 3, 4)
     np.testing.assert_allclose(setup.displacement(setup.deflection_angle(values)), values)
     np.testing.assert_allclose(setup.normalized_potential(setup.potential(values)), values)
@@ -233,7 +246,7 @@ def test_density_must_be_positive(optical: OpticalSetup, density: float) -> None
 @pytest.mark.parametrize(
     "setup", [ProtonSetup(**PROTON), OpticalSetup(**OPTICAL)], ids=["proton", "optical"]
 )
-def test_a_setup_survives_every_file(setup: ProtonSetup | OpticalSetup) -> None:
+def test_a_setup_survives_every_file(setup: Setup) -> None:
     dump = setup.model_dump()
     assert type(setup)(**dump) == setup
     assert type(setup).model_validate_json(setup.model_dump_json()) == setup
@@ -243,7 +256,7 @@ def test_a_setup_survives_every_file(setup: ProtonSetup | OpticalSetup) -> None:
 
 
 def test_every_field_tells_its_meaning() -> None:
-    for model in (ProtonSetup, OpticalSetup):
+    for model in SETUPS.values():
         for field in model.model_fields.values():
             assert field.title
             assert field.description
@@ -312,3 +325,86 @@ def test_vectors_must_have_two_components(proton: ProtonSetup) -> None:
         proton.displacement_from_path_integrated_b(1.0)
     with pytest.raises(InputError, match="unit is 'G cm': it must be one of T m, MG um"):
         proton.path_integrated_b(np.zeros((2, 4)), "G cm")  # type: ignore[arg-type]
+
+
+# Source files that may name a kind of setup.
+NAMED_IN = {
+    "__init__.py": "the index of the public names",
+    "__init__.pyi": "the public names",
+    "physics/__init__.pyi": "the public names",
+    "physics/phantoms/_shapes.py": "a magnetic field deflects particles only",
+    "physics/phantoms/_scenes.py": "a magnetic field deflects particles only",
+    "physics/phantoms/_wakefield.py": "a plasma wave is probed by light",
+    "cli/_demo.py": "the demonstration is a magnetic field",
+}
+
+
+def test_a_kind_of_setup_is_named_where_it_is_defined_and_nowhere_else() -> None:
+    source = Path(napari_shadowinv.__file__).parent
+    kinds = re.compile("|".join(model.__name__ for model in SETUPS.values()))
+    found = {
+        path.relative_to(source).as_posix()
+        for path in source.rglob("*.py*")
+        if path.suffix in (".py", ".pyi") and kinds.search(path.read_text(encoding="utf-8"))
+    }
+    assert {path for path in found if not path.startswith("physics/setup/")} == set(NAMED_IN)
+
+
+class NeutralSetup(BeamSetup):
+    """A beam that a force deflects: a kind of setup that the package does not know."""
+
+    title: ClassVar = "neutral atoms"
+    beam: ClassVar = "atoms"
+    deflectors: ClassVar = ("force",)
+    si_fields: ClassVar = (
+        *BeamSetup.si_fields,
+        SIField("path_integrated_force", "N m", "Path-integrated force", is_vector=True),
+    )
+    main_field: ClassVar = MainField("path_integrated_force", "Force", "|∫F dz|", ("Fy", "Fx"))
+    kind: Literal["neutral"] = "neutral"
+    energy: float
+
+    @property
+    def probe(self) -> str:
+        return f"atoms of {self.energy:g} J"
+
+    @classmethod
+    def example(cls) -> Self:
+        return cls(energy=2e-3, source_object_distance=1, object_image_distance=1, pixel_size=1e-6)
+
+    def default_deflector(self, made_with: Any) -> str:
+        return "force"
+
+    def angle_ratio(self, made_with: Any, deflector: str) -> float:
+        return made_with.energy / self.energy
+
+    def path_integrated_force(self, displacement: Any) -> Any:
+        return 2 * self.energy * self.deflection_angle(displacement)
+
+
+def test_a_further_kind_of_setup_tells_all_that_others_need() -> None:
+    setup: Any = NeutralSetup.example()
+    displacement = np.ones((2, 4, 5))
+    force = setup.path_integrated_force(displacement)
+    dataset = dataset_from_field(displacement, None, setup)
+    np.testing.assert_array_equal(dataset["path_integrated_force"], force)
+    assert dataset["path_integrated_force"].attrs["units"] == "N m"
+    (field,) = shown_fields([displacement], setup)
+    assert (field.name, field.unit, field.components) == ("Force", "nN·m", ("Fy", "Fx"))
+    np.testing.assert_allclose(field.vectors, force * 1e9)
+    faster = setup.model_copy(update={"energy": 4e-3})
+    moved = transferred_displacement(displacement, setup, faster)
+    np.testing.assert_allclose(moved, displacement / 2)
+    assert setup_text(setup).startswith("atoms of 0.002 J, magnification 2")
+    with pytest.raises(InputError, match="received kind 'neutral'"):
+        check_pradformat_setup(setup)
+
+
+@pytest.mark.parametrize("kind", SETUPS)
+def test_every_field_of_a_setup_can_be_made(kind: str) -> None:
+    setup = SETUPS[kind].example()
+    for field in setup.si_fields:
+        values = np.ones((2, 3, 4) if field.is_vector else (3, 4))
+        assert setup.field_in_si(field.name, values).shape == values.shape
+    assert setup.main_field.name in {field.name for field in setup.si_fields if field.is_vector}
+    assert setup.angle_ratio(setup, setup.default_deflector(setup)) == 1

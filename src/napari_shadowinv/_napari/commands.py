@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     import napari
     from napari_shadowinv._napari.layers import FullLayerData
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["estimate_source", "high_pass", "invert_uniform", "remove_hot_pixels"]
 
@@ -56,7 +56,7 @@ class _Picked:
     image: NDArray[Any]
     name: str
     frame: Frame
-    setup: ProtonSetup | OpticalSetup | None
+    setup: Setup | None
     setup_origin: str
     role: str | None
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["Frame", "frame_for", "frame_of", "place"]
 
@@ -95,7 +95,7 @@ class Frame:
 
 def frame_for(
     shape: Sequence[int],
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
     *,
     scale: Sequence[float] | None = None,
     translate: Sequence[float] | None = None,
@@ -107,7 +107,7 @@ def frame_for(
     ----------
     shape : sequence of int
         Shape of the image; its last two numbers count.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         Gives the pixel's size in the object plane; without it, lengths are pixels.
     scale, translate, units : sequence, optional
         Taken instead, where given; axis order (y, x).
@@ -155,14 +155,14 @@ def _with_shots(matrix: Matrix, stacked: bool) -> NDArray[np.float64]:
     return whole
 
 
-def place(layer: Any, setup: ProtonSetup | OpticalSetup) -> None:
+def place(layer: Any, setup: Setup) -> None:
     """Give a layer the pixel size that a setup tells, so that it fits to its result.
 
     Parameters
     ----------
     layer : napari.layers.Layer
         An image, whose last two axes are y and x.
-    setup : ProtonSetup or OpticalSetup
+    setup : Setup
         The experiment.
     """
     frame = frame_for(layer.data.shape, setup)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "CAME_WITH",
@@ -65,21 +65,21 @@ class Result:
     ----------
     content : Inversion or xarray.Dataset
         The result; a dataset where a file holds no more than a field.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         The experiment.
     attributes : mapping of str to str
         Which files it was made from, as `napari_shadowinv.io.provenance` tells.
     """
 
     content: Inversion | xarray.Dataset
-    setup: ProtonSetup | OpticalSetup | None = None
+    setup: Setup | None = None
     attributes: Mapping[str, str] = field(default_factory=dict)
 
 
 def mark(
     role: str | None,
     unit: str,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     **more: Any,
 ) -> dict[str, Any]:
     """Make the metadata of a layer.
@@ -91,7 +91,7 @@ def mark(
         None if that is not known.
     unit : str
         Unit of its values; empty if they have none.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         The experiment.
     **more
         Other facts, such as ``result`` (a `Result`), ``source`` (an array) or ``setup_origin``
@@ -134,7 +134,7 @@ def unit_of(layer: Any) -> str:
     return str(mark_of(layer).get("unit", ""))
 
 
-def setup_of(layer: Any) -> ProtonSetup | OpticalSetup | None:
+def setup_of(layer: Any) -> Setup | None:
     """Return the experiment that a layer belongs to, None where it is unknown."""
     from napari_shadowinv.physics.setup import setup_from_dict
 
@@ -147,14 +147,14 @@ def setup_origin_of(layer: Any) -> str:
     return str(mark_of(layer).get("setup_origin", ""))
 
 
-def keep_setup(layer: Any, setup: ProtonSetup | OpticalSetup | None, origin: str) -> None:
+def keep_setup(layer: Any, setup: Setup | None, origin: str) -> None:
     """Make a setup the one of a layer.
 
     Parameters
     ----------
     layer : napari.layers.Layer
         An image.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         The experiment; None takes away what the layer has.
     origin : str
         Where it comes from.

@@ -21,11 +21,11 @@ from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layer_metadata import Result, mark, role_of
 from napari_shadowinv._napari.legend import follow_top_image
 from napari_shadowinv._napari.placing import place_newcomers
-from napari_shadowinv.plotting import ShownField, shown_fields, shown_potential
+from napari_shadowinv.physics.units import shown_fields, shown_potential
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "FullLayerData",
@@ -33,7 +33,6 @@ __all__ = [
     "add_layers",
     "arrow_keywords",
     "caustic_keywords",
-    "component_symbols",
     "intensity_limits",
     "inversion_layers",
     "opened",
@@ -65,7 +64,7 @@ _LARGEST_INTENSITY = 3.5
 
 def inversion_layers(
     inversion: Inversion,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     *,
     name: str = "",
     scale: Sequence[float] | None = None,
@@ -80,7 +79,7 @@ def inversion_layers(
     ----------
     inversion : Inversion
         The result.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Gives the pixel size and the field in SI units; pixels without.
     name : str
         Name of the shot; the layers' names begin with it.
@@ -112,7 +111,7 @@ def inversion_layers(
 def add_inversion(
     viewer: Any,
     inversion: Inversion,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     *,
     name: str = "",
     **keywords: Any,
@@ -125,7 +124,7 @@ def add_inversion(
         Where to add them; a `ViewerModel` needs neither a window nor a display.
     inversion : Inversion
         The result.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         The experiment.
     name : str
         Name of the shot; the layers' names begin with it.
@@ -304,7 +303,6 @@ def _potential(make: _Maker, potential: Array) -> FullLayerData:
 def _field(make: _Maker, displacement: Array) -> list[FullLayerData]:
     """Components of the field, and on top of them its strength."""
     (field,) = shown_fields([displacement], make.result.setup)
-    whole, *parts = component_symbols(field)
     limit = float(np.abs(field.vectors).max())
     strength = field.magnitude
     return [
@@ -313,27 +311,19 @@ def _field(make: _Maker, displacement: Array) -> list[FullLayerData]:
                 plane, role, f"{symbol} ({field.unit})", field.unit, (-limit, limit), _SIGNED_MAP
             )
             for plane, role, symbol in zip(
-                field.vectors, ("field y", "field x"), parts, strict=True
+                field.vectors, ("field y", "field x"), field.components, strict=True
             )
         ),
         make.image(
             strength,
             "field",
-            f"{whole} ({field.unit})",
+            f"{field.symbol} ({field.unit})",
             field.unit,
             (0.0, float(strength.max())),
             _FIELD_MAP,
             visible=True,
         ),
     ]
-
-
-def component_symbols(field: ShownField) -> tuple[str, str, str]:
-    """Return the symbols of a field's strength, of its y and of its x component."""
-    if field.symbol == "|∫B×dz|":
-        return field.symbol, "∫By dz", "∫Bx dz"
-    letter = field.symbol.strip("|")
-    return field.symbol, f"{letter}y", f"{letter}x"
 
 
 def _caustics(make: _Maker, inversion: Inversion) -> FullLayerData:
@@ -357,22 +347,17 @@ def caustic_keywords() -> dict[str, Any]:
 
 
 def _arrows(make: _Maker, displacement: Array) -> list[FullLayerData]:
-    """Displacements of few enough rays that each arrow can be seen.
-
-    A magnetic field is at right angles to them: it has arrows of its own, hidden to begin with.
-    """
+    """Displacements of few enough rays to see each arrow; a field's own arrows are hidden."""
     data, spacing = thinned_arrows(displacement)
     title = "displacement arrows"
     arrows = [make.layer(data, "vectors", "arrows", title, "px", **arrow_keywords(data, spacing))]
-    setup = make.result.setup
-    if setup is None or setup.kind != "proton":
+    (field,) = shown_fields([displacement], make.result.setup)
+    if not field.arrows:
         return arrows
-    (field,) = shown_fields([displacement], setup)
     data, spacing = thinned_arrows(field.vectors)
     look = arrow_keywords(data, spacing, "field")
-    name = "∫B dz arrows"
     hidden = make.layer(
-        data, "vectors", "field arrows", name, field.unit, **{**look, "visible": False}
+        data, "vectors", "field arrows", field.arrows, field.unit, **{**look, "visible": False}
     )
     return [hidden, *arrows]
 

@@ -21,7 +21,6 @@ from napari_shadowinv._napari.shots import radiograph_layers, shot_layer
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.physics.phantoms import Phantom
-    from napari_shadowinv.physics.setup import ProtonSetup
 
 __all__ = [
     "coaxial_line",
@@ -96,7 +95,7 @@ def _proton_shot(
     from napari_shadowinv.io import Radiograph
     from napari_shadowinv.physics.phantoms import paper_setup
 
-    setup: ProtonSetup = paper_setup()
+    setup = paper_setup()
     source = None if beam is None else _COUNTS * beam
     image = _counted(phantom, np.full(_SHAPE, _COUNTS) if source is None else source, seed=1)
     return radiograph_layers(Radiograph(image, setup=setup, source=source), name)

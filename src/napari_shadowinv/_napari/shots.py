@@ -28,9 +28,8 @@ from napari_shadowinv.io.files import in_counting_order
 
 if TYPE_CHECKING:
     from napari_shadowinv.io import Radiograph
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
-    Setup = ProtonSetup | OpticalSetup
 
 __all__ = [
     "IMAGE_SUFFIXES",
@@ -104,7 +103,7 @@ def shot_layer(
         The image.
     name : str
         Name of the layer.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         The experiment.
     limits : tuple of float
         Contrast limits; napari would read two shots of a stack to find some.

@@ -20,7 +20,6 @@ from napari_shadowinv._napari.layers import (
     FullLayerData,
     arrow_keywords,
     caustic_keywords,
-    component_symbols,
     intensity_limits,
     opened,
     symmetric_limits,
@@ -32,9 +31,8 @@ from napari_shadowinv.errors import FileFormatError
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
-    Setup = ProtonSetup | OpticalSetup
 
 __all__ = ["at_shot", "opened_store", "store_layers"]
 
@@ -189,7 +187,7 @@ class _StoreLayers:
         return self._layer(data, "image", role, title, unit, **choices)
 
     def _potential(self) -> list[FullLayerData]:
-        from napari_shadowinv.plotting import shown_potential
+        from napari_shadowinv.physics.units import shown_potential
 
         if not self._is_run("potential"):
             return []
@@ -205,14 +203,16 @@ class _StoreLayers:
         """Components and strength, in the unit that suits the first finished shot."""
         import dask.array
 
-        from napari_shadowinv.plotting import shown_fields
+        from napari_shadowinv.physics.units import shown_fields
 
         # Both components of all shots, as (component, shot, y, x).
         displacement = self._dataset["displacement"].transpose("component", _SHOT, "y", "x").data
         first = self._plane("displacement")
         (field,) = shown_fields([first], self._setup)
-        whole, *parts = component_symbols(field)
-        matrix = _field_of_unit_displacements(self._setup)
+        setup, matrix = self._setup, np.eye(2)
+        if setup is not None:
+            # All fields are linear: that of any displacement follows from those of unit vectors.
+            matrix = setup.field_in_si(setup.main_field.name, matrix)
         matrix = matrix * _ratio(field.vectors, np.tensordot(matrix, first, axes=1))
         vectors = [
             sum(factor * displacement[k] for k, factor in enumerate(row) if factor)
@@ -224,12 +224,14 @@ class _StoreLayers:
         return [
             *(
                 self._image(plane, role, f"{symbol} ({field.unit})", field.unit, limits, "RdBu_r")
-                for plane, role, symbol in zip(vectors, ("field y", "field x"), parts, strict=True)
+                for plane, role, symbol in zip(
+                    vectors, ("field y", "field x"), field.components, strict=True
+                )
             ),
             self._image(
                 strength,
                 "field",
-                f"{whole} ({field.unit})",
+                f"{field.symbol} ({field.unit})",
                 field.unit,
                 (0.0, strongest),
                 "inferno",
@@ -257,16 +259,6 @@ def at_shot(arrows: NDArray[np.float64], shot: int) -> NDArray[np.float64]:
     stacked[:, 0, 0] = shot
     stacked[:, :, 1:] = arrows
     return stacked
-
-
-def _field_of_unit_displacements(setup: Setup | None) -> NDArray[np.float64]:
-    """Matrix that makes a field (T m, rad or px) of a displacement: all fields are linear."""
-    unit_vectors = np.eye(2)
-    if setup is None:
-        return unit_vectors
-    if setup.kind == "proton":
-        return setup.path_integrated_b(unit_vectors)
-    return setup.deflection_angle(unit_vectors)
 
 
 def _ratio(shown: NDArray[np.float64], plane: NDArray[np.float64]) -> float:

@@ -42,8 +42,8 @@ def compared_fields(
     image: NDArray[np.float64], truth: NDArray[np.float64], inversion: Inversion
 ) -> Fields:
     """Displacements by name: the truth, ours, and what linear inversion makes of the image."""
-    from napari_shadowinv.inversion.labels import displacement_from_potential
     from napari_shadowinv.physics.poisson import poisson_invert
+    from napari_shadowinv.physics.setup import displacement_from_potential
 
     poisson = displacement_from_potential(poisson_invert(image))
     return {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from napari_shadowinv.physics.projection import Deflector
-    from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.physics.setup import Deflector, Setup
 
     Plane = NDArray[np.float64]
 

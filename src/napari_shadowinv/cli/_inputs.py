@@ -99,16 +99,16 @@ def setup_from(path: Path) -> Setup:
 
 def _setup(entries: Mapping[str, Any], known: Mapping[str, Any], where: str) -> Setup:
     """Setup from a file's entries; what they leave out comes from the image's own file."""
-    from napari_shadowinv.physics.setup import setup_from_dict
+    from napari_shadowinv.physics.setup import SETUPS, setup_from_dict
 
     if "kind" in known and entries.get("kind", known["kind"]) != known["kind"]:
         known = {}
     elif known and "kind" not in known:
         # A text image tells distances, and of particles the energy, but not what flew.
-        kind = "optical" if "wavelength" in entries else "proton"
-        known = {**known, "kind": entries.get("kind", kind)}
-        if known["kind"] == "optical":
-            known.pop("energy", None)
+        meant = [kind for kind, model in SETUPS.items() if entries.keys() & model.own_fields()]
+        kind = entries.get("kind", meant[-1] if meant else "proton")
+        strange = () if kind == "proton" else SETUPS["proton"].own_fields()
+        known = {name: known[name] for name in known if name not in strange} | {"kind": kind}
     pixel_sizes = {"pixel_size", "detector_pixel_size"}
     if pixel_sizes & entries.keys():
         known = {name: value for name, value in known.items() if name not in pixel_sizes}
@@ -156,7 +156,7 @@ def _named_array(path: Path, variable: str | None) -> NDArray[Any]:
 
 
 def _displacement(path: Path, array: NDArray[Any]) -> NDArray[np.float64]:
-    from napari_shadowinv.inversion.labels import displacement_from_potential
+    from napari_shadowinv.physics.setup import displacement_from_potential
 
     if array.ndim == 2:
         return displacement_from_potential(array)

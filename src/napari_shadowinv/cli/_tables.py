@@ -104,7 +104,7 @@ def crossing_rows(report: Report) -> Rows:
 
 def peak_rows(displacement: NDArray[np.float64], setup: Setup | None) -> Rows:
     """The strongest point, in pixels and where there is a setup in SI units."""
-    from napari_shadowinv.plotting import shown_fields
+    from napari_shadowinv.physics.units import shown_fields
 
     (pixels,) = shown_fields([displacement], None)
     row, column = pixels.peak
@@ -127,13 +127,8 @@ def closing_rows(report: Report, written: Iterable[Path] = ()) -> Rows:
 def setup_text(setup: Setup | None, shot: Radiograph | None = None) -> str:
     """The experiment in a line, or what is missing for SI units."""
     if setup is not None:
-        probe = (
-            f"{setup.energy:g} MeV {setup.species}"
-            if setup.kind == "proton"
-            else f"light of {setup.wavelength * 1e9:g} nm"
-        )
         return (
-            f"{probe}, magnification {setup.magnification:.4g}, "
+            f"{setup.probe}, magnification {setup.magnification:.4g}, "
             f"pixel {setup.object_pixel_size * 1e6:.4g} µm at the object"
         )
     if shot is not None and shot.metadata.get("geometry"):

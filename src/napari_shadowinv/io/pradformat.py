@@ -23,17 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import (
-    FORMAT,
-    dataset_from_field,
-    displacement_from_potential,
-)
+from napari_shadowinv.inversion.labels import FORMAT, dataset_from_field
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
 
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup, Species
+    from napari_shadowinv.physics.setup import Setup, Species
     from napari_shadowinv.preprocessing import Provenance
 
 __all__ = [
@@ -163,7 +159,7 @@ def read_pradformat(path: Path) -> tuple[NDArray[Any], dict[str, Any]] | xarray.
     -------
     (ndarray, dict) or xarray.Dataset
         For a radiograph, the image and what the file says: ``geometry`` holds the fields of
-        `ProtonSetup` that it knows. For an inversion, a dataset with displacement and,
+        a setup of particles that it knows. For an inversion, a dataset with displacement and,
         where given, potential, in pixels and in SI units.
 
     Raises
@@ -202,7 +198,7 @@ def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]
 
 
 def _geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, Any]:
-    """Fields of `ProtonSetup` that the attributes tell."""
+    """Fields of a setup of particles that the attributes tell."""
     geometry: dict[str, Any] = {"kind": "proton"}
     source, image = _distances(attributes)
     species = {symbol: name for name, symbol in _SYMBOLS.items()}.get(
@@ -244,10 +240,9 @@ def _check_square(path: Path, attributes: dict[str, Any], width: str) -> None:
 
 
 def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
-    from napari_shadowinv._system.validation import validated
-    from napari_shadowinv.physics.setup import ProtonSetup
+    from napari_shadowinv.physics.setup import displacement_from_potential, setup_from_dict
 
-    setup = validated(ProtonSetup, _geometry(path, attributes, "dr"), str(path))
+    setup = setup_from_dict(_geometry(path, attributes, "dr"), str(path))
     arrays = _read_datasets(path, ("phi", "defl_ax1", "defl_ax2"))
     if "phi" not in arrays and not {"defl_ax1", "defl_ax2"} <= arrays.keys():
         raise FileFormatError(
@@ -266,7 +261,7 @@ def write_pradformat(
     path: Path,
     displacement: ArrayLike,
     potential: ArrayLike,
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
     *,
     provenance: Provenance | None = None,
 ) -> None:
@@ -280,7 +275,7 @@ def write_pradformat(
         Displacement in px, axis order (y, x).
     potential : array_like, shape (H, W)
         Normalised potential in px².
-    setup : ProtonSetup
+    setup : Setup
         The experiment; the format needs all of it.
     provenance : Provenance, optional
         How the result was made.
@@ -301,17 +296,17 @@ def write_pradformat(
         file.attrs.update(_inversion_attributes(particles, provenance))
 
 
-def check_pradformat_setup(setup: ProtonSetup | OpticalSetup | None) -> ProtonSetup:
+def check_pradformat_setup(setup: Setup | None) -> Setup:
     """Refuse a setup that a pradformat inversion cannot be written with.
 
     Parameters
     ----------
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         What is known of the experiment.
 
     Returns
     -------
-    ProtonSetup
+    Setup
         The same.
 
     Raises
@@ -319,9 +314,7 @@ def check_pradformat_setup(setup: ProtonSetup | OpticalSetup | None) -> ProtonSe
     InputError
         If the setup is missing or that of a light beam.
     """
-    from napari_shadowinv.physics.setup import ProtonSetup
-
-    if not isinstance(setup, ProtonSetup):
+    if setup is None or not setup.in_pradformat:
         found = "none" if setup is None else f"kind '{setup.kind}'"
         raise InputError(
             f"a pradformat inversion needs a setup of kind 'proton', received {found}: give one, "
@@ -330,7 +323,7 @@ def check_pradformat_setup(setup: ProtonSetup | OpticalSetup | None) -> ProtonSe
     return setup
 
 
-def _inversion_attributes(setup: ProtonSetup, provenance: Provenance | None) -> dict[str, Any]:
+def _inversion_attributes(setup: Any, provenance: Provenance | None) -> dict[str, Any]:
     attributes: dict[str, Any] = {
         "object_type": "inversion",
         "inversion_type": "simple",

@@ -31,7 +31,7 @@ from napari_shadowinv.preprocessing import Radiograph
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["read", "read_dataset", "read_radiograph", "read_toml"]
 
@@ -154,13 +154,13 @@ def _radiograph(path: Path, kind: str, array: NDArray[Any], metadata: dict[str, 
     )
 
 
-def _complete_setup(path: Path, geometry: dict[str, Any]) -> ProtonSetup | None:
+def _complete_setup(path: Path, geometry: dict[str, Any]) -> Setup | None:
     if not (geometry.keys() >= _COMPLETE and {"pixel_size", "detector_pixel_size"} & set(geometry)):
         return None
-    from napari_shadowinv._system.validation import validated
-    from napari_shadowinv.physics.setup import ProtonSetup
+    from napari_shadowinv.physics.setup import setup_from_dict
 
-    return validated(ProtonSetup, geometry, str(path))
+    # What tells an energy is a beam of particles.
+    return setup_from_dict({"kind": "proton", **geometry}, str(path))
 
 
 def read_radiograph(

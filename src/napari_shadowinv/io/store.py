@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from napari_shadowinv._system.safety import refusing_damage, small_text
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.inversion.labels import field_in_si, setup_from_dataset, variable_labels
+from napari_shadowinv.inversion.labels import setup_from_dataset, variable_labels
 from napari_shadowinv.io.files import check_folder_of
 
 if TYPE_CHECKING:
@@ -363,4 +363,4 @@ def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
 
 
 def _field_of_block(block: NDArray[Any], name: str, setup: Any) -> NDArray[np.float64]:
-    return np.stack([field_in_si(name, values, setup) for values in block])
+    return np.stack([setup.field_in_si(name, values) for values in block])

@@ -98,7 +98,7 @@ def read_text(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
     array : ndarray of float64, shape (H, W)
         The numbers, the first line on top.
     metadata : dict
-        ``bits``; ``geometry``, the fields of `ProtonSetup` that the comments tell; and, where
+        ``bits``; ``geometry``, the fields of a setup that the comments tell; and, where
         the file holds them, ``source``, the image without the object, and ``mask``, True where
         a pixel can be used.
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.error_bars import Uncertainty
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["IMAGE_SUFFIXES", "RESULT_SUFFIXES", "write"]
 
@@ -40,7 +40,7 @@ def write(
     path: str | Path,
     result: Inversion | Uncertainty | xarray.Dataset | NDArray[Any],
     *,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write a result or an image in the format that the path's ending names.
@@ -53,7 +53,7 @@ def write(
         value white).
     result : Inversion or Uncertainty or xarray.Dataset or ndarray of shape (H, W)
         What to write.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Adds SI units; pradformat needs it. A dataset brings its own.
     overwrite : bool
         Whether an existing file may be replaced.
@@ -90,7 +90,7 @@ def write(
 
 def _dataset(
     result: Inversion | Uncertainty | xarray.Dataset,
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
 ) -> xarray.Dataset:
     import xarray as xr
 
@@ -128,7 +128,7 @@ def _require(dataset: xarray.Dataset, names: tuple[str, ...]) -> None:
         )
 
 
-def _write_image(path: Path, plane: NDArray[Any], setup: ProtonSetup | OpticalSetup | None) -> None:
+def _write_image(path: Path, plane: NDArray[Any], setup: Setup | None) -> None:
     if plane.ndim != 2 or plane.size == 0:
         raise InputError(f"image has shape {plane.shape}: expected (height, width)")
     if path.suffix.lower() == ".npy":

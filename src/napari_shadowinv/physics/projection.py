@@ -24,15 +24,16 @@ their images. The object is thin: rays go straight through it, whatever their di
 from __future__ import annotations
 
 import math
-from typing import Literal, TypedDict, Unpack, get_args
+from typing import TypedDict, Unpack, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.setup import Deflector, Setup
 
 __all__ = [
     "Deflector",
@@ -42,13 +43,6 @@ __all__ = [
     "transferred_displacement",
 ]
 
-FloatArray = NDArray[np.float64]
-AnySetup = ProtonSetup | OpticalSetup
-
-Deflector = Literal["magnetic field", "electric field", "plasma", "refractive index"]
-
-_OF_PARTICLES: tuple[Deflector, ...] = ("magnetic field", "electric field")
-_OF_LIGHT: tuple[Deflector, ...] = ("plasma", "refractive index")
 # A cubic spline needs four samples.
 _SMALLEST_SIDE = 4
 # Share of a pixel by which rounding may put an image's edge beyond the other's.
@@ -59,8 +53,8 @@ _SAME = 1e-9
 
 def project(
     displacement: ArrayLike,
-    made_with: AnySetup,
-    setup: AnySetup,
+    made_with: Setup,
+    setup: Setup,
     *,
     deflector: Deflector | None = None,
     dispersion: float = 1.0,
@@ -75,7 +69,7 @@ def project(
     ----------
     displacement : array_like, shape (2, H, W)
         Displacement in px of `made_with`, axis order (y, x), such as `Inversion.displacement`.
-    made_with, setup : ProtonSetup or OpticalSetup
+    made_with, setup : Setup
         The experiment that the displacement belongs to, and the one to predict.
     deflector, dispersion, shape
         See `transferred_displacement`.
@@ -125,8 +119,8 @@ class _Keywords(TypedDict, total=False):
 
 def project_potential(
     potential: ArrayLike,
-    made_with: AnySetup,
-    setup: AnySetup,
+    made_with: Setup,
+    setup: Setup,
     **keywords: Unpack[_Keywords],
 ) -> FloatArray:
     """Image that a potential in SI units makes, in its own or in another experiment.
@@ -136,7 +130,7 @@ def project_potential(
     potential : array_like, shape (H, W)
         Potential Φ in m at the centres of the pixels of `made_with`, as its `potential` gives
         it; `displacement_from_potential` takes the gradient.
-    made_with, setup : ProtonSetup or OpticalSetup
+    made_with, setup : Setup
         The experiment that the potential belongs to, and the one to predict.
     deflector, dispersion, source, shape, rays_per_pixel, threads
         See `project`.
@@ -157,8 +151,8 @@ def project_potential(
 
 def transferred_displacement(
     displacement: ArrayLike,
-    made_with: AnySetup,
-    setup: AnySetup,
+    made_with: Setup,
+    setup: Setup,
     *,
     deflector: Deflector | None = None,
     dispersion: float = 1.0,
@@ -170,7 +164,7 @@ def transferred_displacement(
     ----------
     displacement : array_like, shape (2, H, W)
         Displacement in px of `made_with`, axis order (y, x).
-    made_with, setup : ProtonSetup or OpticalSetup
+    made_with, setup : Setup
         The experiment that the displacement belongs to, and the other one.
     deflector : {"magnetic field", "electric field", "plasma", "refractive index"}, optional
         What bends the beam. Default: see `default_deflector`.
@@ -215,12 +209,12 @@ def transferred_displacement(
     return factor * _resampled(field, size, ratio)
 
 
-def default_deflector(made_with: AnySetup, setup: AnySetup) -> Deflector:
+def default_deflector(made_with: Setup, setup: Setup) -> Deflector:
     """What is taken to bend the beam if nobody says so.
 
     Parameters
     ----------
-    made_with, setup : ProtonSetup or OpticalSetup
+    made_with, setup : Setup
         Two experiments.
 
     Returns
@@ -235,57 +229,40 @@ def default_deflector(made_with: AnySetup, setup: AnySetup) -> Deflector:
         If the wavelengths differ: then it has to be told. Also if one experiment uses
         particles and the other light.
     """
-    if isinstance(made_with, ProtonSetup) and isinstance(setup, ProtonSetup):
-        return "magnetic field"
-    if not (isinstance(made_with, OpticalSetup) and isinstance(setup, OpticalSetup)):
-        raise InputError(
-            f"the field was measured with a setup of kind {made_with.kind!r}, but the image is "
-            f"requested for kind {setup.kind!r}: expected the same kind; the deflection of light "
-            "does not determine that of particles"
-        )
-    if made_with.wavelength != setup.wavelength:
-        raise InputError(
-            f"the wavelengths differ ({made_with.wavelength:g} and {setup.wavelength:g} m) but "
-            "no deflector was given: choose 'plasma' (angles scale with the wavelength squared) "
-            "or 'refractive index' (angles are unchanged, apart from dispersion)"
-        )
-    return "refractive index"
+    _require_same_kind(made_with, setup)
+    return setup.default_deflector(made_with)
 
 
 def _angle_ratio(
-    made_with: AnySetup, setup: AnySetup, deflector: Deflector | None, dispersion: float
+    made_with: Setup, setup: Setup, deflector: Deflector | None, dispersion: float
 ) -> float:
     """Deflection angle in the new experiment over that in the old one."""
     if not (math.isfinite(dispersion) and dispersion != 0):
         raise InputError(f"dispersion is {dispersion:g}: it must be a finite number, not 0")
-    usual = default_deflector(made_with, setup) if deflector is None else deflector
-    if usual not in get_args(Deflector):
+    if deflector is not None and deflector not in get_args(Deflector):
         raise InputError(
-            f"deflector is {usual!r}: it must be one of {', '.join(get_args(Deflector))}"
+            f"deflector is {deflector!r}: it must be one of {', '.join(get_args(Deflector))}"
         )
+    usual = deflector or default_deflector(made_with, setup)
     if dispersion != 1 and usual != "refractive index":
         raise InputError(
             f"dispersion is {dispersion:g}, but it does not apply to a {usual}: leave it out"
         )
-    if isinstance(made_with, ProtonSetup) and isinstance(setup, ProtonSetup):
-        _require(usual, _OF_PARTICLES, "particles")
-        ratio = setup.particle.charge / made_with.particle.charge
-        ratio *= made_with.momentum / setup.momentum
-        return ratio * made_with.velocity / setup.velocity if usual == "electric field" else ratio
-    if isinstance(made_with, OpticalSetup) and isinstance(setup, OpticalSetup):
-        _require(usual, _OF_LIGHT, "light")
-        if usual == "plasma":
-            return made_with.critical_density / setup.critical_density
-        return dispersion
-    default_deflector(made_with, setup)  # says why not
-    raise AssertionError("unreachable")
-
-
-def _require(deflector: Deflector, possible: tuple[Deflector, ...], beam: str) -> None:
-    if deflector not in possible:
+    _require_same_kind(made_with, setup)
+    if usual not in setup.deflectors:
         raise InputError(
-            f"deflector is {deflector!r}, but the beam is {beam}: expected "
-            f"{' or '.join(map(repr, possible))}"
+            f"deflector is {usual!r}, but the beam is {setup.beam}: expected "
+            f"{' or '.join(map(repr, setup.deflectors))}"
+        )
+    return setup.angle_ratio(made_with, usual) * dispersion
+
+
+def _require_same_kind(made_with: Setup, setup: Setup) -> None:
+    if made_with.kind != setup.kind:
+        raise InputError(
+            f"the field was measured with a setup of kind {made_with.kind!r}, but the image is "
+            f"requested for kind {setup.kind!r}: expected the same kind; the deflection of light "
+            "does not determine that of particles"
         )
 
 
@@ -311,7 +288,7 @@ def _shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
 
 
 def _checked_shape(
-    shape: tuple[int, int], old: tuple[int, int], ratio: float, setup: AnySetup
+    shape: tuple[int, int], old: tuple[int, int], ratio: float, setup: Setup
 ) -> tuple[int, int]:
     if len(shape) != 2 or min(shape) < _SMALLEST_SIDE:
         raise InputError(

@@ -5,8 +5,6 @@
 - frames of a film of many shots: `stack_frames`, for a GIF also `in_few_colours`; the film:
   `write_film`
 - write a figure, whole or not at all: `save_figure`
-- the field that an experimenter asks for, in a handy unit: `shown_fields`; the potential:
-  `shown_potential`
 
 The figures use matplotlib's objects and no pyplot, so they neither need a window nor
 disturb the figures of a notebook.
@@ -14,16 +12,12 @@ disturb the figures of a notebook.
 
 from napari_shadowinv.plotting._figures import comparison_figure, report_figure, save_figure
 from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
-from napari_shadowinv.plotting._units import ShownField, shown_fields, shown_potential
 
 __all__ = [
-    "ShownField",
     "comparison_figure",
     "in_few_colours",
     "report_figure",
     "save_figure",
-    "shown_fields",
-    "shown_potential",
     "stack_frames",
     "write_film",
 ]

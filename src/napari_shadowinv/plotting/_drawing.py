@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv.physics.units import ShownField, shown_potential
 from napari_shadowinv.plotting._panels import Panel
-from napari_shadowinv.plotting._units import ShownField, shown_potential
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing
+from napari_shadowinv.physics.units import ShownField, shown_fields
 from napari_shadowinv.plotting._drawing import (
     draw_cuts,
     draw_field,
@@ -20,14 +21,19 @@ from napari_shadowinv.plotting._drawing import (
     draw_residual,
     draw_side_by_side,
 )
-from napari_shadowinv.plotting._panels import STYLE, choose_grid, new_page, write_footer
-from napari_shadowinv.plotting._units import ShownField, image_scale, shown_fields
+from napari_shadowinv.plotting._panels import (
+    STYLE,
+    choose_grid,
+    image_scale,
+    new_page,
+    write_footer,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 DOTS_PER_INCH = 160  # of a figure's file
 _ALARM_COLOUR = "#b00020"
@@ -36,7 +42,7 @@ _QUIET_COLOUR = "0.3"
 
 def report_figure(
     inversion: Inversion,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     *,
     title: str | None = None,
 ) -> Figure:
@@ -50,7 +56,7 @@ def report_figure(
     ----------
     inversion : Inversion
         The result.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Gives axes in metres and the field in SI units; pixels without.
     title : str, optional
         A heading, such as the shot's name.
@@ -81,7 +87,7 @@ def report_figure(
 
 def comparison_figure(
     fields: Mapping[str, ArrayLike],
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     *,
     title: str | None = None,
     caption: str = "",
@@ -92,7 +98,7 @@ def comparison_figure(
     ----------
     fields : mapping of str to array_like, shape (2, H, W)
         Displacements in px by name; the first is the reference.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Gives axes in metres and the field in SI units; pixels without.
     title : str, optional
         A heading.

@@ -26,8 +26,8 @@ from napari_shadowinv._system.interrupts import interrupts_put_off
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.files import replacing
-from napari_shadowinv.plotting._panels import STYLE, choose_grid, new_page
-from napari_shadowinv.plotting._units import _prefix, image_scale
+from napari_shadowinv.physics.units import PREFIXED_UNITS, prefix_for
+from napari_shadowinv.plotting._panels import STYLE, choose_grid, image_scale, new_page
 
 if TYPE_CHECKING:
     import xarray
@@ -36,7 +36,6 @@ __all__ = ["in_few_colours", "stack_frames", "write_film"]
 
 _DOTS_PER_INCH = 120
 _OUTLIERS = 0.02  # share of the shots whose extremes may lie beyond the colour scale
-_UNITS_WITH_PREFIX = {"m", "rad", "T m", "V"}
 _COLOURS = "viridis"
 _QUALITY = 10  # constant rate factor of H.264: 0 is without loss, 51 the worst
 _GREYS = 56  # of the colours of a GIF, for what is written
@@ -84,7 +83,9 @@ def stack_frames(
     if not high > low:
         raise InputError(f"limits are {low:g} and {high:g}: the second must be larger")
     unit = str(field.attrs.get("units", ""))
-    factor, prefix = _prefix(max(abs(low), abs(high))) if unit in _UNITS_WITH_PREFIX else (1.0, "")
+    factor, prefix = 1.0, ""
+    if unit in PREFIXED_UNITS:
+        factor, prefix = prefix_for(max(abs(low), abs(high)))
     label = f"{field.attrs.get('long_name', variable)} ({prefix}{unit})"
     draw = _Frame((field.sizes["y"], field.sizes["x"]), setup, label, (factor * low, factor * high))
     return (

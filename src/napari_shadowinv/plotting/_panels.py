@@ -6,13 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from napari_shadowinv.plotting._units import FloatArray, Scale
+from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.physics.units import prefix_for
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from napari_shadowinv.physics.setup import Setup
 
 STYLE: Any = {
     "font.family": ["DejaVu Sans"],
@@ -31,6 +34,29 @@ STYLE: Any = {
     "axes.formatter.useoffset": False,
     "axes.formatter.limits": (-3, 5),
 }
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Lengths of the image's axes: how long a pixel is, and in which unit."""
+
+    pixel: float
+    unit: str
+
+    def extent(self, shape: tuple[int, int]) -> tuple[float, float, float, float]:
+        """Left, right, bottom and top edge, for images whose first row is on top."""
+        edges = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
+        left, right, bottom, top = (edge * self.pixel for edge in edges)
+        return left, right, bottom, top
+
+
+def image_scale(shape: tuple[int, int], setup: Setup | None) -> Scale:
+    """Metres at the object with a setup, pixels without."""
+    if setup is None:
+        return Scale(1.0, "px")
+    pixel = setup.object_pixel_size
+    factor, prefix = prefix_for(max(shape) * pixel, allowed=(-9, -6, -3, 0))
+    return Scale(pixel * factor, f"{prefix}m")
 
 
 @dataclass(frozen=True)
@@ -139,7 +165,7 @@ class Panel:
         self._label_axes()
         self._add_colour_bar(picture, label, _extend(plane, limits))
 
-    def contour(self, plane: NDArray[Any], levels: ArrayLike, colour: str, **style: Any) -> None:
+    def contour(self, plane: AnyArray, levels: ArrayLike, colour: str, **style: Any) -> None:
         """Draw lines of equal value onto the picture."""
         self.axes.contour(
             plane,
@@ -152,7 +178,7 @@ class Panel:
 
     def plot(self, values: FloatArray, **style: Any) -> None:
         """Plot a cut along an axis of the image."""
-        self.axes.plot(self.scale.centres(values.size), values, **style)
+        self.axes.plot(np.arange(values.size) * self.scale.pixel, values, **style)
 
     @property
     def width(self) -> float:

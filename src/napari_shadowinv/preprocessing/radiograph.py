@@ -13,7 +13,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["Radiograph"]
 
@@ -26,7 +26,7 @@ class Radiograph:
     ----------
     image : ndarray of float64, shape (H, W)
         Intensity or counts, ``[y, x]``, as stored.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         The geometry, where the file tells all of it.
     path : Path or None
         The file it comes from.
@@ -44,7 +44,7 @@ class Radiograph:
     """
 
     image: FloatArray
-    setup: ProtonSetup | OpticalSetup | None = None
+    setup: Setup | None = None
     path: Path | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     source: FloatArray | None = None

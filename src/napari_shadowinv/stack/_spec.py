@@ -29,7 +29,7 @@ from napari_shadowinv.stack._references import Reader, Shot, described_reader
 from napari_shadowinv.stack._worker import Beam, Work, shared_plan, threads_here
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "Stack",
@@ -59,7 +59,7 @@ class Stack:
         The pixels that can be used.
     options : InversionOptions
         Choices.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         For fields in SI units.
     variables : tuple of str
         The variables that are wanted.
@@ -78,7 +78,7 @@ class Stack:
     sources: Shots | None
     mask: NDArray[np.bool_] | None
     options: InversionOptions
-    setup: ProtonSetup | OpticalSetup | None
+    setup: Setup | None
     variables: tuple[str, ...]
     preparation: Preparation
     warm_start: int = 1
@@ -135,7 +135,7 @@ def describe_stack(
     source: Any,
     mask: ArrayLike | None,
     options: InversionOptions | None,
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
     variables: Collection[str] | None,
     reader: Reader,
     warm_start: int,
@@ -217,7 +217,7 @@ def describe_stack(
 def _checked_variables(
     wanted: Collection[str] | None,
     options: InversionOptions,
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
     *,
     own_sources: bool,
 ) -> tuple[str, ...]:

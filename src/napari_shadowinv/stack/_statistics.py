@@ -8,22 +8,15 @@ import numpy as np
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.store import DONE
+from napari_shadowinv.physics.setup import SETUPS
 
 if TYPE_CHECKING:
     import xarray
 
 __all__ = ["stack_statistics"]
 
-_AVERAGED = (
-    "potential",
-    "displacement",
-    "potential_si",
-    "deflection_angle",
-    "path_integrated_b",
-    "path_integrated_e",
-    "line_integrated_log_index",
-    "line_integrated_density",
-)
+_IN_SI = dict.fromkeys(field.name for kind in SETUPS.values() for field in kind.si_fields)
+_AVERAGED = ("potential", "displacement", *_IN_SI)
 
 
 def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:

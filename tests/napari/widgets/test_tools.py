@@ -14,9 +14,7 @@ from qtpy.QtWidgets import QFileDialog
 from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import mark, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_inversion
-from napari_shadowinv._napari.widgets.forward_model import DEFLECTORS
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.labels import displacement_from_potential
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import (
     coaxial_line,
@@ -26,7 +24,8 @@ from napari_shadowinv.physics.phantoms import (
     wakefield,
     wakefield_setup,
 )
-from napari_shadowinv.physics.projection import Deflector, project
+from napari_shadowinv.physics.projection import project
+from napari_shadowinv.physics.setup import Deflector, displacement_from_potential
 from napari_shadowinv.preprocessing import sources
 
 Array = np.ndarray[Any, Any]
@@ -173,9 +172,10 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     window: Any, open_widget: Any, qtbot: Any, told: list[str], solved: Inversion,
     proton_setup: ProtonSetup,
 ) -> None:  # fmt: skip
-    assert get_args(Deflector) == DEFLECTORS
     add_inversion(window, solved, proton_setup, name="solved")
     tool = open_widget("Forward model")
+    shown = [tool.deflector.itemData(index) for index in range(tool.deflector.count())]
+    assert tuple(shown[1:]) == get_args(Deflector)
     tool.object.set_kind("layer")
     slow = proton_setup.model_copy(update={"energy": 3.0})
     tool.setup.show_setup(slow.model_dump())

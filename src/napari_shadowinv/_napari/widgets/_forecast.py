@@ -17,8 +17,7 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.options import InversionOptions
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.projection import Deflector
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Deflector, Setup
 
 __all__ = ["Forecast", "ForwardJob"]
 
@@ -79,9 +78,9 @@ class ForwardJob:
         Height and width of a phantom's image; a potential has its own.
     to_px2 : float
         Factor that brings the potential to px².
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         The experiment; a magnetic phantom needs it.
-    made_with : ProtonSetup or OpticalSetup, optional
+    made_with : Setup, optional
         The experiment that the field was found in, if it is another one.
     deflector : str, optional
         What bends the beam, see `napari_shadowinv.physics.projection`.
@@ -94,8 +93,8 @@ class ForwardJob:
     field: ArrayLike | PhantomRecipe
     shape: tuple[int, int] = (200, 200)
     to_px2: float = 1.0
-    setup: ProtonSetup | OpticalSetup | None = None
-    made_with: ProtonSetup | OpticalSetup | None = None
+    setup: Setup | None = None
+    made_with: Setup | None = None
     deflector: Deflector | None = None
     source: ArrayLike | None = None
     caustic_jacobian: float = InversionOptions.model_fields["caustic_jacobian"].default
@@ -157,7 +156,7 @@ class ForwardJob:
         return moved, f"For another setup, assuming that only a {deflector} deflects the beam."
 
     def _displacement(self) -> Image:
-        from napari_shadowinv.inversion.labels import displacement_from_potential
+        from napari_shadowinv.physics.setup import displacement_from_potential
 
         if isinstance(self.field, PhantomRecipe):
             return self.field.phantom(self.shape, self.setup).displacement

@@ -27,7 +27,7 @@ from napari_shadowinv.preprocessing import Estimate, Filter, Preparation, Unifor
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.transport.sites import SitePlan
 
 __all__ = ["PREVIEW_SITES", "Crop", "PlanCache", "ShotJob", "SourceJob", "plane_of"]
@@ -129,7 +129,7 @@ class ShotJob:
         Whether to be quick rather than exact.
     source_mask : ndarray of bool, shape (H, W), optional
         True where the object is not: an estimate of the source looks at no other pixels.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         The experiment, for what depends on it before the inversion.
     warnings : tuple of str
         What is known against the image, for the report.
@@ -145,7 +145,7 @@ class ShotJob:
     estimates: SourceCache = field(default_factory=SourceCache)
     preview: bool = False
     source_mask: Mask | None = None
-    setup: ProtonSetup | OpticalSetup | None = None
+    setup: Setup | None = None
     warnings: tuple[str, ...] = ()
 
     def for_preview(self) -> ShotJob:

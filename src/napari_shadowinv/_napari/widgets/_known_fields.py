@@ -24,7 +24,7 @@ from napari_shadowinv._napari.widgets._reading import image_of, shown_plane
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["KnownField", "is_surely_a_field", "known_field", "may_be_a_field"]
 
@@ -41,7 +41,7 @@ class KnownField:
         The potential, or the displacement in px.
     to_px2 : float
         Factor that brings the potential to px².
-    made_with : ProtonSetup or OpticalSetup or None
+    made_with : Setup or None
         The experiment that it belongs to, where the layer knows it.
     text : str
         What it is taken for, in a sentence.
@@ -49,7 +49,7 @@ class KnownField:
 
     values: ArrayLike
     to_px2: float
-    made_with: ProtonSetup | OpticalSetup | None
+    made_with: Setup | None
     text: str
 
 
@@ -75,7 +75,7 @@ def known_field(layer: Any | None, point: Any, setup: Any) -> KnownField:
         A potential, a layer of a result, or an image of a potential in px².
     point : sequence of float
         Where the viewer is along all axes: of a stack, the shot in view counts.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         The experiment of a potential in m that does not know its own.
 
     Raises

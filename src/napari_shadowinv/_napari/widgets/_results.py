@@ -41,7 +41,7 @@ def result_frame(image: Any, setup: Any | None, crop: tuple[slice, slice] | None
     ----------
     image : napari.layers.Image
         The shot.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         The experiment.
     crop : tuple of slice, optional
         The part that is inverted.
@@ -66,7 +66,7 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
         Its camera follows where the image goes.
     image : napari.layers.Image
         The shot.
-    setup : ProtonSetup or OpticalSetup
+    setup : Setup
         The experiment.
     companions : sequence of napari.layers.Layer
         Source, mask and crop: those that lie as the image does go with it, and so do other

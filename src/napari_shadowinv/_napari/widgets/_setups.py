@@ -5,37 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pydantic import BaseModel
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QVBoxLayout, QWidget
 
 from napari_shadowinv._napari.layer_metadata import CAME_WITH, keep_setup, setup_of, setup_origin_of
-from napari_shadowinv._napari.widgets._forms import ModelPicker, wrapping_label
+from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, wrapping_label
 from napari_shadowinv._napari.widgets._toml import TomlButtons
 from napari_shadowinv.errors import InputError
-
-if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
 
 __all__ = ["SetupPicker"]
 
 _NONE = "none"
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
-
-
-def _proton() -> type[BaseModel]:
-    from napari_shadowinv.physics.setup import ProtonSetup
-
-    return ProtonSetup
-
-
-def _optical() -> type[BaseModel]:
-    from napari_shadowinv.physics.setup import OpticalSetup
-
-    return OpticalSetup
 
 
 @dataclass(frozen=True)
@@ -47,11 +32,11 @@ class _Given:
 
 
 class SetupPicker(QWidget):
-    """No setup, particles or light, with buttons for TOML files.
+    """No setup or one of a kind, with buttons for TOML files.
 
     A setup belongs to an image: it is kept with the image's layer, and another image without
     one starts with none. What the user has typed or loaded for one image is in the form when
-    he chooses particles or light for the next, in the next session too; a line tells where
+    he chooses its kind for the next, in the next session too; a line tells where
     it comes from. What came with a file is never handed on.
 
     Signals
@@ -69,12 +54,7 @@ class SetupPicker(QWidget):
         self._own: dict[str, _Given] = {}
         self._shown: dict[str, _Given] = {}
         self.picker = ModelPicker(
-            "Setup",
-            {
-                _NONE: ("none: results in pixels", None),
-                "proton": ("particles (protons, …)", _proton),
-                "optical": ("light", _optical),
-            },
+            "Setup", {_NONE: ("none: results in pixels", None), **kinds_of(SETUPS)}
         )
         self.picker.choice.setToolTip(
             "<qt>With a setup the results are in SI units; lengths can be entered as 1.3 mm or "
@@ -89,7 +69,7 @@ class SetupPicker(QWidget):
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
 
-    def setup(self) -> ProtonSetup | OpticalSetup | None:
+    def setup(self) -> Setup | None:
         """The validated setup.
 
         Raises
@@ -154,12 +134,12 @@ class SetupPicker(QWidget):
             self._show(_NONE)
             self.changed.emit()
 
-    def suggest(self, setup: ProtonSetup | OpticalSetup, origin: str) -> None:
+    def suggest(self, setup: Setup, origin: str) -> None:
         """Show a setup that is not the user's own, until he changes it.
 
         Parameters
         ----------
-        setup : ProtonSetup or OpticalSetup
+        setup : Setup
             The setup.
         origin : str
             Where it comes from.
@@ -243,8 +223,6 @@ class SetupPicker(QWidget):
         return {} if setup is None else setup.model_dump()
 
     def _take(self, loaded: dict[str, object], path: str) -> None:
-        from napari_shadowinv.physics.setup import setup_from_dict
-
         values = setup_from_dict(loaded, path).model_dump()
         whom = self._typed().removeprefix("typed")
         self.show_setup(values, f"loaded from {Path(path).name}{whom}")

@@ -153,7 +153,7 @@ def place_on(layer: Any, setup: Any) -> dict[str, Any]:
     ----------
     layer : napari.layers.Image
         The stack.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         The experiment.
 
     Returns

@@ -19,7 +19,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Estimate, Filter, UniformEstimate
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.stack import RunProgress
 
 __all__ = ["RunBooks", "StackJob"]
@@ -91,7 +91,7 @@ class StackJob:
     mask: Mask | None = None
     cleaning: Filter | None = None
     options: InversionOptions = field(default_factory=InversionOptions)
-    setup: ProtonSetup | OpticalSetup | None = None
+    setup: Setup | None = None
     scheduler: str = "threads"
     workers: int | None = None
     overwrite: bool = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from qtpy.QtWidgets import QHBoxLayout, QLabel, QSpinBox, QWidget
 
@@ -34,14 +34,13 @@ from napari_shadowinv._napari.widgets._results import LastResults, keep_earlier_
 from napari_shadowinv._napari.widgets._runner import Outcome
 from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.setup import SETUPS, Deflector
 
 if TYPE_CHECKING:
     import napari
 
-__all__ = ["DEFLECTORS", "ForwardModel"]
+__all__ = ["ForwardModel"]
 
-# As `napari_shadowinv.physics.projection.Deflector`, whose module takes a second to import.
-DEFLECTORS = ("magnetic field", "electric field", "plasma", "refractive index")
 
 _LAYER = "layer"
 _LARGEST_SIDE = 20_000
@@ -79,7 +78,7 @@ class ForwardModel(ToolPanel):
         self.expected = wrapping_label()
         self.deflector = SteadyComboBox()
         self.deflector.addItem("default for the beam", None)
-        for name in DEFLECTORS:
+        for name in get_args(Deflector):
             self.deflector.addItem(name, name)
         self.deflector.setToolTip(
             "<qt>What deflects the beam. This matters only if the setup differs from that of "
@@ -199,7 +198,7 @@ class ForwardModel(ToolPanel):
         self.setup.picker.set_kind(kind)
         form = self.setup.picker.form
         if form is not None and form.is_empty:
-            self.setup.suggest(_usual_setup(kind), "the paper's beam")
+            self.setup.suggest(SETUPS[kind].example(), "the paper's beam")
 
     def _follow_potential(self) -> None:
         """A potential has the setup of its result; a phantom that of the user."""
@@ -261,13 +260,6 @@ class ForwardModel(ToolPanel):
         self.viewer.reset_view()
         self.warning.setText(forecast.warning)
         self.warning.setVisible(bool(forecast.warning))
-
-
-def _usual_setup(kind: str) -> Any:
-    """The paper's beam of protons or of light."""
-    from napari_shadowinv.physics.phantoms import paper_setup, wakefield_setup
-
-    return paper_setup() if kind == "proton" else wakefield_setup()
 
 
 def _side(what: str) -> QSpinBox:

@@ -70,12 +70,7 @@ def paper_setup() -> ProtonSetup:
     >>> paper_setup().magnification
     16.38
     """
-    return ProtonSetup(
-        energy=14.7,
-        source_object_distance=1.3e-3,
-        object_image_distance=2e-2,
-        pixel_size=1.5e-6,
-    )
+    return ProtonSetup.example()
 
 
 def four_toroids(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:

@@ -36,7 +36,7 @@ def wakefield_setup() -> OpticalSetup:
     ----------
     Kasim et al., arXiv:1607.04179, Section V.
     """
-    return OpticalSetup(wavelength=810e-9, object_image_distance=20e-6, pixel_size=0.25e-6)
+    return OpticalSetup.example()
 
 
 def plasma_wavelength(density: float) -> float:

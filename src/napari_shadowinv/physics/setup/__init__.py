@@ -1,10 +1,12 @@
 """The experiment's geometry and probe, and what they make of a displacement.
 
-- describe an experiment: `ProtonSetup`, `OpticalSetup`; either of them: `Setup`
+- describe an experiment: `ProtonSetup`, `OpticalSetup`; any of them: `Setup`, by kind `SETUPS`
+- what a kind of setup says of itself: `BeamSetup`, `SIField`, `MainField`, `Deflector`
 - get it back from a file's content: `setup_from_dict`; with larger pixels: `binned_setup`
 - convert pixels to SI and back: `BeamSetup.deflection_angle`, `BeamSetup.displacement`,
   `BeamSetup.potential`, `BeamSetup.normalized_potential`
-- from a potential in SI to a displacement in pixels: `BeamSetup.displacement_from_potential`
+- the gradient of a potential in pixels: `displacement_from_potential`; of one in SI:
+  `BeamSetup.displacement_from_potential`
 - path-integrated fields of particles: `ProtonSetup.path_integrated_b`,
   `ProtonSetup.path_integrated_e`; back: `ProtonSetup.displacement_from_path_integrated_b`,
   `ProtonSetup.displacement_from_path_integrated_e`
@@ -29,41 +31,54 @@ place where the potential is zero.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
 from napari_shadowinv._system.validation import nearest, validated
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup._beam import BeamSetup
-from napari_shadowinv.physics.setup._optical import OpticalSetup
+from napari_shadowinv.physics.setup._beam import (
+    BeamSetup,
+    MainField,
+    SIField,
+    displacement_from_potential,
+)
+from napari_shadowinv.physics.setup._optical import LightDeflector, OpticalSetup
 from napari_shadowinv.physics.setup._proton import (
     SPECIES,
     FieldUnit,
     Particle,
+    ParticleDeflector,
     ProtonSetup,
     Species,
 )
 
 __all__ = [
+    "SETUPS",
     "SPECIES",
     "BeamSetup",
+    "Deflector",
     "FieldUnit",
+    "MainField",
     "OpticalSetup",
     "Particle",
     "ProtonSetup",
+    "SIField",
     "Setup",
     "Species",
     "binned_setup",
+    "displacement_from_potential",
     "setup_from_dict",
 ]
 
+# A further kind of setup is added here, and nowhere else.
 Setup = Annotated[ProtonSetup | OpticalSetup, Field(discriminator="kind")]
+Deflector = Literal[ParticleDeflector, LightDeflector]
 
-_KINDS: dict[str, type[ProtonSetup | OpticalSetup]] = {
-    "proton": ProtonSetup,
-    "optical": OpticalSetup,
+SETUPS: dict[str, type[Setup]] = {
+    model.model_fields["kind"].default: model for model in get_args(get_args(Setup)[0])
 }
+"""The kinds of setup by name."""
 
 _EXPECTED = (
     "it must be 'proton' (any charged particles, named by 'species': "
@@ -71,7 +86,7 @@ _EXPECTED = (
 )
 
 
-def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> ProtonSetup | OpticalSetup:
+def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
     """Make the right setup from what a file holds.
 
     Parameters
@@ -84,8 +99,8 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> ProtonS
 
     Returns
     -------
-    ProtonSetup or OpticalSetup
-        As `kind` says.
+    Setup
+        Of the class that `kind` names.
 
     Raises
     ------
@@ -111,26 +126,13 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> ProtonS
     kind = mapping.get("kind")
     if kind is None:
         raise InputError(f"{where}: 'kind' is missing, {_EXPECTED}")
-    if not isinstance(kind, str) or kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in SETUPS:
         raise InputError(f"{where}: 'kind' is {kind!r}, {_EXPECTED}{_meant(str(kind))}")
-    return validated(_KINDS[kind], mapping, where)
+    return validated(SETUPS[kind], mapping, where)
 
 
-def binned_setup(setup: ProtonSetup | OpticalSetup, factor: int) -> ProtonSetup | OpticalSetup:
-    """Return the setup of an image whose pixels were summed in blocks.
-
-    Parameters
-    ----------
-    setup : ProtonSetup or OpticalSetup
-        Setup of the image as measured.
-    factor : int
-        Side of a block in pixels.
-
-    Returns
-    -------
-    ProtonSetup or OpticalSetup
-        The same with a pixel that is `factor` times as wide.
-    """
+def binned_setup(setup: Setup, factor: int) -> Setup:
+    """Return the setup of an image whose pixels were summed in blocks of side `factor`."""
     values = setup.model_dump()
     for name in ("pixel_size", "detector_pixel_size"):
         if values.get(name) is not None:
@@ -140,7 +142,7 @@ def binned_setup(setup: ProtonSetup | OpticalSetup, factor: int) -> ProtonSetup 
 
 def _meant(kind: str) -> str:
     """What somebody may have meant who named another kind."""
-    match = nearest(kind.lower(), list(dict.fromkeys([*_KINDS, *SPECIES])))
-    if match is None or match in _KINDS:
+    match = nearest(kind.lower(), list(dict.fromkeys([*SETUPS, *SPECIES])))
+    if match is None or match in SETUPS:
         return f"; did you mean '{match}'?" if match else ""
     return f'; for this beam give kind = "proton" and species = "{match}"'

@@ -1,30 +1,84 @@
-"""What every probe has: distances, pixels, magnification, and the angles of its rays."""
+"""What every setup has, and what each kind of setup says of itself."""
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
-FloatArray = NDArray[np.float64]
+
+@dataclass(frozen=True)
+class SIField:
+    """A field in SI units: a variable of a dataset, made by a method of the setup.
+
+    A vector is made of the displacement in px, a plane of the normalised potential in px².
+    The method has the name of the variable unless another one is given.
+    """
+
+    name: str
+    unit: str
+    long_name: str
+    is_vector: bool = False
+    method: str = ""
+
+
+@dataclass(frozen=True)
+class MainField:
+    """The vector among a setup's `SIField`s that figures and layers show, and how.
+
+    `components` are the symbols along y and x; `arrows` is the title of the field's own arrows,
+    empty where they would point along the displacement.
+    """
+
+    name: str
+    title: str
+    symbol: str
+    components: tuple[str, str]
+    arrows: str = ""
 
 
 class BeamSetup(BaseModel):
     """Geometry that every probe has: distances, pixels, magnification.
 
-    Made only as a `ProtonSetup` or an `OpticalSetup`. A dump holds no None and takes
-    inf, so it can be written as TOML or JSON and read back.
+    Made only as one of its kinds, which describe themselves: nothing else asks for the kind.
+    A dump holds no None and takes inf, so it can be written as TOML or JSON and read back.
+
+    Attributes
+    ----------
+    title, beam : str
+        What the kind is called in a form, and what its beam is made of.
+    si_fields : tuple of SIField
+        What a result holds in SI units.
+    main_field : MainField
+        The one of them that is shown.
+    deflectors : tuple of str
+        What can deflect the beam; see `angle_ratio`.
+    in_pradformat : bool
+        Whether pradformat can describe the beam.
     """
+
+    title: ClassVar[str]
+    beam: ClassVar[str]
+    si_fields: ClassVar[tuple[SIField, ...]] = (
+        SIField("potential_si", "m", "Deflection potential", method="potential"),
+        SIField("deflection_angle", "rad", "Deflection angle", is_vector=True),
+    )
+    main_field: ClassVar = MainField("deflection_angle", "Deflection angle", "|α|", ("αy", "αx"))
+    deflectors: ClassVar[tuple[str, ...]]
+    in_pradformat: ClassVar[bool] = False
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
-    kind: str = Field(title="Kind", description="Kind of probe: 'proton' or 'optical'.")
+    kind: str = Field(title="Kind", description="Kind of probe.")
     source_object_distance: float = Field(
         gt=0,
         title="Source to object (m)",
@@ -185,13 +239,74 @@ class BeamSetup(BaseModel):
         InputError
             If the potential is no plane or too small to have a gradient.
         """
-        plane = self.normalized_potential(potential)
-        if plane.ndim != 2 or min(plane.shape) < 3:
-            raise InputError(
-                f"potential has shape {plane.shape}: expected (height, width), at least 3 "
-                "pixels each way"
-            )
-        return -np.stack([np.gradient(plane, axis=axis, edge_order=2) for axis in (0, 1)])
+        return displacement_from_potential(self.normalized_potential(potential))
+
+    def field_in_si(self, name: str, values: ArrayLike) -> FloatArray:
+        """One of `si_fields`, of the displacement (px) or the normalised potential (px²)."""
+        (method,) = (field.method or name for field in self.si_fields if field.name == name)
+        made: FloatArray = getattr(self, method)(values)
+        return made
+
+    @classmethod
+    def own_fields(cls) -> set[str]:
+        """Names of the fields that only this kind has."""
+        return cls.model_fields.keys() - BeamSetup.model_fields.keys()
+
+    @property
+    @abstractmethod
+    def probe(self) -> str:
+        """The beam in a few words, such as "14.7 MeV proton"."""
+
+    @classmethod
+    @abstractmethod
+    def example(cls) -> Self:
+        """Return an experiment to start from."""
+
+    @abstractmethod
+    def default_deflector(self, made_with: Any) -> str:
+        """Say what deflects the beam if nobody does, here and with a setup of the same kind.
+
+        Raises
+        ------
+        InputError
+            If it has to be told.
+        """
+
+    @abstractmethod
+    def angle_ratio(self, made_with: Any, deflector: str) -> float:
+        """Deflection angle by one object here over that with a setup of the same kind."""
+
+
+def displacement_from_potential(potential: ArrayLike) -> FloatArray:
+    """Displacement d = -∇φ by central differences, where a file tells only the potential.
+
+    Parameters
+    ----------
+    potential : array_like, shape (H, W)
+        Normalised potential in px².
+
+    Returns
+    -------
+    ndarray, shape (2, H, W)
+        Displacement in px, axis order (y, x), of second order up to the border.
+
+    Raises
+    ------
+    InputError
+        If the potential is no plane or too small to have a gradient.
+
+    Examples
+    --------
+    >>> displacement_from_potential(np.tile(np.arange(4.0) ** 2, (3, 1)))[1, 0, 1:]
+    array([-2., -4., -6.])
+    """
+    plane = np.asarray(potential, dtype=np.float64)
+    if plane.ndim != 2 or min(plane.shape) < 3:
+        raise InputError(
+            f"potential has shape {plane.shape}: expected (height, width), at least 3 pixels "
+            "each way"
+        )
+    return -np.stack([np.gradient(plane, axis=axis, edge_order=2) for axis in (0, 1)])
 
 
 def scaled(values: ArrayLike, factor: float) -> FloatArray:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, ClassVar, Literal, Self, get_args
 
 from numpy.typing import ArrayLike
 from pydantic import Field
 from scipy import constants
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup._beam import BeamSetup, FloatArray, scaled
+from napari_shadowinv.physics.setup._beam import BeamSetup, SIField, scaled
+
+LightDeflector = Literal["plasma", "refractive index"]
 
 
 class OpticalSetup(BeamSetup):
@@ -35,6 +38,19 @@ class OpticalSetup(BeamSetup):
     1.7
     """
 
+    title: ClassVar = "light"
+    beam: ClassVar = "light"
+    deflectors: ClassVar = get_args(LightDeflector)
+    si_fields: ClassVar = (
+        *BeamSetup.si_fields,
+        SIField(
+            "line_integrated_log_index", "m", "Line-integrated logarithm of the refractive index"
+        ),
+        SIField(
+            "line_integrated_density", "m⁻²", "Line-integrated electron density of a thin plasma"
+        ),
+    )
+
     kind: Literal["optical"] = Field(
         default="optical", title="Kind", description="Kind of probe: a beam of light."
     )
@@ -52,6 +68,30 @@ class OpticalSetup(BeamSetup):
         title="Wavelength (m)",
         description="Vacuum wavelength of the light, in m.",
     )
+
+    @property
+    def probe(self) -> str:
+        return f"light of {self.wavelength * 1e9:g} nm"
+
+    @classmethod
+    def example(cls) -> Self:
+        """Return the probe of the paper's plasma wave; see `phantoms.wakefield_setup`."""
+        return cls(wavelength=810e-9, object_image_distance=20e-6, pixel_size=0.25e-6)
+
+    def default_deflector(self, made_with: Any) -> LightDeflector:
+        if made_with.wavelength != self.wavelength:
+            raise InputError(
+                f"the wavelengths differ ({made_with.wavelength:g} and {self.wavelength:g} m) but "
+                "no deflector was given: choose 'plasma' (angles scale with the wavelength "
+                "squared) or 'refractive index' (angles are unchanged, apart from dispersion)"
+            )
+        return "refractive index"
+
+    def angle_ratio(self, made_with: Any, deflector: str) -> float:
+        if deflector == "refractive index":
+            return 1.0
+        ratio: float = made_with.critical_density / self.critical_density
+        return ratio
 
     @property
     def critical_density(self) -> float:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 from scipy import constants
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup._beam import BeamSetup, FloatArray
+from napari_shadowinv.physics.setup._beam import BeamSetup, MainField, SIField
 
+ParticleDeflector = Literal["magnetic field", "electric field"]
 Species = Literal["proton", "deuteron", "triton", "helion", "alpha", "electron"]
 FieldUnit = Literal["T m", "MG um"]
 
@@ -80,6 +82,34 @@ class ProtonSetup(BeamSetup):
     16.38
     """
 
+    title: ClassVar = "particles (protons, …)"
+    beam: ClassVar = "particles"
+    deflectors: ClassVar = get_args(ParticleDeflector)
+    in_pradformat: ClassVar = True
+    si_fields: ClassVar = (
+        *BeamSetup.si_fields,
+        SIField(
+            "path_integrated_b",
+            "T m",
+            "Path-integrated magnetic field, assuming purely magnetic deflection",
+            is_vector=True,
+        ),
+        SIField(
+            "path_integrated_e",
+            "V",
+            "Path-integrated electric field, assuming purely electric deflection",
+            is_vector=True,
+        ),
+    )
+    # A magnetic field is at right angles to the displacement: it has arrows of its own.
+    main_field: ClassVar = MainField(
+        "path_integrated_b",
+        "Path-integrated field",
+        "|∫B×dz|",
+        ("∫By dz", "∫Bx dz"),
+        arrows="∫B dz arrows",
+    )
+
     kind: Literal["proton"] = Field(
         default="proton", title="Kind", description="Kind of probe: a beam of charged particles."
     )
@@ -94,6 +124,30 @@ class ProtonSetup(BeamSetup):
         title="Species",
         description="Particle species; electrons are deflected the opposite way.",
     )
+
+    @property
+    def probe(self) -> str:
+        return f"{self.energy:g} MeV {self.species}"
+
+    @classmethod
+    def example(cls) -> Self:
+        """Return the experiment of the paper's benchmark; see `phantoms.paper_setup`."""
+        return cls(
+            energy=14.7,
+            source_object_distance=1.3e-3,
+            object_image_distance=2e-2,
+            pixel_size=1.5e-6,
+        )
+
+    def default_deflector(self, made_with: Any) -> ParticleDeflector:
+        return "magnetic field"
+
+    def angle_ratio(self, made_with: Any, deflector: str) -> float:
+        ratio: float = self.particle.charge / made_with.particle.charge
+        ratio *= made_with.momentum / self.momentum
+        if deflector == "electric field":
+            ratio = ratio * made_with.velocity / self.velocity
+        return ratio
 
     @property
     def particle(self) -> Particle:

@@ -1,54 +1,38 @@
-"""Lengths, fields and potentials in units whose numbers are handy to read."""
+"""Fields and potentials in units whose numbers are handy to read.
+
+- the field that an experimenter asks for: `shown_fields`; the potential: `shown_potential`
+- the prefix for a number: `prefix_for`; the units that take one: `PREFIXED_UNITS`
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup, Setup
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.physics.setup import SETUPS, Setup
 
-FloatArray = NDArray[np.float64]
+__all__ = ["PREFIXED_UNITS", "ShownField", "prefix_for", "shown_fields", "shown_potential"]
 
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 
+# The prefix of a power, such as m⁻², would be raised to that power.
+PREFIXED_UNITS = {
+    field.unit
+    for kind in SETUPS.values()
+    for field in kind.si_fields
+    if field.unit.replace(" ", "").isalpha()
+}
 
-def _prefix(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> tuple[float, str]:
+
+def prefix_for(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> tuple[float, str]:
     """Return the factor and the SI prefix that bring a value to 1 or more."""
     if not largest > 0 or not np.isfinite(largest):
         return 1.0, ""
     power = max((p for p in allowed if largest >= 10.0**p), default=min(allowed))
     return 10.0**-power, _PREFIXES[power]
-
-
-@dataclass(frozen=True)
-class Scale:
-    """Lengths of the image's axes: how long a pixel is, and in which unit."""
-
-    pixel: float
-    unit: str
-
-    def extent(self, shape: tuple[int, int]) -> tuple[float, float, float, float]:
-        """Left, right, bottom and top edge, for images whose first row is on top."""
-        edges = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
-        left, right, bottom, top = (edge * self.pixel for edge in edges)
-        return left, right, bottom, top
-
-    def centres(self, count: int) -> FloatArray:
-        return np.arange(count, dtype=np.float64) * self.pixel
-
-
-def image_scale(shape: tuple[int, int], setup: Setup | None) -> Scale:
-    """Metres at the object with a setup, pixels without."""
-    if setup is None:
-        return Scale(1.0, "px")
-    pixel = setup.object_pixel_size
-    factor, prefix = _prefix(max(shape) * pixel, allowed=(-9, -6, -3, 0))
-    return Scale(pixel * factor, f"{prefix}m")
 
 
 @dataclass(frozen=True)
@@ -61,12 +45,18 @@ class ShownField:
         Components in axis order (y, x).
     name, symbol, unit : str
         What it is.
+    components : tuple of str
+        Symbols of the y and the x component.
+    arrows : str
+        Title of the field's arrows; empty where they would point along the displacement.
     """
 
     vectors: FloatArray
     name: str
     symbol: str
     unit: str
+    components: tuple[str, str]
+    arrows: str = ""
 
     @property
     def magnitude(self) -> FloatArray:
@@ -91,18 +81,16 @@ class ShownField:
         return f"{text} ({largest * 10.0**power / 1e-4:.3g} MG·µm)"
 
 
-def shown_fields(
-    displacements: Collection[FloatArray], setup: ProtonSetup | OpticalSetup | None
-) -> list[ShownField]:
+def shown_fields(displacements: Collection[FloatArray], setup: Setup | None) -> list[ShownField]:
     """Turn displacements into what an experimenter asks for, in one unit for all.
 
     Parameters
     ----------
     displacements : collection of ndarray, shape (2, H, W)
         Displacements in px.
-    setup : ProtonSetup or OpticalSetup or None
-        With it, the path-integrated magnetic field of particles, or the deflection angle of
-        light; without, the displacement in px.
+    setup : Setup or None
+        With it, the main field of its kind: the path-integrated magnetic field of particles,
+        or the deflection angle of light; without, the displacement in px.
 
     Returns
     -------
@@ -110,15 +98,16 @@ def shown_fields(
         One for each displacement.
     """
     if setup is None:
-        return [ShownField(d, "Displacement", "|d|", "px") for d in displacements]
-    if setup.kind == "proton":
-        fields = [setup.path_integrated_b(d) for d in displacements]
-        name, symbol, unit = "Path-integrated field", "|∫B×dz|", "T·m"
-    else:
-        fields = [setup.deflection_angle(d) for d in displacements]
-        name, symbol, unit = "Deflection angle", "|α|", "rad"
-    factor, prefix = _prefix(max(float(np.hypot(*field).max()) for field in fields))
-    return [ShownField(field * factor, name, symbol, f"{prefix}{unit}") for field in fields]
+        return [ShownField(d, "Displacement", "|d|", "px", ("dy", "dx")) for d in displacements]
+    main = setup.main_field
+    (unit,) = (field.unit for field in setup.si_fields if field.name == main.name)
+    fields = [setup.field_in_si(main.name, d) for d in displacements]
+    factor, prefix = prefix_for(max(float(np.hypot(*field).max()) for field in fields))
+    unit = prefix + unit.replace(" ", "·")
+    return [
+        ShownField(field * factor, main.title, main.symbol, unit, main.components, main.arrows)
+        for field in fields
+    ]
 
 
 def shown_potential(potential: FloatArray, setup: Setup | None) -> tuple[FloatArray, str]:
@@ -126,5 +115,5 @@ def shown_potential(potential: FloatArray, setup: Setup | None) -> tuple[FloatAr
     if setup is None:
         return potential, "px²"
     metres = setup.potential(potential)
-    factor, prefix = _prefix(float(np.abs(metres).max()))
+    factor, prefix = prefix_for(float(np.abs(metres).max()))
     return metres * factor, f"{prefix}m"
