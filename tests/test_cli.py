@@ -21,10 +21,12 @@ from scipy.io import savemat
 from typer.testing import CliRunner, Result
 
 from napari_shadowinv import __version__
+from napari_shadowinv import preprocessing as filters
+from napari_shadowinv import preprocessing as sources
 from napari_shadowinv._system.memory import physical_memory
 from napari_shadowinv.cli import _report, app
-from napari_shadowinv.cli._choices import Choices
-from napari_shadowinv.cli._inputs import Experiment, experiment_from
+from napari_shadowinv.cli._flags import recipe_of
+from napari_shadowinv.cli._inputs import read_shot, setup_for
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.inversion.compilation import code_folder
@@ -35,7 +37,16 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.preprocessing import filters, sources
+from napari_shadowinv.pipeline import gathered
+from napari_shadowinv.preprocessing import (
+    BackgroundFilter,
+    Bin,
+    ButterworthFilter,
+    HotPixelFilter,
+    LowPassFilter,
+    Radiograph,
+    Recipe,
+)
 
 BLOB = gaussian_blob((24, 32), 6.0, 4.0, (10, 18))
 
@@ -90,9 +101,12 @@ def refused(folder: Path) -> Callable[..., None]:
     return run
 
 
-def read_experiment(image: str, factor: int = 1, **given: Any) -> Experiment:
-    files = {"source": None, "setup": None, "channel": None, **given}
-    return experiment_from(Path(image), factor=factor, **files)
+def prepared(
+    image: str, source: str | None = None, mask: str | None = None, **flags: Any
+) -> Radiograph:
+    """A shot and its source after the steps that flags ask for."""
+    recipe = recipe_of(flags, Recipe(mask=None if mask is None else Path(mask)), {})
+    return gathered(recipe, image, source=source).prepared()
 
 
 def dataset(path: str | Path) -> xr.Dataset:
@@ -109,7 +123,7 @@ def test_version_and_help() -> None:
 
 
 def test_help_needs_no_heavy_import() -> None:
-    heavy = ["numba", "numpy", "pydantic", "xarray", "matplotlib", "scipy", "h5py"]
+    heavy = ["numba", "scipy.fft", "scipy.optimize", "xarray", "matplotlib", "skimage", "h5py"]
     code = f"import sys, napari_shadowinv.cli; print([m for m in {heavy!r} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.stdout.strip() == "[]", result.stderr
@@ -564,13 +578,14 @@ def test_geometry_in_a_text_image_is_used_and_shown(folder: Path) -> None:
     # What the file leaves out comes from the setup, with and without a kind.
     for entries in ("energy = 14.7\n", 'kind = "proton"\nenergy = 14.7\n'):
         (folder / "energy.toml").write_text(entries)
-        setup = read_experiment("half.txt", setup=Path("energy.toml")).setup
+        half = read_shot(Path("half.txt"), None, None)
+        setup = setup_for(Path("energy.toml"), half, Recipe())
         assert isinstance(setup, ProtonSetup)
         assert (setup.energy, setup.object_image_distance) == (14.7, 0.3)
         assert setup.object_pixel_size == pytest.approx(1e-5)
     light = "wavelength = 5e-7\nsource_object_distance = inf\n"
     (folder / "light.toml").write_text(light)
-    seen = read_experiment("all.txt", setup=Path("light.toml")).setup
+    seen = setup_for(Path("light.toml"), read_shot(Path("all.txt"), None, None), Recipe())
     assert isinstance(seen, OpticalSetup)
     assert (seen.object_image_distance, seen.magnification) == (0.3, 1)
 
@@ -584,14 +599,13 @@ def test_reference_in_a_text_image_is_the_source(folder: Path) -> None:
     )
     assert shadowinv("invert", "both.txt").exit_code == 0
     np.testing.assert_allclose(dataset("both.shadowinv")["source"], source, rtol=1e-9)
-    chosen = Choices(source_from="uniform")
-    estimate = read_experiment("both.txt", choices=chosen).source
-    assert estimate is not None
-    assert np.ptp(estimate.image) == 0
+    flags = ["--source-from", "uniform", "--overwrite"]
+    assert shadowinv("invert", "both.txt", *flags).exit_code == 0
+    assert np.ptp(dataset("both.shadowinv")["source"].values) == 0
     with pytest.raises(
         InputError, match="contains its own source, but a filter would flatten the image"
     ):
-        read_experiment("both.txt", choices=Choices(high_pass=3))
+        prepared("both.txt", high_pass=3)
 
 
 def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
@@ -605,44 +619,35 @@ def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
     usable[:4, :5] = 0
     iio.imwrite("usable.png", usable)
     mask = usable > 0
-    choices: tuple[tuple[dict[str, Any], dict[str, Path], np.ndarray], ...] = (
-        ({"source_from": "uniform"}, {}, sources.uniform_source(image)),
+    bare_file, mask_file = ["--source-mask", "bare.png"], ["--mask", "usable.png"]
+    choices: tuple[tuple[str, list[object], np.ndarray], ...] = (
+        ("uniform", [], sources.uniform_source(image)),
+        ("gaussian", bare_file, sources.gaussian_source(image, mask=bare)),
+        ("polynomial", ["--source-degree", 3], sources.polynomial_source(image, degree=3)),
+        ("low-pass", ["--source-width", 4], sources.low_pass_source(image, 4.0)),
         (
-            {"source_from": "gaussian"},
-            {"source_mask": Path("bare.png")},
-            sources.gaussian_source(image, mask=bare),
-        ),
-        (
-            {"source_from": "polynomial", "source_degree": 3},
-            {},
-            sources.polynomial_source(image, degree=3),
-        ),
-        (
-            {"source_from": "low-pass", "source_width": 4},
-            {},
-            sources.low_pass_source(image, 4.0),
-        ),
-        (
-            {"source_from": "total-variation", "source_weight": 0.5},
-            {"mask": Path("usable.png")},
+            "total-variation",
+            ["--source-weight", 0.5, *mask_file],
             sources.total_variation_source(image, weight=0.5, mask=mask),
         ),
         (
-            {"source_from": "interpolated", "source_width": 2},
-            {"source_mask": Path("bare.png"), "mask": Path("usable.png")},
+            "interpolated",
+            ["--source-width", 2, *bare_file, *mask_file],
             sources.interpolated_source(image, bare & mask, width=2.0),
         ),
     )
-    for choice, files, expected in choices:
-        chosen = Choices.model_validate(choice)
-        estimate = read_experiment("shot.npy", choices=chosen, **files).source
-        assert estimate is not None
-        np.testing.assert_array_equal(estimate.image, expected)
-    result = shadowinv("invert", "shot.npy", "--source-from", "total-variation")
-    assert "estimated from the image: total variation" in " ".join(result.stdout.split())
-    saved = dataset("shot.shadowinv")
-    np.testing.assert_array_equal(saved["source"], sources.total_variation_source(image))
-    assert json.loads(saved.attrs["source_preparation"]) == {"source_from": "total-variation"}
+    for name, flags, expected in choices:
+        result = shadowinv("invert", "shot.npy", "--source-from", name, *flags, "--overwrite")
+        assert result.exit_code in (0, 3), result.output
+        used = mask if "usable.png" in flags else True
+        saved = dataset("shot.shadowinv")
+        np.testing.assert_array_equal(saved["source"], np.where(used, expected, 0))
+        kept = Inversion.from_dataset(saved).provenance
+        assert kept is not None
+        assert kept.recipe.estimate is not None
+        assert kept.recipe.estimate.name() == name
+        text = " ".join(result.stdout.split())
+        assert f"source {kept.recipe.estimate.described}" in text
 
 
 def test_filters_are_those_of_the_library(folder: Path) -> None:
@@ -664,26 +669,28 @@ def test_filters_are_those_of_the_library(folder: Path) -> None:
     np.testing.assert_allclose(
         saved["image"], expected * saved["source"].mean().item() / expected.mean()
     )
-    assert json.loads(saved.attrs["input_preparation"]) == {
-        "hot_pixels": 6.0,
-        "background_degree": 1,
-        "low_pass": 1.5,
-    }
-    assert "hot_pixels" in shadowinv("info", "shot.shadowinv").stdout
-    # The same from a file, where a flag wins.
-    (folder / "options.toml").write_text(
-        "n_sites = 300\n[prepare]\nhot_pixels = 6\nbackground_degree = 1\nlow_pass = 9\n"
+    steps = Inversion.from_dataset(saved).provenance.recipe.steps
+    assert steps == (
+        HotPixelFilter(threshold=6),
+        Bin(factor=2),
+        BackgroundFilter(degree=1),
+        LowPassFilter(width=1.5),
     )
-    arguments = ["--options", "options.toml", "--bin", 2, "--low-pass", 1.5, "--overwrite"]
+    assert "1 hot and 0 dead pixels" in " ".join(shadowinv("info", "shot.shadowinv").stdout.split())
+    # The same from a file, where a flag wins.
+    (folder / "recipe.toml").write_text(
+        "[options]\nn_sites = 300\n"
+        "[[steps]]\nstep = 'hot-pixels'\n[[steps]]\nstep = 'bin'\nfactor = 2\n"
+        "[[steps]]\nstep = 'background'\ndegree = 1\n[[steps]]\nstep = 'low-pass'\nwidth = 9\n"
+    )
+    arguments = ["--recipe", "recipe.toml", "--low-pass", 1.5, "--overwrite"]
     assert shadowinv("invert", "shot.npy", *arguments).exit_code == 0
     again = dataset("shot.shadowinv")
     np.testing.assert_array_equal(again["image"], saved["image"])
     assert Inversion.from_dataset(again).options.n_sites == 300
     # A measured source is blurred as its shot is.
-    chosen = Choices(low_pass=2)
-    beam = read_experiment("shot.npy", source=Path("beam.npy"), choices=chosen).source
-    assert beam is not None
-    np.testing.assert_array_equal(beam.image, filters.low_pass(ramp, 2.0))
+    beam = prepared("shot.npy", source="beam.npy", low_pass=2).source
+    np.testing.assert_array_equal(beam, filters.low_pass(ramp, 2.0))
 
 
 def test_the_butterworth_filter_is_that_of_the_library(folder: Path, shot: Path) -> None:
@@ -696,30 +703,25 @@ def test_the_butterworth_filter_is_that_of_the_library(folder: Path, shot: Path)
     np.testing.assert_allclose(
         saved["image"], expected * saved["source"].mean().item() / expected.mean()
     )
-    assert json.loads(saved.attrs["input_preparation"]) == {
-        "butterworth": 12.0,
-        "butterworth_order": 3,
-    }
+    steps = Inversion.from_dataset(saved).provenance.recipe.steps
+    assert steps == (ButterworthFilter(cutoff=12, order=3),)
     # What keeps the large structures keeps the beam: a measured source is filtered alike.
     np.save("beam.npy", image)
-    chosen = Choices(butterworth=9, butterworth_kind="low")
-    beam = read_experiment("shot.npy", source=Path("beam.npy"), choices=chosen).source
-    assert beam is not None
-    np.testing.assert_array_equal(beam.image, filters.butterworth(image, 9.0, kind="low"))
+    beam = prepared("shot.npy", source="beam.npy", butterworth=9, butterworth_kind="low").source
+    np.testing.assert_array_equal(beam, filters.butterworth(image, 9.0, kind="low"))
 
 
 def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
     usable = np.ones((24, 32), np.uint8)
     usable[:5, :6] = 0
     iio.imwrite("usable.png", usable)
-    chosen = Choices(low_pass=2, hot_pixels=6, background_degree=1)
+    steps = {"low_pass": 2, "hot_pixels": 6, "background_degree": 1}
     images = []
     for junk in (0.0, 1e5, np.nan):
         image = np.load(shot)
         image[:5, :6] = junk
         np.save(shot, image)
-        prepared = read_experiment(shot.name, mask=Path("usable.png"), choices=chosen).shot
-        images.append(prepared.image)
+        images.append(prepared(shot.name, mask="usable.png", **steps).image)
     np.testing.assert_array_equal(images[0], images[1])
     np.testing.assert_array_equal(images[0], images[2])
     flags = ["--mask", "usable.png", "--low-pass", 2, "--hot-pixels", 6]
@@ -738,24 +740,26 @@ def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "names"),
     [
-        (["--source-from", "gausian"], ("'source_from' is 'gausian'", "'gaussian'")),
-        (["--source-from", "low-pass"], "needs --source-width"),
-        (["--source-from", "interpolated"], "needs --source-mask"),
+        (["--source-from", "gausian"], ("--source-from is 'gausian'", "'gaussian'")),
+        (["--source-from", "interpolated"], "without a source mask"),
         (["--source-from", "isotropic"], "'isotropic' without a setup"),
         (["--source-centre-y", 3], ("--source-centre-y", "--source-from isotropic")),
         (["--source", "shot.npy"], ("shot.npy", "the source is the image itself")),
         (["--source-from", "gaussian", "--source", "shot.npy"], "choose one of them"),
         (["--source-from", "gaussian", "--source-degree", 3], ("--source-degree", "polynomial")),
         (["--source-weight", 2], ("--source-weight", "total-variation")),
-        (["--source-mask", "shot.npy"], ("--source-mask", "--source-from")),
-        (["--source", "shot.npy", "--background-degree", 0], ("--source", "--background-degree")),
-        (["--source", "shot.npy", "--high-pass", 3], ("--source", "--high-pass")),
-        (["--source", "shot.npy", "--butterworth", 9], ("--source", "--butterworth")),
+        (["--source-mask", "shot.npy"], "got a source mask but no source estimate"),
+        (["--source", "shot.npy", "--background-degree", 0], ("got a source", "flatten")),
+        (["--source", "shot.npy", "--high-pass", 3], ("got a source", "high-pass")),
+        (["--source", "shot.npy", "--butterworth", 9], ("got a source", "Butterworth")),
         (["--butterworth-order", 3], ("--butterworth-order", "it needs --butterworth")),
-        (["--butterworth", 9, "--butterworth-kind", "band"], ("'butterworth_kind'", "'high'")),
-        (["--hot-pixels", 0], ("'hot_pixels' is 0", "greater than 0")),
-        (["--low-pass", -1], ("'low_pass' is -1", "greater than 0")),
-        (["--background-degree", 11], ("'background_degree' is 11", "at most 10")),
+        (
+            ["--butterworth", 9, "--butterworth-kind", "band"],
+            ("--butterworth: 'kind' is 'band'", "'high'"),
+        ),
+        (["--hot-pixels", 0], ("--hot-pixels: 'threshold' is 0", "greater than 0")),
+        (["--low-pass", -1], ("--low-pass: 'width' is -1", "greater than 0")),
+        (["--background-degree", 11], ("'degree' is 11", "at most 10")),
         (["--variable", "shot"], ("shot.npy", "neither a MATLAB nor an HDF5 file")),
     ],
 )
@@ -796,15 +800,25 @@ def test_a_point_source_is_taken_for_one_or_told_of(folder: Path, shot: Path) ->
     np.testing.assert_array_equal(dataset("result.shadowinv")["source"], expected)
 
 
-def test_mistakes_in_the_prepare_table_are_named(
+def test_mistakes_in_a_recipe_are_named(
     folder: Path, shot: Path, refused: Callable[..., None]
 ) -> None:
     for text, names in (
-        ("[prepare]\nhot_pixel = 6\n", ("[prepare]", "'hot_pixel'", "'hot_pixels'")),
-        ("prepare = 6\n", ("[prepare]", "received 6")),
+        ("step = []\n", ("'step'", "'steps'")),
+        ("[[steps]]\nstep = 'low-pas'\n", ("steps", "'low-pas'", "'low-pass'")),
+        ("[[steps]]\nstep = 'low-pass'\nwith = 2\n", ("'steps.0.with'", "'width'")),
+        ("[[steps]]\nstep = 'low-pass'\nwidth = 0\n", ("'steps.0.width' is 0", "greater than 0")),
+        ("[[steps]]\nwidth = 2\n", ("steps", "'step'")),
+        ("[source]\nmethod = 'polynomial'\ndegree = 11\n", ("'source.degree' is 11", "at most 10")),
+        ("[setup]\nkind = 'proton'\nenergy = -1\n", ("'setup.energy' is -1",)),
+        ("[options]\nn_site = 1\n", ("'n_site'", "'n_sites'")),
+        ("steps = 6\n", ("'steps' is 6",)),
+        ("mask = 'nowhere.png'\n", ("nowhere.png",)),
     ):
-        (folder / "options.toml").write_text(text)
-        refused("invert", shot, "--options", "options.toml", names=("options.toml", *names))
+        (folder / "recipe.toml").write_text(text)
+        refused("invert", shot, "--recipe", "recipe.toml", names=names)
+    (folder / "options.toml").write_text("[prepare]\nhot_pixels = 6\n")
+    refused("invert", shot, "--options", "options.toml", names=("[prepare]", "--recipe"))
 
 
 def test_info_tells_what_is_inside(folder: Path) -> None:

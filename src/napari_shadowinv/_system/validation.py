@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -78,27 +78,61 @@ def nearest(name: str, known: list[str]) -> str | None:
 
 def _sentence(model_class: type[BaseModel], error: ValidationError) -> str:
     details = error.errors(include_url=False)
-    known = list(model_class.model_fields)
     meant = {
-        nearest(str(detail["loc"][-1]), known)
+        nearest(str(detail["loc"][-1]), list(_place(model_class, detail["loc"])[0].model_fields))
         for detail in details
         if detail["type"] == "extra_forbidden"
     }
     return "; ".join(
-        _clause(model_class, dict(detail), known)
+        _clause(model_class, dict(detail))
         for detail in details
         if not (detail["type"] == "missing" and detail["loc"][-1] in meant)
     )
 
 
-def _clause(model_class: type[BaseModel], detail: dict[str, Any], known: list[str]) -> str:
-    name = ".".join(str(part) for part in detail["loc"])
+def _place(
+    model_class: type[BaseModel], loc: tuple[int | str, ...]
+) -> tuple[type[BaseModel], list[str]]:
+    """Model in which a value stands, and the names that lead there, without those of unions."""
+    names: list[str] = []
+    models = [model_class]
+    for part in loc:
+        field = models[0].model_fields.get(str(part)) if len(models) == 1 else None
+        if field is not None and part != loc[-1]:
+            names.append(str(part))
+            models = _models_in(field.annotation) or models
+        elif isinstance(part, int) or part == loc[-1]:
+            names.append(str(part))
+        else:  # the tag of a union
+            models = [one for one in models if _is_tagged(one, part)] or models
+    return models[0], names
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models_in(part)]
+
+
+def _is_tagged(model: type[BaseModel], tag: str) -> bool:
+    return any(
+        get_origin(field.annotation) is Literal and field.default == tag
+        for field in model.model_fields.values()
+    )
+
+
+def _clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
+    model, names = _place(model_class, detail["loc"])
+    name = ".".join(names)
     kind, context = detail["type"], detail.get("ctx", {})
     if kind == "extra_forbidden":
-        match = nearest(name, known)
+        known = list(model.model_fields)
+        match = nearest(names[-1], known)
         hint = f", did you mean '{match}'?" if match else f"; known keys are {', '.join(known)}"
         return f"unknown key '{name}'{hint}"
-    field = model_class.model_fields.get(name)
+    if kind.startswith("union_tag"):
+        return _tag_clause(name, kind, context)
+    field = model.model_fields.get(names[-1]) if names else None
     title = _lower(field.title) if field is not None and field.title else "it"
     if kind == "missing":
         return f"'{name}' is missing, give the {title}"
@@ -112,6 +146,16 @@ def _clause(model_class: type[BaseModel], detail: dict[str, Any], known: list[st
     if message.startswith(_PYDANTIC_OPENING):
         return f"{received}: {title} must be {message.removeprefix(_PYDANTIC_OPENING)}"
     return f"{received}: {_lower(message)}"
+
+
+def _tag_clause(name: str, kind: str, context: dict[str, Any]) -> str:
+    key = context["discriminator"].strip("'")
+    if kind == "union_tag_not_found":
+        return f"'{name}' has no '{key}': give it, to say which"
+    expected = [tag.strip("' ") for tag in context["expected_tags"].split(",")]
+    match = nearest(str(context["tag"]), expected)
+    hint = f"did you mean '{match}'?" if match else f"expected one of {', '.join(expected)}"
+    return f"'{name}.{key}' is '{context['tag']}', {hint}"
 
 
 def _lower(text: str) -> str:

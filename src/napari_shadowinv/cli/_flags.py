@@ -139,7 +139,7 @@ def _flag(flag: str, field: FieldInfo, panel: str, told: str) -> tuple[str, insp
     kind, metavar = _type_of(field)
     option = Option(f"--{flag}", help=told, metavar=metavar, rich_help_panel=panel)
     name = flag.replace("-", "_")
-    annotation = Annotated[kind | None, option]
+    annotation = Annotated[kind | None, option]  # type: ignore[valid-type]
     keyword = inspect.Parameter.KEYWORD_ONLY
     return name, inspect.Parameter(name, keyword, default=None, annotation=annotation)
 
@@ -154,7 +154,7 @@ def _all_flags() -> dict[str, inspect.Parameter]:
         for step in STEPS.values()
         for name, field in step.parameters().items()
     ]
-    method = FieldInfo(annotation=str | None, title="Source")  # type: ignore[arg-type]
+    method = FieldInfo(annotation=str | None, title="Source")
     told = f"How to estimate the undisturbed beam: {', '.join(ESTIMATES)}."
     flags.append(_flag("source-from", method, _ESTIMATES, told))
     for name in dict.fromkeys(n for one in ESTIMATES.values() for n in one.parameters()):

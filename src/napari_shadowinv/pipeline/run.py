@@ -271,8 +271,9 @@ def gathered(
                 f"{whole.path or 'the shot'} contains its own source, but a filter would flatten "
                 "the image: leave the filter out, or choose the source 'uniform'"
             )
-    usable = _mask(mask, recipe.mask, "mask") or _Mask(whole.mask, None)
-    bare = _mask(source_mask, recipe.source_mask, "source mask") or _Mask(whole.source_mask, None)
+    usable = _mask(mask, recipe.mask, "mask", whole) or _Mask(whole.mask, None)
+    bare = _mask(source_mask, recipe.source_mask, "source mask", whole)
+    bare = bare or _Mask(whole.source_mask, None)
     if wanted is None:
         wanted = UniformEstimate() if beam is None else MeasuredSource()
     elif isinstance(wanted, MeasuredSource):
@@ -319,7 +320,9 @@ class _Mask:
         return packed.model_copy(update={"file": text_of(self.file.name)})
 
 
-def _mask(given: ArrayLike | None, file: Path | None, name: str) -> _Mask | None:
+def _mask(
+    given: ArrayLike | None, file: Path | None, name: str, shot: Radiograph
+) -> _Mask | None:
     if given is not None:
         pixels = np.asarray(given)
         if pixels.dtype != np.bool_:
@@ -328,7 +331,14 @@ def _mask(given: ArrayLike | None, file: Path | None, name: str) -> _Mask | None
                 "a number, as in mask > 0"
             )
         return _Mask(pixels, None)
-    return None if file is None else _Mask(picture_mask(file), file)
+    if file is None:
+        return None
+    pixels = picture_mask(file)
+    if pixels.shape != shot.shape:
+        raise InputError(
+            f"{file}: {name} has shape {pixels.shape}, image {shot.shape}: they must match"
+        )
+    return _Mask(pixels, file)
 
 
 def picture_mask(path: Path) -> BoolArray:

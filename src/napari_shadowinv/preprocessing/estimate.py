@@ -20,12 +20,13 @@ class Estimate(Choice):
 
     Attributes
     ----------
-    needs_mask : bool
-        Whether it does nothing without a mask.
+    needs_mask, uses_mask : bool
+        Whether it does nothing without a mask, or anything with one.
     """
 
     key = "method"
     needs_mask: ClassVar[bool] = False
+    uses_mask: ClassVar[bool] = True
 
     def check(self, *, has_mask: bool) -> None:
         """Refuse to work without a mask where one is needed.

@@ -80,6 +80,7 @@ class UniformEstimate(Estimate):
     """The same everywhere."""
 
     title = "uniform"
+    uses_mask = False
     method: Literal["uniform"] = "uniform"
 
     def _source(

@@ -35,6 +35,7 @@ class IsotropicEstimate(Estimate):
     """A point that shines evenly in all directions, on a flat detector."""
 
     title = "isotropic point source"
+    uses_mask = False
     method: Literal["isotropic"] = "isotropic"
     centre_y: float | None = Field(
         default=None,

@@ -225,7 +225,7 @@ class Recipe(BaseModel):
                     "hides the object from the estimate but not from the inversion: give one"
                 )
             check_masks(shot.mask, shot.source_mask)
-        elif shot.source_mask is not None:
+        if shot.source_mask is not None and not (self.estimate and self.estimate.uses_mask):
             raise InputError(
                 "got a source mask but no source estimate to use it: leave the mask out, or "
                 "choose an estimate"

@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from napari.layers import Image, Labels, Shapes
+from napari_shadowinv._napari.widgets._estimating import quick_source
+from napari_shadowinv.cli._choices import Choices
+from napari_shadowinv.cli._preparing import filtered
 
 from napari_shadowinv import (
     InputError,
@@ -19,7 +22,6 @@ from napari_shadowinv import (
     InversionOptions,
 )
 from napari_shadowinv._napari.widgets._cost import cost_of
-from napari_shadowinv._napari.widgets._estimating import quick_source
 from napari_shadowinv._napari.widgets._forecast import ForwardJob
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob, SourceJob
 from napari_shadowinv._napari.widgets._phantoms import BlobRecipe, ToroidRecipe
@@ -33,8 +35,6 @@ from napari_shadowinv._napari.widgets._sampling import (
     table_text,
 )
 from napari_shadowinv._napari.widgets._stacking import StackJob
-from napari_shadowinv.cli._choices import Choices
-from napari_shadowinv.cli._preparing import filtered
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
