@@ -64,6 +64,7 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
     list of (data, keywords, layer type)
         The layers as they were saved. Those that were not saved with it are hidden.
     """
+    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.labels import setup_from_dataset
 
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
