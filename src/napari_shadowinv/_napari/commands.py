@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     import napari
     from napari_shadowinv._napari.layers import FullLayerData
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["estimate_source", "high_pass", "invert_uniform", "remove_hot_pixels"]
 
@@ -56,97 +56,42 @@ class _Picked:
     image: NDArray[Any]
     name: str
     frame: Frame
-    setup: ProtonSetup | OpticalSetup | None
+    setup: Setup | None
     setup_origin: str
     role: str | None
 
 
-def _nothing() -> list[Any]:
-    return []
-
-
-@notify_errors(otherwise=_nothing)
+@notify_errors(otherwise=list)
 def invert_uniform(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Invert the selected image against a uniform source, with the default options.
-
-    Parameters
-    ----------
-    layer : napari.layers.Image
-        A grey image, or a stack of them.
-    viewer : napari.Viewer, optional
-        Tells which shot of a stack is meant.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The layers of the result. From a menu they come later, and this is empty.
-
-    Raises
-    ------
-    InputError
-        If no shot is selected or it cannot be inverted; from a menu, the user is told.
-    """
+    """Invert the selected image against a uniform source, with the default options."""
     return _begin(_picked(layer, viewer), _inverted, "Inverting", viewer)
 
 
-@notify_errors(otherwise=_nothing)
+@notify_errors(otherwise=list)
 def remove_hot_pixels(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Replace pixels that stand out of the noise by the median of their neighbours.
-
-    Parameters
-    ----------
-    layer, viewer
-        See `invert_uniform`.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The repaired image, with the number of such pixels in its name.
-    """
+    """Replace pixels that stand out of the noise by the median of their neighbours."""
     return _begin(
         _picked(layer, viewer, may_be_source), _repaired, "Removing hot pixels from", viewer
     )
 
 
-@notify_errors(otherwise=_nothing)
+@notify_errors(otherwise=list)
 def high_pass(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Take away structures larger than some 0.15 of the image's shorter side; the mean stays.
-
-    Parameters
-    ----------
-    layer, viewer
-        See `invert_uniform`.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The filtered image.
-    """
+    """Take away structures larger than some 0.15 of the image's shorter side; the mean stays."""
     return _begin(_picked(layer, viewer, may_be_source), _high_passed, "Filtering", viewer)
 
 
-@notify_errors(otherwise=_nothing)
+@notify_errors(otherwise=list)
 def estimate_source(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Estimate the undisturbed beam as the image of least total variation near the selected one.
-
-    Parameters
-    ----------
-    layer, viewer
-        See `invert_uniform`.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The estimate, to be chosen as the source of an inversion.
-    """
+    """Estimate the undisturbed beam as the image of least total variation near the selected one."""
     return _begin(_picked(layer, viewer), _beam, "Estimating the source of", viewer)
 
 

@@ -18,13 +18,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from napari_shadowinv._typing import FloatArray
 
 if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "CAME_WITH",
@@ -59,66 +60,21 @@ CAME_WITH = "came with"
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What the layers of one result show, whole: all that is needed to write it.
+    """What the layers of one result show, whole: all that is needed to write it."""
 
-    Attributes
-    ----------
-    content : Inversion or xarray.Dataset
-        The result; a dataset where a file holds no more than a field.
-    setup : ProtonSetup or OpticalSetup or None
-        The experiment.
-    attributes : mapping of str to str
-        Which files it was made from, as `napari_shadowinv.io.provenance` tells.
-    """
-
-    content: Inversion | xarray.Dataset
-    setup: ProtonSetup | OpticalSetup | None = None
-    attributes: Mapping[str, str] = field(default_factory=dict)
+    content: Inversion | xarray.Dataset  # a dataset where a file holds no more than a field
+    setup: Setup | None = None
+    attributes: Mapping[str, str] = field(default_factory=dict)  # which files it was made from
 
 
-def mark(
-    role: str | None,
-    unit: str,
-    setup: ProtonSetup | OpticalSetup | None = None,
-    **more: Any,
-) -> dict[str, Any]:
-    """Make the metadata of a layer.
-
-    Parameters
-    ----------
-    role : str or None
-        What it shows: ``"shot"``, ``"source"``, ``"potential"``, ``"field"``, ``"sites"``, …;
-        None if that is not known.
-    unit : str
-        Unit of its values; empty if they have none.
-    setup : ProtonSetup or OpticalSetup, optional
-        The experiment.
-    **more
-        Other facts, such as ``result`` (a `Result`), ``source`` (an array) or ``setup_origin``
-        (see `setup_origin_of`).
-
-    Returns
-    -------
-    dict
-        To be passed to a layer as `metadata`.
-    """
+def mark(role: str | None, unit: str, setup: Setup | None = None, **more: Any) -> dict[str, Any]:
+    """Make the metadata of a layer; `role` and `unit` are None and empty where unknown."""
     described = {} if setup is None else {"setup": setup.model_dump()}
     return {KEY: {"role": role, "unit": unit, **described, **more}}
 
 
 def mark_of(layer: Any) -> dict[str, Any]:
-    """Return what a layer knows about itself; empty for a layer of other origin.
-
-    Parameters
-    ----------
-    layer : napari.layers.Layer or mapping
-        A layer, or the keywords of one.
-
-    Returns
-    -------
-    dict
-        With ``role`` and ``unit`` at least, if it is a layer of this plugin.
-    """
+    """Return what a layer, or the keywords of one, tell about it; empty for other origins."""
     metadata = layer.get("metadata") if isinstance(layer, Mapping) else layer.metadata
     found = (metadata or {}).get(KEY)
     return found if isinstance(found, dict) else {}
@@ -134,7 +90,7 @@ def unit_of(layer: Any) -> str:
     return str(mark_of(layer).get("unit", ""))
 
 
-def setup_of(layer: Any) -> ProtonSetup | OpticalSetup | None:
+def setup_of(layer: Any) -> Setup | None:
     """Return the experiment that a layer belongs to, None where it is unknown."""
     from napari_shadowinv.physics.setup import setup_from_dict
 
@@ -147,18 +103,8 @@ def setup_origin_of(layer: Any) -> str:
     return str(mark_of(layer).get("setup_origin", ""))
 
 
-def keep_setup(layer: Any, setup: ProtonSetup | OpticalSetup | None, origin: str) -> None:
-    """Make a setup the one of a layer.
-
-    Parameters
-    ----------
-    layer : napari.layers.Layer
-        An image.
-    setup : ProtonSetup or OpticalSetup or None
-        The experiment; None takes away what the layer has.
-    origin : str
-        Where it comes from.
-    """
+def keep_setup(layer: Any, setup: Setup | None, origin: str) -> None:
+    """Make a setup, which comes from `origin`, the one of a layer; None takes it away."""
     others = {
         name: value
         for name, value in mark_of(layer).items()
@@ -190,7 +136,7 @@ def result_of(layer: Any) -> Result | None:
     return found if isinstance(found, Result) else None
 
 
-def source_of(layer: Any) -> NDArray[np.float64] | None:
+def source_of(layer: Any) -> FloatArray | None:
     """Return the undisturbed beam that came with an image, None if none did."""
     found = mark_of(layer).get("source")
     return None if found is None else np.asarray(found)

@@ -9,17 +9,16 @@ Each shot carries its setup, and its undisturbed beam where that is not uniform.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._napari.layer_metadata import CAME_WITH
-from napari_shadowinv._napari.lazy import lazy_stack
-from napari_shadowinv._napari.shots import radiograph_layers, shot_layer
+from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
+from napari_shadowinv._napari.shots import lazy_stack, radiograph_layers, shot_layer
+from napari_shadowinv._typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
-    from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.physics.phantoms import Phantom
     from napari_shadowinv.physics.setup import ProtonSetup
 
@@ -73,7 +72,6 @@ def coaxial_line() -> list[FullLayerData]:
 
 def wakefield_run() -> list[FullLayerData]:
     """Twenty optical shots of a plasma wave that moves, grows and fades; made when shown."""
-    from napari_shadowinv._napari.layers import intensity_limits
     from napari_shadowinv.physics.phantoms import wakefield_setup
 
     stack = lazy_stack(_wakefield_shot, range(_RUN_LENGTH), _RUN_SHAPE)
@@ -91,7 +89,7 @@ def _toroid_of(peak: float) -> Phantom:
 
 
 def _proton_shot(
-    name: str, phantom: Phantom, beam: NDArray[np.float64] | None = None
+    name: str, phantom: Phantom, beam: FloatArray | None = None
 ) -> list[FullLayerData]:
     from napari_shadowinv.io import Radiograph
     from napari_shadowinv.physics.phantoms import paper_setup
@@ -102,7 +100,7 @@ def _proton_shot(
     return radiograph_layers(Radiograph(image, setup=setup, source=source), name)
 
 
-def _counted(phantom: Phantom, source: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+def _counted(phantom: Phantom, source: FloatArray, seed: int) -> FloatArray:
     """Image of a source through an object, with the noise of counting."""
     from napari_shadowinv.physics.forward import synthetic_image
 
@@ -110,23 +108,23 @@ def _counted(phantom: Phantom, source: NDArray[np.float64], seed: int) -> NDArra
     return np.random.default_rng(seed).poisson(expected).astype(np.float64)
 
 
-def _places() -> tuple[NDArray[Any], NDArray[Any]]:
+def _places() -> tuple[AnyArray, AnyArray]:
     """Coordinates from -1 to 1 on both axes."""
     y, x = (np.linspace(-1, 1, side) for side in _SHAPE)
     return y[:, None], x[None, :]
 
 
-def _gaussian_beam() -> NDArray[np.float64]:
+def _gaussian_beam() -> FloatArray:
     y, x = _places()
     return np.asarray(0.25 + np.exp(-((y - 0.1) ** 2 + (x + 0.15) ** 2) / 1.4))
 
 
-def _uneven_beam() -> NDArray[np.float64]:
+def _uneven_beam() -> FloatArray:
     y, x = _places()
     return np.asarray(1 + 0.3 * np.sin(2.3 * x + 0.4) * np.cos(1.7 * y - 0.3) + 0.15 * x)
 
 
-def _wakefield_shot(shot: int) -> NDArray[np.float64]:
+def _wakefield_shot(shot: int) -> FloatArray:
     """One moment: the wave comes in from the left, is strongest in the middle, and decays."""
     from napari_shadowinv.physics.phantoms import wakefield, wakefield_setup
 

@@ -3,6 +3,7 @@
 - one image, with what its file tells: `radiograph_layers`
 - any image or stack of images: `shot_layer`
 - many files along an axis of shots, each read when it is shown: `stack_layers`
+- any planes that are made when they are looked at: `lazy_stack`
 - the images in a folder, shot 2 before shot 10: `images_in`
 """
 
@@ -10,31 +11,29 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layer_metadata import CAME_WITH, MASK, SHOT, SOURCE, mark
 from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
-from napari_shadowinv._napari.lazy import lazy_stack
 from napari_shadowinv._napari.notifications import show_caution
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
 
 if TYPE_CHECKING:
     from napari_shadowinv.io import Radiograph
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-
-    Setup = ProtonSetup | OpticalSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "IMAGE_SUFFIXES",
     "images_in",
+    "lazy_stack",
     "radiograph_layers",
     "shot_layer",
     "stack_layers",
@@ -47,21 +46,7 @@ IMAGE_SUFFIXES = frozenset(_PICTURES | _NUMBERS | _CAMERAS)
 
 
 def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
-    """Describe an image, and its undisturbed beam and mask where the file holds them.
-
-    Parameters
-    ----------
-    shot : Radiograph
-        What was read.
-    name : str
-        Name of the layer. Default: the file's.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The source and the mask, if any, and the image above them. Painted pixels of the mask
-        cannot be used.
-    """
+    """Describe an image, above its undisturbed beam and its mask, painted where not usable."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
     frame = _frame(shot)
@@ -96,36 +81,13 @@ def shot_layer(
     frame: Frame | None = None,
     **more: Any,
 ) -> FullLayerData:
-    """Describe an image or a stack of images.
-
-    Parameters
-    ----------
-    data : ndarray or dask array, shape (H, W) or (shots, H, W)
-        The image.
-    name : str
-        Name of the layer.
-    setup : ProtonSetup or OpticalSetup or None
-        The experiment.
-    limits : tuple of float
-        Contrast limits; napari would read two shots of a stack to find some.
-    role : {"shot", "source"} or None
-        What it is, None if that is not known.
-    frame : Frame, optional
-        Where it lies. Default: as the setup tells.
-    **more
-        Facts to keep with it; those that are None are left out.
-
-    Returns
-    -------
-    (data, keywords, layer type)
-        The layer.
-    """
+    """Describe an image or a stack of images; facts that are None are left out."""
     frame = frame or frame_for(data.shape, setup)
     known = {key: value for key, value in more.items() if value is not None}
     keywords = {
         "name": name,
         "colormap": "gray",
-        "contrast_limits": limits,
+        "contrast_limits": limits,  # napari would read two shots of a stack to find some
         "metadata": mark(role, "intensity", setup, **known),
         **frame.keywords(stacked=data.ndim > 2),
     }
@@ -151,18 +113,9 @@ def _frame(shot: Radiograph) -> Frame:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """List the images in a folder, in the order in which people count.
+    """List the images in a folder in the order in which people count.
 
-    Parameters
-    ----------
-    folder : Path
-        A folder; those within it are left alone.
-
-    Returns
-    -------
-    list of Path
-        Files of the most frequent ending that names an image: a table of settings beside a
-        run of TIFFs is not a shot.
+    They have the most frequent ending: a table of settings beside a run of TIFFs is not a shot.
     """
     files = [
         path
@@ -179,23 +132,7 @@ def images_in(folder: Path) -> list[Path]:
 def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
     """Describe a run of shots as one lazy stack; only the first that can be read is read now.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Images of one shape.
-    name : str
-        Name of the layer. Default: the folder's.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        One image layer over a dask array of shape (shots, H, W). A shot that cannot be read,
-        or of another shape, is dark and gives a warning when it is shown.
-
-    Raises
-    ------
-    FileFormatError
-        If none of the files can be read.
+    A shot that cannot be read, or of another shape, is dark and gives a warning when it is shown.
     """
     first, at = _first_readable(paths)
     for text in first.warnings:
@@ -216,6 +153,27 @@ def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
     return [layer]
 
 
+def lazy_stack(
+    make: Callable[..., FloatArray],
+    items: Sequence[Any],
+    shape: tuple[int, int],
+    ready: FloatArray | None = None,
+    at: int = 0,
+) -> Any:
+    """Stack the planes that `make` makes of items, one chunk each; the one `at` may be ready."""
+    from dask import array
+    from dask.delayed import delayed
+
+    made = delayed(make, pure=True)
+    planes = [
+        array.from_array(ready, chunks=shape)  # type: ignore[no-untyped-call]
+        if ready is not None and index == at
+        else array.from_delayed(made(item), shape=shape, dtype=np.float64)  # type: ignore[no-untyped-call]
+        for index, item in enumerate(items)
+    ]
+    return array.stack(planes)  # type: ignore[no-untyped-call]
+
+
 def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
     from napari_shadowinv.io import read_radiograph
 
@@ -228,7 +186,7 @@ def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
     raise FileFormatError(f"none of {len(paths)} files can be read as a shot: {mistakes[0]}")
 
 
-def _plane_of(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _plane_of(path: Path, shape: tuple[int, int]) -> FloatArray:
     """Read one shot of a stack; a stray file does not end the show."""
     from napari_shadowinv.io import read_radiograph
 
