@@ -366,13 +366,13 @@ def _arrows(shown: _Shown, kind: Kind) -> Content:
     return data if shown.shot is None else at_shot(data, shown.shot), words, look
 
 
-def thinned_arrows(field: FloatArray, along: int = _ARROWS_ALONG) -> tuple[FloatArray, float]:
+def thinned_arrows(field: FloatArray) -> tuple[FloatArray, float]:
     """Pick vectors (y, x) of a field on a grid: starts and vectors (n, 2, 2), and the spacing.
 
     Those of nearly no length are left out.
     """
     height, width = field.shape[1:]
-    step = max(1, -(-max(height, width) // along))
+    step = max(1, -(-max(height, width) // _ARROWS_ALONG))
     rows, columns = (
         index.ravel() for index in np.mgrid[step // 2 : height : step, step // 2 : width : step]
     )
