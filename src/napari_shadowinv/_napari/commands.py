@@ -130,15 +130,10 @@ def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
     """Do the work at once, or beside a window."""
     if viewer is None or not in_event_loop():
         return list(work(picked, lambda: False))
-    _work_beside(picked, work, f"{doing} {picked.name}", viewer)
-    return []
-
-
-def _work_beside(picked: _Picked, work: Work, title: str, viewer: Any) -> None:
     from napari.qt.threading import create_worker
     from napari.utils import cancelable_progress
 
-    bar = cancelable_progress(total=0, desc=title)
+    bar = cancelable_progress(total=0, desc=f"{doing} {picked.name}")
 
     def finish(outcome: tuple[list[FullLayerData], Exception | None]) -> None:
         layers, error = outcome
@@ -161,6 +156,7 @@ def _work_beside(picked: _Picked, work: Work, title: str, viewer: Any) -> None:
     worker = create_worker(run)
     worker.returned.connect(finish)
     worker.start()
+    return []
 
 
 def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:

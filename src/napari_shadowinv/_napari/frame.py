@@ -21,7 +21,6 @@ __all__ = ["Frame", "frame_for", "frame_of", "place"]
 
 Matrix = tuple[tuple[float, ...], ...]
 
-_MICROMETRES_PER_METRE = 1e6
 # Up to here a length in µm has four digits at most.
 _LONGEST_IN_MICROMETRES = 10_000.0
 
@@ -74,7 +73,7 @@ def frame_for(
     """Choose a frame in µm, in mm for more than 1 cm, or in pixels; what is given goes before."""
     frame = Frame()
     if setup is not None:
-        pixel, unit = setup.object_pixel_size * _MICROMETRES_PER_METRE, "um"
+        pixel, unit = setup.object_pixel_size * 1e6, "um"
         if max(shape[-2:]) * pixel > _LONGEST_IN_MICROMETRES:
             pixel, unit = pixel * 1e-3, "mm"
         frame = Frame(scale=(pixel, pixel), units=(unit, unit))

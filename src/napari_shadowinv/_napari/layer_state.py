@@ -16,6 +16,7 @@ import numpy as np
 from napari_shadowinv._napari.frame import frame_for
 from napari_shadowinv._napari.layer_metadata import Result, role_of
 from napari_shadowinv._napari.layers import FullLayerData, result_layers
+from napari_shadowinv.inversion.labels import setup_from_dataset
 
 if TYPE_CHECKING:
     import xarray
@@ -50,7 +51,6 @@ _KEPT_BY_ALL = ("name", "visible", "opacity", "blending", *_PLACE)
 def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]:
     """Describe the layers of a result as they were saved; those that were not are hidden."""
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.labels import setup_from_dataset
 
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     setup = setup_from_dataset(dataset)

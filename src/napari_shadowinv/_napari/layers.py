@@ -19,8 +19,8 @@ import numpy as np
 
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layer_metadata import Result, mark, role_of
-from napari_shadowinv._napari.sites import power_cells, site_features
-from napari_shadowinv._napari.viewer_sync import follow_top_image, place_newcomers
+from napari_shadowinv._napari.sites import Cells, power_cells, site_features
+from napari_shadowinv._napari.viewer_sync import keep_in_step
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.inversion.labels import VARIABLES
 from napari_shadowinv.plotting import ShownField, shown_fields, shown_potential
@@ -88,6 +88,7 @@ KINDS = (
     Kind("field arrows", "displacement", "∫B dz arrows", type="vectors", shown_of="shot"),
     Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),
     Kind("sites", "sites", "sites{share}", colormap="inferno", type="points", shown_of="shot"),
+    Kind("cells", "sites", "power cells", type="shapes", shown_of="shot"),
 )
 
 
@@ -177,8 +178,7 @@ def add_layers(
             viewer.layers.selection.active = layer
     overlays = getattr(getattr(viewer, "canvas", None), "overlays", viewer)  # napari before 0.9
     overlays.scale_bar.visible = True
-    follow_top_image(viewer)
-    place_newcomers(viewer)
+    keep_in_step(viewer)
     return added
 
 
@@ -196,23 +196,8 @@ def result_layers(
     dataset = xr.Dataset(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     )
-    layers = dataset_layers(dataset, result.setup, frame, name, facts)
-    if cells:
-        polygons, kept = power_cells(content)
-        features = {key: values[kept] for key, values in site_features(dataset).items()}
-        keywords = {
-            "name": f"{name} power cells".strip(),
-            "metadata": mark("cells", "", result.setup, **facts),
-            "shape_type": "polygon",
-            "features": features,
-            "face_color": "transparent",
-            "edge_color": _CAUSTIC_COLOUR,
-            "edge_width": 0.05,
-            "opacity": 0.7,
-            "visible": False,
-        }
-        layers.append((polygons, keywords | frame.keywords(), "shapes"))
-    return layers
+    diagram = power_cells(content) if cells else None
+    return dataset_layers(dataset, result.setup, frame, name, facts, cells=diagram)
 
 
 def dataset_layers(
@@ -222,9 +207,10 @@ def dataset_layers(
     name: str,
     facts: Mapping[str, Any],
     shot: int | None = None,
+    cells: Cells | None = None,
 ) -> list[FullLayerData]:
     """Describe the layers of a result, or of a stack in the units and contrast of one `shot`."""
-    shown = _Shown(dataset, setup, shot)
+    shown = _Shown(dataset, setup, shot, cells)
     layers = []
     for kind in KINDS:
         if not shown.has(kind):
@@ -242,13 +228,14 @@ def dataset_layers(
     return layers
 
 
+@dataclass
 class _Shown:
     """A result, or a stack of which one shot decides on units and contrast."""
 
-    def __init__(self, dataset: xarray.Dataset, setup: Setup | None, shot: int | None) -> None:
-        self.dataset = dataset
-        self.setup = setup
-        self.shot = shot
+    dataset: xarray.Dataset
+    setup: Setup | None
+    shot: int | None
+    cells: Cells | None
 
     def has(self, kind: Kind) -> bool:
         if kind.shown_of == ("shot" if self.shot is not None else "stack"):
@@ -257,6 +244,8 @@ class _Shown:
             return False
         if kind.role == "field arrows":
             return self.setup is not None and self.setup.kind == "proton"
+        if kind.role == "cells":
+            return self.cells is not None
         return kind.role != "source" or bool(np.ptp(self.plane("source")))
 
     def along_shots(self, variable: str) -> bool:
@@ -407,11 +396,25 @@ def _sites(shown: _Shown, kind: Kind) -> Content:
     return sites[::every], {"share": "" if every == 1 else f" (1 in {every})"}, look
 
 
+def _cells(shown: _Shown, kind: Kind) -> Content:
+    polygons, kept = shown.cells or ([], [])
+    look = {
+        "shape_type": "polygon",
+        "features": {key: values[kept] for key, values in site_features(shown.dataset).items()},
+        "face_color": "transparent",
+        "edge_color": _CAUSTIC_COLOUR,
+        "edge_width": 0.05,
+        "opacity": 0.7,
+    }
+    return polygons, {}, look
+
+
 _CONTENTS: dict[str, Callable[[_Shown, Kind], Content]] = {
     "image": _image,
     "labels": _caustics,
     "vectors": _arrows,
     "points": _sites,
+    "shapes": _cells,
 }
 
 

@@ -24,10 +24,10 @@ from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
 from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io import Radiograph, read_radiograph
 from napari_shadowinv.io.files import in_counting_order
 
 if TYPE_CHECKING:
-    from napari_shadowinv.io import Radiograph
     from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
@@ -175,8 +175,6 @@ def lazy_stack(
 
 
 def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
-    from napari_shadowinv.io import read_radiograph
-
     mistakes: list[str] = []
     for index, path in enumerate(paths):
         try:
@@ -188,8 +186,6 @@ def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
 
 def _plane_of(path: Path, shape: tuple[int, int]) -> FloatArray:
     """Read one shot of a stack; a stray file does not end the show."""
-    from napari_shadowinv.io import read_radiograph
-
     try:
         image = read_radiograph(path).image
         if image.shape != shape:

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.inversion import Inversion
 
-__all__ = ["power_cells", "site_features"]
+__all__ = ["Cells", "power_cells", "site_features"]
+
+Cells = tuple[list[FloatArray], NDArray[np.intp]]
 
 _MOST_CELLS = 5_000
 
@@ -37,7 +39,7 @@ def site_features(dataset: xarray.Dataset) -> dict[str, FloatArray]:
     }
 
 
-def power_cells(inversion: Inversion) -> tuple[list[FloatArray], NDArray[np.intp]]:
+def power_cells(inversion: Inversion) -> Cells:
     """Corners (y, x) of the cells that the solver ended with, and the site of each.
 
     They are cut off at the image's border; an empty cell has no polygon.

@@ -20,14 +20,10 @@ import numpy as np
 
 from napari_shadowinv._napari.frame import frame_for
 from napari_shadowinv._napari.layer_metadata import mark_of, role_of
-from napari_shadowinv._napari.layers import (
-    FullLayerData,
-    at_shot,
-    dataset_layers,
-    thinned_arrows,
-)
+from napari_shadowinv._napari.layers import FullLayerData, at_shot, dataset_layers, thinned_arrows
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.inversion.labels import setup_from_dataset
 
 if TYPE_CHECKING:
     import xarray
@@ -38,8 +34,6 @@ __all__ = ["follow_once_added", "follow_shots", "store_layers"]
 @refusing_damage
 def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot."""
-    from napari_shadowinv.inversion.labels import setup_from_dataset
-
     dataset = _opened(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(".shadowinv")
     setup = setup_from_dataset(dataset)

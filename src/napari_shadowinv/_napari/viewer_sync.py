@@ -1,7 +1,7 @@
-"""What keeps in step with a viewer that shows results.
+"""What keeps in step with a viewer that shows results: `keep_in_step`.
 
-- one colour bar in the canvas, for the image that is seen: `follow_top_image`
-- images that are opened beside results: `place_newcomers`
+One colour bar in the canvas, for the image that is seen, and images that are opened beside
+results.
 """
 
 from __future__ import annotations
@@ -12,30 +12,26 @@ from typing import Any
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import role_of
 
-__all__ = ["follow_top_image", "place_newcomers"]
+__all__ = ["keep_in_step"]
 
-_followed: weakref.WeakSet[Any] = weakref.WeakSet()
-_placed: weakref.WeakSet[Any] = weakref.WeakSet()
+_watched: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
-def _new_events(viewer: Any, taken: weakref.WeakSet[Any]) -> Any | None:
-    """Return the events of a viewer's layers, None if they were taken before."""
+def keep_in_step(viewer: Any) -> None:
+    """Watch the layers of a viewer; calling it again does nothing more."""
     # A widget may be handed a proxy, made anew each time.
     events = getattr(viewer.layers.events, "__wrapped__", viewer.layers.events)
-    if events in taken:
-        return None
-    taken.add(events)
-    return events
+    if events not in _watched:
+        _watched.add(events)
+        _follow_top_image(viewer, events)
+        _place_newcomers(viewer, events)
 
 
-def follow_top_image(viewer: Any) -> None:
+def _follow_top_image(viewer: Any, events: Any) -> None:
     """Show colour bar and name of the topmost visible image, if it is one of this plugin's.
 
     The name tells the unit. Whoever switches the bar off keeps it off.
     """
-    events = _new_events(viewer, _followed)
-    if events is None:
-        return
     shown: list[Any] = []
 
     def follow(_: Any = None) -> None:
@@ -82,19 +78,17 @@ def _show_bar(layer: Any, on: bool) -> None:
     layer.name_overlay.visible = on
 
 
-def place_newcomers(viewer: Any) -> None:
+def _place_newcomers(viewer: Any, events: Any) -> None:
     """Lay images that are opened from now on over results of the same size, or say how to.
 
     Results lie in µm or mm, an image from a file in pixels: side by side, napari drops the unit
     of its scale bar. What has a scale keeps it.
     """
-    events = _new_events(viewer, _placed)
-    if events is None:
-        return
 
     def receive(event: Any) -> None:
         layer = event.value
-        fields = [one for one in viewer.layers if _is_placed_field(one)]
+        fields = [one for one in viewer.layers if role_of(one) == "field"]
+        fields = [one for one in fields if frame_of(one).units != Frame().units]
         if fields and _is_bare_image(layer):
             _receive(layer, fields)
 
@@ -128,10 +122,6 @@ def _is_bare_image(layer: Any) -> bool:
         return False
     own = role_of(layer) is not None and layer.source.path is None
     return not own and frame_of(layer) == Frame()
-
-
-def _is_placed_field(layer: Any) -> bool:
-    return role_of(layer) == "field" and frame_of(layer).units != Frame().units
 
 
 def _size(layer: Any) -> tuple[int, ...]:
