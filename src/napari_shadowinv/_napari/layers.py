@@ -254,8 +254,10 @@ class _Shown:
         return found is not None and (self.shot is None or "shot" in found.dims)
 
     def plane(self, variable: str) -> FloatArray:
+        """Values in one shot, as numbers."""
         values = self.dataset[variable]
-        return np.asarray(values if self.shot is None else values[self.shot], dtype=np.float64)
+        one = values if self.shot is None else values.isel(shot=self.shot)
+        return np.asarray(one, dtype=np.float64)
 
     @cached_property
     def field(self) -> ShownField:
@@ -263,11 +265,20 @@ class _Shown:
         return field
 
     @cached_property
+    def magnitude(self) -> FloatArray:
+        return self.field.magnitude
+
+    @cached_property
     def vectors(self) -> Any:
         """Components (y, x) of the field, in its unit."""
         if self.shot is None:
             return self.field.vectors
-        matrix = _field_of_unit_displacements(self.setup)
+        # All fields are linear in the displacement.
+        matrix = np.eye(2)
+        if self.setup is not None and self.setup.kind == "proton":
+            matrix = self.setup.path_integrated_b(matrix)
+        elif self.setup is not None:
+            matrix = self.setup.deflection_angle(matrix)
         first = np.tensordot(matrix, self.plane("displacement"), axes=1)
         matrix = matrix * _ratio(self.field.vectors, first)
         stack = self.dataset["displacement"].transpose("component", "shot", "y", "x").data
@@ -277,7 +288,7 @@ class _Shown:
     def intensity_limits(self) -> Limits:
         """Contrast that image, source and re-projection share."""
         for name in ("image", "reprojection"):
-            if name in self.dataset:
+            if self.along_shots(name):
                 return intensity_limits(self.plane(name))
         return 0.0, 1.0
 
@@ -307,21 +318,17 @@ def _image(shown: _Shown, kind: Kind) -> Content:
 
 def _field(shown: _Shown, role: str) -> tuple[Any, Limits, dict[str, str]]:
     """Strength or a component of the field, its limits, its unit and symbol."""
-    field, is_stack = shown.field, shown.shot is not None
-    magnitude = field.magnitude
+    field = shown.field
+    strongest = float(shown.magnitude.max())
     if role == "field":
-        data = magnitude
-        if is_stack:
-            import dask.array
-
-            data = dask.array.hypot(*shown.vectors)
-        limits = (0.0, float(magnitude.max()))
-        return data, limits, {"unit": field.unit, "symbol": field.symbol}
+        # On lazy arrays, numpy's functions are dask's.
+        data = shown.magnitude if shown.shot is None else np.hypot(*shown.vectors)
+        return data, (0.0, strongest), {"unit": field.unit, "symbol": field.symbol}
     axis = role[-1]
     letter = field.symbol.strip("|")
     symbol = f"∫B{axis} dz" if field.symbol == "|∫B×dz|" else f"{letter}{axis}"
-    # In another shot the field may point the other way.
-    limit = float(magnitude.max() if is_stack else np.abs(field.vectors).max())
+    # In another shot of a stack the field may lie along the other axis.
+    limit = strongest if shown.shot is not None else float(np.abs(field.vectors).max())
     return shown.vectors["yx".index(axis)], (-limit, limit), {"unit": field.unit, "symbol": symbol}
 
 
@@ -416,16 +423,6 @@ _CONTENTS: dict[str, Callable[[_Shown, Kind], Content]] = {
     "points": _sites,
     "shapes": _cells,
 }
-
-
-def _field_of_unit_displacements(setup: Setup | None) -> FloatArray:
-    """Matrix that makes a field (T m, rad or px) of a displacement: all fields are linear."""
-    unit_vectors = np.eye(2)
-    if setup is None:
-        return unit_vectors
-    if setup.kind == "proton":
-        return setup.path_integrated_b(unit_vectors)
-    return setup.deflection_angle(unit_vectors)
 
 
 def _ratio(shown: FloatArray, plane: FloatArray) -> float:

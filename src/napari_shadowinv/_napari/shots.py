@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv import io
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layer_metadata import CAME_WITH, MASK, SHOT, SOURCE, mark
 from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
 from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io import Radiograph, read_radiograph
 from napari_shadowinv.io.files import in_counting_order
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ _CAMERAS = {".b16", ".spe"}
 IMAGE_SUFFIXES = frozenset(_PICTURES | _NUMBERS | _CAMERAS)
 
 
-def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
+def radiograph_layers(shot: io.Radiograph, name: str = "") -> list[FullLayerData]:
     """Describe an image, above its undisturbed beam and its mask, painted where not usable."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
@@ -94,7 +94,7 @@ def shot_layer(
     return data, keywords, "image"
 
 
-def _facts(shot: Radiograph, origin: str) -> dict[str, Any]:
+def _facts(shot: io.Radiograph, origin: str) -> dict[str, Any]:
     """What is known of a file; a layer keeps no more than this of it."""
     return {
         "setup_origin": None if shot.setup is None else f"{CAME_WITH} {origin}",
@@ -104,7 +104,7 @@ def _facts(shot: Radiograph, origin: str) -> dict[str, Any]:
     }
 
 
-def _frame(shot: Radiograph) -> Frame:
+def _frame(shot: io.Radiograph) -> Frame:
     """Pixels of the object plane, if the file tells their size, even where it tells no more."""
     side = dict(shot.metadata.get("geometry") or {}).get("pixel_size")
     if shot.setup is not None or side is None:
@@ -174,11 +174,11 @@ def lazy_stack(
     return array.stack(planes)  # type: ignore[no-untyped-call]
 
 
-def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
+def _first_readable(paths: Sequence[Path]) -> tuple[io.Radiograph, int]:
     mistakes: list[str] = []
     for index, path in enumerate(paths):
         try:
-            return read_radiograph(path), index
+            return io.read_radiograph(path), index
         except (FileFormatError, InputError) as error:
             mistakes.append(str(error))
     raise FileFormatError(f"none of {len(paths)} files can be read as a shot: {mistakes[0]}")
@@ -187,7 +187,7 @@ def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
 def _plane_of(path: Path, shape: tuple[int, int]) -> FloatArray:
     """Read one shot of a stack; a stray file does not end the show."""
     try:
-        image = read_radiograph(path).image
+        image = io.read_radiograph(path).image
         if image.shape != shape:
             raise InputError(
                 f"{path} has {image.shape[0]}×{image.shape[1]} pixels, but the first shot has "
