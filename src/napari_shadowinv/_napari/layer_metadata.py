@@ -1,8 +1,6 @@
 """What a layer of this plugin knows about itself, kept in its metadata.
 
-- write it: `mark`; give a layer another setup: `keep_setup`
-- read it from a layer: `role_of`, `unit_of`, `setup_of`, `setup_origin_of`, `result_of`,
-  `source_of`
+- write it: `mark`, `keep_setup`; read it: `role_of`, `unit_of`, `setup_of`, …
 - what a layer can be used as: `may_be_shot`, `may_be_source`, `may_be_mask`
 - everything behind the layers of one result: `Result`
 
@@ -105,14 +103,12 @@ def setup_origin_of(layer: Any) -> str:
 
 def keep_setup(layer: Any, setup: Setup | None, origin: str) -> None:
     """Make a setup, which comes from `origin`, the one of a layer; None takes it away."""
-    others = {
-        name: value
-        for name, value in mark_of(layer).items()
-        if name not in ("setup", "setup_origin")
-    }
-    given = {} if setup is None else {"setup": setup.model_dump(), "setup_origin": origin}
     # A new dict: a duplicate of the layer may share the old one.
-    layer.metadata[KEY] = others | given
+    known = dict(mark_of(layer))
+    known.pop("setup", None)
+    known.pop("setup_origin", None)
+    given = {} if setup is None else {"setup": setup.model_dump(), "setup_origin": origin}
+    layer.metadata[KEY] = known | given
 
 
 def may_be_shot(layer: Any) -> bool:

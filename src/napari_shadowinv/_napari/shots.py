@@ -50,11 +50,8 @@ def radiograph_layers(shot: io.Radiograph, name: str = "") -> list[FullLayerData
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
     frame = _frame(shot)
-    facts = _facts(shot, f"the sample '{name}'" if shot.path is None else shot.path.name)
-    image = shot_layer(
-        shot.image, name, shot.setup, limits, frame=frame, source=shot.source, **facts
-    )
     layers: list[FullLayerData] = []
+    facts = _facts(shot, f"the sample '{name}'" if shot.path is None else shot.path.name)
     if shot.source is not None:
         data, keywords, kind = shot_layer(
             shot.source, f"{name} source", shot.setup, limits, SOURCE, frame=frame, **facts
@@ -68,7 +65,10 @@ def radiograph_layers(shot: io.Radiograph, name: str = "") -> list[FullLayerData
             **frame.keywords(stacked=False),
         }
         layers.append(((~shot.mask).astype(np.uint8), keywords, "labels"))
-    return [*layers, image]
+    layers.append(
+        shot_layer(shot.image, name, shot.setup, limits, frame=frame, source=shot.source, **facts)
+    )
+    return layers
 
 
 def shot_layer(
