@@ -15,16 +15,22 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import (
     SOURCE,
+    Result,
     may_be_shot,
     may_be_source,
     role_of,
     setup_of,
     setup_origin_of,
+)
+from napari_shadowinv._napari.layers import (
+    FullLayerData,
+    add_layers,
+    intensity_limits,
+    result_layers,
 )
 from napari_shadowinv._napari.notifications import (
     MISTAKES,
@@ -32,6 +38,9 @@ from napari_shadowinv._napari.notifications import (
     notify_errors,
     show_mistake,
 )
+from napari_shadowinv._napari.shots import shot_layer
+from napari_shadowinv._system.progress import ShouldStop
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 
 if TYPE_CHECKING:
@@ -39,12 +48,9 @@ if TYPE_CHECKING:
     import napari.types
 
     import napari
-    from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["estimate_source", "high_pass", "invert_uniform", "remove_hot_pixels"]
-
-ShouldStop = Callable[[], bool]
 
 _HIGH_PASS_SHARE = 0.15
 
@@ -53,7 +59,7 @@ _HIGH_PASS_SHARE = 0.15
 class _Picked:
     """The image that a command works on."""
 
-    image: NDArray[Any]
+    image: AnyArray
     name: str
     frame: Frame
     setup: Setup | None
@@ -61,92 +67,37 @@ class _Picked:
     role: str | None
 
 
-def _nothing() -> list[Any]:
-    return []
-
-
-@notify_errors(otherwise=_nothing)
+@notify_errors(otherwise=list)
 def invert_uniform(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Invert the selected image against a uniform source, with the default options.
-
-    Parameters
-    ----------
-    layer : napari.layers.Image
-        A grey image, or a stack of them.
-    viewer : napari.Viewer, optional
-        Tells which shot of a stack is meant.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The layers of the result. From a menu they come later, and this is empty.
-
-    Raises
-    ------
-    InputError
-        If no shot is selected or it cannot be inverted; from a menu, the user is told.
-    """
+    """Invert the selected image against a uniform source, with the default options."""
     return _begin(_picked(layer, viewer), _inverted, "Inverting", viewer)
 
 
-@notify_errors(otherwise=_nothing)
+@notify_errors(otherwise=list)
 def remove_hot_pixels(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Replace pixels that stand out of the noise by the median of their neighbours.
-
-    Parameters
-    ----------
-    layer, viewer
-        See `invert_uniform`.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The repaired image, with the number of such pixels in its name.
-    """
+    """Replace pixels that stand out of the noise by the median of their neighbours."""
     return _begin(
         _picked(layer, viewer, may_be_source), _repaired, "Removing hot pixels from", viewer
     )
 
 
-@notify_errors(otherwise=_nothing)
+@notify_errors(otherwise=list)
 def high_pass(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Take away structures larger than some 0.15 of the image's shorter side; the mean stays.
-
-    Parameters
-    ----------
-    layer, viewer
-        See `invert_uniform`.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The filtered image.
-    """
+    """Take away structures larger than some 0.15 of the image's shorter side; the mean stays."""
     return _begin(_picked(layer, viewer, may_be_source), _high_passed, "Filtering", viewer)
 
 
-@notify_errors(otherwise=_nothing)
+@notify_errors(otherwise=list)
 def estimate_source(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Estimate the undisturbed beam as the image of least total variation near the selected one.
-
-    Parameters
-    ----------
-    layer, viewer
-        See `invert_uniform`.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The estimate, to be chosen as the source of an inversion.
-    """
+    """Estimate the undisturbed beam as the image of least total variation near the selected one."""
     return _begin(_picked(layer, viewer), _beam, "Estimating the source of", viewer)
 
 
@@ -163,26 +114,13 @@ def _picked(layer: Any, viewer: Any, usable: Callable[[Any], bool] = may_be_shot
     if not usable(layer):
         kind = "a source" if role_of(layer) == SOURCE else "part of a result"
         raise InputError(f"layer '{layer.name}' is {kind}: select the shot")
-    data = layer.data[0] if layer.multiscale else layer.data
-    name = layer.name
+    data, name = layer.data[0] if layer.multiscale else layer.data, layer.name
     if data.ndim > 2:
-        at = _shown(viewer, data.ndim)
+        steps = [0] * data.ndim if viewer is None else viewer.dims.current_step
+        at = tuple(int(step) for step in steps[-data.ndim : -2])
         data, name = data[at], f"{name} {','.join(map(str, at))}"
-    return _Picked(
-        np.asarray(data),
-        name,
-        frame_of(layer),
-        setup_of(layer),
-        setup_origin_of(layer),
-        role_of(layer),
-    )
-
-
-def _shown(viewer: Any, ndim: int) -> tuple[int, ...]:
-    """Index of the plane that is shown, of a layer with more axes than y and x."""
-    if viewer is None:
-        return (0,) * (ndim - 2)
-    return tuple(int(step) for step in viewer.dims.current_step[-ndim:-2])
+    known = setup_of(layer), setup_origin_of(layer), role_of(layer)
+    return _Picked(np.asarray(data), name, frame_of(layer), *known)
 
 
 Work = Callable[[_Picked, ShouldStop], "list[FullLayerData]"]
@@ -192,17 +130,10 @@ def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
     """Do the work at once, or beside a window."""
     if viewer is None or not in_event_loop():
         return list(work(picked, lambda: False))
-    _work_beside(picked, work, f"{doing} {picked.name}", viewer)
-    return []
-
-
-def _work_beside(picked: _Picked, work: Work, title: str, viewer: Any) -> None:
     from napari.qt.threading import create_worker
     from napari.utils import cancelable_progress
 
-    from napari_shadowinv._napari.layers import add_layers
-
-    bar = cancelable_progress(total=0, desc=title)
+    bar = cancelable_progress(total=0, desc=f"{doing} {picked.name}")
 
     def finish(outcome: tuple[list[FullLayerData], Exception | None]) -> None:
         layers, error = outcome
@@ -225,11 +156,10 @@ def _work_beside(picked: _Picked, work: Work, title: str, viewer: Any) -> None:
     worker = create_worker(run)
     worker.returned.connect(finish)
     worker.start()
+    return []
 
 
 def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
-    from napari_shadowinv._napari.layer_metadata import Result
-    from napari_shadowinv._napari.layers import result_layers
     from napari_shadowinv.inversion import invert
 
     inversion = invert(picked.image, should_stop=should_stop)
@@ -260,18 +190,12 @@ def _beam(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     return [_filtered(replace(picked, role=SOURCE), source, "source by total variation")]
 
 
-def _filtered(picked: _Picked, image: NDArray[np.float64], title: str) -> FullLayerData:
-    from napari_shadowinv._napari.layers import intensity_limits
-    from napari_shadowinv._napari.shots import shot_layer
-
-    # The same limits show what a filter did.
-    limits = intensity_limits(picked.image)
-    name = f"{picked.name} {title}"
+def _filtered(picked: _Picked, image: FloatArray, title: str) -> FullLayerData:
     return shot_layer(
         image,
-        name,
+        f"{picked.name} {title}",
         picked.setup,
-        limits,
+        intensity_limits(picked.image),  # the same limits show what a filter did
         picked.role,
         frame=picked.frame,
         setup_origin=picked.setup_origin or None,

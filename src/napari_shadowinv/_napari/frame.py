@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from napari_shadowinv._typing import FloatArray
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
@@ -20,34 +21,18 @@ __all__ = ["Frame", "frame_for", "frame_of", "place"]
 
 Matrix = tuple[tuple[float, ...], ...]
 
-_MICROMETRES_PER_METRE = 1e6
 # Up to here a length in µm has four digits at most.
 _LONGEST_IN_MICROMETRES = 10_000.0
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Pixel size, position and unit of a plane's axes (y, x).
-
-    Attributes
-    ----------
-    scale : tuple of float
-        Sides of a pixel, in `units`.
-    translate : tuple of float
-        Position of the centre of pixel (0, 0), in `units`.
-    units : tuple of str
-        Unit of each axis, as pint knows them: ``"um"``, ``"mm"`` or ``"pixel"``.
-    rotate : tuple of tuple of float
-        Rotation matrix, as of a camera that was turned.
-    shear : float
-        Slant of the rows.
-    affine : tuple of tuple of float
-        What is done to the place after all that: a homogeneous 3 × 3 matrix.
-    """
+    """Pixel size, position (of the centre of pixel (0, 0)) and unit of a plane's axes (y, x)."""
 
     scale: tuple[float, float] = (1.0, 1.0)
     translate: tuple[float, float] = (0.0, 0.0)
     units: tuple[str, str] = ("pixel", "pixel")
+    # A rotation matrix, the slant of the rows, and a homogeneous matrix after all that.
     rotate: Matrix = ((1.0, 0.0), (0.0, 1.0))
     shear: float = 0.0
     affine: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -60,37 +45,21 @@ class Frame:
         return replace(self, translate=(float(origin[0]), float(origin[1])))
 
     def keywords(self, *, stacked: bool = False) -> dict[str, Any]:
-        """Return the keywords that place a layer.
-
-        Parameters
-        ----------
-        stacked : bool
-            Whether an axis of shots comes first.
-
-        Returns
-        -------
-        dict
-            ``scale``, ``translate``, ``units``, ``axis_labels``; ``rotate``, ``shear`` and
-            ``affine`` where a frame is not upright.
-        """
-        first: tuple[tuple[Any, ...], ...] = (
-            ((1.0,), (0.0,), ("pixel",), ("shot",)) if stacked else ((), (), (), ())
-        )
-        own = (self.scale, self.translate, self.units, ("y", "x"))
-        names = ("scale", "translate", "units", "axis_labels")
-        placed = {name: one + two for name, one, two in zip(names, first, own, strict=True)}
-        return placed | self._tilt(stacked)
-
-    def _tilt(self, stacked: bool) -> dict[str, Any]:
+        """Return the keywords that place a layer; `stacked` if an axis of shots comes first."""
+        keywords: dict[str, Any] = {
+            "scale": (1.0, *self.scale) if stacked else self.scale,
+            "translate": (0.0, *self.translate) if stacked else self.translate,
+            "units": ("pixel", *self.units) if stacked else self.units,
+            "axis_labels": ("shot", "y", "x") if stacked else ("y", "x"),
+        }
         upright = Frame()
-        tilt: dict[str, Any] = {}
         if self.rotate != upright.rotate:
-            tilt["rotate"] = _with_shots(self.rotate, stacked)
+            keywords["rotate"] = _with_shots(self.rotate, stacked)
         if self.shear != upright.shear:
-            tilt["shear"] = [0.0, 0.0, self.shear] if stacked else [self.shear]
+            keywords["shear"] = [0.0, 0.0, self.shear] if stacked else [self.shear]
         if self.affine != upright.affine:
-            tilt["affine"] = _with_shots(self.affine, stacked)
-        return tilt
+            keywords["affine"] = _with_shots(self.affine, stacked)
+        return keywords
 
 
 def frame_for(
@@ -101,25 +70,10 @@ def frame_for(
     translate: Sequence[float] | None = None,
     units: Sequence[str] | None = None,
 ) -> Frame:
-    """Choose the frame of an image.
-
-    Parameters
-    ----------
-    shape : sequence of int
-        Shape of the image; its last two numbers count.
-    setup : Setup or None
-        Gives the pixel's size in the object plane; without it, lengths are pixels.
-    scale, translate, units : sequence, optional
-        Taken instead, where given; axis order (y, x).
-
-    Returns
-    -------
-    Frame
-        In µm, in mm where the image is larger than 1 cm, or in pixels.
-    """
+    """Choose a frame in µm, in mm for more than 1 cm, or in pixels; what is given goes before."""
     frame = Frame()
     if setup is not None:
-        pixel, unit = setup.object_pixel_size * _MICROMETRES_PER_METRE, "um"
+        pixel, unit = setup.object_pixel_size * 1e6, "um"
         if max(shape[-2:]) * pixel > _LONGEST_IN_MICROMETRES:
             pixel, unit = pixel * 1e-3, "mm"
         frame = Frame(scale=(pixel, pixel), units=(unit, unit))
@@ -142,11 +96,11 @@ def frame_of(layer: Any) -> Frame:
     )
 
 
-def _matrix(values: NDArray[np.float64]) -> Matrix:
+def _matrix(values: FloatArray) -> Matrix:
     return tuple(tuple(float(value) for value in row) for row in values)
 
 
-def _with_shots(matrix: Matrix, stacked: bool) -> NDArray[np.float64]:
+def _with_shots(matrix: Matrix, stacked: bool) -> FloatArray:
     """A matrix of the axes y and x that leaves an axis of shots before them alone."""
     if not stacked:
         return np.array(matrix)
@@ -156,17 +110,8 @@ def _with_shots(matrix: Matrix, stacked: bool) -> NDArray[np.float64]:
 
 
 def place(layer: Any, setup: Setup) -> None:
-    """Give a layer the pixel size that a setup tells, so that it fits to its result.
-
-    Parameters
-    ----------
-    layer : napari.layers.Layer
-        An image, whose last two axes are y and x.
-    setup : Setup
-        The experiment.
-    """
+    """Give an image, whose last axes are y and x, the pixel size of its results."""
     frame = frame_for(layer.data.shape, setup)
-    labels = layer.axis_labels
     layer.scale = (*layer.scale[:-2], *frame.scale)
     layer.units = (*layer.units[:-2], *frame.units)
-    layer.axis_labels = (*labels[:-2], "y", "x")
+    layer.axis_labels = (*layer.axis_labels[:-2], "y", "x")

@@ -1,8 +1,6 @@
 """What a layer of this plugin knows about itself, kept in its metadata.
 
-- write it: `mark`; give a layer another setup: `keep_setup`
-- read it from a layer: `role_of`, `unit_of`, `setup_of`, `setup_origin_of`, `result_of`,
-  `source_of`
+- write it: `mark`, `keep_setup`; read it: `role_of`, `unit_of`, `setup_of`, …
 - what a layer can be used as: `may_be_shot`, `may_be_source`, `may_be_mask`
 - everything behind the layers of one result: `Result`
 
@@ -18,7 +16,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from napari_shadowinv._typing import FloatArray
 
 if TYPE_CHECKING:
     import xarray
@@ -59,66 +58,21 @@ CAME_WITH = "came with"
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What the layers of one result show, whole: all that is needed to write it.
+    """What the layers of one result show, whole: all that is needed to write it."""
 
-    Attributes
-    ----------
-    content : Inversion or xarray.Dataset
-        The result; a dataset where a file holds no more than a field.
-    setup : Setup or None
-        The experiment.
-    attributes : mapping of str to str
-        Which files it was made from, as `napari_shadowinv.io.provenance` tells.
-    """
-
-    content: Inversion | xarray.Dataset
+    content: Inversion | xarray.Dataset  # a dataset where a file holds no more than a field
     setup: Setup | None = None
-    attributes: Mapping[str, str] = field(default_factory=dict)
+    attributes: Mapping[str, str] = field(default_factory=dict)  # which files it was made from
 
 
-def mark(
-    role: str | None,
-    unit: str,
-    setup: Setup | None = None,
-    **more: Any,
-) -> dict[str, Any]:
-    """Make the metadata of a layer.
-
-    Parameters
-    ----------
-    role : str or None
-        What it shows: ``"shot"``, ``"source"``, ``"potential"``, ``"field"``, ``"sites"``, …;
-        None if that is not known.
-    unit : str
-        Unit of its values; empty if they have none.
-    setup : Setup, optional
-        The experiment.
-    **more
-        Other facts, such as ``result`` (a `Result`), ``source`` (an array) or ``setup_origin``
-        (see `setup_origin_of`).
-
-    Returns
-    -------
-    dict
-        To be passed to a layer as `metadata`.
-    """
+def mark(role: str | None, unit: str, setup: Setup | None = None, **more: Any) -> dict[str, Any]:
+    """Make the metadata of a layer; `role` and `unit` are None and empty where unknown."""
     described = {} if setup is None else {"setup": setup.model_dump()}
     return {KEY: {"role": role, "unit": unit, **described, **more}}
 
 
 def mark_of(layer: Any) -> dict[str, Any]:
-    """Return what a layer knows about itself; empty for a layer of other origin.
-
-    Parameters
-    ----------
-    layer : napari.layers.Layer or mapping
-        A layer, or the keywords of one.
-
-    Returns
-    -------
-    dict
-        With ``role`` and ``unit`` at least, if it is a layer of this plugin.
-    """
+    """Return what a layer, or the keywords of one, tell about it; empty for other origins."""
     metadata = layer.get("metadata") if isinstance(layer, Mapping) else layer.metadata
     found = (metadata or {}).get(KEY)
     return found if isinstance(found, dict) else {}
@@ -148,25 +102,13 @@ def setup_origin_of(layer: Any) -> str:
 
 
 def keep_setup(layer: Any, setup: Setup | None, origin: str) -> None:
-    """Make a setup the one of a layer.
-
-    Parameters
-    ----------
-    layer : napari.layers.Layer
-        An image.
-    setup : Setup or None
-        The experiment; None takes away what the layer has.
-    origin : str
-        Where it comes from.
-    """
-    others = {
-        name: value
-        for name, value in mark_of(layer).items()
-        if name not in ("setup", "setup_origin")
-    }
-    given = {} if setup is None else {"setup": setup.model_dump(), "setup_origin": origin}
+    """Make a setup, which comes from `origin`, the one of a layer; None takes it away."""
     # A new dict: a duplicate of the layer may share the old one.
-    layer.metadata[KEY] = others | given
+    known = dict(mark_of(layer))
+    known.pop("setup", None)
+    known.pop("setup_origin", None)
+    given = {} if setup is None else {"setup": setup.model_dump(), "setup_origin": origin}
+    layer.metadata[KEY] = known | given
 
 
 def may_be_shot(layer: Any) -> bool:
@@ -190,7 +132,7 @@ def result_of(layer: Any) -> Result | None:
     return found if isinstance(found, Result) else None
 
 
-def source_of(layer: Any) -> NDArray[np.float64] | None:
+def source_of(layer: Any) -> FloatArray | None:
     """Return the undisturbed beam that came with an image, None if none did."""
     found = mark_of(layer).get("source")
     return None if found is None else np.asarray(found)

@@ -16,11 +16,10 @@ import numpy as np
 from napari_shadowinv._napari.frame import frame_for
 from napari_shadowinv._napari.layer_metadata import Result, role_of
 from napari_shadowinv._napari.layers import FullLayerData, result_layers
+from napari_shadowinv.inversion.labels import setup_from_dataset
 
 if TYPE_CHECKING:
     import xarray
-
-    from napari_shadowinv.inversion import Inversion
 
 __all__ = ["dataset_of_layers", "layers_of_dataset"]
 
@@ -50,22 +49,8 @@ _KEPT_BY_ALL = ("name", "visible", "opacity", "blending", *_PLACE)
 
 
 def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]:
-    """Describe the layers of a result that was read.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The result of an inversion, or a field of other origin.
-    name : str
-        Name of the shot, where the dataset does not tell how its layers were called.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The layers as they were saved. Those that were not saved with it are hidden.
-    """
+    """Describe the layers of a result as they were saved; those that were not are hidden."""
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.labels import setup_from_dataset
 
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     setup = setup_from_dataset(dataset)
@@ -78,52 +63,31 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
     shape = dataset["displacement"].shape[-2:]
     frame = frame_for(shape, setup, **{key: place.get(key) for key in _PLACE})
     layers = result_layers(result, frame, name, cells="cells" in looks)
-    return [_as_it_was(layer, looks) for layer in layers]
-
-
-def _as_it_was(layer: FullLayerData, looks: dict[str, dict[str, Any]]) -> FullLayerData:
-    data, keywords, kind = layer
     if not looks:
-        return layer
-    known = looks.get(role_of(keywords) or "", {"visible": False})
-    return data, {**keywords, **known}, kind
+        return layers
+    hidden = {"visible": False}
+    return [
+        (data, keywords | looks.get(role_of(keywords) or "", hidden), kind)
+        for data, keywords, kind in layers
+    ]
 
 
 def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray.Dataset:
-    """Make the dataset of a result that keeps how its layers look.
-
-    Parameters
-    ----------
-    layers : sequence of (data, keywords, layer type)
-        Layers of one result.
-    result : Result
-        The result behind them.
-
-    Returns
-    -------
-    xarray.Dataset
-        All of the result; caustics as they were painted last.
-    """
+    """Make the dataset of a result that keeps how its layers look, with caustics as painted."""
     import xarray as xr
 
     content = result.content
-    looks = {role_of(layer[1]): _look(layer) for layer in layers}
+    looks = {role_of(keywords): _look(keywords, kind) for _, keywords, kind in layers}
     kept = {_LOOKS: json.dumps(looks)}
     if isinstance(content, xr.Dataset):
         return content.assign_attrs(kept)
-    painted = _with_painted_caustics(content, layers)
-    return painted.to_dataset(result.setup, attributes={**result.attributes, **kept})
-
-
-def _with_painted_caustics(inversion: Inversion, layers: Sequence[FullLayerData]) -> Inversion:
     for data, keywords, _ in layers:
         if role_of(keywords) == "caustic":
-            return replace(inversion, caustic=np.asarray(data) > 0)
-    return inversion
+            content = replace(content, caustic=np.asarray(data) > 0)
+    return content.to_dataset(result.setup, attributes={**result.attributes, **kept})
 
 
-def _look(layer: FullLayerData) -> dict[str, Any]:
-    _, keywords, kind = layer
+def _look(keywords: dict[str, Any], kind: str) -> dict[str, Any]:
     names = (*_KEPT_BY_ALL, *_KEPT.get(kind, ()))
     return {name: _plain(keywords[name]) for name in names if keywords.get(name) is not None}
 

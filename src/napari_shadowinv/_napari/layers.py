@@ -1,58 +1,55 @@
-"""A result as napari layers.
+"""Results as napari layers, of one shot or of a stack of shots.
 
-- describe them, without a viewer: `inversion_layers`
-- put them into a viewer, with or without a window: `add_inversion`
+- the kinds of layers: `KINDS`; a labelled dataset as layers: `dataset_layers`
+- a result as layers: `inversion_layers`, `result_layers`
+- put layers into a viewer, with or without a window: `add_inversion`, `add_layers`
 
-The lowest layer comes first. The strength of the field and the arrows are visible, all others
-are there to be switched on. What each layer shows, in which unit, and the whole result behind
+The lowest layer comes first. What each layer shows, in which unit, and the whole result behind
 it are in its metadata; see `napari_shadowinv._napari.layer_metadata`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layer_metadata import Result, mark, role_of
-from napari_shadowinv._napari.legend import follow_top_image
-from napari_shadowinv._napari.placing import place_newcomers
-from napari_shadowinv.physics.units import shown_fields, shown_potential
+from napari_shadowinv._napari.sites import Cells, power_cells, site_features
+from napari_shadowinv._napari.viewer_sync import keep_in_step
+from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.inversion.labels import VARIABLES
+from napari_shadowinv.plotting import ShownField, shown_fields, shown_potential
 
 if TYPE_CHECKING:
+    import xarray
+
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
+    "KINDS",
     "FullLayerData",
     "add_inversion",
     "add_layers",
-    "arrow_keywords",
-    "caustic_keywords",
+    "at_shot",
+    "dataset_layers",
     "intensity_limits",
     "inversion_layers",
-    "opened",
     "result_layers",
-    "show_scale_bar",
-    "symmetric_limits",
     "thinned_arrows",
 ]
 
-Array = NDArray[np.float64]
 FullLayerData = tuple[Any, dict[str, Any], str]
+Limits = tuple[float, float]
 
-_INTENSITY_MAP = "gray"
-_POTENTIAL_MAP = "viridis"
-_FIELD_MAP = "inferno"
-_SIGNED_MAP = "RdBu_r"
 # Both stand out of every colour of the field's map.
 _CAUSTIC_COLOUR = "#5dff5d"
-_ARROW_COLOUR = "#00c8ff"
-_FIELD_ARROW_COLOUR = "#ffffff"
+_ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
 
 _ARROWS_ALONG = 28
 _SHORTEST_ARROW = 0.05
@@ -60,6 +57,39 @@ _MOST_SITES_SHOWN = 200_000
 _BRIGHTEST = 99.7
 _ENOUGH_PIXELS = 100_000
 _LARGEST_INTENSITY = 3.5
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of layer; ``{unit}`` and ``{symbol}`` in a title depend on the setup."""
+
+    role: str
+    variable: str
+    title: str
+    unit: str = ""
+    colormap: str = ""
+    type: str = "image"
+    visible: bool = False
+    shown_of: Literal["shot", "stack", "both"] = "both"
+
+
+KINDS = (
+    Kind("image", "image", "image", "flux/px²", "gray"),
+    Kind("source", "source", "source", "flux/px²", "gray", shown_of="shot"),
+    Kind("reprojection", "reprojection", "re-projection", "flux/px²", "gray"),
+    Kind("residual", "residual", "residual (% of mean)", "%", "RdBu_r", shown_of="shot"),
+    Kind("residual", "residual", "residual", "flux/px²", "RdBu_r", shown_of="stack"),
+    Kind("potential", "potential", "potential ({unit})", colormap="viridis"),
+    Kind("field y", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
+    Kind("field x", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
+    Kind("field", "displacement", "{symbol} ({unit})", colormap="inferno", visible=True),
+    Kind("caustic", "caustic", "caustics", type="labels"),
+    # A magnetic field is at right angles to the displacement.
+    Kind("field arrows", "displacement", "∫B dz arrows", type="vectors", shown_of="shot"),
+    Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),
+    Kind("sites", "sites", "sites{share}", colormap="inferno", type="points", shown_of="shot"),
+    Kind("cells", "sites", "power cells", type="shapes", shown_of="shot"),
+)
 
 
 def inversion_layers(
@@ -73,39 +103,11 @@ def inversion_layers(
     cells: bool = False,
     attributes: Mapping[str, str] | None = None,
 ) -> list[FullLayerData]:
-    """Describe the layers of a result.
-
-    Parameters
-    ----------
-    inversion : Inversion
-        The result.
-    setup : Setup, optional
-        Gives the pixel size and the field in SI units; pixels without.
-    name : str
-        Name of the shot; the layers' names begin with it.
-    scale, translate, units : sequence, optional
-        Place of the image in the world, axis order (y, x), where it is not the setup's:
-        a binned or cropped image lies on its original with those of the original's layer.
-    cells : bool
-        Whether to add the power cells as polygons, for up to 5,000 sites.
-    attributes : mapping of str to str, optional
-        Where the result comes from, see `napari_shadowinv.io.provenance`; kept for writing.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        As napari's ``Layer.create`` takes them, the lowest first.
-
-    Raises
-    ------
-    InputError
-        If cells are asked for and there are too many.
-    """
-    result = Result(inversion, setup, dict(attributes or {}))
+    """Describe the layers of a result; the keywords are those of `add_inversion`."""
     frame = frame_for(
         inversion.potential.shape, setup, scale=scale, translate=translate, units=units
     )
-    return result_layers(result, frame, name, cells=cells)
+    return result_layers(Result(inversion, setup, dict(attributes or {})), frame, name, cells=cells)
 
 
 def add_inversion(
@@ -118,18 +120,25 @@ def add_inversion(
 ) -> list[Any]:
     """Add the layers of a result to a viewer, with a scale bar.
 
+    The strength of the field and the arrows are visible, all others are there to be switched on.
+
     Parameters
     ----------
     viewer : napari.Viewer or napari.components.ViewerModel
         Where to add them; a `ViewerModel` needs neither a window nor a display.
     inversion : Inversion
         The result.
-    setup : Setup, optional
-        The experiment.
+    setup : ProtonSetup or OpticalSetup, optional
+        Gives the pixel size and the field in SI units; pixels without.
     name : str
         Name of the shot; the layers' names begin with it.
     **keywords
-        More of `inversion_layers`.
+        ``scale``, ``translate``, ``units`` (sequences in axis order y, x): place of the image
+        in the world, where it is not the setup's; a binned or cropped image lies on its
+        original with those of the original's layer.
+        ``cells`` (bool): whether to add the power cells as polygons, for up to 5,000 sites.
+        ``attributes`` (mapping of str to str): which files the result comes from; kept for
+        writing.
 
     Returns
     -------
@@ -139,7 +148,7 @@ def add_inversion(
     Raises
     ------
     InputError
-        As `inversion_layers`.
+        If cells are asked for and there are too many.
 
     Examples
     --------
@@ -156,22 +165,7 @@ def add_inversion(
 def add_layers(
     viewer: Any, described: Sequence[FullLayerData], *, below: Any | None = None
 ) -> list[Any]:
-    """Add described layers to a viewer, select the field, switch on scale bar and colour bar.
-
-    Parameters
-    ----------
-    viewer : napari.Viewer or napari.components.ViewerModel
-        Where to add them.
-    described : sequence of (data, keywords, layer type)
-        The layers.
-    below : napari.layers.Layer, optional
-        A layer of the viewer to put them under. Default: on top of all.
-
-    Returns
-    -------
-    list of napari.layers.Layer
-        The new layers, in the same order.
-    """
+    """Add layers on top or below a layer, select the field, switch on scale bar and colour bar."""
     from napari.layers import Layer
 
     added = [Layer.create(*layer) for layer in described]
@@ -182,287 +176,263 @@ def add_layers(
         if role_of(layer) == "field":
             # The status line then tells the field below the mouse.
             viewer.layers.selection.active = layer
-    show_scale_bar(viewer)
-    follow_top_image(viewer)
-    place_newcomers(viewer)
-    return added
-
-
-def show_scale_bar(viewer: Any) -> None:
-    """Switch on the scale bar of a viewer."""
     overlays = getattr(getattr(viewer, "canvas", None), "overlays", viewer)  # napari before 0.9
     overlays.scale_bar.visible = True
-
-
-@dataclass(frozen=True)
-class _Maker:
-    """Makes layers that share a result, a frame and a name."""
-
-    result: Result
-    frame: Frame
-    name: str
-
-    def layer(
-        self, data: Any, kind: str, role: str, title: str, unit: str = "", **keywords: Any
-    ) -> FullLayerData:
-        made_from = dict(self.result.attributes)
-        metadata = mark(role, unit, self.result.setup, result=self.result, made_from=made_from)
-        return (
-            data,
-            {
-                "name": f"{self.name} {title}".strip(),
-                "metadata": metadata,
-                **self.frame.keywords(),
-                **keywords,
-            },
-            kind,
-        )
-
-    def image(
-        self, plane: ArrayLike, role: str, title: str, unit: str, limits: tuple[float, float],
-        colormap: str, **keywords: Any,
-    ) -> FullLayerData:  # fmt: skip
-        choices = {"colormap": colormap, "contrast_limits": opened(limits), "visible": False}
-        return self.layer(plane, "image", role, title, unit, **{**choices, **keywords})
+    keep_in_step(viewer)
+    return added
 
 
 def result_layers(
     result: Result, frame: Frame, name: str = "", *, cells: bool = False
 ) -> list[FullLayerData]:
-    """Describe the layers of a result or of a mere field.
-
-    Parameters
-    ----------
-    result : Result
-        What to show.
-    frame : Frame
-        Where it lies.
-    name : str
-        Name of the shot.
-    cells : bool
-        See `inversion_layers`.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The layers, the lowest first.
-    """
+    """Describe the layers of a result or of a mere field; with `cells`, its power cells, too."""
     import xarray as xr
 
-    make = _Maker(result, frame, name)
     content = result.content
+    facts = {"result": result, "made_from": dict(result.attributes)}
     if isinstance(content, xr.Dataset):
-        displacement = np.asarray(content["displacement"])
-        return [
-            *(
-                [_potential(make, np.asarray(content["potential"]))]
-                if "potential" in content
-                else []
-            ),
-            *_field(make, displacement),
-            *_arrows(make, displacement),
-        ]
-    return [
-        *_intensities(make, content),
-        _potential(make, content.potential),
-        *_field(make, content.displacement),
-        _caustics(make, content),
-        *_arrows(make, content.displacement),
-        _sites(make, content),
-        *([_cells(make, content)] if cells else []),
-    ]
-
-
-def _intensities(make: _Maker, inversion: Inversion) -> list[FullLayerData]:
-    """What was inverted, what the answer makes of it, and what is left over."""
-    unit = "flux/px²"
-    limits = intensity_limits(inversion.image)
-    percent = 100 * inversion.residual / inversion.image[inversion.mask].mean()
-    layers = [make.image(inversion.image, "image", "image", unit, limits, _INTENSITY_MAP)]
-    if np.ptp(inversion.source):
-        layers.append(
-            make.image(inversion.source, "source", "source", unit, limits, _INTENSITY_MAP)
-        )
-    return [
-        *layers,
-        make.image(
-            inversion.reprojection, "reprojection", "re-projection", unit, limits, _INTENSITY_MAP
-        ),
-        make.image(
-            percent, "residual", "residual (% of mean)", "%", symmetric_limits(percent), _SIGNED_MAP
-        ),
-    ]
-
-
-def _potential(make: _Maker, potential: Array) -> FullLayerData:
-    plane, unit = shown_potential(potential, make.result.setup)
-    limits = (float(plane.min()), float(plane.max()))
-    return make.image(plane, "potential", f"potential ({unit})", unit, limits, _POTENTIAL_MAP)
-
-
-def _field(make: _Maker, displacement: Array) -> list[FullLayerData]:
-    """Components of the field, and on top of them its strength."""
-    (field,) = shown_fields([displacement], make.result.setup)
-    limit = float(np.abs(field.vectors).max())
-    strength = field.magnitude
-    return [
-        *(
-            make.image(
-                plane, role, f"{symbol} ({field.unit})", field.unit, (-limit, limit), _SIGNED_MAP
-            )
-            for plane, role, symbol in zip(
-                field.vectors, ("field y", "field x"), field.components, strict=True
-            )
-        ),
-        make.image(
-            strength,
-            "field",
-            f"{field.symbol} ({field.unit})",
-            field.unit,
-            (0.0, float(strength.max())),
-            _FIELD_MAP,
-            visible=True,
-        ),
-    ]
-
-
-def _caustics(make: _Maker, inversion: Inversion) -> FullLayerData:
-    return make.layer(
-        inversion.caustic.astype(np.uint8),
-        "labels",
-        "caustic",
-        "caustics",
-        **caustic_keywords(),
+        field = content[[name for name in ("displacement", "potential") if name in content]]
+        return dataset_layers(field, result.setup, frame, name, facts)
+    dataset = xr.Dataset(
+        {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     )
+    diagram = power_cells(content) if cells else None
+    return dataset_layers(dataset, result.setup, frame, name, facts, cells=diagram)
 
 
-def caustic_keywords() -> dict[str, Any]:
-    """Return how caustics look: one colour on nothing."""
+def dataset_layers(
+    dataset: xarray.Dataset,
+    setup: Setup | None,
+    frame: Frame,
+    name: str,
+    facts: Mapping[str, Any],
+    shot: int | None = None,
+    cells: Cells | None = None,
+) -> list[FullLayerData]:
+    """Describe the layers of a result, or of a stack in the units and contrast of one `shot`."""
+    shown = _Shown(dataset, setup, shot, cells)
+    layers = []
+    for kind in KINDS:
+        if not shown.has(kind):
+            continue
+        data, words, look = _CONTENTS[kind.type](shown, kind)
+        unit = words.get("unit", kind.unit)
+        keywords = {
+            "name": f"{name} {kind.title.format(**words)}".strip(),
+            "metadata": mark(kind.role, unit, setup, **facts),
+            "visible": kind.visible,
+            **frame.keywords(stacked=shot is not None),
+            **look,
+        }
+        layers.append((data, keywords, kind.type))
+    return layers
+
+
+@dataclass
+class _Shown:
+    """A result, or a stack of which one shot decides on units and contrast."""
+
+    dataset: xarray.Dataset
+    setup: Setup | None
+    shot: int | None
+    cells: Cells | None
+
+    def has(self, kind: Kind) -> bool:
+        if kind.shown_of == ("shot" if self.shot is not None else "stack"):
+            return False
+        if not self.along_shots(kind.variable):
+            return False
+        if kind.role == "field arrows":
+            return self.setup is not None and self.setup.kind == "proton"
+        if kind.role == "cells":
+            return self.cells is not None
+        return kind.role != "source" or bool(np.ptp(self.plane("source")))
+
+    def along_shots(self, variable: str) -> bool:
+        """Whether there is a variable, in a stack one of each shot."""
+        found = self.dataset.get(variable)
+        return found is not None and (self.shot is None or "shot" in found.dims)
+
+    def plane(self, variable: str) -> FloatArray:
+        """Values in one shot, as numbers."""
+        values = self.dataset[variable]
+        one = values if self.shot is None else values.isel(shot=self.shot)
+        return np.asarray(one, dtype=np.float64)
+
+    @cached_property
+    def field(self) -> ShownField:
+        (field,) = shown_fields([self.plane("displacement")], self.setup)
+        return field
+
+    @cached_property
+    def magnitude(self) -> FloatArray:
+        return self.field.magnitude
+
+    @cached_property
+    def vectors(self) -> Any:
+        """Components (y, x) of the field, in its unit."""
+        if self.shot is None:
+            return self.field.vectors
+        # All fields are linear in the displacement.
+        matrix = np.eye(2)
+        if self.setup is not None and self.setup.kind == "proton":
+            matrix = self.setup.path_integrated_b(matrix)
+        elif self.setup is not None:
+            matrix = self.setup.deflection_angle(matrix)
+        first = np.tensordot(matrix, self.plane("displacement"), axes=1)
+        matrix = matrix * _ratio(self.field.vectors, first)
+        stack = self.dataset["displacement"].transpose("component", "shot", "y", "x").data
+        return [sum(factor * stack[k] for k, factor in enumerate(row) if factor) for row in matrix]
+
+    @cached_property
+    def intensity_limits(self) -> Limits:
+        """Contrast that image, source and re-projection share."""
+        for name in ("image", "reprojection"):
+            if self.along_shots(name):
+                return intensity_limits(self.plane(name))
+        return 0.0, 1.0
+
+
+Content = tuple[Any, dict[str, str], dict[str, Any]]  # data, words of the title, keywords
+
+
+def _image(shown: _Shown, kind: Kind) -> Content:
+    words: dict[str, str] = {}
+    data = shown.dataset[kind.variable].data
+    if kind.variable == "displacement":
+        data, limits, words = _field(shown, kind.role)
+    elif kind.role == "potential":
+        plane = shown.plane("potential")
+        values, unit = shown_potential(plane, shown.setup)
+        data = values if shown.shot is None else data * _ratio(values, plane)
+        limits, words = (float(values.min()), float(values.max())), {"unit": unit}
+    elif kind.role == "residual":
+        if kind.unit == "%":
+            used = shown.plane("image")[shown.dataset["mask"].values]
+            data = 100 * data / used.mean()
+        limits = _symmetric_limits(data if shown.shot is None else shown.plane("residual"))
+    else:
+        limits = shown.intensity_limits
+    return data, words, {"colormap": kind.colormap, "contrast_limits": _opened(limits)}
+
+
+def _field(shown: _Shown, role: str) -> tuple[Any, Limits, dict[str, str]]:
+    """Strength or a component of the field, its limits, its unit and symbol."""
+    field = shown.field
+    strongest = float(shown.magnitude.max())
+    if role == "field":
+        # On lazy arrays, numpy's functions are dask's.
+        data = shown.magnitude if shown.shot is None else np.hypot(*shown.vectors)
+        return data, (0.0, strongest), {"unit": field.unit, "symbol": field.symbol}
+    axis = role[-1]
+    letter = field.symbol.strip("|")
+    symbol = f"∫B{axis} dz" if field.symbol == "|∫B×dz|" else f"{letter}{axis}"
+    # In another shot of a stack the field may lie along the other axis.
+    limit = strongest if shown.shot is not None else float(np.abs(field.vectors).max())
+    return shown.vectors["yx".index(axis)], (-limit, limit), {"unit": field.unit, "symbol": symbol}
+
+
+def _caustics(shown: _Shown, kind: Kind) -> Content:
     from napari.utils.colormaps import CyclicLabelColormap
     from napari.utils.colormaps.standardize_color import transform_color
 
     # A dictionary of colours would do, but napari compiles code for it, for two seconds.
     colours = transform_color(["transparent", _CAUSTIC_COLOUR])
-    return {"colormap": CyclicLabelColormap(colours), "opacity": 0.5, "visible": False}
+    look = {"colormap": CyclicLabelColormap(colours), "opacity": 0.5}
+    return shown.dataset["caustic"].data.astype(np.uint8), {}, look
 
 
-def _arrows(make: _Maker, displacement: Array) -> list[FullLayerData]:
-    """Displacements of few enough rays to see each arrow; a field's own arrows are hidden."""
-    data, spacing = thinned_arrows(displacement)
-    title = "displacement arrows"
-    arrows = [make.layer(data, "vectors", "arrows", title, "px", **arrow_keywords(data, spacing))]
-    (field,) = shown_fields([displacement], make.result.setup)
-    if not field.arrows:
-        return arrows
-    data, spacing = thinned_arrows(field.vectors)
-    look = arrow_keywords(data, spacing, "field")
-    hidden = make.layer(
-        data, "vectors", "field arrows", field.arrows, field.unit, **{**look, "visible": False}
-    )
-    return [hidden, *arrows]
-
-
-def arrow_keywords(data: Array, spacing: float, shown: str = "displacement") -> dict[str, Any]:
-    """Return how arrows look, from those of one result; see `thinned_arrows`."""
+def _arrows(shown: _Shown, kind: Kind) -> Content:
+    """Vectors of few enough rays that each arrow can be seen."""
+    is_field = kind.role == "field arrows"
+    data, spacing = thinned_arrows(shown.field.vectors if is_field else shown.plane("displacement"))
     lengths = np.hypot(*data[:, 1].T)
     # Most arrows keep to their own place; the strongest reach to the next but one at most.
     usual = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
-    return {
-        "features": {shown: lengths},
+    look = {
+        "features": {"field" if is_field else "displacement": lengths},
         "vector_style": "arrow",
-        "edge_color": _FIELD_ARROW_COLOUR if shown == "field" else _ARROW_COLOUR,
+        "edge_color": _ARROW_COLOURS[kind.role],
         "edge_width": spacing / 9,
         # The data keep their unit; only the drawing is stretched.
         "length": float(0.95 * spacing / usual) if usual else 1.0,
         "opacity": 0.75,
     }
+    words = {"unit": shown.field.unit} if is_field else {}
+    return data if shown.shot is None else at_shot(data, shown.shot), words, look
 
 
-def thinned_arrows(displacement: Array, along: int = _ARROWS_ALONG) -> tuple[Array, float]:
-    """Pick the displacement of rays, or another field of vectors, on a coarse grid.
+def thinned_arrows(field: FloatArray) -> tuple[FloatArray, float]:
+    """Pick vectors (y, x) of a field on a grid: starts and vectors (n, 2, 2), and the spacing.
 
-    Parameters
-    ----------
-    displacement : ndarray, shape (2, H, W)
-        Displacement in px, or a field in its unit.
-    along : int
-        Number of rays along the longer side.
-
-    Returns
-    -------
-    data : ndarray, shape (n, 2, 2)
-        Start of each ray in px and its vector, both (y, x). Rays that go nearly nowhere are
-        left out.
-    spacing : float
-        Distance of the rays in px.
+    Those of nearly no length are left out.
     """
-    height, width = displacement.shape[1:]
-    step = max(1, -(-max(height, width) // along))
+    height, width = field.shape[1:]
+    step = max(1, -(-max(height, width) // _ARROWS_ALONG))
     rows, columns = (
         index.ravel() for index in np.mgrid[step // 2 : height : step, step // 2 : width : step]
     )
-    data = np.stack(
-        [np.column_stack([rows, columns]), displacement[:, rows, columns].T], axis=1
-    ).astype(np.float64)
+    starts = np.column_stack([rows, columns])
+    data = np.stack([starts, field[:, rows, columns].T], axis=1).astype(np.float64)
     lengths = np.hypot(*data[:, 1].T)
     return data[lengths > _SHORTEST_ARROW * lengths.max(initial=0.0)], float(step)
 
 
-def _sites(make: _Maker, inversion: Inversion) -> FullLayerData:
-    from napari_shadowinv._napari.sites import site_features, site_spacing
-
-    every = -(-len(inversion.sites) // _MOST_SITES_SHOWN)
-    shown = slice(None, None, every)
-    features = {name: values[shown] for name, values in site_features(inversion).items()}
-    return make.layer(
-        inversion.sites[shown],
-        "points",
-        "sites",
-        "sites" if every == 1 else f"sites (1 in {every})",
-        features=features,
-        face_color="displacement",
-        face_colormap=_FIELD_MAP,
-        face_contrast_limits=opened((0.0, float(features["displacement"].max(initial=0.0)))),
-        border_width=0.0,
-        size=0.7 * site_spacing(inversion) * every**0.5,
-        symbol="disc",
-        visible=False,
-    )
+def at_shot(arrows: FloatArray, shot: int) -> FloatArray:
+    """Return arrows of a plane, shape (n, 2, 2), as those of a shot, shape (n, 2, 3)."""
+    stacked = np.zeros((len(arrows), 2, 3))
+    stacked[:, 0, 0] = shot
+    stacked[:, :, 1:] = arrows
+    return stacked
 
 
-def _cells(make: _Maker, inversion: Inversion) -> FullLayerData:
-    from napari_shadowinv._napari.sites import power_cells, site_features
-
-    polygons, kept = power_cells(inversion)
-    features = site_features(inversion)
-    return make.layer(
-        polygons,
-        "shapes",
-        "cells",
-        "power cells",
-        shape_type="polygon",
-        features={name: values[kept] for name, values in features.items()},
-        face_color="transparent",
-        edge_color=_CAUSTIC_COLOUR,
-        edge_width=0.05,
-        opacity=0.7,
-        visible=False,
-    )
+def _sites(shown: _Shown, kind: Kind) -> Content:
+    sites = shown.dataset["sites"].values
+    every = -(-len(sites) // _MOST_SITES_SHOWN)
+    features = {key: values[::every] for key, values in site_features(shown.dataset).items()}
+    spacing = (shown.dataset["potential"].size / len(sites)) ** 0.5
+    look = {
+        "features": features,
+        "face_color": "displacement",
+        "face_colormap": kind.colormap,
+        "face_contrast_limits": _opened((0.0, float(features["displacement"].max(initial=0.0)))),
+        "border_width": 0.0,
+        "size": 0.7 * spacing * every**0.5,
+        "symbol": "disc",
+    }
+    return sites[::every], {"share": "" if every == 1 else f" (1 in {every})"}, look
 
 
-def intensity_limits(image: NDArray[Any]) -> tuple[float, float]:
-    """Return limits that neither a caustic's few bright pixels nor a faint contrast can spoil.
+def _cells(shown: _Shown, kind: Kind) -> Content:
+    polygons, kept = shown.cells or ([], [])
+    look = {
+        "shape_type": "polygon",
+        "features": {key: values[kept] for key, values in site_features(shown.dataset).items()},
+        "face_color": "transparent",
+        "edge_color": _CAUSTIC_COLOUR,
+        "edge_width": 0.05,
+        "opacity": 0.7,
+    }
+    return polygons, {}, look
 
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-        An image; pixels that are not finite do not count.
 
-    Returns
-    -------
-    tuple of float
-        Lowest and highest value to tell apart.
-    """
+_CONTENTS: dict[str, Callable[[_Shown, Kind], Content]] = {
+    "image": _image,
+    "labels": _caustics,
+    "vectors": _arrows,
+    "points": _sites,
+    "shapes": _cells,
+}
+
+
+def _ratio(shown: FloatArray, plane: FloatArray) -> float:
+    """Factor between two planes that differ by a factor only."""
+    largest = np.unravel_index(np.argmax(np.abs(plane)), plane.shape)
+    return float(shown[largest] / plane[largest]) if plane[largest] else 1.0
+
+
+def intensity_limits(image: AnyArray) -> Limits:
+    """Return limits that neither a caustic's few bright pixels nor a faint contrast can spoil."""
     sample = _sample(image)
     finite = sample[np.isfinite(sample)]
     if not finite.size:
@@ -470,22 +440,22 @@ def intensity_limits(image: NDArray[Any]) -> tuple[float, float]:
     dark, bright = (float(value) for value in np.percentile(finite, (0.1, _BRIGHTEST)))
     mean = float(finite.mean())
     high = min(bright, _LARGEST_INTENSITY * mean) if mean > 0 else bright
-    return opened((0.0 if 0 <= dark < 0.3 * high else dark, high))
+    return _opened((0.0 if 0 <= dark < 0.3 * high else dark, high))
 
 
-def symmetric_limits(plane: Array) -> tuple[float, float]:
+def _symmetric_limits(plane: FloatArray) -> Limits:
     """Return limits around zero that a handful of pixels at a caustic cannot blow up."""
     limit = float(np.percentile(np.abs(_sample(plane)), _BRIGHTEST))
     return -limit, limit
 
 
-def _sample(plane: NDArray[Any]) -> NDArray[Any]:
+def _sample(plane: AnyArray) -> AnyArray:
     """Enough pixels of a large image for its limits."""
     step = max(1, int(np.sqrt(plane.size / _ENOUGH_PIXELS)))
     return plane[::step, ::step]
 
 
-def opened(limits: tuple[float, float]) -> tuple[float, float]:
+def _opened(limits: Limits) -> Limits:
     """Return limits with something between them, also where all values are one."""
     low, high = limits
     return (low, high) if high > low else (low, low + 1.0)

@@ -23,10 +23,7 @@ Answer = TypeVar("Answer")
 
 
 def in_event_loop() -> bool:
-    """Whether the call comes from a window: a menu, a dialog, napari's console.
-
-    A script that calls napari gets exceptions, as any Python function raises them.
-    """
+    """Whether the call comes from a menu, a dialog, napari's console, and not from a script."""
     if "qtpy" not in sys.modules:
         return False
     from qtpy.QtCore import QThread
@@ -36,18 +33,7 @@ def in_event_loop() -> bool:
 
 
 def notify_errors(otherwise: Callable[[], Answer]) -> Callable[..., Callable[..., Answer]]:
-    """Turn a user's mistake into one notification, if a window is there to show it.
-
-    Parameters
-    ----------
-    otherwise : callable
-        Makes what the function returns then.
-
-    Returns
-    -------
-    callable
-        A decorator. In a script, the errors are raised as they are.
-    """
+    """Turn a user's mistake, in a window, into one notification; `otherwise` makes the answer."""
 
     def decorate(function: Callable[..., Answer]) -> Callable[..., Answer]:
         @functools.wraps(function)

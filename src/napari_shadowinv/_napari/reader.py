@@ -100,8 +100,7 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
     if not isinstance(path, str):
         return list(stack_layers([Path(item) for item in path]))
     if path.rstrip("/").endswith(_STORE_SUFFIX):
-        from napari_shadowinv._napari.arrow_sync import follow_once_added
-        from napari_shadowinv._napari.stores import store_layers
+        from napari_shadowinv._napari.stores import follow_once_added, store_layers
 
         layers = store_layers(Path(path))
         follow_once_added(layers)

@@ -3,6 +3,7 @@
 - one image, with what its file tells: `radiograph_layers`
 - any image or stack of images: `shot_layer`
 - many files along an axis of shots, each read when it is shown: `stack_layers`
+- any planes that are made when they are looked at: `lazy_stack`
 - the images in a folder, shot 2 before shot 10: `images_in`
 """
 
@@ -10,30 +11,29 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv import io
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layer_metadata import CAME_WITH, MASK, SHOT, SOURCE, mark
 from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
-from napari_shadowinv._napari.lazy import lazy_stack
 from napari_shadowinv._napari.notifications import show_caution
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
 
 if TYPE_CHECKING:
-    from napari_shadowinv.io import Radiograph
     from napari_shadowinv.physics.setup import Setup
-
 
 __all__ = [
     "IMAGE_SUFFIXES",
     "images_in",
+    "lazy_stack",
     "radiograph_layers",
     "shot_layer",
     "stack_layers",
@@ -45,30 +45,13 @@ _CAMERAS = {".b16", ".spe"}
 IMAGE_SUFFIXES = frozenset(_PICTURES | _NUMBERS | _CAMERAS)
 
 
-def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
-    """Describe an image, and its undisturbed beam and mask where the file holds them.
-
-    Parameters
-    ----------
-    shot : Radiograph
-        What was read.
-    name : str
-        Name of the layer. Default: the file's.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The source and the mask, if any, and the image above them. Painted pixels of the mask
-        cannot be used.
-    """
+def radiograph_layers(shot: io.Radiograph, name: str = "") -> list[FullLayerData]:
+    """Describe an image, above its undisturbed beam and its mask, painted where not usable."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
     frame = _frame(shot)
-    facts = _facts(shot, f"the sample '{name}'" if shot.path is None else shot.path.name)
-    image = shot_layer(
-        shot.image, name, shot.setup, limits, frame=frame, source=shot.source, **facts
-    )
     layers: list[FullLayerData] = []
+    facts = _facts(shot, f"the sample '{name}'" if shot.path is None else shot.path.name)
     if shot.source is not None:
         data, keywords, kind = shot_layer(
             shot.source, f"{name} source", shot.setup, limits, SOURCE, frame=frame, **facts
@@ -82,7 +65,10 @@ def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
             **frame.keywords(stacked=False),
         }
         layers.append(((~shot.mask).astype(np.uint8), keywords, "labels"))
-    return [*layers, image]
+    layers.append(
+        shot_layer(shot.image, name, shot.setup, limits, frame=frame, source=shot.source, **facts)
+    )
+    return layers
 
 
 def shot_layer(
@@ -95,43 +81,20 @@ def shot_layer(
     frame: Frame | None = None,
     **more: Any,
 ) -> FullLayerData:
-    """Describe an image or a stack of images.
-
-    Parameters
-    ----------
-    data : ndarray or dask array, shape (H, W) or (shots, H, W)
-        The image.
-    name : str
-        Name of the layer.
-    setup : Setup or None
-        The experiment.
-    limits : tuple of float
-        Contrast limits; napari would read two shots of a stack to find some.
-    role : {"shot", "source"} or None
-        What it is, None if that is not known.
-    frame : Frame, optional
-        Where it lies. Default: as the setup tells.
-    **more
-        Facts to keep with it; those that are None are left out.
-
-    Returns
-    -------
-    (data, keywords, layer type)
-        The layer.
-    """
+    """Describe an image or a stack of images; facts that are None are left out."""
     frame = frame or frame_for(data.shape, setup)
     known = {key: value for key, value in more.items() if value is not None}
     keywords = {
         "name": name,
         "colormap": "gray",
-        "contrast_limits": limits,
+        "contrast_limits": limits,  # napari would read two shots of a stack to find some
         "metadata": mark(role, "intensity", setup, **known),
         **frame.keywords(stacked=data.ndim > 2),
     }
     return data, keywords, "image"
 
 
-def _facts(shot: Radiograph, origin: str) -> dict[str, Any]:
+def _facts(shot: io.Radiograph, origin: str) -> dict[str, Any]:
     """What is known of a file; a layer keeps no more than this of it."""
     return {
         "setup_origin": None if shot.setup is None else f"{CAME_WITH} {origin}",
@@ -141,7 +104,7 @@ def _facts(shot: Radiograph, origin: str) -> dict[str, Any]:
     }
 
 
-def _frame(shot: Radiograph) -> Frame:
+def _frame(shot: io.Radiograph) -> Frame:
     """Pixels of the object plane, if the file tells their size, even where it tells no more."""
     side = dict(shot.metadata.get("geometry") or {}).get("pixel_size")
     if shot.setup is not None or side is None:
@@ -150,18 +113,9 @@ def _frame(shot: Radiograph) -> Frame:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """List the images in a folder, in the order in which people count.
+    """List the images in a folder in the order in which people count.
 
-    Parameters
-    ----------
-    folder : Path
-        A folder; those within it are left alone.
-
-    Returns
-    -------
-    list of Path
-        Files of the most frequent ending that names an image: a table of settings beside a
-        run of TIFFs is not a shot.
+    They have the most frequent ending: a table of settings beside a run of TIFFs is not a shot.
     """
     files = [
         path
@@ -178,23 +132,7 @@ def images_in(folder: Path) -> list[Path]:
 def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
     """Describe a run of shots as one lazy stack; only the first that can be read is read now.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Images of one shape.
-    name : str
-        Name of the layer. Default: the folder's.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        One image layer over a dask array of shape (shots, H, W). A shot that cannot be read,
-        or of another shape, is dark and gives a warning when it is shown.
-
-    Raises
-    ------
-    FileFormatError
-        If none of the files can be read.
+    A shot that cannot be read, or of another shape, is dark and gives a warning when it is shown.
     """
     first, at = _first_readable(paths)
     for text in first.warnings:
@@ -215,24 +153,41 @@ def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
     return [layer]
 
 
-def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
-    from napari_shadowinv.io import read_radiograph
+def lazy_stack(
+    make: Callable[..., FloatArray],
+    items: Sequence[Any],
+    shape: tuple[int, int],
+    ready: FloatArray | None = None,
+    at: int = 0,
+) -> Any:
+    """Stack the planes that `make` makes of items, one chunk each; the one `at` may be ready."""
+    from dask import array
+    from dask.delayed import delayed
 
+    made = delayed(make, pure=True)
+    planes = [
+        array.from_array(ready, chunks=shape)  # type: ignore[no-untyped-call]
+        if ready is not None and index == at
+        else array.from_delayed(made(item), shape=shape, dtype=np.float64)  # type: ignore[no-untyped-call]
+        for index, item in enumerate(items)
+    ]
+    return array.stack(planes)  # type: ignore[no-untyped-call]
+
+
+def _first_readable(paths: Sequence[Path]) -> tuple[io.Radiograph, int]:
     mistakes: list[str] = []
     for index, path in enumerate(paths):
         try:
-            return read_radiograph(path), index
+            return io.read_radiograph(path), index
         except (FileFormatError, InputError) as error:
             mistakes.append(str(error))
     raise FileFormatError(f"none of {len(paths)} files can be read as a shot: {mistakes[0]}")
 
 
-def _plane_of(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _plane_of(path: Path, shape: tuple[int, int]) -> FloatArray:
     """Read one shot of a stack; a stray file does not end the show."""
-    from napari_shadowinv.io import read_radiograph
-
     try:
-        image = read_radiograph(path).image
+        image = io.read_radiograph(path).image
         if image.shape != shape:
             raise InputError(
                 f"{path} has {image.shape[0]}×{image.shape[1]} pixels, but the first shot has "

@@ -11,70 +11,43 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
+    import xarray
+
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.inversion import Inversion
 
-__all__ = ["MOST_CELLS", "power_cells", "site_features", "site_spacing"]
+__all__ = ["Cells", "power_cells", "site_features"]
 
-Array = NDArray[np.float64]
+Cells = tuple[list[FloatArray], NDArray[np.intp]]
 
-MOST_CELLS = 5_000
+_MOST_CELLS = 5_000
 
 
-def site_features(inversion: Inversion) -> dict[str, Array]:
-    """Gather what is known about each site.
-
-    Parameters
-    ----------
-    inversion : Inversion
-        The result.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (n,)
-        ``weight`` in px², ``mass`` in the source's flux, ``displacement`` in px, and
-        ``flux residual``: what the cell holds too much of the image, as a share of the mass.
-    """
+def site_features(dataset: xarray.Dataset) -> dict[str, FloatArray]:
+    """Weight (px²), mass (flux), displacement (px) of each site, and its cell's flux residual."""
+    mass = dataset["site_mass"].values
     return {
-        "weight": inversion.weights,
-        "mass": inversion.site_mass,
-        "displacement": np.hypot(*inversion.site_displacement.T),
-        "flux residual": inversion.site_flux / inversion.site_mass - 1,
+        "weight": dataset["weights"].values,
+        "mass": mass,
+        "displacement": np.hypot(*dataset["site_displacement"].values.T),
+        # What the cell holds too much of the image, as a share of the mass.
+        "flux residual": dataset["site_flux"].values / mass - 1,
     }
 
 
-def site_spacing(inversion: Inversion) -> float:
-    """Return the mean distance of neighbouring sites in px."""
-    return float(np.sqrt(inversion.potential.size / len(inversion.sites)))
+def power_cells(inversion: Inversion) -> Cells:
+    """Corners (y, x) of the cells that the solver ended with, and the site of each.
 
-
-def power_cells(inversion: Inversion) -> tuple[list[Array], NDArray[np.intp]]:
-    """Find the power cells that the solver ended with.
-
-    Parameters
-    ----------
-    inversion : Inversion
-        The result, with 5,000 sites at most.
-
-    Returns
-    -------
-    polygons : list of ndarray, shape (k, 2)
-        Corners (y, x) of each cell, cut off at the image's border.
-    sites : ndarray of int
-        The site of each polygon; an empty cell has none.
-
-    Raises
-    ------
-    InputError
-        If there are too many sites to draw.
+    They are cut off at the image's border; an empty cell has no polygon.
     """
     count = len(inversion.sites)
-    if count > MOST_CELLS:
+    if count > _MOST_CELLS:
         raise InputError(
-            f"the result has {count:,} sites: power cells can be shown for up to {MOST_CELLS:,} "
+            f"the result has {count:,} sites: power cells can be shown for up to {_MOST_CELLS:,} "
             "sites; invert with fewer sites to show the cells"
         )
     diagram, margin = _diagram(inversion)
@@ -101,14 +74,10 @@ def _diagram(inversion: Inversion) -> tuple[PowerDiagram, int]:
     return PowerDiagram(triangulation, anything, threads=options.threads), margin
 
 
-def _clipped(corners: Array, height: int, width: int) -> Array:
+def _clipped(corners: FloatArray, height: int, width: int) -> FloatArray:
     """Cut a convex polygon off at the image's border, one side after the other."""
-    for axis, sign, limit in (
-        (0, -1, 0.5),
-        (0, 1, height - 0.5),
-        (1, -1, 0.5),
-        (1, 1, width - 0.5),
-    ):
+    sides = ((0, -1, 0.5), (0, 1, height - 0.5), (1, -1, 0.5), (1, 1, width - 0.5))
+    for axis, sign, limit in sides:
         if not len(corners):
             break
         inside = limit - sign * corners[:, axis]

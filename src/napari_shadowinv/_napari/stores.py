@@ -1,76 +1,50 @@
-"""The results of a run of shots as lazy layers with an axis of shots: `store_layers`.
+"""The results of a run of shots as lazy layers with an axis of shots.
 
-A store holds what one result holds, with the dimension ``shot`` in front. Shots that are not
-done yet are empty in it, and are shown so; nothing but the first shot that is done is read
-before it is looked at.
+- the layers of a store: `store_layers`
+- arrows that show the shot in view: `follow_shots`; those that a reader is about to hand over:
+  `follow_once_added`
+
+Shots that are not done yet are shown empty; nothing but the first shot that is done is read
+before it is looked at. Images are read by napari, a shot at a time. It has no such vectors: the
+arrows of one shot are replaced by those of the next.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from napari_shadowinv._napari.frame import Frame, frame_for
-from napari_shadowinv._napari.layer_metadata import mark
-from napari_shadowinv._napari.layers import (
-    FullLayerData,
-    arrow_keywords,
-    caustic_keywords,
-    intensity_limits,
-    opened,
-    symmetric_limits,
-    thinned_arrows,
-)
+from napari_shadowinv._napari.frame import frame_for
+from napari_shadowinv._napari.layer_metadata import mark_of, role_of
+from napari_shadowinv._napari.layers import FullLayerData, at_shot, dataset_layers, thinned_arrows
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.inversion.labels import setup_from_dataset
 
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import Setup
-
-
-__all__ = ["at_shot", "opened_store", "store_layers"]
-
-_SHOT = "shot"
-_DONE = 1  # as a store's variable "status" marks a shot
+__all__ = ["follow_once_added", "follow_shots", "store_layers"]
 
 
 @refusing_damage
 def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
-    """Describe the layers of a store.
-
-    Parameters
-    ----------
-    path : Path
-        A ``.shadowinv.zarr`` folder.
-    name : str
-        Name of the run. Default: the folder's.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        Layers over dask arrays of shape (shots, H, W), the lowest first: those of a single
-        result as far as the store has them, without sites. The arrows are those of the first
-        finished shot; see `napari_shadowinv._napari.arrow_sync`.
-
-    Raises
-    ------
-    FileFormatError
-        If there is no such store or no shot in it is done.
-    """
-    dataset = opened_store(path)
+    """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot."""
+    dataset = _opened(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(".shadowinv")
-    return _StoreLayers(path, dataset, name).layers()
+    setup = setup_from_dataset(dataset)
+    frame = frame_for(dataset["displacement"].shape, setup)
+    facts = {"store": str(path), "shots": _shot_names(dataset)}
+    return dataset_layers(dataset, setup, frame, name, facts, _first_done(dataset, path))
 
 
 @refusing_damage
-def opened_store(path: Path) -> xarray.Dataset:
-    """Open a store lazily, or say why it is none."""
+def _opened(path: Path) -> xarray.Dataset:
+    """Open a store lazily, the axis of shots first, or say why it is none."""
     import xarray as xr
 
     from napari_shadowinv.io.store_files import CheckedStore
@@ -81,187 +55,98 @@ def opened_store(path: Path) -> xarray.Dataset:
     dataset: xr.Dataset = xr.open_zarr(
         CheckedStore(path), chunks={}, decode_times=False, mask_and_scale=False, consolidated=False
     )
-    if "displacement" not in dataset or _SHOT not in dataset["displacement"].dims:
+    if "displacement" not in dataset or "shot" not in dataset["displacement"].dims:
         raise FileFormatError(
             f"{path} is a Zarr folder but not a store of inverted shots (it has no "
             "displacement): open it with napari's own reader"
         )
-    return dataset
+    return dataset.transpose("shot", "component", "y", "x", ...)
 
 
-class _StoreLayers:
-    """Makes the layers of one store."""
+def _first_done(dataset: xarray.Dataset, path: Path) -> int:
+    from napari_shadowinv.io.store import DONE
 
-    def __init__(self, path: Path, dataset: xarray.Dataset, name: str) -> None:
-        from napari_shadowinv.inversion.labels import setup_from_dataset
-
-        self._path = path
-        self._dataset = dataset.transpose(_SHOT, ...)
-        self._name = name
-        self._setup: Setup | None = setup_from_dataset(dataset)
-        self._done = self._first_done()
-        shape = self._dataset["displacement"].shape[-2:]
-        self._frame: Frame = frame_for(shape, self._setup)
-
-    def _first_done(self) -> int:
-        displacement = self._dataset["displacement"]
-        shots: Iterable[int] = range(displacement.sizes[_SHOT])
-        if self._is_run("status"):
-            shots = np.flatnonzero(self._dataset["status"].values == _DONE)
-        for shot in shots:
-            if np.isfinite(displacement[shot].values).all():
-                return int(shot)
-        raise FileFormatError(f"{self._path} contains no finished shot yet: wait for the first one")
-
-    def layers(self) -> list[FullLayerData]:
-        return [
-            *self._intensities(),
-            *self._potential(),
-            *self._field(),
-            *self._caustics(),
-            self._arrows(),
-        ]
-
-    def _layer(
-        self, data: Any, kind: str, role: str, title: str, unit: str, **keywords: Any
-    ) -> FullLayerData:
-        metadata = mark(role, unit, self._setup, store=str(self._path), shots=self._shots())
-        return (
-            data,
-            {
-                "name": f"{self._name} {title}".strip(),
-                "metadata": metadata,
-                "visible": False,
-                **self._frame.keywords(stacked=True),
-                **keywords,
-            },
-            kind,
-        )
-
-    def _shots(self) -> list[str]:
-        """Names of the shots, where the store tells them."""
-        for name in ("input_file", "name", _SHOT):
-            if name in self._dataset.variables and self._dataset[name].dims == (_SHOT,):
-                return [str(value) for value in self._dataset[name].values]
-        return [str(shot) for shot in range(self._dataset.sizes[_SHOT])]
-
-    def _plane(self, name: str) -> NDArray[np.float64]:
-        """The first finished shot of a variable."""
-        return np.asarray(self._dataset[name][self._done].values, dtype=np.float64)
-
-    def _intensities(self) -> list[FullLayerData]:
-        layers = []
-        base = next((name for name in ("image", "reprojection") if name in self._dataset), None)
-        limits = (0.0, 1.0) if base is None else intensity_limits(self._plane(base))
-        for name, title in (("image", "image"), ("reprojection", "re-projection")):
-            if self._is_run(name):
-                layers.append(
-                    self._image(self._data(name), name, title, "flux/px²", limits, "gray")
-                )
-        if self._is_run("residual"):
-            limits = symmetric_limits(self._plane("residual"))
-            layers.append(
-                self._image(
-                    self._data("residual"), "residual", "residual", "flux/px²", limits, "RdBu_r"
-                )
-            )
-        return layers
-
-    def _is_run(self, name: str) -> bool:
-        return name in self._dataset and _SHOT in self._dataset[name].dims
-
-    def _data(self, name: str) -> Any:
-        return self._dataset[name].data
-
-    def _image(
-        self,
-        data: Any,
-        role: str,
-        title: str,
-        unit: str,
-        limits: tuple[float, float],
-        colormap: str,
-        **keywords: Any,
-    ) -> FullLayerData:
-        choices = {"colormap": colormap, "contrast_limits": opened(limits), **keywords}
-        return self._layer(data, "image", role, title, unit, **choices)
-
-    def _potential(self) -> list[FullLayerData]:
-        from napari_shadowinv.physics.units import shown_potential
-
-        if not self._is_run("potential"):
-            return []
-        plane = self._plane("potential")
-        shown, unit = shown_potential(plane, self._setup)
-        factor = _ratio(shown, plane)
-        limits = (float(shown.min()), float(shown.max()))
-        data = self._data("potential") * factor
-        title = f"potential ({unit})"
-        return [self._image(data, "potential", title, unit, limits, "viridis")]
-
-    def _field(self) -> list[FullLayerData]:
-        """Components and strength, in the unit that suits the first finished shot."""
-        import dask.array
-
-        from napari_shadowinv.physics.units import shown_fields
-
-        # Both components of all shots, as (component, shot, y, x).
-        displacement = self._dataset["displacement"].transpose("component", _SHOT, "y", "x").data
-        first = self._plane("displacement")
-        (field,) = shown_fields([first], self._setup)
-        setup, matrix = self._setup, np.eye(2)
-        if setup is not None:
-            # All fields are linear: that of any displacement follows from those of unit vectors.
-            matrix = setup.field_in_si(setup.main_field.name, matrix)
-        matrix = matrix * _ratio(field.vectors, np.tensordot(matrix, first, axes=1))
-        vectors = [
-            sum(factor * displacement[k] for k, factor in enumerate(row) if factor)
-            for row in matrix
-        ]
-        strongest = float(field.magnitude.max())
-        limits = (-strongest, strongest)
-        strength = dask.array.hypot(*vectors)
-        return [
-            *(
-                self._image(plane, role, f"{symbol} ({field.unit})", field.unit, limits, "RdBu_r")
-                for plane, role, symbol in zip(
-                    vectors, ("field y", "field x"), field.components, strict=True
-                )
-            ),
-            self._image(
-                strength,
-                "field",
-                f"{field.symbol} ({field.unit})",
-                field.unit,
-                (0.0, strongest),
-                "inferno",
-                visible=True,
-            ),
-        ]
-
-    def _caustics(self) -> list[FullLayerData]:
-        if not self._is_run("caustic"):
-            return []
-        caustic = self._data("caustic").astype(np.uint8)
-        return [self._layer(caustic, "labels", "caustic", "caustics", "", **caustic_keywords())]
-
-    def _arrows(self) -> FullLayerData:
-        data, spacing = thinned_arrows(self._plane("displacement"))
-        keywords = {"visible": True, **arrow_keywords(data, spacing)}
-        return self._layer(
-            at_shot(data, self._done), "vectors", "arrows", "displacement arrows", "px", **keywords
-        )
+    displacement = dataset["displacement"]
+    shots: Iterable[int] = range(displacement.sizes["shot"])
+    if "status" in dataset and "shot" in dataset["status"].dims:
+        shots = np.flatnonzero(dataset["status"].values == DONE)
+    for shot in shots:
+        if np.isfinite(displacement[shot].values).all():
+            return int(shot)
+    raise FileFormatError(f"{path} contains no finished shot yet: wait for the first one")
 
 
-def at_shot(arrows: NDArray[np.float64], shot: int) -> NDArray[np.float64]:
-    """Return arrows of a plane, shape (n, 2, 2), as those of a shot, shape (n, 2, 3)."""
-    stacked = np.zeros((len(arrows), 2, 3))
-    stacked[:, 0, 0] = shot
-    stacked[:, :, 1:] = arrows
-    return stacked
+def _shot_names(dataset: xarray.Dataset) -> list[str]:
+    for name in ("input_file", "name", "shot"):
+        if name in dataset.variables and dataset[name].dims == ("shot",):
+            return [str(value) for value in dataset[name].values]
+    return [str(shot) for shot in range(dataset.sizes["shot"])]
 
 
-def _ratio(shown: NDArray[np.float64], plane: NDArray[np.float64]) -> float:
-    """Factor between two planes that differ by a factor only."""
-    largest = np.unravel_index(np.argmax(np.abs(plane)), plane.shape)
-    return float(shown[largest] / plane[largest]) if plane[largest] else 1.0
+def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
+    """Let arrows show the shot in view while they are in the viewer; return what reads them again.
+
+    All shots are drawn at the same scale. Read again, a shot may be done that was not before.
+    """
+    displacement = _displacement(layer)
+    shown: list[int] = []
+
+    def shot_in_view() -> int:
+        return round(float(layer.world_to_data(viewer.dims.point[-layer.ndim :])[0]))
+
+    def read() -> None:
+        shot = shot_in_view()
+        if not layer.visible or not 0 <= shot < len(displacement):
+            return
+        shown[:] = [shot]
+        try:
+            plane = displacement[shot].values
+        except OSError:
+            return  # the field comes from the same place, and tells of it
+        data, _ = thinned_arrows(plane)
+        layer.data = at_shot(data, shot)
+        layer.features = {"displacement": np.hypot(*data[:, 1].T)}
+
+    def read_again() -> None:
+        nonlocal displacement
+        displacement = _displacement(layer)
+        read()
+
+    def follow(_: Any = None) -> None:
+        if shown != [shot_in_view()]:
+            read()
+
+    def leave(event: Any) -> None:
+        if event.value is layer:
+            viewer.dims.events.current_step.disconnect(follow)
+            viewer.layers.events.removed.disconnect(leave)
+
+    viewer.dims.events.current_step.connect(follow)
+    viewer.layers.events.removed.connect(leave)
+    layer.events.visible.connect(follow)
+    follow()
+    return read_again
+
+
+def _displacement(layer: Any) -> xarray.DataArray:
+    return _opened(Path(mark_of(layer)["store"]))["displacement"]
+
+
+def follow_once_added(described: Sequence[FullLayerData]) -> None:
+    """Let arrows follow in the window that asked for them; without one, nobody leafs."""
+    if "napari._qt" not in sys.modules:
+        return
+    from napari import current_viewer
+
+    viewer = current_viewer()
+    stores = {mark_of(one[1]).get("store") for one in described if role_of(one[1]) == "arrows"}
+    if viewer is None or not stores:
+        return
+
+    def begin(event: Any) -> None:
+        layer = event.value
+        if role_of(layer) == "arrows" and mark_of(layer).get("store") in stores:
+            viewer.layers.events.inserted.disconnect(begin)
+            follow_shots(viewer, layer)
+
+    viewer.layers.events.inserted.connect(begin)

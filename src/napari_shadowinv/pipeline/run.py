@@ -320,9 +320,7 @@ class _Mask:
         return packed.model_copy(update={"file": text_of(self.file.name)})
 
 
-def _mask(
-    given: ArrayLike | None, file: Path | None, name: str, shot: Radiograph
-) -> _Mask | None:
+def _mask(given: ArrayLike | None, file: Path | None, name: str, shot: Radiograph) -> _Mask | None:
     if given is not None:
         pixels = np.asarray(given)
         if pixels.dtype != np.bool_:

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from qtpy.QtCore import QTimer
 from qtpy.QtWidgets import QCheckBox, QLabel
 
-from napari_shadowinv._napari.arrow_sync import follow_shots
 from napari_shadowinv._napari.layer_metadata import role_of
+from napari_shadowinv._napari.stores import follow_shots
 from napari_shadowinv._napari.widgets._base import Part, ToolPanel
 from napari_shadowinv._napari.widgets._cleaning import CleaningSection
 from napari_shadowinv._napari.widgets._forms import labelled

@@ -1,0 +1,130 @@
+"""What keeps in step with a viewer that shows results: `keep_in_step`.
+
+One colour bar in the canvas, for the image that is seen, and images that are opened beside
+results.
+"""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+from napari_shadowinv._napari.frame import Frame, frame_of
+from napari_shadowinv._napari.layer_metadata import role_of
+
+__all__ = ["keep_in_step"]
+
+_watched: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+def keep_in_step(viewer: Any) -> None:
+    """Watch the layers of a viewer; calling it again does nothing more."""
+    # A widget may be handed a proxy, made anew each time.
+    events = getattr(viewer.layers.events, "__wrapped__", viewer.layers.events)
+    if events not in _watched:
+        _watched.add(events)
+        _follow_top_image(viewer, events)
+        _place_newcomers(viewer, events)
+
+
+def _follow_top_image(viewer: Any, events: Any) -> None:
+    """Show colour bar and name of the topmost visible image, if it is one of this plugin's.
+
+    The name tells the unit. Whoever switches the bar off keeps it off.
+    """
+    shown: list[Any] = []
+
+    def follow(_: Any = None) -> None:
+        top = _top_image(viewer.layers)
+        if shown and shown[0] is top:
+            return
+        wanted = not shown or shown[0].colorbar.visible
+        for layer in shown:
+            _show_bar(layer, False)
+        if top is not None and role_of(top) is not None:
+            shown[:] = [top]
+            _show_bar(top, wanted)
+        elif wanted:
+            shown.clear()
+
+    def watch(event: Any) -> None:
+        event.value.events.visible.connect(follow)
+        follow()
+
+    def leave(event: Any) -> None:
+        event.value.events.visible.disconnect(follow)
+        follow()
+
+    for layer in viewer.layers:
+        layer.events.visible.connect(follow)
+    events.inserted.connect(watch)
+    events.removed.connect(leave)
+    events.reordered.connect(follow)
+    follow()
+
+
+def _top_image(layers: Any) -> Any | None:
+    """The topmost visible layer that has a colour bar; napari has none for colour images."""
+    for layer in reversed(layers):
+        if layer.visible and layer.__class__.__name__ == "Image":
+            return layer if hasattr(layer, "colorbar") and not layer.rgb else None
+    return None
+
+
+def _show_bar(layer: Any, on: bool) -> None:
+    layer.colorbar.visible = on
+    # Beside the bar, as napari lays out what shares a corner.
+    layer.name_overlay.position = layer.colorbar.position
+    layer.name_overlay.visible = on
+
+
+def _place_newcomers(viewer: Any, events: Any) -> None:
+    """Lay images that are opened from now on over results of the same size, or say how to.
+
+    Results lie in µm or mm, an image from a file in pixels: side by side, napari drops the unit
+    of its scale bar. What has a scale keeps it.
+    """
+
+    def receive(event: Any) -> None:
+        layer = event.value
+        fields = [one for one in viewer.layers if role_of(one) == "field"]
+        fields = [one for one in fields if frame_of(one).units != Frame().units]
+        if fields and _is_bare_image(layer):
+            _receive(layer, fields)
+
+    events.inserted.connect(receive)
+
+
+def _receive(layer: Any, fields: list[Any]) -> None:
+    from napari.utils.notifications import show_info, show_warning
+
+    alike = [one for one in fields if one.data.shape[-2:] == _size(layer)]
+    if not alike:
+        unit = f"{fields[-1].units[-1]:~P}"
+        show_warning(
+            f"'{layer.name}' is in pixels, the results are in {unit}, and their sizes differ, so "
+            "they do not overlap. Set a scale: choose the layer in 'Invert shot' with its setup "
+            "and press Run, or move it into place (layer controls → transform)"
+        )
+        return
+    frame = frame_of(alike[-1])
+    for name, value in frame.keywords(stacked=layer.ndim > 2).items():
+        setattr(layer, name, value)
+    show_info(
+        f"'{layer.name}' has the same size in pixels as '{alike[-1].name}': it was placed at the "
+        f"same position, with pixels of {frame.scale[-1]:.4g} {alike[-1].units[-1]:~P}"
+    )
+
+
+def _is_bare_image(layer: Any) -> bool:
+    """Whether it is an image of the user's that lies where napari puts it by default."""
+    if layer.__class__.__name__ != "Image" or not 2 <= layer.ndim <= 3:
+        return False
+    own = role_of(layer) is not None and layer.source.path is None
+    return not own and frame_of(layer) == Frame()
+
+
+def _size(layer: Any) -> tuple[int, ...]:
+    data = layer.data[0] if layer.multiscale else layer.data
+    shape = data.shape[:-1] if layer.rgb else data.shape
+    return tuple(shape[-2:])
