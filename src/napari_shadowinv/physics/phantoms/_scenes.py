@@ -104,20 +104,7 @@ def four_toroids(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1
 def cosine_ellipses(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
     """Two elliptical toroids whose potentials are cos² up to a rim, counter-clockwise.
 
-    Parameters
-    ----------
-    shape, setup, strength
-        See `four_toroids`; the peak fields are 64 and 62 MG µm.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape is not positive, or the strength is not finite.
+    The peak fields are 64 and 62 MG µm; for the rest see `four_toroids`.
 
     References
     ----------
@@ -129,20 +116,7 @@ def cosine_ellipses(shape: tuple[int, int], setup: ProtonSetup, strength: float 
 def focusing_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
     """Two elliptical Gaussian toroids close together, clockwise: they focus protons.
 
-    Parameters
-    ----------
-    shape, setup, strength
-        See `four_toroids`; the peak fields are 63 MG µm.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape is not positive, or the strength is not finite.
+    The peak fields are 63 MG µm; for the rest see `four_toroids`.
 
     References
     ----------
@@ -154,21 +128,8 @@ def focusing_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 
 def opposite_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
     """Gaussian toroids of opposite direction: counter-clockwise left, clockwise right.
 
-    Parameters
-    ----------
-    shape, setup, strength
-        See `four_toroids`; the peak fields are 154 and 68 MG µm, as it takes less to make
-        rays meet than to drive them apart until they meet others.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape is not positive, or the strength is not finite.
+    The peak fields are 154 and 68 MG µm, as it takes less to make rays meet than to drive them
+    apart until they meet others; for the rest see `four_toroids`.
 
     References
     ----------
