@@ -17,17 +17,18 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import solveh_banded
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry._kernel import njit
 
 __all__ = ["jacobian_determinant", "synthetic_image"]
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+# Of a tile: y0, x0, y1, x1, y2, x2, y3, x3.
+Corners = tuple[float, float, float, float, float, float, float, float]
 
 # A cubic spline without knots next to the border needs four samples.
 _SMALLEST_SIDE = 4
@@ -212,10 +213,8 @@ def _bands(height: int) -> list[tuple[int, int]]:
 
 
 def _landing_rows(coefficients: FloatArray, first: int, last: int) -> tuple[int, int]:
-    """Rows of the image that the rows ``first`` to ``last`` of the source can reach.
-
-    A spline never leaves the range of its coefficients, so these bound it.
-    """
+    """Rows of the image that the rows ``first`` to ``last`` of the source can reach."""
+    # A spline never leaves the range of its coefficients.
     height = coefficients.shape[0] - 4
     nearby = coefficients[first : last + 4]
     top = min(max(first + nearby.min() - 1, 0.0), height)
@@ -224,17 +223,17 @@ def _landing_rows(coefficients: FloatArray, first: int, last: int) -> tuple[int,
 
 
 def _spline_coefficients(values: FloatArray) -> FloatArray:
-    """Coefficients of the bicubic B-spline through all values, two more on each side.
-
-    The first and last polynomial pieces of a row continue across one more knot ("not a
-    knot") and on to the rim of the image, half a pixel outside the last centres.
-    """
+    """Coefficients of the bicubic B-spline through all values, two more on each side."""
     along_y = _line_coefficients(values)
     return np.ascontiguousarray(_line_coefficients(along_y.T).T)
 
 
 def _line_coefficients(values: FloatArray) -> FloatArray:
-    """B-spline coefficients along the first axis, shape (n + 4, m)."""
+    """B-spline coefficients along the first axis, shape (n + 4, m).
+
+    The first and last polynomial pieces continue across one more knot ("not a knot") and on to
+    the rim of the image, half a pixel outside the last centres.
+    """
     n = values.shape[0]
     coefficients = np.empty((n + 4, values.shape[1]))
     inner = coefficients[2:-2]
@@ -257,15 +256,7 @@ def _line_coefficients(values: FloatArray) -> FloatArray:
 
 
 def _spline_samples(n: int, tiles: int) -> tuple[IntArray, FloatArray]:
-    """Where to evaluate a line of `n` pixels at the corners of its tiles.
-
-    Returns
-    -------
-    start : ndarray of int64, shape (n * tiles + 1,)
-        First of the four coefficients of each corner.
-    weights : ndarray of float64, shape (n * tiles + 1, 4)
-        Their weights.
-    """
+    """First of the four coefficients of each corner of a line's tiles, and their weights."""
     position = np.arange(n * tiles + 1) / tiles - 0.5
     knot = np.floor(position)
     t = position - knot
@@ -289,11 +280,8 @@ def _deposit_band(
     top: int,
     window: FloatArray,
 ) -> None:
-    """Add the image of the source's rows ``first`` to ``last`` to a window of the image.
-
-    Positions are counted from the window's corner, so that pixel (i, j) of the window
-    covers [i, i + 1] × [j, j + 1].
-    """
+    """Add the image of the source's rows ``first`` to ``last`` to a window of the image."""
+    # Positions count from the window's corner: its pixel (i, j) covers [i, i + 1] × [j, j + 1].
     corners = start_x.size
     upper = np.empty((2, corners))
     lower = np.empty((2, corners))
@@ -354,27 +342,16 @@ def _deposit_tile(
     one = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
     other = (x2 - x0) * (y3 - y0) - (y2 - y0) * (x3 - x0)
     if one * other >= 0:
-        _deposit(window, share, one + other, y0, x0, y1, x1, y2, x2, y3, x3)
+        _deposit(window, share, one + other, (y0, x0, y1, x1, y2, x2, y3, x3))
     else:
-        _deposit(window, share / 2, one, y0, x0, y1, x1, y2, x2, y2, x2)
-        _deposit(window, share / 2, other, y0, x0, y2, x2, y3, x3, y3, x3)
+        _deposit(window, share / 2, one, (y0, x0, y1, x1, y2, x2, y2, x2))
+        _deposit(window, share / 2, other, (y0, x0, y2, x2, y3, x3, y3, x3))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _deposit(
-    window: FloatArray,
-    share: float,
-    double_area: float,
-    y0: float,
-    x0: float,
-    y1: float,
-    x1: float,
-    y2: float,
-    x2: float,
-    y3: float,
-    x3: float,
-) -> None:
+def _deposit(window: FloatArray, share: float, double_area: float, corners: Corners) -> None:
     """Share flux among the pixels by their overlap with a quadrilateral of uniform density."""
+    y0, x0, y1, x1, y2, x2, y3, x3 = corners
     height, width = window.shape
     top, bottom = min(y0, y1, y2, y3), max(y0, y1, y2, y3)
     left, right = min(x0, x1, x2, x3), max(x0, x1, x2, x3)
@@ -389,7 +366,7 @@ def _deposit(
         window[i0, j0] += share
         return
     if abs(double_area) < _SLIVER * ((bottom - top) ** 2 + (right - left) ** 2):
-        _deposit_line(window, share, y0, x0, y1, x1, y2, x2, y3, x3)
+        _deposit_line(window, share, corners)
         return
 
     scale = 2 * share / double_area
@@ -397,9 +374,9 @@ def _deposit(
     for i in range(i0, i1 + 1):
         before = 0.0
         if left < 0:
-            before = _area_left(i, 0.0, y0, x0, y1, x1, y2, x2, y3, x3)
+            before = _area_left(i, 0.0, corners)
         for j in range(j0, j1 + 1):
-            area = _area_left(i, j + 1.0, y0, x0, y1, x1, y2, x2, y3, x3)
+            area = _area_left(i, j + 1.0, corners)
             amount = min(max(scale * (area - before), 0.0), rest)
             window[i, j] += amount
             rest -= amount
@@ -409,19 +386,9 @@ def _deposit(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _deposit_line(
-    window: FloatArray,
-    share: float,
-    y0: float,
-    x0: float,
-    y1: float,
-    x1: float,
-    y2: float,
-    x2: float,
-    y3: float,
-    x3: float,
-) -> None:
+def _deposit_line(window: FloatArray, share: float, corners: Corners) -> None:
     """Add a quadrilateral without area as four points, halfway from its corners to its middle."""
+    y0, x0, y1, x1, y2, x2, y3, x3 = corners
     height, width = window.shape
     middle_y, middle_x = (y0 + y1 + y2 + y3) / 4, (x0 + x1 + x2 + x3) / 4
     for corner_y, corner_x in ((y0, x0), (y1, x1), (y2, x2), (y3, x3)):
@@ -431,22 +398,10 @@ def _deposit_line(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _area_left(
-    row: int,
-    cut: float,
-    y0: float,
-    x0: float,
-    y1: float,
-    x1: float,
-    y2: float,
-    x2: float,
-    y3: float,
-    x3: float,
-) -> float:
-    """Signed area of the part of a quadrilateral in a row of pixels, left of ``x = cut``.
-
-    Green's theorem: it is ∮ min(x - cut, 0) dy along the boundary within the row.
-    """
+def _area_left(row: int, cut: float, corners: Corners) -> float:
+    """Signed area of a quadrilateral within a row of pixels, left of ``x = cut``."""
+    # Green's theorem: it is ∮ min(x - cut, 0) dy along the boundary within the row.
+    y0, x0, y1, x1, y2, x2, y3, x3 = corners
     return (
         _edge_integral(row, cut, y0, x0, y1, x1)
         + _edge_integral(row, cut, y1, x1, y2, x2)

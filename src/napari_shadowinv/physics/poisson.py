@@ -7,14 +7,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.fft import dctn, idctn
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
 __all__ = ["border_mean", "poisson_invert"]
-
-FloatArray = NDArray[np.float64]
 
 
 def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> FloatArray:

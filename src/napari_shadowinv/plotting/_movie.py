@@ -1,9 +1,4 @@
-"""Frames of a film: one variable of a stack, shot after shot, on one colour scale.
-
-- the frames: `stack_frames`
-- the same in the 256 colours that a GIF has: `in_few_colours`
-- a film of them, as MP4 or GIF: `write_film`
-"""
+"""Films: one variable of a stack, shot after shot, on one colour scale."""
 
 from __future__ import annotations
 
@@ -23,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._system.interrupts import interrupts_put_off
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.files import replacing
@@ -31,8 +27,6 @@ from napari_shadowinv.plotting._panels import STYLE, choose_grid, image_scale, n
 
 if TYPE_CHECKING:
     import xarray
-
-__all__ = ["in_few_colours", "stack_frames", "write_film"]
 
 _DOTS_PER_INCH = 120
 _OUTLIERS = 0.02  # share of the shots whose extremes may lie beyond the colour scale
@@ -94,7 +88,7 @@ def stack_frames(
     )
 
 
-def _plane(field: xarray.DataArray, index: int) -> NDArray[np.float64]:
+def _plane(field: xarray.DataArray, index: int) -> FloatArray:
     values = np.asarray(field.isel(shot=index).values, dtype=np.float64)
     return values if values.ndim == 2 else np.sqrt((values**2).sum(axis=0))
 
@@ -131,7 +125,7 @@ class _Frame:
         self._axes = panel.axes
         self._picture = panel.axes.images[0]
 
-    def __call__(self, plane: NDArray[np.float64], name: str) -> NDArray[np.uint8]:
+    def __call__(self, plane: FloatArray, name: str) -> NDArray[np.uint8]:
         from matplotlib import rc_context
 
         self._picture.set_data(plane)

@@ -151,65 +151,38 @@ class Panel:
         self, plane: FloatArray, title: str, label: str, cmap: str, limits: tuple[float, float]
     ) -> None:
         """Show a plane in false colours; the colour bar tells where limits cut it."""
-        picture = self.axes.imshow(
-            plane,
-            extent=self.scale.extent(plane.shape),
-            cmap=cmap,
-            vmin=limits[0],
-            vmax=limits[1],
-            # Smoothing would hide single bad pixels.
-            interpolation="nearest",
-            aspect="equal",
-        )
+        low, high = limits
+        # Smoothing would hide single bad pixels.
+        choices: Any = {"vmin": low, "vmax": high, "interpolation": "nearest", "aspect": "equal"}
+        extent = self.scale.extent(plane.shape)
+        picture = self.axes.imshow(plane, extent=extent, cmap=cmap, **choices)
         self.axes.set_title(title)
-        self._label_axes()
-        self._add_colour_bar(picture, label, _extend(plane, limits))
+        self.axes.set_xlabel(f"x ({self.scale.unit})")
+        self.axes.set_ylabel(f"y ({self.scale.unit})")
+        self.few_ticks()
+        below, above = bool(plane.min() < low), bool(plane.max() > high)
+        extend = {(True, True): "both", (True, False): "min", (False, True): "max"}
+        room = self.axes.inset_axes((1 + 0.08 / self.grid.width, 0, 0.12 / self.grid.width, 1))
+        figure: Any = self.axes.figure
+        bar = figure.colorbar(picture, cax=room, extend=extend.get((below, above), "neither"))
+        bar.set_label(label)
+        bar.outline.set_linewidth(0.7)
 
     def contour(self, plane: AnyArray, levels: ArrayLike, colour: str, **style: Any) -> None:
         """Draw lines of equal value onto the picture."""
-        self.axes.contour(
-            plane,
-            levels=levels,
-            extent=self.scale.extent(plane.shape),
-            origin="upper",
-            colors=colour,
-            **style,
-        )
+        place: Any = {"extent": self.scale.extent(plane.shape), "origin": "upper"}
+        self.axes.contour(plane, levels=levels, colors=colour, **place, **style)
 
     def plot(self, values: FloatArray, **style: Any) -> None:
         """Plot a cut along an axis of the image."""
         self.axes.plot(np.arange(values.size) * self.scale.pixel, values, **style)
 
-    @property
-    def width(self) -> float:
-        """Width in inches."""
-        return float(self.axes.get_position().width * self.grid.figure_size[0])
-
     def few_ticks(self) -> None:
         """Keep the tick labels apart on small panels."""
         from matplotlib.ticker import MaxNLocator
 
-        for axis, length in (
-            (self.axes.xaxis, self.width / 0.5),
-            (self.axes.yaxis, self.grid.height / 0.3),
-        ):
-            bins = max(2, min(6, int(length)))
+        width = float(self.axes.get_position().width * self.grid.figure_size[0])
+        x_axis, y_axis = self.axes.xaxis, self.axes.yaxis
+        for axis, most in ((x_axis, width / 0.5), (y_axis, self.grid.height / 0.3)):
+            bins = max(2, min(6, int(most)))
             axis.set_major_locator(MaxNLocator(nbins=bins, steps=[1, 2, 5, 10]))
-
-    def _label_axes(self) -> None:
-        self.axes.set_xlabel(f"x ({self.scale.unit})")
-        self.axes.set_ylabel(f"y ({self.scale.unit})")
-        self.few_ticks()
-
-    def _add_colour_bar(self, picture: Any, label: str, extend: str) -> None:
-        room = self.axes.inset_axes((1 + 0.08 / self.grid.width, 0, 0.12 / self.grid.width, 1))
-        bar = self.axes.figure.colorbar(picture, cax=room, extend=extend)
-        bar.set_label(label)
-        bar.outline.set_linewidth(0.7)
-
-
-def _extend(plane: FloatArray, limits: tuple[float, float]) -> str:
-    below, above = bool(plane.min() < limits[0]), bool(plane.max() > limits[1])
-    if below and above:
-        return "both"
-    return "min" if below else "max" if above else "neither"

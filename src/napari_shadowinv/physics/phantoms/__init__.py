@@ -10,7 +10,6 @@
 - what they are: `Phantom`
 """
 
-from napari_shadowinv.physics.phantoms._phantom import Phantom
 from napari_shadowinv.physics.phantoms._scenes import (
     coaxial_line,
     cosine_ellipses,
@@ -20,7 +19,7 @@ from napari_shadowinv.physics.phantoms._scenes import (
     opposite_pair,
     paper_setup,
 )
-from napari_shadowinv.physics.phantoms._shapes import cosine_toroid, gaussian_blob, toroid
+from napari_shadowinv.physics.phantoms._shapes import Phantom, cosine_toroid, gaussian_blob, toroid
 from napari_shadowinv.physics.phantoms._wakefield import (
     plasma_wavelength,
     wakefield,

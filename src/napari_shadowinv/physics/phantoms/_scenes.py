@@ -7,23 +7,22 @@ minimum is a little below zero, as for the paper's toroid of 194 MG µm.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Callable
 
+import numpy as np
+
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.phantoms._phantom import (
-    Center,
-    FloatArray,
-    Phantom,
-    offsets,
-    require_finite,
-    require_positive,
-)
 from napari_shadowinv.physics.phantoms._shapes import (
+    Center,
+    Phantom,
     Radii,
     cosine_toroid,
     gaussian_blob,
+    offsets,
     outward_displacement,
+    require_finite,
+    require_positive,
     toroid,
 )
 from napari_shadowinv.physics.setup import ProtonSetup
@@ -99,88 +98,44 @@ def four_toroids(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1
     ----------
     Kasim et al., arXiv:1607.04179, Fig. 6 (a).
     """
-    return _toroids(_FOUR_TOROIDS, shape, setup, strength)
+    return _scene(toroid, _FOUR_TOROIDS, shape, setup, strength)
 
 
 def cosine_ellipses(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
     """Two elliptical toroids whose potentials are cos² up to a rim, counter-clockwise.
 
-    Parameters
-    ----------
-    shape, setup, strength
-        See `four_toroids`; the peak fields are 64 and 62 MG µm.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape is not positive, or the strength is not finite.
+    The peak fields are 64 and 62 MG µm; for the rest see `four_toroids`.
 
     References
     ----------
     Kasim et al., arXiv:1607.04179, Fig. 6 (b).
     """
-    side = _side(shape, setup, strength)
-    parts = [
-        cosine_toroid(shape, setup, strength * peak, _times(radii, side), _at(share, shape), angle)
-        for peak, radii, share, angle in _COSINE_ELLIPSES
-    ]
-    return _sum(parts)
+    return _scene(cosine_toroid, _COSINE_ELLIPSES, shape, setup, strength)
 
 
 def focusing_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
     """Two elliptical Gaussian toroids close together, clockwise: they focus protons.
 
-    Parameters
-    ----------
-    shape, setup, strength
-        See `four_toroids`; the peak fields are 63 MG µm.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape is not positive, or the strength is not finite.
+    The peak fields are 63 MG µm; for the rest see `four_toroids`.
 
     References
     ----------
     Kasim et al., arXiv:1607.04179, Fig. 6 (c).
     """
-    return _toroids(_FOCUSING_PAIR, shape, setup, strength)
+    return _scene(toroid, _FOCUSING_PAIR, shape, setup, strength)
 
 
 def opposite_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
     """Gaussian toroids of opposite direction: counter-clockwise left, clockwise right.
 
-    Parameters
-    ----------
-    shape, setup, strength
-        See `four_toroids`; the peak fields are 154 and 68 MG µm, as it takes less to make
-        rays meet than to drive them apart until they meet others.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape is not positive, or the strength is not finite.
+    The peak fields are 154 and 68 MG µm, as it takes less to make rays meet than to drive them
+    apart until they meet others; for the rest see `four_toroids`.
 
     References
     ----------
     Kasim et al., arXiv:1607.04179, Fig. 6 (d).
     """
-    return _toroids(_OPPOSITE_PAIR, shape, setup, strength)
+    return _scene(toroid, _OPPOSITE_PAIR, shape, setup, strength)
 
 
 def coaxial_line(
@@ -189,7 +144,7 @@ def coaxial_line(
     peak: float = 60.0,
     radii: tuple[float, float, float] = (21e-6, 66e-6, 78e-6),
     center: Center = None,
-) -> tuple[Phantom, NDArray[np.bool_]]:
+) -> tuple[Phantom, BoolArray]:
     """Coaxial line along the beam: a field between two conductors that stop the beam.
 
     The currents of the two conductors are equal and opposite, and uniform inside each. So
@@ -247,10 +202,7 @@ def coaxial_line(
 def _coaxial_profile(
     r: FloatArray, inner: float, outer: float, rim: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Current inside r over r², and the integral of current over r from r outwards.
-
-    The current is that of the inner conductor's, 1.
-    """
+    """Current inside r over r², and the integral of current over r outwards; at most 1."""
     s = np.clip(r, outer, rim)
     wall = rim**2 - outer**2
     # ∫ (c² - s²) / (wall s) ds from s to c, with c the rim
@@ -288,55 +240,24 @@ def ellipse_pair(shape: tuple[int, int], strength: float = 1.0) -> Phantom:
     """
     height, width = shape
     unit = min(height, width) / 100
-    first = gaussian_blob(
-        shape,
-        45.0 * strength * unit**2,
-        (7.0 * unit, 12.0 * unit),
-        (0.37 * height, 0.42 * width),
-        0.5,
-    )
-    second = gaussian_blob(
-        shape,
-        -15.0 * strength * unit**2,
-        (10.0 * unit, 6.0 * unit),
-        (0.63 * height, 0.66 * width),
-        0.3,
-    )
-    return first + second
-
-
-def _toroids(
-    parts: tuple[Part, ...], shape: tuple[int, int], setup: ProtonSetup, strength: float
-) -> Phantom:
-    side = _side(shape, setup, strength)
-    return _sum(
-        [
-            toroid(shape, setup, strength * peak, _times(sigma, side), _at(share, shape), angle)
-            for peak, sigma, share, angle in parts
-        ]
+    one, other = 45.0 * strength * unit**2, -15.0 * strength * unit**2
+    first_place, second_place = (0.37 * height, 0.42 * width), (0.63 * height, 0.66 * width)
+    return gaussian_blob(shape, one, (7.0 * unit, 12.0 * unit), first_place, 0.5) + gaussian_blob(
+        shape, other, (10.0 * unit, 6.0 * unit), second_place, 0.3
     )
 
 
-def _side(shape: tuple[int, int], setup: ProtonSetup, strength: float) -> float:
-    """Length of the image's smaller side in m."""
+def _scene(
+    make: Callable[..., Phantom], parts: tuple[Part, ...], shape: tuple[int, int],
+    setup: ProtonSetup, strength: float,
+) -> Phantom:  # fmt: skip
+    """Sum of the parts, each made by `toroid` or `cosine_toroid`."""
     require_finite(strength=strength)
     require_positive("smaller side of the image", min(shape), "px")
-    return min(shape) * setup.object_pixel_size
-
-
-def _times(radii: Radii, length: float) -> Radii:
-    if isinstance(radii, tuple):
-        return length * radii[0], length * radii[1]
-    return length * radii
-
-
-def _at(share: tuple[float, float], shape: tuple[int, int]) -> tuple[float, float]:
-    """Pixel at a share of height and width, counted from the image's edge."""
-    return share[0] * shape[0] - 0.5, share[1] * shape[1] - 0.5
-
-
-def _sum(parts: list[Phantom]) -> Phantom:
-    total, *others = parts
-    for other in others:
-        total = total + other
-    return total
+    side = min(shape) * setup.object_pixel_size
+    made = []
+    for peak, radii, share, angle in parts:
+        lengths = (side * radii[0], side * radii[1]) if isinstance(radii, tuple) else side * radii
+        center = share[0] * shape[0] - 0.5, share[1] * shape[1] - 0.5
+        made.append(make(shape, setup, strength * peak, lengths, center, angle))
+    return sum(made[1:], start=made[0])

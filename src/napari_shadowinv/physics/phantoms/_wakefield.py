@@ -8,9 +8,8 @@ import numpy as np
 from scipy import constants
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.phantoms._phantom import (
+from napari_shadowinv.physics.phantoms._shapes import (
     Center,
-    FloatArray,
     Phantom,
     offsets,
     require_finite,
@@ -151,20 +150,9 @@ def wakefield(
     integral = amplitude * np.sqrt(np.pi / s) * np.exp(1j * wave_number * xi - s * y**2)
     integral *= np.exp(-(xi**2) / (2 * length**2))
     slope_x = integral * (1j * wave_number - xi / length**2)
-    return _thin_plasma(setup, density, integral.real, (integral * -2 * s * y).real, slope_x.real)
-
-
-def _thin_plasma(
-    setup: OpticalSetup,
-    density: float,
-    integral: FloatArray,
-    slope_y: FloatArray,
-    slope_x: FloatArray,
-) -> Phantom:
-    """Phantom of ∫Δn/n₀ dz (m) and its derivatives per metre."""
+    slopes = np.stack([(integral * -2 * s * y).real, slope_x.real])
     per_metre = density / (2 * setup.critical_density)
-    slopes = np.stack([slope_y, slope_x])
     return Phantom(
-        setup.normalized_potential(per_metre * integral),
+        setup.normalized_potential(per_metre * integral.real),
         setup.displacement(-per_metre * slopes),
     )

@@ -221,24 +221,7 @@ class BeamSetup(BaseModel):
         return scaled(potential, 1 / (self.object_pixel_size * self._angle_per_pixel))
 
     def displacement_from_potential(self, potential: ArrayLike) -> FloatArray:
-        """Displacement in pixels of a potential in SI units, d = -∇φ.
-
-        Parameters
-        ----------
-        potential : array_like, shape (H, W)
-            Potential Φ in m at the centres of this setup's pixels.
-
-        Returns
-        -------
-        ndarray, shape (2, H, W)
-            Displacement in px of the object plane, axis order (y, x), by differences that
-            are of second order up to the border.
-
-        Raises
-        ------
-        InputError
-            If the potential is no plane or too small to have a gradient.
-        """
+        """Displacement (px) of a potential in SI units (m); see the function of this name."""
         return displacement_from_potential(self.normalized_potential(potential))
 
     def field_in_si(self, name: str, values: ArrayLike) -> FloatArray:
