@@ -23,7 +23,7 @@ from napari_shadowinv._napari.sites import Cells, power_cells, site_features
 from napari_shadowinv._napari.viewer_sync import keep_in_step
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.inversion.labels import VARIABLES
-from napari_shadowinv.plotting import ShownField, shown_fields, shown_potential
+from napari_shadowinv.physics.units import ShownField, shown_fields, shown_potential
 
 if TYPE_CHECKING:
     import xarray
