@@ -1,17 +1,13 @@
-"""Orders of points: along a Hilbert curve, and along it in random rounds.
-
-- sort points so that near in the order is near in the plane: `hilbert_permutation`
-- insert sorted points in an order that no arrangement of them can spoil: `insertion_order`
-"""
+"""Orders of points: along a Hilbert curve, and along it in random rounds."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
-
-__all__ = ["hilbert_permutation", "insertion_order"]
+from napari_shadowinv.geometry._mesh import Indices
 
 BITS = 16
 DIGIT_BITS = 11
@@ -22,7 +18,7 @@ ROUND_BITS = 3
 
 @kernel
 def _distance_along(x: int, y: int) -> int:
-    """Distance of the grid cell (x, y) along the curve; free of branches that guess wrong."""
+    """Return the distance of grid cell (x, y) along the curve, without branches to mispredict."""
     distance = 0
     for bit in range(BITS - 1, -1, -1):
         right = (x >> bit) & 1
@@ -38,7 +34,7 @@ def _distance_along(x: int, y: int) -> int:
 
 
 @kernel_that_allocates
-def _keys(points: NDArray[np.float64]) -> NDArray[np.uint32]:
+def _keys(points: FloatArray) -> NDArray[np.uint32]:
     n = points.shape[0]
     keys = np.zeros(n, dtype=np.uint32)
     x_low, x_high = points[:, 0].min(), points[:, 0].max()
@@ -56,8 +52,8 @@ def _keys(points: NDArray[np.float64]) -> NDArray[np.uint32]:
 
 
 @kernel_that_allocates
-def _stable_order(keys: NDArray[np.uint32]) -> NDArray[np.int32]:
-    """Permutation that sorts the keys; equal keys keep their order."""
+def _stable_order(keys: NDArray[np.uint32]) -> Indices:
+    """Return the permutation that sorts the keys; equal keys keep their order."""
     n = keys.size
     order = np.arange(n).astype(np.int32)
     if np.all(keys[:-1] <= keys[1:]):
@@ -79,25 +75,14 @@ def _stable_order(keys: NDArray[np.uint32]) -> NDArray[np.int32]:
 
 
 @kernel_that_allocates
-def hilbert_permutation(points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Sort points along a Hilbert curve through a grid of 2¹⁶ × 2¹⁶ square cells.
-
-    Parameters
-    ----------
-    points : ndarray, shape (n, 2)
-        Coordinates.
-
-    Returns
-    -------
-    ndarray of int32, shape (n,)
-        The permutation; points in one grid cell keep their order.
-    """
+def hilbert_permutation(points: FloatArray) -> Indices:
+    """Sort points along a Hilbert curve through 2¹⁶ × 2¹⁶ cells; those in one keep their order."""
     return _stable_order(_keys(points))
 
 
 @kernel
 def _round_of(k: int) -> int:
-    """Tell how many rounds before the last one point k is inserted, by a hash of k."""
+    """Return how many rounds before the last point k is inserted, by a hash of k."""
     z = (np.uint64(k) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -110,21 +95,10 @@ def _round_of(k: int) -> int:
 
 
 @kernel_that_allocates
-def insertion_order(n: int) -> NDArray[np.int64]:
-    """Biased randomized insertion order: ever larger random samples, each in order.
-
-    Amenta, Choi and Rote 2003, Proc. 19th Symp. Computational Geometry, 211.
-
-    Parameters
-    ----------
-    n : int
-        Number of sites, which are taken to be sorted along a curve.
-
-    Returns
-    -------
-    ndarray of int64, shape (n,)
-        A permutation; always the same.
-    """
+def insertion_order(n: int) -> IntArray:
+    """Permute sorted sites into ever larger random samples, each in order; always the same way."""
+    # Biased randomized insertion order, which no arrangement of the sites can spoil: Amenta,
+    # Choi and Rote 2003, Proc. 19th Symp. Computational Geometry, 211.
     starts = np.zeros(33, dtype=np.int64)
     for k in range(n):
         starts[32 - _round_of(k)] += 1

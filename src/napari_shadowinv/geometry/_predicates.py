@@ -1,10 +1,5 @@
 """Signs that can be trusted: orientation, and the weighted in-circle test of an edge.
 
-- on which side of a line a site lies, exactly: `turn`
-- whether an edge of a triangulation is locally regular, and if not, how it gives way:
-  `edge_state`
-- how far a site lies above the plane of a lifted triangle: `excess`
-
 The orientation is exact: where rounding could hide the sign, it is computed again with
 sums of floats that lose nothing (Shewchuk 1997, Discrete Comput. Geom. 18, 305). The
 in-circle test only reports signs that its error bound certifies. Together these make each
@@ -18,30 +13,17 @@ one of the sites, and doubled: |r - r₀|² - (w - w₀).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import kernel
 
-__all__ = [
-    "CROSS_BOUND",
-    "FLIP",
-    "LEGAL",
-    "REFLEX_A",
-    "REFLEX_B",
-    "edge_state",
-    "excess",
-    "kernel",
-    "precise_excess",
-    "turn",
-]
-
-Float64 = NDArray[np.float64]
 Twofold = tuple[float, float]
 
-LEGAL = 0
-FLIP = 1
-REFLEX_A = 2
-REFLEX_B = 3
+# What to do with the edge a-b between the triangles (p, a, b) and (q, b, a).
+LEGAL = 0  # it is locally regular, or so close to it that rounding decides
+FLIP = 1  # p-q must replace it
+REFLEX_A = 2  # a is hidden: it lies in the triangle (p, q, b), above its lifted plane
+REFLEX_B = 3  # b is hidden likewise
 
 # Error bounds in units of the permanent: (3 + 16 ε) ε for the cross product of two
 # differences, 12 ε (+ O(ε²)) for the lifted determinant, ε = 2⁻⁵³; both rounded up.
@@ -54,7 +36,7 @@ SPLITTER = 2.0**27 + 1.0
 
 @kernel
 def _two_difference(a: float, b: float) -> tuple[float, float]:
-    """Rounded a - b, and what rounding took away."""
+    """Return a - b rounded, and what rounding took away."""
     difference = a - b
     b_virtual = a - difference
     a_virtual = difference + b_virtual
@@ -63,7 +45,7 @@ def _two_difference(a: float, b: float) -> tuple[float, float]:
 
 @kernel
 def _two_sum(a: float, b: float) -> tuple[float, float]:
-    """Rounded a + b, and what rounding took away."""
+    """Return a + b rounded, and what rounding took away."""
     total = a + b
     b_virtual = total - a
     a_virtual = total - b_virtual
@@ -72,7 +54,7 @@ def _two_sum(a: float, b: float) -> tuple[float, float]:
 
 @kernel
 def _two_product(a: float, b: float) -> tuple[float, float]:
-    """Rounded a·b, and what rounding took away."""
+    """Return a·b rounded, and what rounding took away."""
     product = a * b
     scaled = SPLITTER * a
     a_high = scaled - (scaled - a)
@@ -85,7 +67,7 @@ def _two_product(a: float, b: float) -> tuple[float, float]:
 
 
 @kernel
-def _grow(terms: Float64, count: int, value: float) -> int:
+def _grow(terms: FloatArray, count: int, value: float) -> int:
     """Add a float to a sum of non-overlapping terms, smallest first, without loss."""
     for k in range(count):
         value, terms[k] = _two_sum(value, terms[k])
@@ -94,7 +76,7 @@ def _grow(terms: Float64, count: int, value: float) -> int:
 
 
 @kernel
-def _grow_product(terms: Float64, count: int, a: float, b: float) -> int:
+def _grow_product(terms: FloatArray, count: int, a: float, b: float) -> int:
     high, low = _two_product(a, b)
     return _grow(terms, _grow(terms, count, low), high)
 
@@ -107,7 +89,7 @@ def _sign(value: float) -> int:
 
 
 @kernel
-def _exact_turn(points: Float64, terms: Float64, a: int, b: int, c: int) -> int:
+def _exact_turn(points: FloatArray, terms: FloatArray, a: int, b: int, c: int) -> int:
     ux, ux_tail = _two_difference(points[b, 0], points[a, 0])
     uy, uy_tail = _two_difference(points[b, 1], points[a, 1])
     vx, vx_tail = _two_difference(points[c, 0], points[a, 0])
@@ -131,23 +113,8 @@ def _exact_turn(points: Float64, terms: Float64, a: int, b: int, c: int) -> int:
 
 
 @kernel
-def turn(points: Float64, scratch: Float64, a: int, b: int, c: int) -> int:
-    """Sign of cross(b - a, c - a), exactly.
-
-    Parameters
-    ----------
-    points : ndarray, shape (k, 2)
-        Coordinates.
-    scratch : ndarray, shape (16,)
-        Room for the exact sum.
-    a, b, c : int
-        Rows of `points`.
-
-    Returns
-    -------
-    int
-        1 if a, b, c turn counter-clockwise, -1 if clockwise, 0 if they are collinear.
-    """
+def turn(points: FloatArray, scratch: FloatArray, a: int, b: int, c: int) -> int:
+    """Return the exact sign of cross(b - a, c - a): 1 where a, b, c turn counter-clockwise."""
     left = (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1])
     right = (points[b, 1] - points[a, 1]) * (points[c, 0] - points[a, 0])
     cross = left - right
@@ -161,28 +128,9 @@ def turn(points: Float64, scratch: Float64, a: int, b: int, c: int) -> int:
 
 @kernel
 def edge_state(
-    points: Float64, weights: Float64, scratch: Float64, p: int, a: int, b: int, q: int
+    points: FloatArray, weights: FloatArray, scratch: FloatArray, p: int, a: int, b: int, q: int
 ) -> int:
-    """Tell what to do with the edge a-b between the triangles (p, a, b) and (q, b, a).
-
-    Parameters
-    ----------
-    points : ndarray, shape (k, 2)
-        Coordinates.
-    weights : ndarray, shape (k,)
-        Weights, in squared units of the coordinates.
-    scratch : ndarray, shape (16,)
-        Room for the exact sum.
-    p, a, b, q : int
-        The corners of the quadrilateral, counter-clockwise p, a, q, b.
-
-    Returns
-    -------
-    int
-        LEGAL if the edge is locally regular, or so close to it that rounding decides;
-        FLIP if p-q must replace it; REFLEX_A if a is hidden: it lies in the triangle
-        (p, q, b), above its lifted plane; REFLEX_B likewise.
-    """
+    """Tell what to do with the edge a-b; p, a, q, b go around the edge counter-clockwise."""
     ax = points[a, 0] - points[p, 0]
     ay = points[a, 1] - points[p, 1]
     bx = points[b, 0] - points[p, 0]
@@ -228,28 +176,9 @@ def edge_state(
 
 @kernel
 def excess(
-    points: Float64, weights: Float64, a: int, b: int, c: int, v: int
+    points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
 ) -> tuple[float, float]:
-    """Tell how far v lies above the lifted plane of the triangle (a, b, c), and how surely.
-
-    Parameters
-    ----------
-    points : ndarray, shape (k, 2)
-        Coordinates.
-    weights : ndarray, shape (k,)
-        Weights, in squared units of the coordinates.
-    a, b, c : int
-        The triangle, counter-clockwise.
-    v : int
-        The site.
-
-    Returns
-    -------
-    height : float
-        Doubled height above the plane: by this much the weight of v must rise to touch it.
-    bound : float
-        Bound of its rounding error.
-    """
+    """Return by how much the weight of v must rise to touch (a, b, c), and a bound of the error."""
     ax = points[a, 0] - points[v, 0]
     ay = points[a, 1] - points[v, 1]
     bx = points[b, 0] - points[v, 0]
@@ -297,9 +226,9 @@ def _cross(ax: Twofold, ay: Twofold, bx: Twofold, by: Twofold) -> Twofold:
 
 @kernel
 def _relative(
-    points: Float64, weights: Float64, a: int, v: int
+    points: FloatArray, weights: FloatArray, a: int, v: int
 ) -> tuple[Twofold, Twofold, Twofold]:
-    """Coordinates and doubled height of a, seen from v."""
+    """Return the coordinates and doubled height of a, seen from v."""
     x = _two_difference(points[a, 0], points[v, 0])
     y = _two_difference(points[a, 1], points[v, 1])
     loss = _two_difference(weights[v], weights[a])
@@ -307,25 +236,10 @@ def _relative(
 
 
 @kernel
-def precise_excess(points: Float64, weights: Float64, a: int, b: int, c: int, v: int) -> float:
-    """Height of `excess` in twofold precision: right for triangles next to a line, too.
-
-    Parameters
-    ----------
-    points : ndarray, shape (k, 2)
-        Coordinates.
-    weights : ndarray, shape (k,)
-        Weights, in squared units of the coordinates.
-    a, b, c : int
-        The triangle, counter-clockwise.
-    v : int
-        The site.
-
-    Returns
-    -------
-    float
-        Doubled height of v above the plane.
-    """
+def precise_excess(
+    points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
+) -> float:
+    """Return the height of `excess` in twofold precision: right for slivers, too."""
     ax, ay, a_lift = _relative(points, weights, a, v)
     bx, by, b_lift = _relative(points, weights, b, v)
     cx, cy, c_lift = _relative(points, weights, c, v)

@@ -7,14 +7,12 @@ taken out and put in again where they belong.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry._flips import DONE, EXHAUSTED, REMOVE, insert, repair, restore
 from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
 from napari_shadowinv.geometry._mesh import EVERYWHERE, SIZE, Mesh, compact, remove
 from napari_shadowinv.geometry._predicates import CROSS_BOUND, turn
-
-__all__ = ["relocate"]
 
 _MOST_STRAYS = 0.1  # of the sites; with more of them a new triangulation is faster
 
@@ -32,7 +30,7 @@ def _overturned(mesh: Mesh, t: int) -> bool:
 
 
 @kernel_that_allocates
-def _stay_behind(mesh: Mesh, origins: NDArray[np.float64], strays: NDArray[np.bool_]) -> bool:
+def _stay_behind(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
     """Return the corners of overturned triangles to their origins; tell if there were any."""
     found = False
     for t in range(mesh.counters[SIZE]):
@@ -46,7 +44,7 @@ def _stay_behind(mesh: Mesh, origins: NDArray[np.float64], strays: NDArray[np.bo
 
 
 @kernel_that_allocates
-def _take_out(mesh: Mesh, strays: NDArray[np.bool_]) -> int:
+def _take_out(mesh: Mesh, strays: BoolArray) -> int:
     """Remove the strays that are in the triangulation."""
     found = True
     while found:  # flips may move a stray to a triangle that the pass has left behind
@@ -63,21 +61,8 @@ def _take_out(mesh: Mesh, strays: NDArray[np.bool_]) -> int:
 
 
 @kernel_that_allocates
-def relocate(mesh: Mesh, targets: NDArray[np.float64]) -> int:
-    """Move the sites and make the triangulation regular again.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        A regular triangulation; its points are changed.
-    targets : ndarray, shape (n, 2)
-        Where the sites go, within the ghosts.
-
-    Returns
-    -------
-    int
-        DONE, or EXHAUSTED when building the mesh anew is the better way.
-    """
+def relocate(mesh: Mesh, targets: FloatArray) -> int:
+    """Move the sites and repair the mesh; EXHAUSTED where building it anew is the better way."""
     n = targets.shape[0]
     origins = mesh.points[:n].copy()
     strays = np.zeros(n, dtype=np.bool_)

@@ -21,13 +21,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 
 __all__ = ["Density", "split_pixels", "walk_edge"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,8 @@ class Density:
         last column holds the whole row's.
     """
 
-    image: Array
-    sums: Array
+    image: FloatArray
+    sums: FloatArray
 
     @classmethod
     def from_image(cls, image: ArrayLike) -> Density:
@@ -61,7 +60,7 @@ class Density:
         return self.image.shape[0], self.image.shape[1]
 
     @property
-    def region(self) -> Array:
+    def region(self) -> FloatArray:
         """Corners (y, x) of the image, half a pixel beyond the outermost centres, shape (2, 2)."""
         return np.array([[0.0, 0.0], self.shape]) - 0.5
 
@@ -72,7 +71,7 @@ class Density:
 
 
 @njit(nogil=True, cache=True)
-def _row_sums(image: Array) -> Array:
+def _row_sums(image: FloatArray) -> FloatArray:
     height, width = image.shape
     sums = np.zeros((3, height, width + 1))
     for row in range(height):
@@ -86,20 +85,8 @@ def _row_sums(image: Array) -> Array:
     return sums
 
 
-def split_pixels(image: Array, factor: int) -> Array:
-    """Split each pixel of an image into factor × factor that share its flux evenly.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-        Flux of each pixel.
-    factor : int
-        1 or more.
-
-    Returns
-    -------
-    ndarray, shape (H · factor, W · factor)
-    """
+def split_pixels(image: FloatArray, factor: int) -> FloatArray:
+    """Split each pixel of an image into factor × factor that share its flux evenly."""
     return np.repeat(np.repeat(image / factor**2, factor, axis=0), factor, axis=1)
 
 
@@ -128,7 +115,7 @@ def _moments(
 @njit(nogil=True, cache=True, inline="always")
 def _moments_in_pixel(
     value: float,
-    sums: Array,
+    sums: FloatArray,
     row: int,
     column: int,
     y0: float,
@@ -161,9 +148,9 @@ def _moments_in_pixel(
 
 @njit(nogil=True, cache=True)
 def _walk_inside(
-    image: Array, sums: Array, ya: float, xa: float, yb: float, xb: float, with_moments: bool
+    image: FloatArray, sums: FloatArray, ya: float, xa: float, yb: float, xb: float, with_moments: bool
 ) -> tuple[float, float, float, float, float]:
-    """Integrate along a segment inside the image; see `walk_edge`."""
+    """Integrate along a segment inside the image, as `walk_edge` does."""
     height, width = image.shape
     row = min(int(ya), height - 1)
     column = min(int(xa), width - 1)
@@ -212,7 +199,7 @@ def _walk_inside(
 
 @njit(nogil=True, cache=True)
 def _walk_right_of_image(
-    image: Array, sums: Array, ya: float, yb: float
+    image: FloatArray, sums: FloatArray, ya: float, yb: float
 ) -> tuple[float, float, float, float]:
     """Integrate from row position ya to yb beyond the right edge, where F is the row's sum."""
     height, width = image.shape
@@ -236,7 +223,7 @@ def _walk_right_of_image(
 
 @njit(nogil=True, cache=True)
 def walk_edge(
-    image: Array, sums: Array, ya: float, xa: float, yb: float, xb: float, with_moments: bool
+    image: FloatArray, sums: FloatArray, ya: float, xa: float, yb: float, xb: float, with_moments: bool
 ) -> tuple[float, float, float, float, float]:
     """Integrate along the segment from (ya, xa) to (yb, xb), in corner coordinates.
 
@@ -279,7 +266,7 @@ def walk_edge(
 
 @njit(nogil=True, cache=True)
 def _inside_share(position: float, step: float, size: int) -> tuple[float, float]:
-    """Range of t in [0, 1] for which position + t·step lies in [0, size]."""
+    """Return the range of t in [0, 1] for which position + t·step lies in [0, size]."""
     if step == 0:
         return (0.0, 1.0) if 0 <= position < size else (1.0, 1.0)
     first = -position / step
@@ -291,7 +278,7 @@ def _inside_share(position: float, step: float, size: int) -> tuple[float, float
 def _point(
     ya: float, xa: float, yb: float, xb: float, t: float, height: int, width: int
 ) -> tuple[float, float]:
-    """The point at share t of a segment, not further out than the image's border."""
+    """Return the point at share t of a segment, not beyond the image's border."""
     y = ya + t * (yb - ya) if t < 1 else yb
     x = xa + t * (xb - xa) if t < 1 else xb
     return min(max(y, 0.0), float(height)), min(max(x, 0.0), float(width))
