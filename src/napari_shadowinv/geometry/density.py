@@ -148,7 +148,13 @@ def _moments_in_pixel(
 
 @njit(nogil=True, cache=True)
 def _walk_inside(
-    image: FloatArray, sums: FloatArray, ya: float, xa: float, yb: float, xb: float, with_moments: bool
+    image: FloatArray,
+    sums: FloatArray,
+    ya: float,
+    xa: float,
+    yb: float,
+    xb: float,
+    with_moments: bool,
 ) -> tuple[float, float, float, float, float]:
     """Integrate along a segment inside the image, as `walk_edge` does."""
     height, width = image.shape
@@ -223,7 +229,13 @@ def _walk_right_of_image(
 
 @njit(nogil=True, cache=True)
 def walk_edge(
-    image: FloatArray, sums: FloatArray, ya: float, xa: float, yb: float, xb: float, with_moments: bool
+    image: FloatArray,
+    sums: FloatArray,
+    ya: float,
+    xa: float,
+    yb: float,
+    xb: float,
+    with_moments: bool,
 ) -> tuple[float, float, float, float, float]:
     """Integrate along the segment from (ya, xa) to (yb, xb), in corner coordinates.
 

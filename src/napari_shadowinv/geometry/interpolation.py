@@ -73,7 +73,12 @@ def mirrored_across_border(
 
 @njit(nogil=True, cache=True)
 def _sweep(
-    vertices: Indices, neighbors: Indices, points: FloatArray, values: FloatArray, gradients: FloatArray, n: int
+    vertices: Indices,
+    neighbors: Indices,
+    points: FloatArray,
+    values: FloatArray,
+    gradients: FloatArray,
+    n: int,
 ) -> FloatArray:
     """Make one Jacobi sweep towards the gradients of least bending along the edges."""
     system = np.zeros((n, 5))
@@ -166,7 +171,9 @@ def _edge_ordinates(
 
 
 @njit(nogil=True, cache=True)
-def _patch(p: FloatArray, f: FloatArray, g: FloatArray, y: float, x: float) -> tuple[float, float, float]:
+def _patch(
+    p: FloatArray, f: FloatArray, g: FloatArray, y: float, x: float
+) -> tuple[float, float, float]:
     """Return value and gradient at (y, x) of the surface over the triangle p."""
     cy = (p[0, 0] + p[1, 0] + p[2, 0]) / 3
     cx = (p[0, 1] + p[1, 1] + p[2, 1]) / 3
@@ -197,7 +204,7 @@ def _patch(p: FloatArray, f: FloatArray, g: FloatArray, y: float, x: float) -> t
         by_centre[k] = (to_centre[k] + inside[(k + 1) % 3] + inside[(k + 2) % 3]) / 3
     centre = (by_centre[0] + by_centre[1] + by_centre[2]) / 3
 
-    k = np.argmin(bary)  # the patch that holds the point
+    k = int(np.argmin(bary))  # the patch that holds the point
     i = (k + 1) % 3
     j = (k + 2) % 3
     u = bary[i] - bary[k]

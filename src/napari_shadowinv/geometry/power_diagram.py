@@ -34,7 +34,13 @@ __all__ = ["PowerDiagram"]
 
 @njit(nogil=True, cache=True)
 def _power_centres(
-    start: int, stop: int, points: FloatArray, weights: FloatArray, n: int, vertices: Indices, centres: FloatArray
+    start: int,
+    stop: int,
+    points: FloatArray,
+    weights: FloatArray,
+    n: int,
+    vertices: Indices,
+    centres: FloatArray,
 ) -> None:
     """Find the point of equal power distance to the three sites of each triangle."""
     for t in range(start, stop):
@@ -214,7 +220,7 @@ class PowerDiagram:
             triangulation.vertices,
             self.vertices,
         )
-        #: Pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside.
+        # pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside
         self.edges, sides = _edges_of(triangulation)
         self._integrals = np.empty((len(sides), 5 if with_moments else 2))
         in_ranges(
