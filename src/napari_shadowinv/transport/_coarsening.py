@@ -86,7 +86,9 @@ def _put_lower_first(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _read_laplacian(starts: Indices, columns: Indices, values: FloatArray, network: Network) -> None:
+def _read_laplacian(
+    starts: Indices, columns: Indices, values: FloatArray, network: Network
+) -> None:
     """Take the conductors out of a sparse matrix, in any order of columns."""
     neighbors = network.neighbors
     conductances = network.conductances

@@ -9,17 +9,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from napari_shadowinv._system.memory import physical_memory
 from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 
 __all__ = ["lbfgs", "quasi_newton"]
 
-Array = NDArray[np.float64]
 
 _CORRECTIONS = 20  # pairs of steps and gradients that L-BFGS keeps
 _MATRICES = 4  # n × n matrices that scipy's BFGS holds at once
@@ -27,30 +26,13 @@ _MATRICES = 4  # n × n matrices that scipy's BFGS holds at once
 
 def lbfgs(
     objective: TransportObjective,
-    weights: Array,
+    weights: FloatArray,
     *,
     tolerance: float,
     max_iterations: int,
     report: Reporter | None = None,
 ) -> Solution:
-    """Minimise the convex function by limited-memory BFGS.
-
-    Parameters
-    ----------
-    objective : TransportObjective
-        The problem.
-    weights : ndarray, shape (n,)
-        Start, px²; cells may be empty.
-    tolerance : float
-        Largest relative flux error allowed in any cell.
-    max_iterations : int
-        Most steps.
-    report : Reporter, optional
-        Told of each step.
-
-    Returns
-    -------
-    Solution
+    """Minimise the convex function by limited-memory BFGS; cells may be empty at the start.
 
     References
     ----------
@@ -62,22 +44,13 @@ def lbfgs(
 
 def quasi_newton(
     objective: TransportObjective,
-    weights: Array,
+    weights: FloatArray,
     *,
     tolerance: float,
     max_iterations: int,
     report: Reporter | None = None,
 ) -> Solution:
     """Minimise the convex function by BFGS, which keeps an n × n matrix.
-
-    Parameters
-    ----------
-    objective, weights, tolerance, max_iterations, report
-        See `lbfgs`.
-
-    Returns
-    -------
-    Solution
 
     Raises
     ------
@@ -102,7 +75,7 @@ def quasi_newton(
 
 def _descend(
     objective: TransportObjective,
-    start: Array,
+    start: FloatArray,
     tolerance: float,
     max_iterations: int,
     report: Reporter | None,
@@ -115,21 +88,20 @@ def _descend(
     # weights in units of the cells' area and flux in units of a cell's make a well-scaled problem
     height, width = objective.image.shape
     area = height * width / len(mass)
-    message = f"{len(mass):,} sites, residual "
     residual = np.inf
     steps = 0
 
-    def scaled(weights: Array) -> tuple[float, Array]:
+    def scaled(weights: FloatArray) -> tuple[float, FloatArray]:
         nonlocal residual
         value, gradient = objective.value_and_gradient(area * weights)
         residual = float(np.max(np.abs(gradient) / mass))
         return value / (area * flux), gradient / flux
 
-    def after_step(_: Array) -> None:
+    def after_step(_: FloatArray) -> None:
         nonlocal steps
         steps += 1
         if report is not None:
-            report("transport", steps, None, f"{message}{residual:.2g}")
+            report("transport", steps, None, f"{len(mass):,} sites, residual {residual:.2g}")
         if residual <= tolerance:
             raise StopIteration
 

@@ -329,7 +329,9 @@ def solve_laplacian(
     return _solve_directly(laplacian, right, ground)
 
 
-def _solve_directly(laplacian: csr_array, right: FloatArray, ground: FloatArray | None) -> FloatArray:
+def _solve_directly(
+    laplacian: csr_array, right: FloatArray, ground: FloatArray | None
+) -> FloatArray:
     """Factorise the system, without a ground all but its first unknown."""
     if ground is not None:
         return _factorised(laplacian + diags_array(ground), right)
