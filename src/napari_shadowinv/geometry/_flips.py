@@ -1,10 +1,10 @@
-"""Building and repairing a regular triangulation by flips; see `triangulation`."""
+"""Building, repairing and moving a regular triangulation by flips; see `triangulation`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from napari_shadowinv._typing import BoolArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry import _mesh
 from napari_shadowinv.geometry._hilbert import insertion_order
 from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
@@ -31,6 +31,9 @@ INSIDE, ON_EDGE, ON_CORNER, NOWHERE = 0, 1, 2, 3
 
 # Longest step above the plane when a weight is raised, in roundings of the weight.
 LONGEST_STEP = 1 << 15
+
+# Share of sites out of place from which on a new triangulation is faster.
+MOST_STRAYS = 0.1
 
 
 @kernel
@@ -411,4 +414,60 @@ def build(mesh: Mesh) -> int:
         status = _sweep(mesh, np.empty(0, np.bool_))
     _mesh.compact(mesh)
     _sort_triangles(mesh)
+    return status
+
+
+@kernel_that_allocates
+def _stay_behind(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
+    """Return the corners of overturned triangles to their origins; tell if there were any."""
+    found = False
+    for t in range(mesh.counters[_mesh.SIZE]):
+        i, j, k = mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2]
+        if turn(mesh.points, mesh.scratch, i, j, k) <= 0:
+            found = True
+            for v in (i, j, k):
+                if v < strays.size:
+                    mesh.points[v] = origins[v]
+                    strays[v] = True
+    return found
+
+
+@kernel_that_allocates
+def _take_out(mesh: Mesh, strays: BoolArray) -> int:
+    """Remove the strays that are in the triangulation."""
+    found = True
+    while found:  # flips may move a stray to a triangle that the pass has left behind
+        found = False
+        for h in range(3 * mesh.counters[_mesh.SIZE]):
+            v = mesh.corners[h]
+            if mesh.corners[h - h % 3] >= 0 and v < strays.size and strays[v]:
+                found = True
+                _mesh.remove(mesh, h)
+                mesh.counters[_mesh.EVERYWHERE] = 1
+                if restore(mesh) != DONE:
+                    return EXHAUSTED
+    return DONE
+
+
+@kernel_that_allocates
+def relocate(mesh: Mesh, targets: FloatArray) -> int:
+    """Move the sites and repair the mesh; EXHAUSTED where building it anew is the better way."""
+    # All sites move at once, but for the corners of triangles that this would turn over: these
+    # are taken out and put in again where they belong.
+    n = targets.shape[0]
+    origins = mesh.points[:n].copy()
+    strays = np.zeros(n, dtype=np.bool_)
+    mesh.points[:n] = targets
+    while _stay_behind(mesh, origins, strays):
+        pass
+    if strays.sum() > MOST_STRAYS * n or repair(mesh, REMOVE, strays[:0]) != DONE:
+        return EXHAUSTED
+    status = _take_out(mesh, strays)
+    for v in range(n):
+        if strays[v]:
+            mesh.points[v] = targets[v]
+    for v in range(n):
+        if mesh.hidden[v] and status == DONE:
+            status = insert(mesh, v, 1.0 if strays[v] else -1.0)
+    _mesh.compact(mesh)
     return status

@@ -10,7 +10,6 @@ from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
 from napari_shadowinv.geometry._mesh import Indices
 
 BITS = 16
-DIGIT_BITS = 11
 
 # A round of insertion has 2³ - 1 times as many points as all before it.
 ROUND_BITS = 3
@@ -34,9 +33,10 @@ def _distance_along(x: int, y: int) -> int:
 
 
 @kernel_that_allocates
-def _keys(points: FloatArray) -> NDArray[np.uint32]:
+def _keys(points: FloatArray) -> NDArray[np.uint64]:
+    """Return numbers to sort by: a point's distance along the curve, then its row."""
     n = points.shape[0]
-    keys = np.zeros(n, dtype=np.uint32)
+    keys = np.arange(n).astype(np.uint64)
     x_low, x_high = points[:, 0].min(), points[:, 0].max()
     y_low, y_high = points[:, 1].min(), points[:, 1].max()
     extent = max(x_high - x_low, y_high - y_low)
@@ -47,37 +47,13 @@ def _keys(points: FloatArray) -> NDArray[np.uint32]:
     for i in range(n):
         x = min(int((points[i, 0] - x_low) * scale), last)
         y = min(int((points[i, 1] - y_low) * scale), last)
-        keys[i] = _distance_along(x, y)
+        keys[i] |= np.uint64(_distance_along(x, y)) << np.uint64(32)
     return keys
 
 
-@kernel_that_allocates
-def _stable_order(keys: NDArray[np.uint32]) -> Indices:
-    """Return the permutation that sorts the keys; equal keys keep their order."""
-    n = keys.size
-    order = np.arange(n).astype(np.int32)
-    if np.all(keys[:-1] <= keys[1:]):
-        return order
-    other = np.empty(n, dtype=np.int32)
-    mask = (1 << DIGIT_BITS) - 1
-    for shift in range(0, 2 * BITS, DIGIT_BITS):
-        starts = np.zeros(mask + 2, dtype=np.int64)
-        for k in range(n):
-            starts[((np.int64(keys[k]) >> shift) & mask) + 1] += 1
-        for digit in range(mask + 1):
-            starts[digit + 1] += starts[digit]
-        for i in order:
-            place = (np.int64(keys[i]) >> shift) & mask
-            other[starts[place]] = i
-            starts[place] += 1
-        order, other = other, order
-    return order
-
-
-@kernel_that_allocates
 def hilbert_permutation(points: FloatArray) -> Indices:
     """Sort points along a Hilbert curve through 2¹⁶ × 2¹⁶ cells; those in one keep their order."""
-    return _stable_order(_keys(points))
+    return (np.sort(_keys(points)) & 0xFFFFFFFF).astype(np.int32)
 
 
 @kernel

@@ -127,58 +127,10 @@ def turn(points: FloatArray, scratch: FloatArray, a: int, b: int, c: int) -> int
 
 
 @kernel
-def edge_state(
-    points: FloatArray, weights: FloatArray, scratch: FloatArray, p: int, a: int, b: int, q: int
-) -> int:
-    """Tell what to do with the edge a-b; p, a, q, b go around the edge counter-clockwise."""
-    ax = points[a, 0] - points[p, 0]
-    ay = points[a, 1] - points[p, 1]
-    bx = points[b, 0] - points[p, 0]
-    by = points[b, 1] - points[p, 1]
-    qx = points[q, 0] - points[p, 0]
-    qy = points[q, 1] - points[p, 1]
-    a_gain = weights[a] - weights[p]
-    b_gain = weights[b] - weights[p]
-    q_gain = weights[q] - weights[p]
-    a_square = ax * ax + ay * ay
-    b_square = bx * bx + by * by
-    q_square = qx * qx + qy * qy
-    ab_left = ax * by
-    ab_right = ay * bx
-    aq_left = ax * qy
-    aq_right = ay * qx
-    qb_left = qx * by
-    qb_right = qy * bx
-    aq = aq_left - aq_right
-    qb = qb_left - qb_right
-    aq_size = abs(aq_left) + abs(aq_right)
-    qb_size = abs(qb_left) + abs(qb_right)
-    height = (
-        (q_square - q_gain) * (ab_left - ab_right)
-        - (a_square - a_gain) * qb
-        - (b_square - b_gain) * aq
-    )
-    size = (
-        (q_square + abs(q_gain)) * (abs(ab_left) + abs(ab_right))
-        + (a_square + abs(a_gain)) * qb_size
-        + (b_square + abs(b_gain)) * aq_size
-    )
-    if height >= -LIFT_BOUND * size:
-        return LEGAL
-    if aq > CROSS_BOUND * aq_size and qb > CROSS_BOUND * qb_size:
-        return FLIP
-    if turn(points, scratch, p, a, q) <= 0:
-        return REFLEX_A
-    if turn(points, scratch, p, q, b) <= 0:
-        return REFLEX_B
-    return FLIP
-
-
-@kernel
-def excess(
+def _lifted(
     points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
-) -> tuple[float, float]:
-    """Return by how much the weight of v must rise to touch (a, b, c), and a bound of the error."""
+) -> tuple[float, float, float]:
+    """Return the determinant of the lifted a, b, c seen from v, its permanent, and the area."""
     ax = points[a, 0] - points[v, 0]
     ay = points[a, 1] - points[v, 1]
     bx = points[b, 0] - points[v, 0]
@@ -194,16 +146,39 @@ def excess(
     bc = bx * cy - by * cx
     ca = cx * ay - cy * ax
     ab = ax * by - ay * bx
-    plane = (a_square - a_gain) * bc + (b_square - b_gain) * ca + (c_square - c_gain) * ab
+    height = (a_square - a_gain) * bc + (b_square - b_gain) * ca + (c_square - c_gain) * ab
     size = (
         (a_square + abs(a_gain)) * (abs(bx * cy) + abs(by * cx))
         + (b_square + abs(b_gain)) * (abs(cx * ay) + abs(cy * ax))
         + (c_square + abs(c_gain)) * (abs(ax * by) + abs(ay * bx))
     )
-    area = bc + ca + ab
+    return height, size, bc + ca + ab
+
+
+@kernel
+def edge_state(
+    points: FloatArray, weights: FloatArray, scratch: FloatArray, p: int, a: int, b: int, q: int
+) -> int:
+    """Tell what to do with the edge a-b; p, a, q, b go around it counter-clockwise."""
+    height, size, _ = _lifted(points, weights, q, a, b, p)
+    if height >= -LIFT_BOUND * size:
+        return LEGAL
+    if turn(points, scratch, p, a, q) <= 0:
+        return REFLEX_A
+    if turn(points, scratch, p, q, b) <= 0:
+        return REFLEX_B
+    return FLIP
+
+
+@kernel
+def excess(
+    points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
+) -> tuple[float, float]:
+    """Return by how much the weight of v must rise to touch (a, b, c), and a bound of the error."""
+    height, size, area = _lifted(points, weights, a, b, c, v)
     if area <= 0.0:
         return 0.0, np.inf
-    return -plane / area, LIFT_BOUND * size / area
+    return -height / area, LIFT_BOUND * size / area
 
 
 @kernel

@@ -34,7 +34,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import _flips
 from napari_shadowinv.geometry._hilbert import hilbert_permutation
 from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Indices, Mesh
-from napari_shadowinv.geometry._relocation import relocate
 
 __all__ = ["RegularTriangulation", "hilbert_order"]
 
@@ -66,7 +65,7 @@ def hilbert_order(points: ArrayLike) -> Indices:
     >>> hilbert_order([[0.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
     array([0, 2, 1, 3], dtype=int32)
     """
-    return np.asarray(hilbert_permutation(_checked_points(points)))
+    return hilbert_permutation(_checked_points(points))
 
 
 def _checked_points(points: ArrayLike) -> FloatArray:
@@ -273,7 +272,7 @@ class RegularTriangulation:
         self._forget()
         if same_ghosts:
             self._mesh = self._mesh._replace(points=self._mesh.points.copy())
-            if relocate(self._mesh, targets) == _flips.DONE:
+            if _flips.relocate(self._mesh, targets) == _flips.DONE:
                 return
         self._mesh = self._mesh._replace(points=points)
         self._weigh_ghosts()
