@@ -417,7 +417,7 @@ def build(mesh: Mesh) -> int:
     return status
 
 
-@kernel_that_allocates
+@kernel
 def _stay_behind(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
     """Return the corners of overturned triangles to their origins; tell if there were any."""
     found = False
@@ -427,12 +427,13 @@ def _stay_behind(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
             found = True
             for v in (i, j, k):
                 if v < strays.size:
-                    mesh.points[v] = origins[v]
+                    mesh.points[v, 0] = origins[v, 0]
+                    mesh.points[v, 1] = origins[v, 1]
                     strays[v] = True
     return found
 
 
-@kernel_that_allocates
+@kernel
 def _take_out(mesh: Mesh, strays: BoolArray) -> int:
     """Remove the strays that are in the triangulation."""
     found = True
