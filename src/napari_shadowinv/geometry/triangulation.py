@@ -145,11 +145,7 @@ class RegularTriangulation:
     """
 
     def __init__(
-        self,
-        sites: ArrayLike,
-        weights: ArrayLike | None = None,
-        *,
-        region: ArrayLike | None = None,
+        self, sites: ArrayLike, weights: ArrayLike | None = None, *, region: ArrayLike | None = None
     ) -> None:
         given = _checked_points(sites)
         n = given.shape[0]

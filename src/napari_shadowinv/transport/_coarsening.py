@@ -189,13 +189,7 @@ def _list_members(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _contract(
-    fine: Network,
-    start: int,
-    stop: int,
-    groups: Indices,
-    coarse: Network,
-    first: int,
-    last: int,
+    fine: Network, start: int, stop: int, groups: Indices, coarse: Network, first: int, last: int
 ) -> None:
     """Make each group one node, with the sums of the conductances between groups."""
     begins, members = _list_members(start, stop, groups, first, last)

@@ -70,9 +70,7 @@ class Mirrored:
         origins = np.concatenate([np.arange(len(sites)), origin])[order]
         senses = np.concatenate([np.ones_like(sites), sense])[order]
         return cls(
-            RegularTriangulation(points[order]),
-            origins.astype(np.int32),
-            senses.astype(np.int8),
+            RegularTriangulation(points[order]), origins.astype(np.int32), senses.astype(np.int8)
         )
 
 
