@@ -28,6 +28,8 @@ from napari_shadowinv.geometry._kernel import njit
 
 __all__ = ["Density", "split_pixels", "walk_edge"]
 
+Triple = tuple[float, float, float]
+
 
 @dataclass(frozen=True)
 class Density:
@@ -91,18 +93,10 @@ def split_pixels(image: FloatArray, factor: int) -> FloatArray:
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _moments(
-    f0: float,
-    f_mid: float,
-    f1: float,
-    g: float,
-    k0: float,
-    k_mid: float,
-    k1: float,
-    y0: float,
-    y1: float,
-) -> tuple[float, float, float]:
-    """∫ y F dy, ∫ G dy and ∫ (y² F + K) dy by Simpson's rule; g is the sum for G."""
+def _moments(f: Triple, g: float, k: Triple, y0: float, y1: float) -> Triple:
+    """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy by Simpson's rule; g is the sum for G."""
+    f0, f_mid, f1 = f
+    k0, k_mid, k1 = k
     y_mid = 0.5 * (y0 + y1)
     sixth = (y1 - y0) / 6
     return (
@@ -114,16 +108,16 @@ def _moments(
 
 @njit(nogil=True, cache=True, inline="always")
 def _moments_in_pixel(
-    value: float,
     sums: FloatArray,
-    row: int,
-    column: int,
+    value: float,
+    pixel: tuple[int, int],
     y0: float,
     x0: float,
     y1: float,
     x1: float,
-) -> tuple[float, float, float]:
-    """∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
+) -> Triple:
+    """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
+    row, column = pixel
     left = float(column)
     left2 = left * left
     left3 = left2 * left
@@ -133,17 +127,13 @@ def _moments_in_pixel(
     k_base = sums[2, row, column] - value * left3 / 3
     g = 6 * g_base + value * (x0 * x0 + 4 * x_mid * x_mid + x1 * x1) / 2
     third = value / 3
-    return _moments(
-        f_base + value * x0,
-        f_base + value * x_mid,
-        f_base + value * x1,
-        g,
+    f = f_base + value * x0, f_base + value * x_mid, f_base + value * x1
+    k = (
         k_base + third * x0 * x0 * x0,
         k_base + third * x_mid * x_mid * x_mid,
         k_base + third * x1 * x1 * x1,
-        y0,
-        y1,
     )
+    return _moments(f, g, k, y0, y1)
 
 
 @njit(nogil=True, cache=True)
@@ -189,7 +179,9 @@ def _walk_inside(
         flux += value * (t_next - t)
         mass += (sums[0, row, column] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
         if with_moments:
-            of_y, of_x, of_both = _moments_in_pixel(value, sums, row, column, y, x, y_next, x_next)
+            of_y, of_x, of_both = _moments_in_pixel(
+                sums, value, (row, column), y, x, y_next, x_next
+            )
             moment_y += of_y
             moment_x += of_x
             inertia += of_both
@@ -216,10 +208,8 @@ def _walk_right_of_image(
     for row in range(min(int(low), height - 1), min(int(high), height - 1) + 1):
         y0 = max(low, float(row))
         y1 = min(high, row + 1.0)
-        f = sums[0, row, width]
-        g = sums[1, row, width]
-        k = sums[2, row, width]
-        of_y, of_x, of_both = _moments(f, f, f, 6 * g, k, k, k, y0, y1)
+        f, g, k = sums[0, row, width], sums[1, row, width], sums[2, row, width]
+        of_y, of_x, of_both = _moments((f, f, f), 6 * g, (k, k, k), y0, y1)
         mass += sign * f * (y1 - y0)
         moment_y += sign * of_y
         moment_x += sign * of_x
@@ -239,11 +229,7 @@ def walk_edge(
 ) -> tuple[float, float, float, float, float]:
     """Integrate along the segment from (ya, xa) to (yb, xb), in corner coordinates.
 
-    Returns
-    -------
-    tuple of float
-        ∫ I ds, then ∫ F dy, ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy; the last three
-        are 0 unless `with_moments`.
+    Returns ∫ I ds, ∫ F dy, and if `with_moments`, else 0, ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy.
     """
     height, width = image.shape
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:

@@ -25,7 +25,14 @@ from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
-__all__ = ["BLOCK", "CloughTocher", "fit_gradients", "locate", "mirrored_across_border"]
+__all__ = [
+    "BLOCK",
+    "CloughTocher",
+    "arrays_of",
+    "fit_gradients",
+    "locate",
+    "mirrored_across_border",
+]
 
 BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
 
@@ -33,16 +40,7 @@ BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothi
 def mirrored_across_border(
     sites: FloatArray, shape: tuple[int, int], band: float
 ) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
-    """Mirror the sites that are closer than `band` to the image's border across it.
-
-    Parameters
-    ----------
-    sites : ndarray, shape (n, 2)
-        Positions inside the image.
-    shape : tuple of int
-        Shape (H, W) of the image.
-    band : float
-        Width of the strip that is mirrored, in px.
+    """Mirror the sites that are closer than `band` px to the image's border across it.
 
     Returns
     -------
@@ -120,10 +118,14 @@ def fit_gradients(
     ----------
     G. M. Nielson, Mathematics of Computation 40, 253 (1983).
     """
-    mesh = triangulation.vertices, triangulation.neighbors, triangulation.points
     for _ in range(sweeps):
-        gradients = _sweep(*mesh, values, gradients, len(values))
+        gradients = _sweep(*arrays_of(triangulation), values, gradients, len(values))
     return gradients
+
+
+def arrays_of(triangulation: RegularTriangulation) -> tuple[Indices, Indices, FloatArray]:
+    """Return what kernels want to know of a triangulation."""
+    return triangulation.vertices, triangulation.neighbors, triangulation.points
 
 
 @njit(nogil=True, cache=True)
@@ -190,16 +192,13 @@ def _patch(
         slope[k, 1] = (p[j, 0] - p[i, 0]) / double_area
 
     # ordinates: along edge k (opposite vertex k) near its two ends, and inside its patch
-    near_first = np.empty(3)
-    near_second = np.empty(3)
-    inside = np.empty(3)
-    to_centre = np.empty(3)
+    near_first, near_second, inside = np.empty(3), np.empty(3), np.empty(3)
+    to_centre, by_centre = np.empty(3), np.empty(3)
     for k in range(3):
         near_first[k], near_second[k], inside[k] = _edge_ordinates(
             p, f, g, (k + 1) % 3, (k + 2) % 3, cy, cx
         )
         to_centre[k] = f[k] + (g[k, 0] * (cy - p[k, 0]) + g[k, 1] * (cx - p[k, 1])) / 3
-    by_centre = np.empty(3)
     for k in range(3):
         by_centre[k] = (to_centre[k] + inside[(k + 1) % 3] + inside[(k + 2) % 3]) / 3
     centre = (by_centre[0] + by_centre[1] + by_centre[2]) / 3
@@ -346,32 +345,14 @@ class CloughTocher:
         self._threads = available_threads(threads)
 
     def __call__(self, queries: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Evaluate the surface.
+        """Return values, shape (m,), and gradients, shape (m, 2), at points (y, x).
 
-        Parameters
-        ----------
-        queries : ndarray, shape (m, 2)
-            Points (y, x); neighbours in the list should be neighbours in the plane.
-            Outside the sites' hull the nearest hull site is continued linearly.
-
-        Returns
-        -------
-        values : ndarray, shape (m,)
-        gradients : ndarray, shape (m, 2)
+        Neighbours in the list should be neighbours in the plane. Outside the sites' hull the
+        nearest hull site is continued linearly.
         """
         queries = np.ascontiguousarray(queries, dtype=np.float64)
         out = np.zeros((len(queries), 3))
-        in_ranges(
-            _evaluate_blocks,
-            -(-len(queries) // BLOCK),
-            self._threads,
-            queries,
-            self._triangulation.vertices,
-            self._triangulation.neighbors,
-            self._triangulation.points,
-            self._values,
-            self._gradients,
-            out,
-            smallest=2,
-        )
+        surface = (*arrays_of(self._triangulation), self._values, self._gradients)
+        blocks = -(-len(queries) // BLOCK)
+        in_ranges(_evaluate_blocks, blocks, self._threads, queries, *surface, out, smallest=2)
         return out[:, 0], out[:, 1:]

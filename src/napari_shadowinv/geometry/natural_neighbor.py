@@ -19,7 +19,7 @@ from napari_shadowinv._system.threads import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
-from napari_shadowinv.geometry.interpolation import BLOCK, locate
+from napari_shadowinv.geometry.interpolation import BLOCK, arrays_of, locate
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 __all__ = ["natural_neighbor"]
@@ -201,22 +201,18 @@ def natural_neighbor(
     *,
     threads: int | None = None,
 ) -> FloatArray:
-    """Interpolate values at scattered sites by Sibson's natural neighbours.
+    """Interpolate values at the sites of a Delaunay triangulation (zero weights).
 
     Parameters
     ----------
     triangulation : RegularTriangulation
-        Delaunay triangulation (zero weights) of the n sites.
+        Of n sites.
     values : array_like, shape (n, ...)
         Values at the sites.
     queries : array_like, shape (m, 2)
         Points (y, x) inside the hull of the sites.
     threads : int, optional
         Default: all cores. Results do not depend on it.
-
-    Returns
-    -------
-    ndarray, shape (m, ...)
 
     Examples
     --------
@@ -231,15 +227,14 @@ def natural_neighbor(
     out = np.empty((len(points), columns.shape[1]))
     for column in range(columns.shape[1]):
         result = np.empty(len(points))
+        known = (*arrays_of(triangulation), np.ascontiguousarray(columns[:, column]))
+        blocks = -(-len(points) // BLOCK)
         in_ranges(
             _interpolate_blocks,
-            -(-len(points) // BLOCK),
+            blocks,
             available_threads(threads),
             points,
-            triangulation.vertices,
-            triangulation.neighbors,
-            triangulation.points,
-            np.ascontiguousarray(columns[:, column]),
+            *known,
             result,
             smallest=2,
         )

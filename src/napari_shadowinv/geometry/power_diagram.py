@@ -4,7 +4,7 @@ The power diagram of sites r_i with weights w_i gives site i the cell
 
     P_i = { r : |r - r_i|² - w_i ≤ |r - r_j|² - w_j for all j }
 
-(paper, section II.B). It is the dual of the regular triangulation: a triangle's power
+(paper, sections II.B and III.A). It is the dual of the regular triangulation: a triangle's power
 centre is a corner of three cells, an edge of the triangulation crosses the border of
 two. Each border is walked once through the pixels and added with opposite signs to its two
 cells, so the cells tile the image to rounding.
@@ -94,14 +94,10 @@ def _integrate_edges(
     for e in range(start, stop):
         left = sides[e, 0]
         right = sides[e, 1]
+        ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
+        yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
         flux, mass, moment_y, moment_x, inertia = walk_edge(
-            image,
-            sums,
-            centres[left, 0] + 0.5,
-            centres[left, 1] + 0.5,
-            centres[right, 0] + 0.5,
-            centres[right, 1] + 0.5,
-            with_moments,
+            image, sums, ya, xa, yb, xb, with_moments
         )
         integrals[e, 0] = flux
         integrals[e, 1] = mass
@@ -179,12 +175,7 @@ class PowerDiagram:
     with_moments : bool
         Whether centroids and moments of inertia will be asked for.
     threads : int, optional
-        Threads for the integrals; default all cores. Results do not depend on it.
-
-    References
-    ----------
-    Paper, sections II.B and III.A; C.f. Aurenhammer, Hoffmann and Aronov,
-    Algorithmica 20, 61 (1998) for the transport between the cells.
+        Default: all cores. Results do not depend on it.
 
     Examples
     --------
@@ -210,30 +201,13 @@ class PowerDiagram:
         self.sites = triangulation.sites
         self.vertices: FloatArray = np.empty((len(triangulation.vertices), 2))
         threads = available_threads(threads)
-        in_ranges(
-            _power_centres,
-            len(self.vertices),
-            threads,
-            triangulation.points,
-            triangulation.weights,
-            self.n_sites,
-            triangulation.vertices,
-            self.vertices,
-        )
+        dual = triangulation.points, triangulation.weights, self.n_sites, triangulation.vertices
+        in_ranges(_power_centres, len(self.vertices), threads, *dual, self.vertices)
         # pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside
         self.edges, sides = _edges_of(triangulation)
         self._integrals = np.empty((len(sides), 5 if with_moments else 2))
-        in_ranges(
-            _integrate_edges,
-            len(sides),
-            threads,
-            sides,
-            self.vertices,
-            density.image,
-            density.sums,
-            with_moments,
-            self._integrals,
-        )
+        borders = sides, self.vertices, density.image, density.sums, with_moments
+        in_ranges(_integrate_edges, len(sides), threads, *borders, self._integrals)
 
     def _cell_sums(self, column: int) -> FloatArray:
         sums = np.zeros(self.n_sites)

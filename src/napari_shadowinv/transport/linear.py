@@ -251,7 +251,10 @@ class LaplacianSolver:
             relative = self._norm(self._vectors.residual) / scale
             if relative <= tolerance or iterations == max_iterations or not energy > 0.0:
                 # the residual was only updated so far, and rounding errors add up
-                relative = self._renew_residual(right, solution) / scale
+                residual = self._vectors.residual[: self._n]
+                self._multiply(solution, residual)
+                np.subtract(right, residual, out=residual)
+                relative = self._norm(residual) / scale
             if not energy > 0.0:
                 break
         return self._centred(solution), iterations, relative
@@ -274,22 +277,9 @@ class LaplacianSolver:
             _advance(n, length, solution, vectors)
         return energy
 
-    def _renew_residual(self, right: FloatArray, solution: FloatArray) -> float:
-        residual = self._vectors.residual[: self._n]
-        self._multiply(solution, residual)
-        np.subtract(right, residual, out=residual)
-        return self._norm(residual)
-
     def _multiply(self, x: FloatArray, product: FloatArray) -> None:
-        in_ranges(
-            _multiply,
-            self._n,
-            self._threads,
-            self._hierarchy.network,
-            x,
-            product,
-            smallest=_WORTH_A_THREAD,
-        )
+        operands = self._hierarchy.network, x, product
+        in_ranges(_multiply, self._n, self._threads, *operands, smallest=_WORTH_A_THREAD)
 
     def _norm(self, x: FloatArray) -> float:
         return float(np.sqrt(_dot(0, self._n, x, x)))
@@ -303,14 +293,7 @@ def solve_laplacian(
     *,
     ground: FloatArray | None = None,
 ) -> FloatArray:
-    """Solve L x = b as `LaplacianSolver` does; by factorisation where that does not get there.
-
-    Small systems are factorised straight away.
-
-    Raises
-    ------
-    RuntimeError
-        The graph is not connected.
+    """Solve L x = b as `LaplacianSolver` does, or by factorisation if small or too hard for it.
 
     Examples
     --------
