@@ -1,8 +1,6 @@
 """Regular triangulations that follow their weights: the dual of a power diagram.
 
 - triangulate weighted sites, or repair for new weights or places: `RegularTriangulation`
-- raise the weights of sites with empty cells until they count:
-  `RegularTriangulation.lower_hidden`
 - sort sites so that neighbours are close in memory: `hilbert_order`
 
 A site at r with weight w owns the points x where |x - r|² - w is smallest: its power cell.
@@ -124,7 +122,9 @@ class RegularTriangulation:
     Raises
     ------
     InputError
-        If shapes do not match or a value is not finite.
+        Here and in the methods, if shapes do not match or a value is not finite.
+    RuntimeError
+        Likewise, if the limit of flips was reached.
 
     Notes
     -----
@@ -209,7 +209,7 @@ class RegularTriangulation:
     def update(
         self, weights: ArrayLike, *, stop_when_hidden: bool = False, threads: int = 1
     ) -> bool:
-        """Repair the triangulation for new weights.
+        """Repair the triangulation for new weights; return False if it was stopped.
 
         Parameters
         ----------
@@ -220,16 +220,6 @@ class RegularTriangulation:
             What is left is valid and has all those sites, but is irregular until the next update.
         threads : int
             Threads that look for irregular edges; the flips themselves take one.
-
-        Returns
-        -------
-        bool
-            True if the triangulation is regular for the new weights, False if it was stopped.
-
-        Raises
-        ------
-        InputError
-            If the weights are not finite or not of shape (n,).
         """
         self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
         self._forget()
@@ -252,11 +242,6 @@ class RegularTriangulation:
         Cheap where the neighbours of most sites stay the same, as in a Lloyd step; else as slow
         as a new triangulation. Copies made before keep the old places. Of sites that come to the
         same place with the same weight any one may become the vertex.
-
-        Raises
-        ------
-        InputError
-            If the sites are not finite or not as many as before.
         """
         given = _checked_points(sites)
         n = self._mesh.hidden.size
@@ -281,20 +266,8 @@ class RegularTriangulation:
         others. The triangulation is then that of the new weights, with every site in it; the
         cells of the raised sites have no area within rounding. In clusters so tight that the
         weights' rounding exceeds what separates the cells, such sites may hide again in the next
-        `update`.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            The new weights. Sites at the same place get the weight of the heaviest; only one
-            of them can be in the triangulation.
-
-        Raises
-        ------
-        InputError
-            If the weights are not finite or not of shape (n,).
-        RuntimeError
-            If the limit of flips was reached.
+        `update`. Sites at the same place get the weight of the heaviest; only one of them can be
+        in the triangulation. Returns the new weights.
         """
         self.update(weights)
         ghosts = np.inf

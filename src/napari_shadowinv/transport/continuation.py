@@ -75,25 +75,10 @@ def sharpen(
 ) -> Solution:
     """Solve one level from zero weights by following the solution from a blurred image.
 
-    Parameters
-    ----------
-    level : Level
-        The sites.
-    sharp : TransportObjective
-        What is to be solved.
-    soften : callable
-        Makes the objective for the level of split pixels, the blur in those pixels, and the
-        parts of a pixel's side (see `Level.split`).
-    tolerance : float
-        Largest relative flux error allowed in any cell.
-    max_iterations : int
-        Most Newton steps, on all blurred images together.
-
-    Returns
-    -------
-    Solution
-        Where the sharp image could not be reached, that of the sharpest one that was; the
-        reason then tells its blur. Where the sharp image was nearly solved, that solution.
+    `soften` makes the objective for the level of split pixels, the blur in those pixels, and the
+    parts of a pixel's side (see `Level.split`). The iterations count on all images together.
+    Where the sharp image could not be reached, the solution is that of the sharpest one that was,
+    and the reason tells its blur; where the sharp image was nearly solved, that solution.
     """
     solved: list[_Solved] = []
     nearest: Solution | None = None

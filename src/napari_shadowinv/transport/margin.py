@@ -96,18 +96,8 @@ def edge_flux(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Sort the flux that has crossed the image's edge by the nearest side.
 
-    Parameters
-    ----------
-    left_behind, arrived : ndarray, shape (H + 2 m, W + 2 m)
-        Where the image's and where the margin's share of the source have landed.
-    margin : Margin
-        The beam.
-
-    Returns
-    -------
-    left, entered : dict of str to float
-        For each of the sides top, bottom, left and right the flux, as a share of the source's
-        flux in the image.
+    The image's share of the source has landed as `left_behind`, the margin's as `arrived`.
+    Returns what left and what entered at each side, as a share of the source's flux in the image.
     """
     pixels = np.moveaxis(np.indices(margin.beam.shape), 0, -1)
     nearest = margin.edge_distance(pixels).argmin(axis=-1)

@@ -34,27 +34,13 @@ __all__ = ["OpenObjective", "Solution", "TransportObjective"]
 
 @dataclass(frozen=True)
 class Solution:
-    """Weights of one level and how they were reached.
+    """Weights of one level and how they were reached."""
 
-    Attributes
-    ----------
-    weights : ndarray, shape (n,)
-        px²; of mean zero, but where the boundary is free.
-    residual : float
-        Largest relative flux error of a cell.
-    iterations : int
-        Steps of the solver.
-    converged : bool
-        Whether the residual is within the tolerance.
-    reason : str
-        Why it did not converge; empty if it did.
-    """
-
-    weights: FloatArray
-    residual: float
+    weights: FloatArray  # shape (n,), px²; of mean zero, but where the boundary is free
+    residual: float  # largest relative flux error of a cell
     iterations: int
-    converged: bool
-    reason: str = ""
+    converged: bool  # whether the residual is within the tolerance
+    reason: str = ""  # why it did not converge
 
 
 class TransportObjective:
@@ -69,7 +55,7 @@ class TransportObjective:
     image : Density
         The image.
     threads : int, optional
-        Threads of the kernels; results do not depend on it.
+        Default: all cores. Results do not depend on it.
     """
 
     def __init__(
@@ -109,23 +95,10 @@ class TransportObjective:
     def newton_step(
         self, laplacian: csr_array, weights: FloatArray, gap: FloatArray, tolerance: float
     ) -> FloatArray:
-        """Return the change of the weights that closes the gap to first order.
+        """Return the change of the weights that fills what each cell lacks to first order.
 
-        Parameters
-        ----------
-        laplacian : csr_array, shape (n, n)
-            Of the diagram for these weights.
-        weights : ndarray, shape (n,)
-            Where the step starts, px².
-        gap : ndarray, shape (n,)
-            Flux that each cell lacks.
-        tolerance : float
-            Relative residual of the linear system.
-
-        Raises
-        ------
-        RuntimeError
-            The cells fall into groups with no flux between them.
+        The Laplacian is that of the diagram for these weights. Raises a RuntimeError where the
+        cells fall into groups with no flux between them.
         """
         return solve_laplacian(laplacian, gap, tolerance, available_threads(self.threads))
 

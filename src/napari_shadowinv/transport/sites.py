@@ -44,21 +44,11 @@ _MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between site
 
 @dataclass(frozen=True)
 class Mirrored:
-    """Sites and the mirror images of those near the image's border.
-
-    Attributes
-    ----------
-    triangulation : RegularTriangulation
-        Delaunay triangulation of sites and mirror images; it covers the whole image.
-    origin : ndarray of int32, shape (n + k,)
-        The site that each point is, or is the mirror image of.
-    sense : ndarray of int8, shape (n + k, 2)
-        -1 for the axes along which a point was mirrored, else 1.
-    """
+    """Sites and the mirror images of those near the image's border, which cover the image."""
 
     triangulation: RegularTriangulation
-    origin: Indices
-    sense: NDArray[np.int8]
+    origin: Indices  # the site that each point is, or is the mirror image of
+    sense: NDArray[np.int8]  # (y, x): -1 for the axes along which a point was mirrored, else 1
 
     @classmethod
     def from_sites(cls, sites: FloatArray, shape: tuple[int, int]) -> Mirrored:
@@ -213,26 +203,10 @@ def lloyd(
 ) -> tuple[PowerDiagram, int]:
     """Move each site to the centroid of its Voronoi cell, again and again.
 
-    Parameters
-    ----------
-    triangulation : RegularTriangulation
-        Of the sites, without weights; it is moved along with them.
-    source : Density
-        Weighs the centroids.
-    iterations : int
-        Most steps.
-    tolerance : float
-        The steps end when the root mean square distance of sites from centroids is below
-        this, in units of the mean spacing of the sites.
-    report : callable, optional
-        Told before each step how many were made, and the number of sites.
-
-    Returns
-    -------
-    diagram : PowerDiagram
-        Of the sites where they are now, with moments.
-    steps : int
-        Steps that were made.
+    The triangulation, without weights, is moved along with the sites. The steps end when the
+    root mean square distance of sites from centroids is below the tolerance, in units of the
+    mean spacing of the sites. The report is told before each step how many were made, and the
+    number of sites. Returns the diagram with moments, and the steps that were made.
 
     References
     ----------

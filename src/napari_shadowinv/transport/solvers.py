@@ -50,12 +50,9 @@ class LevelSolution(Solution):
         What each cell holds of the image.
     displacement : ndarray, shape (n, 2)
         Centroid of each cell in the image minus that of the same site's cell in the
-        source, px. (The paper subtracts the site, which is the same after enough Lloyd
-        steps; with the centroid an image that equals its source gives exactly zero.)
-
-    References
-    ----------
-    Paper, lines 21–23 of its algorithm.
+        source, px. (The paper, in lines 21–23 of its algorithm, subtracts the site, which is the
+        same after enough Lloyd steps; with the centroid an image that equals its source gives
+        exactly zero.)
     """
 
     flux: FloatArray
@@ -103,11 +100,6 @@ def solve(
     list of LevelSolution
         One for each level that was tried, and for the finest one tried afresh where a level
         led nowhere; the last is the answer.
-
-    Raises
-    ------
-    InputError
-        If the solver does not fit in memory.
     """
     if options.stages == "single":
         levels = levels[-1:]
