@@ -81,10 +81,9 @@ def _give_way(mesh: Mesh, h: int, g: int, reflex_a: bool) -> None:
         return
     p, q = mesh.corners[h], mesh.corners[g]
     other = mesh.corners[before(h) if reflex_a else after(h)]
-    if reflex_a:
-        _raise_vertex(mesh, v, p, q, other)
-    else:
-        _raise_vertex(mesh, v, q, p, other)
+    if not reflex_a:
+        p, q = q, p
+    _raise_vertex(mesh, v, p, q, other)
 
 
 @kernel

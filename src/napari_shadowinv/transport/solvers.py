@@ -22,7 +22,7 @@ from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.transport.continuation import blurred, sharpen
-from napari_shadowinv.transport.descent import lbfgs, quasi_newton
+from napari_shadowinv.transport.descent import descend
 from napari_shadowinv.transport.margin import Margin
 from napari_shadowinv.transport.newton import newton, with_full_cells
 from napari_shadowinv.transport.objective import OpenObjective, Solution, TransportObjective
@@ -237,15 +237,12 @@ def _solve_level(
     report: Reporter | None,
 ) -> Solution:
     """Run the solver that the options name on one level."""
-    method = {"newton": newton, "lbfgs": lbfgs, "quasi-newton": quasi_newton}[options.solver]
+    most = options.max_iterations
     if options.solver == "newton":
-        weights = with_full_cells(objective, weights)
-    return method(
-        objective,
-        weights,
-        tolerance=tolerance,
-        max_iterations=options.max_iterations,
-        report=report,
+        start = with_full_cells(objective, weights)
+        return newton(objective, start, tolerance=tolerance, max_iterations=most, report=report)
+    return descend(
+        objective, weights, options.solver, tolerance=tolerance, max_iterations=most, report=report
     )
 
 
