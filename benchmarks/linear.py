@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
-from napari_shadowinv.transport._multigrid import LaplacianSolver
+from napari_shadowinv.transport.linear import LaplacianSolver
 
 try:
     import pyamg

@@ -39,7 +39,7 @@ PARTS = {  # function, or file of functions, that belong to a part of the work
     "_sum_over_cells": "integrals along borders",
     "_laplacian": "Hessian",
     "_coarsening.py": "multigrid: set-up",
-    "_multigrid.py": "multigrid: cycles",
+    "linear.py": "multigrid: cycles",
     "interpolation.py": "coarse to fine, and read-out",
     "forward.py": "re-projection",
     # with one thread only the re-projection waits for workers, which the profiler does not see

@@ -15,8 +15,7 @@ from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 from napari_shadowinv.transport import linear
-from napari_shadowinv.transport._multigrid import LaplacianSolver
-from napari_shadowinv.transport.linear import solve_laplacian
+from napari_shadowinv.transport.linear import LaplacianSolver, solve_laplacian
 
 Array = NDArray[np.float64]
 Edges = NDArray[np.int64]

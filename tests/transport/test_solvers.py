@@ -10,7 +10,7 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.transport.continuation import blurred
-from napari_shadowinv.transport.descent import quasi_newton
+from napari_shadowinv.transport.descent import descend
 from napari_shadowinv.transport.newton import newton
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import plan_levels
@@ -123,7 +123,7 @@ def test_a_matrix_that_does_not_fit_is_refused():
         Density.from_image(np.ones((100, 100))),
     )
     with pytest.raises(InputError, match="use lbfgs, or at most"):
-        quasi_newton(objective, np.zeros(300_000), tolerance=1e-3, max_iterations=1)
+        descend(objective, np.zeros(300_000), "quasi-newton", tolerance=1e-3, max_iterations=1)
 
 
 def test_an_exhausted_solver_says_how_far_it_got_and_why(plan):

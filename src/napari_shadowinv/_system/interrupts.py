@@ -7,16 +7,11 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["interrupts_put_off"]
-
 
 @contextmanager
 def interrupts_put_off() -> Iterator[None]:
-    """Raise a Ctrl-C that comes in the block when the block has ended.
-
-    For short work in the main thread that another thread would go on with, or that cannot be
-    undone when it is half done. In other threads, which Ctrl-C never reaches, nothing is changed.
-    """
+    """Put a Ctrl-C off until the end of a short block that must not be left half done."""
+    # Ctrl-C never reaches other threads.
     if threading.current_thread() is not threading.main_thread():
         yield
         return

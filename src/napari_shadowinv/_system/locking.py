@@ -1,7 +1,4 @@
-"""One writer at a time: a lock that a dead process cannot hold.
-
-- hold it during a block: `locked`
-"""
+"""One writer at a time: a lock that a dead process cannot hold."""
 
 from __future__ import annotations
 
@@ -19,8 +16,6 @@ from typing import BinaryIO, cast
 
 from napari_shadowinv.errors import FileFormatError
 
-__all__ = ["locked"]
-
 _BEAT = 2.0  # seconds between two signs of life
 _WATCH = 30.0  # seconds without one after which a lock is stale
 _SETTLE = 1.0  # seconds after which another that took a stale lock, too, has been seen
@@ -28,23 +23,10 @@ _SETTLE = 1.0  # seconds after which another that took a stale lock, too, has be
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keep other processes from writing to something, until the block ends.
-
-    The operating system takes the lock from a process that dies. Where a file system has no
-    locks, or is shared and they do not reach other hosts, signs of life stand in for them: a
-    lock whose file does not change while one watches is stale, whatever the clocks say.
-
-    Parameters
-    ----------
-    path : Path
-        What is written to; the lock is a hidden file beside it.
-
-    Raises
-    ------
-    FileFormatError
-        If a living process holds the lock; the sentence names it. Or if the lock cannot be
-        written, or is no file of its own.
-    """
+    """Keep other processes from writing to a path, by a hidden file beside it, in a block."""
+    # The operating system takes the lock from a process that dies. Where a file system has no
+    # locks, or is shared and they do not reach other hosts, signs of life stand in for them: a
+    # lock whose file does not change while one watches is stale, whatever the clocks say.
     lock = path.with_name(f".{path.name}.lock")
     file, is_new = _opened(path, lock)
     with file:
@@ -116,8 +98,10 @@ def _take(path: Path, lock: Path, file: BinaryIO, is_new: bool) -> None:
 
 
 def _held(path: Path, file: BinaryIO) -> FileFormatError:
+    found = _content(file)
+    holder = f"process {found.get('pid')} on {found.get('host')}" if found else "another process"
     return FileFormatError(
-        f"{path} is being written by {_holder(file)}: wait for that process, or stop it first"
+        f"{path} is being written by {holder}: wait for that process, or stop it first"
     )
 
 
@@ -133,7 +117,7 @@ def _is_silent(lock: Path) -> bool:
 
 
 def _look(lock: Path) -> tuple[int, bytes] | None:
-    """Time stamp and content; opened anew, as a network file system looks only then."""
+    """Return time stamp and content; opened anew, as a network file system looks only then."""
     try:
         with lock.open("rb") as file:
             return os.fstat(file.fileno()).st_mtime_ns, file.read()
@@ -159,11 +143,8 @@ def _give_back(file: BinaryIO, lock: Path) -> None:
 
 
 def _sign(file: BinaryIO) -> dict[str, object]:
-    signature: dict[str, object] = {
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-        "run": secrets.token_hex(8),
-    }
+    run = secrets.token_hex(8)
+    signature: dict[str, object] = {"host": socket.gethostname(), "pid": os.getpid(), "run": run}
     file.seek(0)
     file.truncate()
     file.write(json.dumps(signature).encode())
@@ -177,13 +158,6 @@ def _content(file: BinaryIO) -> dict[str, object]:
     except (ValueError, OSError):
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def _holder(file: BinaryIO) -> str:
-    found = _content(file)
-    if not found:
-        return "another process"
-    return f"process {found.get('pid')} on {found.get('host')}"
 
 
 # `_taken` tells whether the operating system gave the lock; None where it has no locks.

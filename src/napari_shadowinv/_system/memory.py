@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 
-__all__ = ["physical_memory"]
-
 
 def physical_memory() -> int | None:
     """Physical memory in bytes, or None where the system does not tell."""

@@ -12,30 +12,15 @@ from dataclasses import dataclass
 
 from napari_shadowinv.errors import InversionCancelled
 
-__all__ = ["OnProgress", "OnWarning", "Progress", "Reporter", "ShouldStop"]
-
 
 @dataclass(frozen=True)
 class Progress:
-    """One sign of life from a long computation.
+    """One sign of life from a long computation."""
 
-    Attributes
-    ----------
-    stage : str
-        What is being done: ``"compile"``, ``"prepare"``, ``"sites"``, ``"transport"``,
-        ``"read-out"``, ``"samples"``.
-    step : int
-        Steps of this stage that are finished.
-    total : int or None
-        Steps that this stage has; None where nobody can know.
-    message : str
-        A short text for people, such as the residual reached.
-    """
-
-    stage: str
-    step: int
-    total: int | None = None
-    message: str = ""
+    stage: str  # such as "compile", "prepare", "sites", "transport", "read-out", "samples"
+    step: int  # steps of this stage that are finished
+    total: int | None = None  # where it is known
+    message: str = ""  # for people, such as the residual reached
 
 
 OnProgress = Callable[[Progress], None]
@@ -44,20 +29,7 @@ ShouldStop = Callable[[], bool]
 
 
 class Reporter:
-    """Passes progress on and raises `InversionCancelled` when asked to stop.
-
-    Parameters
-    ----------
-    on_progress : callable, optional
-        Receives each `Progress`.
-    should_stop : callable, optional
-        Asked at each step; a true answer ends the work.
-
-    Raises
-    ------
-    InversionCancelled
-        From a call, when `should_stop` returned true.
-    """
+    """Passes progress on and raises `InversionCancelled` when asked to stop."""
 
     def __init__(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None

@@ -2,7 +2,7 @@
 
 - whatever a damaged file makes a reader raise is told in one sentence: `refusing_damage`
 - only regular files are opened: `check_regular`
-- a limit on what a file may unfold to in memory: `check_size`, `size_limit`
+- a limit on what a file may unfold to in memory: `check_size`
 - small files of text, such as setups and calibrations: `small_text`
 """
 
@@ -18,17 +18,7 @@ from typing import Concatenate, ParamSpec, TypeVar, cast
 from napari_shadowinv._system.memory import physical_memory
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 
-__all__ = [
-    "LIMIT_VARIABLE",
-    "check_regular",
-    "check_size",
-    "refusing_damage",
-    "size_limit",
-    "small_text",
-]
-
-LIMIT_VARIABLE = "SHADOWINV_MAX_GB"
-"""Environment variable with the most gigabytes that a file may unfold to."""
+LIMIT_VARIABLE = "SHADOWINV_MAX_GB"  # the most gigabytes that a file may unfold to
 
 # Reading needs a few copies of the image, and other programs some memory too.
 _SHARE_OF_MEMORY = 1 / 8
@@ -42,19 +32,7 @@ Content = TypeVar("Content")
 def refusing_damage(
     read: Callable[Concatenate[Path, P], Content],
 ) -> Callable[Concatenate[str | Path, P], Content]:
-    """Tell whatever a reader raises as damage to its file, with the reason as the cause.
-
-    Parameters
-    ----------
-    read : callable
-        Takes the path of a file or of a folder first.
-
-    Returns
-    -------
-    callable
-        The same, but it raises nothing else than a `FileFormatError`, an `InputError`, or what
-        ends a program on purpose.
-    """
+    """Turn whatever a reader of a path raises into a `FileFormatError`, with it as the cause."""
 
     @functools.wraps(read)
     def guarded(path: str | Path, *args: P.args, **kwargs: P.kwargs) -> Content:
@@ -85,20 +63,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def check_regular(path: Path, expected: str) -> None:
-    """Refuse what is no regular file, before it is opened: a pipe would block for ever.
-
-    Parameters
-    ----------
-    path : Path
-        What is to be opened; links are followed.
-    expected : str
-        What should be there, for the message.
-
-    Raises
-    ------
-    FileFormatError
-        If there is nothing, or a folder, a pipe, a socket or a device.
-    """
+    """Refuse what is no regular file, before it is opened: a pipe would block for ever."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -117,18 +82,7 @@ def check_regular(path: Path, expected: str) -> None:
 
 
 def size_limit() -> int:
-    """Return how many bytes a file may unfold to in memory.
-
-    Returns
-    -------
-    int
-        What the environment variable `LIMIT_VARIABLE` says in GB, or an eighth of the memory.
-
-    Raises
-    ------
-    InputError
-        If the variable is no positive number.
-    """
+    """Return how many bytes a file may unfold to, by `LIMIT_VARIABLE` or the memory."""
     text = os.environ.get(LIMIT_VARIABLE)
     if text is None:
         return int(_SHARE_OF_MEMORY * (physical_memory() or _MEMORY_IF_UNKNOWN))
@@ -142,20 +96,7 @@ def size_limit() -> int:
 
 
 def check_size(path: str | Path, promised: int) -> None:
-    """Refuse what would unfold to more than fits well into memory, before it does.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    promised : int
-        Bytes in memory, pixels counted as 64-bit numbers.
-
-    Raises
-    ------
-    FileFormatError
-        If that is more than `size_limit`.
-    """
+    """Refuse a file that would unfold to more bytes in memory than fit well, before it does."""
     limit = size_limit()
     if promised > limit:
         raise FileFormatError(
@@ -166,26 +107,7 @@ def check_size(path: str | Path, promised: int) -> None:
 
 
 def small_text(path: Path, expected: str, encoding: str = "utf-8") -> str:
-    """Return the text of a file that nobody makes large.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    expected : str
-        What should be in it, for messages.
-    encoding : str
-        How it is written.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    FileFormatError
-        If it is missing, no regular file, larger than 1 MB, or no text.
-    """
+    """Return the text of a file that nobody makes large."""
     check_regular(path, expected)
     with path.open("rb") as file:
         raw = file.read(_LARGEST_TEXT + 1)

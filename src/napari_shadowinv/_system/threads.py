@@ -13,8 +13,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-__all__ = ["available_threads", "in_ranges"]
-
 
 def available_threads(threads: int | None) -> int:
     """Return `threads`, or the number of cores this process may use where it is None."""
@@ -31,18 +29,7 @@ def in_ranges(
 ) -> None:
     """Call ``kernel(start, stop, *args)`` on ranges that cover ``0 … n``, in parallel.
 
-    Parameters
-    ----------
-    kernel : callable
-        A function that releases the GIL and writes its results into `args`.
-    n : int
-        Number of items.
-    threads : int
-        Most ranges to work on at once.
-    *args
-        Passed on.
-    smallest : int
-        Fewest items that are worth a thread.
+    A range has no fewer items than `smallest`, the number that is worth a thread.
     """
     ranges = max(1, min(threads, n // smallest))
     bounds = [n * k // ranges for k in range(ranges + 1)]

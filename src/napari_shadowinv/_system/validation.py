@@ -1,7 +1,4 @@
-"""One clear sentence for a parameter that is wrong.
-
-- make a model from what a user wrote: `validated`
-"""
+"""One clear sentence for a parameter that is wrong."""
 
 from __future__ import annotations
 
@@ -12,8 +9,6 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from napari_shadowinv.errors import InputError
-
-__all__ = ["nearest", "validated"]
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -30,36 +25,7 @@ _PYDANTIC_OPENING = "Input should be "
 def validated(
     model_class: type[Model], mapping: Mapping[str, Any], where: str = "parameters"
 ) -> Model:
-    """Make a model from a mapping; say in one sentence what is wrong with it.
-
-    Parameters
-    ----------
-    model_class : type of pydantic.BaseModel
-        The model to make.
-    mapping : mapping of str to object
-        Its fields, such as a TOML file holds them.
-    where : str, optional
-        Where the mapping comes from; the message begins with it.
-
-    Returns
-    -------
-    model_class
-        The validated model.
-
-    Raises
-    ------
-    InputError
-        If a key is unknown (the nearest known one is named) or missing, or a value
-        cannot be used.
-
-    Examples
-    --------
-    >>> from napari_shadowinv.options import InversionOptions
-    >>> validated(InversionOptions, {"tolerence": 0.01}, "options.toml")
-    Traceback (most recent call last):
-    napari_shadowinv.errors.InputError: options.toml: unknown key 'tolerence', did you mean
-    'tolerance'?
-    """
+    """Make a model from a mapping, or raise an `InputError` that begins with `where`."""
     if not isinstance(mapping, Mapping):
         raise InputError(
             f"{where}: received {_shown(mapping)}, expected a table of keys and values"

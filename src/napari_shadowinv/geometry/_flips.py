@@ -1,36 +1,14 @@
-"""Building and repairing a regular triangulation by flips; see `triangulation`."""
+"""Building, repairing and moving a regular triangulation by flips; see `triangulation`."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.geometry import _mesh
 from napari_shadowinv.geometry._hilbert import insertion_order
 from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
-from napari_shadowinv.geometry._mesh import (
-    EVERYWHERE,
-    FLIPS,
-    FREE,
-    LAST,
-    LIMIT,
-    OVERFLOW,
-    POLICY,
-    RAISES,
-    SIZE,
-    TOP,
-    Mesh,
-    after,
-    around,
-    before,
-    compact,
-    flip,
-    push,
-    push_triangle,
-    remove,
-    replace,
-    split_edge,
-    split_triangle,
-)
+from napari_shadowinv.geometry._mesh import Mesh, after, around, before, push
 from napari_shadowinv.geometry._predicates import (
     FLIP,
     LEGAL,
@@ -42,48 +20,27 @@ from napari_shadowinv.geometry._predicates import (
     turn,
 )
 
-__all__ = [
-    "DONE",
-    "EXHAUSTED",
-    "HIDDEN",
-    "REMOVE",
-    "STOP",
-    "build",
-    "insert",
-    "look_for_irregular",
-    "raise_hidden",
-    "repair",
-    "restore",
-]
-
 # What to do with a vertex that is proven hidden.
-REMOVE = 0
-STOP = 1
-RAISE = 2
-KEEP = 3
+REMOVE, STOP, RAISE, KEEP = 0, 1, 2, 3
 
 # How a repair ended.
-DONE = 0
-HIDDEN = 1
-EXHAUSTED = 2
+DONE, HIDDEN, EXHAUSTED = 0, 1, 2  # exhausted: the limit of flips was reached
 
 # Where a site was found.
-INSIDE = 0
-ON_EDGE = 1
-ON_CORNER = 2
-NOWHERE = 3
+INSIDE, ON_EDGE, ON_CORNER, NOWHERE = 0, 1, 2, 3
 
 # Longest step above the plane when a weight is raised, in roundings of the weight.
 LONGEST_STEP = 1 << 15
 
+# Share of sites out of place from which on a new triangulation is faster.
+MOST_STRAYS = 0.1
+
 
 @kernel
 def _state(mesh: Mesh, h: int, g: int) -> int:
-    """Tell the state of the edge h with twin g; its corners are a = after(h), b = before(h).
-
-    Seen from a distant corner the small differences between the others would be lost; so the
-    nearer one looks. The answer must not depend on the side that the edge was reached from.
-    """
+    """Tell the state of the edge h with twin g; its corners are a = after(h), b = before(h)."""
+    # Seen from a distant corner the small differences between the others would be lost, so the
+    # nearer one looks. The answer must not depend on the side that the edge was reached from.
     points = mesh.points
     p, a, b, q = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)], mesh.corners[g]
     p_far = abs(points[p, 0] - points[a, 0]) + abs(points[p, 1] - points[a, 1])
@@ -96,15 +53,13 @@ def _state(mesh: Mesh, h: int, g: int) -> int:
 
 @kernel
 def _raise_vertex(mesh: Mesh, h: int, a: int, b: int, c: int) -> None:
-    """Raise the weight of the vertex at corner h to the lifted plane of (a, b, c).
-
-    Close sites that are coplanar but for rounding would chase each other up by single roundings.
-    A wider step now and then (1, 8, 1, 64, 1, 8, 1, 512 ... roundings) ends that soon.
-    """
+    """Raise the weight of the vertex at corner h to the lifted plane of (a, b, c)."""
     v = mesh.corners[h]
     weight = mesh.weights[v]
-    mesh.counters[RAISES] += 1
-    step = min((mesh.counters[RAISES] & -mesh.counters[RAISES]) ** 3, LONGEST_STEP)
+    # Close sites that are coplanar but for rounding would chase each other up by single roundings.
+    # A wider step now and then (1, 8, 1, 64, 1, 8, 1, 512 ... roundings) ends that soon.
+    mesh.counters[_mesh.RAISES] += 1
+    step = min((mesh.counters[_mesh.RAISES] & -mesh.counters[_mesh.RAISES]) ** 3, LONGEST_STEP)
     rounding = np.nextafter(abs(weight), np.inf) - abs(weight)
     height = precise_excess(mesh.points, mesh.weights, a, b, c, v)
     mesh.weights[v] = weight + max(height, 0.0) + step * rounding
@@ -121,28 +76,25 @@ def _raise_vertex(mesh: Mesh, h: int, a: int, b: int, c: int) -> None:
 def _give_way(mesh: Mesh, h: int, g: int, reflex_a: bool) -> None:
     """Remove or raise the hidden end of the edge h, whose twin is g."""
     v = after(h) if reflex_a else before(h)
-    if mesh.counters[POLICY] == REMOVE:
-        remove(mesh, v)
+    if mesh.counters[_mesh.POLICY] == REMOVE:
+        _mesh.remove(mesh, v)
         return
     p, q = mesh.corners[h], mesh.corners[g]
     other = mesh.corners[before(h) if reflex_a else after(h)]
-    if reflex_a:
-        _raise_vertex(mesh, v, p, q, other)
-    else:
-        _raise_vertex(mesh, v, q, p, other)
+    if not reflex_a:
+        p, q = q, p
+    _raise_vertex(mesh, v, p, q, other)
 
 
 @kernel
 def restore(mesh: Mesh) -> int:
-    """Flip until the stack is empty.
-
-    After an insertion into a regular triangulation only edges opposite to the new vertex can
-    be irregular; with counters[EVERYWHERE] all four edges around a flip are looked at.
-    """
+    """Flip until the stack is empty."""
+    # After an insertion into a regular triangulation only edges opposite to the new vertex can
+    # be irregular; with EVERYWHERE all four edges around a flip are looked at.
     counters, twins, corners = mesh.counters, mesh.twins, mesh.corners
-    while counters[TOP] > 0:
-        counters[TOP] -= 1
-        h = mesh.stack[counters[TOP]]
+    while counters[_mesh.TOP] > 0:
+        counters[_mesh.TOP] -= 1
+        h = mesh.stack[counters[_mesh.TOP]]
         if corners[h - h % 3] < 0:
             continue
         g = twins[h]
@@ -151,34 +103,32 @@ def restore(mesh: Mesh) -> int:
         state = _state(mesh, h, g)
         if state == LEGAL:
             continue
-        if counters[FLIPS] + counters[RAISES] >= counters[LIMIT]:
-            counters[TOP] = 0
+        if counters[_mesh.FLIPS] + counters[_mesh.RAISES] >= counters[_mesh.LIMIT]:
+            counters[_mesh.TOP] = 0
             return EXHAUSTED
         if state == FLIP:
-            flip(mesh, h, g)
-            if counters[EVERYWHERE] == 1:
+            _mesh.flip(mesh, h, g)
+            if counters[_mesh.EVERYWHERE] == 1:
                 push(mesh, before(h))
                 push(mesh, g)
             push(mesh, h)
             push(mesh, before(g))
             continue
-        if counters[POLICY] == KEEP:
+        if counters[_mesh.POLICY] == KEEP:
             continue
-        if counters[POLICY] == STOP:
-            counters[TOP] = 0
+        if counters[_mesh.POLICY] == STOP:
+            counters[_mesh.TOP] = 0
             return HIDDEN
-        counters[EVERYWHERE] = 1
+        counters[_mesh.EVERYWHERE] = 1
         _give_way(mesh, h, g, state == REFLEX_A)
     return DONE
 
 
 @kernel
 def _irregular_edges(mesh: Mesh, t: int) -> int:
-    """Find the edges of an inner triangle that may be irregular: bit k for the one opposite to k.
-
-    Edges that the neighbour has to look at are left out. The triangle's own part of the
-    determinant serves for its three edges.
-    """
+    """Find which edges of an inner triangle may be irregular: bit k for the one opposite to k."""
+    # Edges that the neighbour has to look at are left out. The triangle's own part of the
+    # determinant serves for its three edges.
     corners, twins, points, weights = mesh.corners, mesh.twins, mesh.points, mesh.weights
     e = 3 * t
     i, j, k = corners[e], corners[e + 1], corners[e + 2]
@@ -237,38 +187,33 @@ def _mark_irregular(mesh: Mesh, t: int) -> bool:
 
 
 @kernel
-def look_for_irregular(start: int, stop: int, mesh: Mesh, suspects: NDArray[np.bool_]) -> None:
-    """Tell which triangles may have an irregular edge; those at the ghosts always may.
-
-    Nothing else is written, so several ranges of triangles can be looked at at once.
-    """
+def look_for_irregular(start: int, stop: int, mesh: Mesh, suspects: BoolArray) -> None:
+    """Mark the triangles that may have an irregular edge; those at the ghosts always may."""
     for t in range(start, stop):
         suspects[t] = not _is_inner(mesh, t) or _irregular_edges(mesh, t) != 0
 
 
 @kernel
-def _sweep(mesh: Mesh, suspects: NDArray[np.bool_]) -> int:
-    """Make every edge locally regular; the sites stay those that are in.
-
-    Triangles known to be no `suspects` are passed over at first; those that a flip makes have
-    their edges looked at anyway.
-    """
+def _sweep(mesh: Mesh, suspects: BoolArray) -> int:
+    """Make every edge locally regular, without inserting hidden sites."""
+    # Triangles known to be no suspects are passed over at first; those that a flip makes have
+    # their edges looked at anyway.
     counters = mesh.counters
     known = suspects.size
-    counters[OVERFLOW] = 1
-    while counters[OVERFLOW] == 1:
-        counters[OVERFLOW] = 0
+    counters[_mesh.OVERFLOW] = 1
+    while counters[_mesh.OVERFLOW] == 1:
+        counters[_mesh.OVERFLOW] = 0
         t = 0
-        while t < counters[SIZE]:
+        while t < counters[_mesh.SIZE]:
             if mesh.corners[3 * t] < 0 or (t < known and not suspects[t]):
                 marked = False
-            elif counters[POLICY] == RAISE:
-                push_triangle(mesh, t)
+            elif counters[_mesh.POLICY] == RAISE:
+                _mesh.push_triangle(mesh, t)
                 marked = True
             else:
                 marked = _mark_irregular(mesh, t)
             if marked:
-                counters[EVERYWHERE] = 1
+                counters[_mesh.EVERYWHERE] = 1
                 status = restore(mesh)
                 if status != DONE:
                     return status
@@ -279,18 +224,15 @@ def _sweep(mesh: Mesh, suspects: NDArray[np.bool_]) -> int:
 
 @kernel
 def _locate(mesh: Mesh, v: int) -> tuple[int, int]:
-    """Walk to site v; where it is, and that triangle's corner, edge or first corner.
-
-    The walk visits the other two edges in random order: so it cannot go in circles.
-    """
+    """Walk to site v; return where it is, and that triangle's corner, edge or first corner."""
     corners, twins, points = mesh.corners, mesh.twins, mesh.points
-    h = 3 * mesh.counters[LAST]
+    h = 3 * mesh.counters[_mesh.LAST]
     side = turn(points, mesh.scratch, corners[h + 1], corners[h + 2], v)
     if side < 0:
         h, side = twins[h], 1
-    noise = v + 1
+    noise = v + 1  # visiting the other two edges in random order, it cannot go in circles
     steps = 0
-    while steps < 4 * mesh.counters[SIZE] + 1000:
+    while steps < 4 * mesh.counters[_mesh.SIZE] + 1000:
         steps += 1
         noise = (noise * 1103515245 + 12345) & 0x7FFFFFFF
         swap = (noise >> 16) & 1
@@ -320,26 +262,19 @@ def _locate(mesh: Mesh, v: int) -> tuple[int, int]:
 
 
 @kernel
-def _outweighs(mesh: Mesh, v: int, u: int) -> bool:
-    """Tell whether v, rather than its duplicate u, is the one that stays."""
-    return mesh.weights[v] > mesh.weights[u] or (mesh.weights[v] == mesh.weights[u] and v < u)
-
-
-@kernel
 def insert(mesh: Mesh, v: int, certainty: float) -> int:
-    """Insert site v where its power cell is not empty.
-
-    `certainty` in units of the error bound: 1 lets in a site that may touch the lower hull
-    (zero area), -1 only one that lies certainly below it, infinity any.
-    """
+    """Insert site v where its power cell is not empty."""
+    # The certainty in units of the error bound: 1 lets in a site that may touch the lower hull
+    # (zero area), -1 only one that lies certainly below it, infinity any.
     where, h = _locate(mesh, v)
     if where == NOWHERE:
         return EXHAUSTED
-    mesh.counters[LAST] = h // 3
+    mesh.counters[_mesh.LAST] = h // 3
     if where == ON_CORNER:
-        if not _outweighs(mesh, v, mesh.corners[h]):
+        u, weights = mesh.corners[h], mesh.weights
+        if weights[u] > weights[v] or (weights[u] == weights[v] and u < v):
             return DONE
-        replace(mesh, h, v)
+        _mesh.replace(mesh, h, v)
     else:
         a, b, c = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)]
         height, bound = excess(mesh.points, mesh.weights, a, b, c, v)
@@ -347,19 +282,17 @@ def insert(mesh: Mesh, v: int, certainty: float) -> int:
             return DONE
         mesh.hidden[v] = False
         if where == INSIDE:
-            split_triangle(mesh, h // 3, v)
+            _mesh.split_triangle(mesh, h // 3, v)
         else:
-            split_edge(mesh, h, v)
-    mesh.counters[EVERYWHERE] = 0
+            _mesh.split_edge(mesh, h, v)
+    mesh.counters[_mesh.EVERYWHERE] = 0
     return restore(mesh)
 
 
 @kernel_that_allocates
 def _return_hidden(mesh: Mesh) -> int:
-    """Insert the hidden sites that lie below the lower hull.
-
-    One pass is enough: an insertion lowers the hull, so who stays hidden stays so.
-    """
+    """Insert the hidden sites that lie below the lower hull."""
+    # One pass is enough: an insertion lowers the hull, so a site above it stays hidden.
     for v in range(mesh.hidden.size):
         if mesh.hidden[v]:
             status = insert(mesh, v, -1.0)
@@ -368,34 +301,23 @@ def _return_hidden(mesh: Mesh) -> int:
     return DONE
 
 
+@kernel
+def _begin(mesh: Mesh, policy: int) -> None:
+    for counter in (_mesh.TOP, _mesh.FLIPS, _mesh.RAISES):
+        mesh.counters[counter] = 0
+    mesh.counters[_mesh.POLICY] = policy
+
+
 @kernel_that_allocates
-def repair(mesh: Mesh, policy: int, suspects: NDArray[np.bool_]) -> int:
-    """Make the triangulation regular for the weights in `mesh`.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        The triangulation; any valid one.
-    policy : int
-        REMOVE hidden sites, or STOP at the first.
-    suspects : ndarray of bool
-        What `look_for_irregular` has found, or empty.
-
-    Returns
-    -------
-    int
-        DONE, HIDDEN (with STOP) or EXHAUSTED, when the limit of flips was reached.
-    """
-    mesh.counters[TOP] = 0
-    mesh.counters[FLIPS] = 0
-    mesh.counters[RAISES] = 0
-    mesh.counters[POLICY] = policy
+def repair(mesh: Mesh, policy: int, suspects: BoolArray) -> int:
+    """Make any valid triangulation regular; `suspects` are `look_for_irregular`'s, or empty."""
+    _begin(mesh, policy)
     status = _sweep(mesh, suspects)
     if status == DONE:
         status = _return_hidden(mesh)
-    if status == DONE and mesh.counters[OVERFLOW] == 1:
+    if status == DONE and mesh.counters[_mesh.OVERFLOW] == 1:
         status = _sweep(mesh, suspects[:0])
-    compact(mesh)
+    _mesh.compact(mesh)
     return status
 
 
@@ -405,7 +327,7 @@ def _insert_on_hull(mesh: Mesh, v: int) -> int:
     where, h = _locate(mesh, v)
     if where == NOWHERE:
         return EXHAUSTED
-    mesh.counters[LAST] = h // 3
+    mesh.counters[_mesh.LAST] = h // 3
     a, b, c = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)]
     if where == ON_CORNER:
         mesh.weights[v] = max(mesh.weights[v], mesh.weights[a])
@@ -417,46 +339,31 @@ def _insert_on_hull(mesh: Mesh, v: int) -> int:
 
 @kernel_that_allocates
 def raise_hidden(mesh: Mesh) -> int:
-    """Raise the weights of the hidden sites to the lower hull and insert them.
-
-    Rounding leaves some of them a trace above the hull; these are raised a trace more, until
-    none is hidden. Where the weights' own rounding exceeds the squared distance of sites times
-    the relative rounding (tight clusters), that may not end; then the trace is left to be.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        A regular triangulation; its weights are changed.
-
-    Returns
-    -------
-    int
-        DONE, or EXHAUSTED. Duplicates of other sites get their weight, but stay out.
-    """
-    mesh.counters[TOP] = 0
-    mesh.counters[FLIPS] = 0
-    mesh.counters[RAISES] = 0
-    mesh.counters[POLICY] = KEEP
+    """Raise the weights of hidden sites to the lower hull and insert all but duplicates."""
+    # Rounding leaves some of them a trace above the hull; these are raised a trace more, until
+    # none is hidden. Where the weights' own rounding exceeds the squared distance of sites times
+    # the relative rounding (tight clusters), that may not end; then the trace is left.
+    _begin(mesh, KEEP)
     for v in insertion_order(mesh.hidden.size):
         if mesh.hidden[v] and _insert_on_hull(mesh, v) == EXHAUSTED:
             return EXHAUSTED
     on_hull = mesh.weights.copy()
-    mesh.counters[POLICY] = RAISE
+    mesh.counters[_mesh.POLICY] = RAISE
     if _sweep(mesh, np.empty(0, np.bool_)) == EXHAUSTED:
         mesh.weights[:] = on_hull
-    compact(mesh)
+    _mesh.compact(mesh)
     return DONE
 
 
 @kernel
 def _start(mesh: Mesh) -> None:
-    """Two triangles of ghosts, no site."""
+    """Make two triangles of ghosts, with no site."""
     n = mesh.hidden.size
     mesh.counters[:] = 0
-    mesh.counters[FREE] = -1
-    mesh.counters[POLICY] = REMOVE
-    mesh.counters[SIZE] = 2
-    mesh.counters[LIMIT] = 100 * n + 1000
+    mesh.counters[_mesh.FREE] = -1
+    mesh.counters[_mesh.POLICY] = REMOVE
+    mesh.counters[_mesh.SIZE] = 2
+    mesh.counters[_mesh.LIMIT] = 100 * n + 1000
     mesh.hidden[:] = True
     for h, corner in enumerate((n, n + 1, n + 2, n + 2, n + 3, n)):
         mesh.corners[h] = corner
@@ -468,7 +375,7 @@ def _start(mesh: Mesh) -> None:
 @kernel_that_allocates
 def _sort_triangles(mesh: Mesh) -> None:
     """Store the triangles in the order of their smallest corner: neighbours close in memory."""
-    m = mesh.counters[SIZE]
+    m = mesh.counters[_mesh.SIZE]
     n = mesh.hidden.size
     starts = np.zeros(n + 5, dtype=np.int32)
     smallest = np.empty(m, dtype=np.int32)
@@ -490,31 +397,77 @@ def _sort_triangles(mesh: Mesh) -> None:
             g = twins[3 * t + k]
             mesh.corners[3 * s + k] = corners[3 * t + k]
             mesh.twins[3 * s + k] = 3 * places[g // 3] + g % 3 if g >= 0 else -1
-    mesh.counters[LAST] = places[mesh.counters[LAST]]
+    mesh.counters[_mesh.LAST] = places[mesh.counters[_mesh.LAST]]
 
 
 @kernel_that_allocates
 def build(mesh: Mesh) -> int:
-    """Build the regular triangulation from scratch.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Points, sorted along a curve, and weights; the rest is written.
-
-    Returns
-    -------
-    int
-        DONE or EXHAUSTED.
-    """
+    """Build the regular triangulation of the points, which are sorted along a curve."""
     _start(mesh)
     status = DONE
     for v in insertion_order(mesh.hidden.size):
         status = insert(mesh, v, 1.0)
         if status != DONE:
             break
-    if status == DONE and mesh.counters[OVERFLOW] == 1:
+    if status == DONE and mesh.counters[_mesh.OVERFLOW] == 1:
         status = _sweep(mesh, np.empty(0, np.bool_))
-    compact(mesh)
+    _mesh.compact(mesh)
     _sort_triangles(mesh)
+    return status
+
+
+@kernel
+def _stay_behind(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
+    """Return the corners of overturned triangles to their origins; tell if there were any."""
+    found = False
+    for t in range(mesh.counters[_mesh.SIZE]):
+        i, j, k = mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2]
+        if turn(mesh.points, mesh.scratch, i, j, k) <= 0:
+            found = True
+            for v in (i, j, k):
+                if v < strays.size:
+                    mesh.points[v, 0] = origins[v, 0]
+                    mesh.points[v, 1] = origins[v, 1]
+                    strays[v] = True
+    return found
+
+
+@kernel
+def _take_out(mesh: Mesh, strays: BoolArray) -> int:
+    """Remove the strays that are in the triangulation."""
+    found = True
+    while found:  # flips may move a stray to a triangle that the pass has left behind
+        found = False
+        for h in range(3 * mesh.counters[_mesh.SIZE]):
+            v = mesh.corners[h]
+            if mesh.corners[h - h % 3] >= 0 and v < strays.size and strays[v]:
+                found = True
+                _mesh.remove(mesh, h)
+                mesh.counters[_mesh.EVERYWHERE] = 1
+                if restore(mesh) != DONE:
+                    return EXHAUSTED
+    return DONE
+
+
+@kernel_that_allocates
+def relocate(mesh: Mesh, targets: FloatArray) -> int:
+    """Move the sites and repair the mesh; EXHAUSTED where building it anew is the better way."""
+    # All sites move at once, but for the corners of triangles that this would turn over: these
+    # are taken out and put in again where they belong.
+    n = targets.shape[0]
+    origins = mesh.points[:n].copy()
+    strays = np.zeros(n, dtype=np.bool_)
+    mesh.points[:n] = targets
+    while _stay_behind(mesh, origins, strays):
+        pass
+    if strays.sum() > MOST_STRAYS * n or repair(mesh, REMOVE, strays[:0]) != DONE:
+        return EXHAUSTED
+    status = _take_out(mesh, strays)
+    for v in range(n):
+        if strays[v]:
+            mesh.points[v] = targets[v]
+    for v in range(n):
+        if mesh.hidden[v] and status == DONE:
+            status = insert(mesh, v, 1.0 if strays[v] else -1.0)
+    _mesh.compact(mesh)
     return status

@@ -1,20 +1,15 @@
-"""Orders of points: along a Hilbert curve, and along it in random rounds.
-
-- sort points so that near in the order is near in the plane: `hilbert_permutation`
-- insert sorted points in an order that no arrangement of them can spoil: `insertion_order`
-"""
+"""Orders of points: along a Hilbert curve, and along it in random rounds."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
-
-__all__ = ["hilbert_permutation", "insertion_order"]
+from napari_shadowinv.geometry._mesh import Indices
 
 BITS = 16
-DIGIT_BITS = 11
 
 # A round of insertion has 2³ - 1 times as many points as all before it.
 ROUND_BITS = 3
@@ -22,7 +17,7 @@ ROUND_BITS = 3
 
 @kernel
 def _distance_along(x: int, y: int) -> int:
-    """Distance of the grid cell (x, y) along the curve; free of branches that guess wrong."""
+    """Return the distance of grid cell (x, y) along the curve, without branches to mispredict."""
     distance = 0
     for bit in range(BITS - 1, -1, -1):
         right = (x >> bit) & 1
@@ -38,9 +33,10 @@ def _distance_along(x: int, y: int) -> int:
 
 
 @kernel_that_allocates
-def _keys(points: NDArray[np.float64]) -> NDArray[np.uint32]:
+def _keys(points: FloatArray) -> NDArray[np.uint64]:
+    """Return numbers to sort by: a point's distance along the curve, then its row."""
     n = points.shape[0]
-    keys = np.zeros(n, dtype=np.uint32)
+    keys = np.arange(n).astype(np.uint64)
     x_low, x_high = points[:, 0].min(), points[:, 0].max()
     y_low, y_high = points[:, 1].min(), points[:, 1].max()
     extent = max(x_high - x_low, y_high - y_low)
@@ -51,53 +47,18 @@ def _keys(points: NDArray[np.float64]) -> NDArray[np.uint32]:
     for i in range(n):
         x = min(int((points[i, 0] - x_low) * scale), last)
         y = min(int((points[i, 1] - y_low) * scale), last)
-        keys[i] = _distance_along(x, y)
+        keys[i] |= np.uint64(_distance_along(x, y)) << np.uint64(32)
     return keys
 
 
-@kernel_that_allocates
-def _stable_order(keys: NDArray[np.uint32]) -> NDArray[np.int32]:
-    """Permutation that sorts the keys; equal keys keep their order."""
-    n = keys.size
-    order = np.arange(n).astype(np.int32)
-    if np.all(keys[:-1] <= keys[1:]):
-        return order
-    other = np.empty(n, dtype=np.int32)
-    mask = (1 << DIGIT_BITS) - 1
-    for shift in range(0, 2 * BITS, DIGIT_BITS):
-        starts = np.zeros(mask + 2, dtype=np.int64)
-        for k in range(n):
-            starts[((np.int64(keys[k]) >> shift) & mask) + 1] += 1
-        for digit in range(mask + 1):
-            starts[digit + 1] += starts[digit]
-        for i in order:
-            place = (np.int64(keys[i]) >> shift) & mask
-            other[starts[place]] = i
-            starts[place] += 1
-        order, other = other, order
-    return order
-
-
-@kernel_that_allocates
-def hilbert_permutation(points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Sort points along a Hilbert curve through a grid of 2¹⁶ × 2¹⁶ square cells.
-
-    Parameters
-    ----------
-    points : ndarray, shape (n, 2)
-        Coordinates.
-
-    Returns
-    -------
-    ndarray of int32, shape (n,)
-        The permutation; points in one grid cell keep their order.
-    """
-    return _stable_order(_keys(points))
+def hilbert_permutation(points: FloatArray) -> Indices:
+    """Sort points along a Hilbert curve through 2¹⁶ × 2¹⁶ cells; those in one keep their order."""
+    return (np.sort(_keys(points)) & 0xFFFFFFFF).astype(np.int32)
 
 
 @kernel
 def _round_of(k: int) -> int:
-    """Tell how many rounds before the last one point k is inserted, by a hash of k."""
+    """Return how many rounds before the last point k is inserted, by a hash of k."""
     z = (np.uint64(k) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -110,21 +71,10 @@ def _round_of(k: int) -> int:
 
 
 @kernel_that_allocates
-def insertion_order(n: int) -> NDArray[np.int64]:
-    """Biased randomized insertion order: ever larger random samples, each in order.
-
-    Amenta, Choi and Rote 2003, Proc. 19th Symp. Computational Geometry, 211.
-
-    Parameters
-    ----------
-    n : int
-        Number of sites, which are taken to be sorted along a curve.
-
-    Returns
-    -------
-    ndarray of int64, shape (n,)
-        A permutation; always the same.
-    """
+def insertion_order(n: int) -> IntArray:
+    """Permute sorted sites into ever larger random samples, each in order; always the same way."""
+    # Biased randomized insertion order, which no arrangement of the sites can spoil: Amenta,
+    # Choi and Rote 2003, Proc. 19th Symp. Computational Geometry, 211.
     starts = np.zeros(33, dtype=np.int64)
     for k in range(n):
         starts[32 - _round_of(k)] += 1

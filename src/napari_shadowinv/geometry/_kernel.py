@@ -1,14 +1,10 @@
 """How kernels are compiled, and where their machine code is kept.
 
-- compile a kernel of the triangulation: `kernel`, `kernel_that_allocates`
-- compile another: `njit`, numba's own but for where machine code is kept
-- whether it is kept at all: `is_kept`
-
 Numba keeps machine code in the folder ``NUMBA_CACHE_DIR``, beside the package, or else in the
-home, and fails where none of these can be written. An installation for many users, run by an
-account without a home, is such a case. Then it is kept in a folder of this user in the temporary
-directory, which begins with what lies beside the package; and if that cannot be, compiled anew
-by each process.
+home, and fails where none of these can be written, as for an account without a home that runs
+an installation shared by many users. There it is kept in a private folder in the temporary
+directory, which starts with what lies beside the package; failing that, each process compiles
+anew.
 """
 
 from __future__ import annotations
@@ -25,29 +21,17 @@ from typing import Any, TypeVar, cast
 
 import numba
 
-__all__ = ["is_kept", "kernel", "kernel_that_allocates", "njit"]
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def njit(**options: Any) -> Callable[[Function], Function]:
-    """Return numba's decorator, which keeps the machine code where that is possible.
-
-    Parameters
-    ----------
-    **options
-        Those of `numba.njit`; `cache` is true wherever it can be.
-
-    Returns
-    -------
-    callable
-        The decorator; what it returns is typed as it was written.
-    """
+    """Return numba's decorator; `cache` is true wherever machine code can be kept."""
 
     def compiled(function: Function) -> Function:
         made: Any = numba.njit(**{**options, "cache": is_kept()})(function)
         if _own_folder_is_used():
-            _begin_with_what_is_there(made)
+            beside_package = Path(made.py_func.__code__.co_filename).parent / "__pycache__"
+            _copy_code(beside_package, Path(made.stats.cache_path))
         return cast(Function, made)
 
     return compiled
@@ -55,13 +39,7 @@ def njit(**options: Any) -> Callable[[Function], Function]:
 
 @cache
 def is_kept() -> bool:
-    """Return whether machine code is kept for later processes.
-
-    Returns
-    -------
-    bool
-        False where there is no folder that could be written.
-    """
+    """Return whether machine code is kept for later processes."""
     return _numba_finds_a_folder() or _own_folder_is_used()
 
 
@@ -97,7 +75,7 @@ def _own_folder_is_used() -> bool:
 
 
 def _own_folder() -> Path | None:
-    """A folder that nobody else can have put code into."""
+    """Return a folder that nobody else can have put code into."""
     if not hasattr(os, "getuid"):
         return None
     with suppress(OSError):
@@ -111,14 +89,9 @@ def _own_folder() -> Path | None:
     return None
 
 
-def _begin_with_what_is_there(compiled: Any) -> None:
-    """Take what was compiled beside the package when it was installed."""
-    made = Path(compiled.py_func.__code__.co_filename).parent / "__pycache__"
-    _copy_code(made, Path(compiled.stats.cache_path))
-
-
 @cache
 def _copy_code(made: Path, kept: Path) -> None:
+    """Start with what was compiled when the package was installed."""
     if any(kept.glob("*.nbi")):
         return
     # Numba does without what is missing.
@@ -129,35 +102,12 @@ def _copy_code(made: Path, kept: Path) -> None:
 
 
 def kernel_that_allocates(function: Function) -> Function:
-    """Compile for threads, and keep the machine code between runs.
-
-    Parameters
-    ----------
-    function : callable
-        What to compile.
-
-    Returns
-    -------
-    callable
-        The compiled function, typed as it was written.
-    """
+    """Compile a kernel of the triangulation that makes arrays."""
     return njit(nogil=True, cache=True)(function)
 
 
 def kernel(function: Function) -> Function:
-    """Compile likewise, but without numba's reference counting; must not make an array.
-
-    The counting is atomic and happens each time that an array is taken from a tuple; in short
-    functions that pass a mesh along it costs twice as much as the geometry.
-
-    Parameters
-    ----------
-    function : callable
-        What to compile.
-
-    Returns
-    -------
-    callable
-        The compiled function, typed as it was written.
-    """
+    """Compile a kernel that makes no array, without numba's reference counting."""
+    # The counting is atomic and happens whenever an array is taken from a tuple; in short
+    # functions that pass a mesh along it costs twice as much as the geometry.
     return njit(nogil=True, cache=True, _nrt=False)(function)

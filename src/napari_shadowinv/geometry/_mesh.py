@@ -4,7 +4,7 @@ Triangle t has the corners ``corners[3 t : 3 t + 3]``, counter-clockwise. The nu
 ``h = 3 t + k`` stands for that corner and for the edge opposite to it at once;
 ``twins[h]`` is the same edge seen from the triangle on its other side, or -1.
 A move rewrites the triangles that it touches and puts the edges that may have become
-irregular on the stack. Corners n to n + 3 are the ghosts.
+irregular on the stack. Points n to n + 3 are the ghosts.
 """
 
 from __future__ import annotations
@@ -14,35 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv.geometry._kernel import kernel
 from napari_shadowinv.geometry._predicates import turn
 
-__all__ = [
-    "EVERYWHERE",
-    "FLIPS",
-    "FREE",
-    "LAST",
-    "LIMIT",
-    "N_COUNTERS",
-    "OVERFLOW",
-    "POLICY",
-    "RAISES",
-    "SIZE",
-    "TOP",
-    "Mesh",
-    "after",
-    "around",
-    "before",
-    "compact",
-    "flip",
-    "neighbors_of",
-    "push",
-    "push_triangle",
-    "remove",
-    "replace",
-    "split_edge",
-    "split_triangle",
-]
+Indices = NDArray[np.int32]
 
 # Places in Mesh.counters.
 SIZE = 0  # triangles in use, holes included
@@ -59,53 +35,33 @@ N_COUNTERS = 10
 
 
 class Mesh(NamedTuple):
-    """State of a triangulation, as the kernels see it.
+    """State of a triangulation of n sites, as the kernels see it."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (n + 4, 2)
-        Sites, then the ghosts.
-    weights : ndarray, shape (n + 4,)
-        Weights.
-    corners : ndarray of int32, shape (6 n + 6,)
-        Corners of the triangles; -1 at the first corner of a hole.
-    twins : ndarray of int32, shape (6 n + 6,)
-        The same edge in the neighbour.
-    hidden : ndarray of bool, shape (n,)
-        Sites that are not in the triangulation.
-    stack : ndarray of int64
-        Edges to be looked at.
-    counters : ndarray of int64
-        SIZE, FREE, TOP and so on.
-    scratch : ndarray, shape (16,)
-        Room for exact sums.
-    """
-
-    points: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    corners: NDArray[np.int32]
-    twins: NDArray[np.int32]
-    hidden: NDArray[np.bool_]
-    stack: NDArray[np.int64]
-    counters: NDArray[np.int64]
-    scratch: NDArray[np.float64]
+    points: FloatArray  # (n + 4, 2): sites, then the ghosts
+    weights: FloatArray  # (n + 4,)
+    corners: Indices  # (6 n + 6,); -1 at the first corner of a hole
+    twins: Indices  # (6 n + 6,)
+    hidden: BoolArray  # (n,): sites that are not in the triangulation
+    stack: IntArray  # edges to be looked at
+    counters: IntArray
+    scratch: FloatArray  # (16,): room for exact sums
 
 
 @kernel
 def after(h: int) -> int:
-    """Next corner of the same triangle, counter-clockwise."""
+    """Return the next corner of the same triangle, counter-clockwise."""
     return h - 2 if h % 3 == 2 else h + 1
 
 
 @kernel
 def before(h: int) -> int:
-    """Previous corner of the same triangle."""
+    """Return the previous corner of the same triangle."""
     return h + 2 if h % 3 == 0 else h - 1
 
 
 @kernel
 def around(mesh: Mesh, h: int) -> int:
-    """Same corner in the next triangle of its star, counter-clockwise."""
+    """Return the same corner in the next triangle of its star, counter-clockwise."""
     return after(mesh.twins[after(h)])
 
 
@@ -161,10 +117,8 @@ def _drop_triangle(mesh: Mesh, t: int) -> None:
 
 @kernel
 def flip(mesh: Mesh, h: int, g: int) -> None:
-    """Replace the edge h = a-b of (p, a, b) and (q, b, a) by p-q; g is the twin of h.
-
-    Afterwards h is the corner p of (p, a, q), g the corner q of (q, b, p).
-    """
+    """Replace the edge h = a-b of (p, a, b) and (q, b, a) by p-q; g is the twin of h."""
+    # Afterwards h is the corner p of (p, a, q), g the corner q of (q, b, p).
     h1, h2, g1, g2 = after(h), before(h), after(g), before(g)
     h_outer, g_outer = mesh.twins[g1], mesh.twins[h1]
     mesh.corners[h2] = mesh.corners[g]
@@ -177,7 +131,7 @@ def flip(mesh: Mesh, h: int, g: int) -> None:
 
 @kernel
 def split_triangle(mesh: Mesh, t: int, v: int) -> None:
-    """Put v, which lies strictly inside triangle t, into it; pushes the three edges of t."""
+    """Put v, which lies strictly inside triangle t, into it and push the three edges of t."""
     a, b, c = mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2]
     b_outer, c_outer = mesh.twins[3 * t + 1], mesh.twins[3 * t + 2]
     u = _new_triangle(mesh)
@@ -197,7 +151,7 @@ def split_triangle(mesh: Mesh, t: int, v: int) -> None:
 
 @kernel
 def split_edge(mesh: Mesh, h: int, v: int) -> None:
-    """Put v, which lies strictly inside the edge h, into it; pushes the four edges around."""
+    """Put v, which lies strictly inside edge h, into it and push the four edges around it."""
     g = mesh.twins[h]
     t, u = h // 3, g // 3
     p, a, b, q = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)], mesh.corners[g]
@@ -225,7 +179,7 @@ def split_edge(mesh: Mesh, h: int, v: int) -> None:
 
 @kernel
 def replace(mesh: Mesh, h: int, v: int) -> None:
-    """Let v take the place of its duplicate at corner h; pushes the edges around it."""
+    """Let v take the place of its duplicate at corner h and push the edges around it."""
     mesh.hidden[mesh.corners[h]] = True
     mesh.hidden[v] = False
     g = h
@@ -249,11 +203,9 @@ def _degree(mesh: Mesh, h: int) -> int:
 
 @kernel
 def _cut_ears(mesh: Mesh, h: int, degree: int) -> tuple[int, int]:
-    """Flip edges away from the vertex at corner h until three are left, or four in a cross.
-
-    A star of more than four triangles always has an ear that leaves the vertex strictly
-    inside. One of four has none if and only if the vertex lies on a diagonal.
-    """
+    """Flip edges away from the vertex at corner h until three are left, or four in a cross."""
+    # A star of more than four triangles always has an ear that leaves the vertex strictly
+    # inside. One of four has none if and only if the vertex lies on a diagonal.
     refused = 0
     v = mesh.corners[h]
     while degree > 3 and refused < degree:
@@ -296,17 +248,12 @@ def _merge_three(mesh: Mesh, h: int) -> int:
 @kernel
 def _merge_four(mesh: Mesh, h: int) -> int:
     """Remove a vertex of degree four that lies on a diagonal of its neighbours."""
-    v = mesh.corners[h]
-    if (
-        turn(
-            mesh.points,
-            mesh.scratch,
-            mesh.corners[after(h)],
-            v,
-            mesh.corners[before(around(mesh, h))],
-        )
-        != 0
-    ):
+    v, here, opposite = (
+        mesh.corners[h],
+        mesh.corners[after(h)],
+        mesh.corners[before(around(mesh, h))],
+    )
+    if turn(mesh.points, mesh.scratch, here, v, opposite) != 0:
         h = around(mesh, h)
     g = around(mesh, h)
     f = around(mesh, g)
@@ -331,7 +278,7 @@ def _merge_four(mesh: Mesh, h: int) -> int:
 
 @kernel
 def remove(mesh: Mesh, h: int) -> None:
-    """Take the vertex at corner h out of the triangulation; pushes every edge it leaves."""
+    """Take the vertex at corner h out of the triangulation and push every edge it leaves."""
     mesh.hidden[mesh.corners[h]] = True
     h, degree = _cut_ears(mesh, h, _degree(mesh, h))
     mesh.counters[LAST] = _merge_three(mesh, h) if degree == 3 else _merge_four(mesh, h)
@@ -358,24 +305,3 @@ def compact(mesh: Mesh) -> None:
     counters[SIZE] = size
     counters[FREE] = -1
     counters[LAST] = min(counters[LAST], size - 1)
-
-
-@kernel_that_allocates
-def neighbors_of(mesh: Mesh) -> NDArray[np.int32]:
-    """Triangle on the other side of each edge, -1 if there is none.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        The triangulation, compact.
-
-    Returns
-    -------
-    ndarray of int32, shape (3 m,)
-        In the order of the edges.
-    """
-    size = 3 * mesh.counters[SIZE]
-    neighbors = np.empty(size, dtype=np.int32)
-    for h in range(size):
-        neighbors[h] = mesh.twins[h] // 3
-    return neighbors

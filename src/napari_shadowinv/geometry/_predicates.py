@@ -1,10 +1,5 @@
 """Signs that can be trusted: orientation, and the weighted in-circle test of an edge.
 
-- on which side of a line a site lies, exactly: `turn`
-- whether an edge of a triangulation is locally regular, and if not, how it gives way:
-  `edge_state`
-- how far a site lies above the plane of a lifted triangle: `excess`
-
 The orientation is exact: where rounding could hide the sign, it is computed again with
 sums of floats that lose nothing (Shewchuk 1997, Discrete Comput. Geom. 18, 305). The
 in-circle test only reports signs that its error bound certifies. Together these make each
@@ -18,30 +13,17 @@ one of the sites, and doubled: |r - r₀|² - (w - w₀).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import kernel
 
-__all__ = [
-    "CROSS_BOUND",
-    "FLIP",
-    "LEGAL",
-    "REFLEX_A",
-    "REFLEX_B",
-    "edge_state",
-    "excess",
-    "kernel",
-    "precise_excess",
-    "turn",
-]
-
-Float64 = NDArray[np.float64]
 Twofold = tuple[float, float]
 
-LEGAL = 0
-FLIP = 1
-REFLEX_A = 2
-REFLEX_B = 3
+# What to do with the edge a-b between the triangles (p, a, b) and (q, b, a).
+LEGAL = 0  # it is locally regular, or so close to it that rounding decides
+FLIP = 1  # p-q must replace it
+REFLEX_A = 2  # a is hidden: it lies in the triangle (p, q, b), above its lifted plane
+REFLEX_B = 3  # b is hidden likewise
 
 # Error bounds in units of the permanent: (3 + 16 ε) ε for the cross product of two
 # differences, 12 ε (+ O(ε²)) for the lifted determinant, ε = 2⁻⁵³; both rounded up.
@@ -54,7 +36,7 @@ SPLITTER = 2.0**27 + 1.0
 
 @kernel
 def _two_difference(a: float, b: float) -> tuple[float, float]:
-    """Rounded a - b, and what rounding took away."""
+    """Return a - b rounded, and what rounding took away."""
     difference = a - b
     b_virtual = a - difference
     a_virtual = difference + b_virtual
@@ -63,7 +45,7 @@ def _two_difference(a: float, b: float) -> tuple[float, float]:
 
 @kernel
 def _two_sum(a: float, b: float) -> tuple[float, float]:
-    """Rounded a + b, and what rounding took away."""
+    """Return a + b rounded, and what rounding took away."""
     total = a + b
     b_virtual = total - a
     a_virtual = total - b_virtual
@@ -72,7 +54,7 @@ def _two_sum(a: float, b: float) -> tuple[float, float]:
 
 @kernel
 def _two_product(a: float, b: float) -> tuple[float, float]:
-    """Rounded a·b, and what rounding took away."""
+    """Return a·b rounded, and what rounding took away."""
     product = a * b
     scaled = SPLITTER * a
     a_high = scaled - (scaled - a)
@@ -85,7 +67,7 @@ def _two_product(a: float, b: float) -> tuple[float, float]:
 
 
 @kernel
-def _grow(terms: Float64, count: int, value: float) -> int:
+def _grow(terms: FloatArray, count: int, value: float) -> int:
     """Add a float to a sum of non-overlapping terms, smallest first, without loss."""
     for k in range(count):
         value, terms[k] = _two_sum(value, terms[k])
@@ -94,7 +76,7 @@ def _grow(terms: Float64, count: int, value: float) -> int:
 
 
 @kernel
-def _grow_product(terms: Float64, count: int, a: float, b: float) -> int:
+def _grow_product(terms: FloatArray, count: int, a: float, b: float) -> int:
     high, low = _two_product(a, b)
     return _grow(terms, _grow(terms, count, low), high)
 
@@ -107,7 +89,7 @@ def _sign(value: float) -> int:
 
 
 @kernel
-def _exact_turn(points: Float64, terms: Float64, a: int, b: int, c: int) -> int:
+def _exact_turn(points: FloatArray, terms: FloatArray, a: int, b: int, c: int) -> int:
     ux, ux_tail = _two_difference(points[b, 0], points[a, 0])
     uy, uy_tail = _two_difference(points[b, 1], points[a, 1])
     vx, vx_tail = _two_difference(points[c, 0], points[a, 0])
@@ -131,23 +113,8 @@ def _exact_turn(points: Float64, terms: Float64, a: int, b: int, c: int) -> int:
 
 
 @kernel
-def turn(points: Float64, scratch: Float64, a: int, b: int, c: int) -> int:
-    """Sign of cross(b - a, c - a), exactly.
-
-    Parameters
-    ----------
-    points : ndarray, shape (k, 2)
-        Coordinates.
-    scratch : ndarray, shape (16,)
-        Room for the exact sum.
-    a, b, c : int
-        Rows of `points`.
-
-    Returns
-    -------
-    int
-        1 if a, b, c turn counter-clockwise, -1 if clockwise, 0 if they are collinear.
-    """
+def turn(points: FloatArray, scratch: FloatArray, a: int, b: int, c: int) -> int:
+    """Return the exact sign of cross(b - a, c - a): 1 where a, b, c turn counter-clockwise."""
     left = (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1])
     right = (points[b, 1] - points[a, 1]) * (points[c, 0] - points[a, 0])
     cross = left - right
@@ -160,96 +127,10 @@ def turn(points: Float64, scratch: Float64, a: int, b: int, c: int) -> int:
 
 
 @kernel
-def edge_state(
-    points: Float64, weights: Float64, scratch: Float64, p: int, a: int, b: int, q: int
-) -> int:
-    """Tell what to do with the edge a-b between the triangles (p, a, b) and (q, b, a).
-
-    Parameters
-    ----------
-    points : ndarray, shape (k, 2)
-        Coordinates.
-    weights : ndarray, shape (k,)
-        Weights, in squared units of the coordinates.
-    scratch : ndarray, shape (16,)
-        Room for the exact sum.
-    p, a, b, q : int
-        The corners of the quadrilateral, counter-clockwise p, a, q, b.
-
-    Returns
-    -------
-    int
-        LEGAL if the edge is locally regular, or so close to it that rounding decides;
-        FLIP if p-q must replace it; REFLEX_A if a is hidden: it lies in the triangle
-        (p, q, b), above its lifted plane; REFLEX_B likewise.
-    """
-    ax = points[a, 0] - points[p, 0]
-    ay = points[a, 1] - points[p, 1]
-    bx = points[b, 0] - points[p, 0]
-    by = points[b, 1] - points[p, 1]
-    qx = points[q, 0] - points[p, 0]
-    qy = points[q, 1] - points[p, 1]
-    a_gain = weights[a] - weights[p]
-    b_gain = weights[b] - weights[p]
-    q_gain = weights[q] - weights[p]
-    a_square = ax * ax + ay * ay
-    b_square = bx * bx + by * by
-    q_square = qx * qx + qy * qy
-    ab_left = ax * by
-    ab_right = ay * bx
-    aq_left = ax * qy
-    aq_right = ay * qx
-    qb_left = qx * by
-    qb_right = qy * bx
-    aq = aq_left - aq_right
-    qb = qb_left - qb_right
-    aq_size = abs(aq_left) + abs(aq_right)
-    qb_size = abs(qb_left) + abs(qb_right)
-    height = (
-        (q_square - q_gain) * (ab_left - ab_right)
-        - (a_square - a_gain) * qb
-        - (b_square - b_gain) * aq
-    )
-    size = (
-        (q_square + abs(q_gain)) * (abs(ab_left) + abs(ab_right))
-        + (a_square + abs(a_gain)) * qb_size
-        + (b_square + abs(b_gain)) * aq_size
-    )
-    if height >= -LIFT_BOUND * size:
-        return LEGAL
-    if aq > CROSS_BOUND * aq_size and qb > CROSS_BOUND * qb_size:
-        return FLIP
-    if turn(points, scratch, p, a, q) <= 0:
-        return REFLEX_A
-    if turn(points, scratch, p, q, b) <= 0:
-        return REFLEX_B
-    return FLIP
-
-
-@kernel
-def excess(
-    points: Float64, weights: Float64, a: int, b: int, c: int, v: int
-) -> tuple[float, float]:
-    """Tell how far v lies above the lifted plane of the triangle (a, b, c), and how surely.
-
-    Parameters
-    ----------
-    points : ndarray, shape (k, 2)
-        Coordinates.
-    weights : ndarray, shape (k,)
-        Weights, in squared units of the coordinates.
-    a, b, c : int
-        The triangle, counter-clockwise.
-    v : int
-        The site.
-
-    Returns
-    -------
-    height : float
-        Doubled height above the plane: by this much the weight of v must rise to touch it.
-    bound : float
-        Bound of its rounding error.
-    """
+def _lifted(
+    points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
+) -> tuple[float, float, float]:
+    """Return the determinant of the lifted a, b, c seen from v, its permanent, and the area."""
     ax = points[a, 0] - points[v, 0]
     ay = points[a, 1] - points[v, 1]
     bx = points[b, 0] - points[v, 0]
@@ -265,16 +146,39 @@ def excess(
     bc = bx * cy - by * cx
     ca = cx * ay - cy * ax
     ab = ax * by - ay * bx
-    plane = (a_square - a_gain) * bc + (b_square - b_gain) * ca + (c_square - c_gain) * ab
+    height = (a_square - a_gain) * bc + (b_square - b_gain) * ca + (c_square - c_gain) * ab
     size = (
         (a_square + abs(a_gain)) * (abs(bx * cy) + abs(by * cx))
         + (b_square + abs(b_gain)) * (abs(cx * ay) + abs(cy * ax))
         + (c_square + abs(c_gain)) * (abs(ax * by) + abs(ay * bx))
     )
-    area = bc + ca + ab
+    return height, size, bc + ca + ab
+
+
+@kernel
+def edge_state(
+    points: FloatArray, weights: FloatArray, scratch: FloatArray, p: int, a: int, b: int, q: int
+) -> int:
+    """Tell what to do with the edge a-b; p, a, q, b go around it counter-clockwise."""
+    height, size, _ = _lifted(points, weights, q, a, b, p)
+    if height >= -LIFT_BOUND * size:
+        return LEGAL
+    if turn(points, scratch, p, a, q) <= 0:
+        return REFLEX_A
+    if turn(points, scratch, p, q, b) <= 0:
+        return REFLEX_B
+    return FLIP
+
+
+@kernel
+def excess(
+    points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
+) -> tuple[float, float]:
+    """Return by how much the weight of v must rise to touch (a, b, c), and a bound of the error."""
+    height, size, area = _lifted(points, weights, a, b, c, v)
     if area <= 0.0:
         return 0.0, np.inf
-    return -plane / area, LIFT_BOUND * size / area
+    return -height / area, LIFT_BOUND * size / area
 
 
 @kernel
@@ -297,9 +201,9 @@ def _cross(ax: Twofold, ay: Twofold, bx: Twofold, by: Twofold) -> Twofold:
 
 @kernel
 def _relative(
-    points: Float64, weights: Float64, a: int, v: int
+    points: FloatArray, weights: FloatArray, a: int, v: int
 ) -> tuple[Twofold, Twofold, Twofold]:
-    """Coordinates and doubled height of a, seen from v."""
+    """Return the coordinates and doubled height of a, seen from v."""
     x = _two_difference(points[a, 0], points[v, 0])
     y = _two_difference(points[a, 1], points[v, 1])
     loss = _two_difference(weights[v], weights[a])
@@ -307,25 +211,10 @@ def _relative(
 
 
 @kernel
-def precise_excess(points: Float64, weights: Float64, a: int, b: int, c: int, v: int) -> float:
-    """Height of `excess` in twofold precision: right for triangles next to a line, too.
-
-    Parameters
-    ----------
-    points : ndarray, shape (k, 2)
-        Coordinates.
-    weights : ndarray, shape (k,)
-        Weights, in squared units of the coordinates.
-    a, b, c : int
-        The triangle, counter-clockwise.
-    v : int
-        The site.
-
-    Returns
-    -------
-    float
-        Doubled height of v above the plane.
-    """
+def precise_excess(
+    points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
+) -> float:
+    """Return the height of `excess` in twofold precision: right for slivers, too."""
     ax, ay, a_lift = _relative(points, weights, a, v)
     bx, by, b_lift = _relative(points, weights, b, v)
     cx, cy, c_lift = _relative(points, weights, c, v)

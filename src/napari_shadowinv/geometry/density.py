@@ -21,13 +21,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 
 __all__ = ["Density", "split_pixels", "walk_edge"]
 
-Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class Density:
         last column holds the whole row's.
     """
 
-    image: Array
-    sums: Array
+    image: FloatArray
+    sums: FloatArray
 
     @classmethod
     def from_image(cls, image: ArrayLike) -> Density:
@@ -61,7 +62,7 @@ class Density:
         return self.image.shape[0], self.image.shape[1]
 
     @property
-    def region(self) -> Array:
+    def region(self) -> FloatArray:
         """Corners (y, x) of the image, half a pixel beyond the outermost centres, shape (2, 2)."""
         return np.array([[0.0, 0.0], self.shape]) - 0.5
 
@@ -72,7 +73,7 @@ class Density:
 
 
 @njit(nogil=True, cache=True)
-def _row_sums(image: Array) -> Array:
+def _row_sums(image: FloatArray) -> FloatArray:
     height, width = image.shape
     sums = np.zeros((3, height, width + 1))
     for row in range(height):
@@ -86,36 +87,16 @@ def _row_sums(image: Array) -> Array:
     return sums
 
 
-def split_pixels(image: Array, factor: int) -> Array:
-    """Split each pixel of an image into factor × factor that share its flux evenly.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-        Flux of each pixel.
-    factor : int
-        1 or more.
-
-    Returns
-    -------
-    ndarray, shape (H · factor, W · factor)
-    """
+def split_pixels(image: FloatArray, factor: int) -> FloatArray:
+    """Split each pixel of an image into factor × factor that share its flux evenly."""
     return np.repeat(np.repeat(image / factor**2, factor, axis=0), factor, axis=1)
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _moments(
-    f0: float,
-    f_mid: float,
-    f1: float,
-    g: float,
-    k0: float,
-    k_mid: float,
-    k1: float,
-    y0: float,
-    y1: float,
-) -> tuple[float, float, float]:
-    """∫ y F dy, ∫ G dy and ∫ (y² F + K) dy by Simpson's rule; g is the sum for G."""
+def _moments(f: Triple, g: float, k: Triple, y0: float, y1: float) -> Triple:
+    """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy by Simpson's rule; g is the sum for G."""
+    f0, f_mid, f1 = f
+    k0, k_mid, k1 = k
     y_mid = 0.5 * (y0 + y1)
     sixth = (y1 - y0) / 6
     return (
@@ -127,16 +108,16 @@ def _moments(
 
 @njit(nogil=True, cache=True, inline="always")
 def _moments_in_pixel(
+    sums: FloatArray,
     value: float,
-    sums: Array,
-    row: int,
-    column: int,
+    pixel: tuple[int, int],
     y0: float,
     x0: float,
     y1: float,
     x1: float,
-) -> tuple[float, float, float]:
-    """∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
+) -> Triple:
+    """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
+    row, column = pixel
     left = float(column)
     left2 = left * left
     left3 = left2 * left
@@ -146,24 +127,26 @@ def _moments_in_pixel(
     k_base = sums[2, row, column] - value * left3 / 3
     g = 6 * g_base + value * (x0 * x0 + 4 * x_mid * x_mid + x1 * x1) / 2
     third = value / 3
-    return _moments(
-        f_base + value * x0,
-        f_base + value * x_mid,
-        f_base + value * x1,
-        g,
+    f = f_base + value * x0, f_base + value * x_mid, f_base + value * x1
+    k = (
         k_base + third * x0 * x0 * x0,
         k_base + third * x_mid * x_mid * x_mid,
         k_base + third * x1 * x1 * x1,
-        y0,
-        y1,
     )
+    return _moments(f, g, k, y0, y1)
 
 
 @njit(nogil=True, cache=True)
 def _walk_inside(
-    image: Array, sums: Array, ya: float, xa: float, yb: float, xb: float, with_moments: bool
+    image: FloatArray,
+    sums: FloatArray,
+    ya: float,
+    xa: float,
+    yb: float,
+    xb: float,
+    with_moments: bool,
 ) -> tuple[float, float, float, float, float]:
-    """Integrate along a segment inside the image; see `walk_edge`."""
+    """Integrate along a segment inside the image, as `walk_edge` does."""
     height, width = image.shape
     row = min(int(ya), height - 1)
     column = min(int(xa), width - 1)
@@ -196,7 +179,9 @@ def _walk_inside(
         flux += value * (t_next - t)
         mass += (sums[0, row, column] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
         if with_moments:
-            of_y, of_x, of_both = _moments_in_pixel(value, sums, row, column, y, x, y_next, x_next)
+            of_y, of_x, of_both = _moments_in_pixel(
+                sums, value, (row, column), y, x, y_next, x_next
+            )
             moment_y += of_y
             moment_x += of_x
             inertia += of_both
@@ -212,7 +197,7 @@ def _walk_inside(
 
 @njit(nogil=True, cache=True)
 def _walk_right_of_image(
-    image: Array, sums: Array, ya: float, yb: float
+    image: FloatArray, sums: FloatArray, ya: float, yb: float
 ) -> tuple[float, float, float, float]:
     """Integrate from row position ya to yb beyond the right edge, where F is the row's sum."""
     height, width = image.shape
@@ -223,10 +208,8 @@ def _walk_right_of_image(
     for row in range(min(int(low), height - 1), min(int(high), height - 1) + 1):
         y0 = max(low, float(row))
         y1 = min(high, row + 1.0)
-        f = sums[0, row, width]
-        g = sums[1, row, width]
-        k = sums[2, row, width]
-        of_y, of_x, of_both = _moments(f, f, f, 6 * g, k, k, k, y0, y1)
+        f, g, k = sums[0, row, width], sums[1, row, width], sums[2, row, width]
+        of_y, of_x, of_both = _moments((f, f, f), 6 * g, (k, k, k), y0, y1)
         mass += sign * f * (y1 - y0)
         moment_y += sign * of_y
         moment_x += sign * of_x
@@ -236,15 +219,17 @@ def _walk_right_of_image(
 
 @njit(nogil=True, cache=True)
 def walk_edge(
-    image: Array, sums: Array, ya: float, xa: float, yb: float, xb: float, with_moments: bool
+    image: FloatArray,
+    sums: FloatArray,
+    ya: float,
+    xa: float,
+    yb: float,
+    xb: float,
+    with_moments: bool,
 ) -> tuple[float, float, float, float, float]:
     """Integrate along the segment from (ya, xa) to (yb, xb), in corner coordinates.
 
-    Returns
-    -------
-    tuple of float
-        ∫ I ds, then ∫ F dy, ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy; the last three
-        are 0 unless `with_moments`.
+    Returns ∫ I ds, ∫ F dy, and if `with_moments`, else 0, ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy.
     """
     height, width = image.shape
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
@@ -279,7 +264,7 @@ def walk_edge(
 
 @njit(nogil=True, cache=True)
 def _inside_share(position: float, step: float, size: int) -> tuple[float, float]:
-    """Range of t in [0, 1] for which position + t·step lies in [0, size]."""
+    """Return the range of t in [0, 1] for which position + t·step lies in [0, size]."""
     if step == 0:
         return (0.0, 1.0) if 0 <= position < size else (1.0, 1.0)
     first = -position / step
@@ -291,7 +276,7 @@ def _inside_share(position: float, step: float, size: int) -> tuple[float, float
 def _point(
     ya: float, xa: float, yb: float, xb: float, t: float, height: int, width: int
 ) -> tuple[float, float]:
-    """The point at share t of a segment, not further out than the image's border."""
+    """Return the point at share t of a segment, not beyond the image's border."""
     y = ya + t * (yb - ya) if t < 1 else yb
     x = xa + t * (xb - xa) if t < 1 else xb
     return min(max(y, 0.0), float(height)), min(max(x, 0.0), float(width))

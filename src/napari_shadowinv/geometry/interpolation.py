@@ -20,30 +20,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._system.threads import available_threads, in_ranges
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
+from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
-__all__ = ["BLOCK", "CloughTocher", "fit_gradients", "locate", "mirrored_across_border"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int32]
+__all__ = [
+    "BLOCK",
+    "CloughTocher",
+    "arrays_of",
+    "fit_gradients",
+    "locate",
+    "mirrored_across_border",
+]
 
 BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
 
 
 def mirrored_across_border(
-    sites: Array, shape: tuple[int, int], band: float
-) -> tuple[Array, NDArray[np.intp], Array]:
-    """Mirror the sites that are closer than `band` to the image's border across it.
-
-    Parameters
-    ----------
-    sites : ndarray, shape (n, 2)
-        Positions inside the image.
-    shape : tuple of int
-        Shape (H, W) of the image, which covers [-0.5, H-0.5] × [-0.5, W-0.5].
-    band : float
-        Width of the strip that is mirrored, in px.
+    sites: FloatArray, shape: tuple[int, int], band: float
+) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
+    """Mirror the sites that are closer than `band` px to the image's border across it.
 
     Returns
     -------
@@ -55,13 +52,9 @@ def mirrored_across_border(
         -1 for the axes along which it was mirrored, else 1: what a mirrored gradient is
         multiplied by.
     """
-    points = sites
-    origin = np.arange(len(sites))
-    sense = np.ones_like(sites)
+    points, origin, sense = sites, np.arange(len(sites)), np.ones_like(sites)
     for axis in (0, 1):
-        images = [points]
-        origins = [origin]
-        senses = [sense]
+        images, origins, senses = [points], [origin], [sense]
         for wall in (-0.5, shape[axis] - 0.5):
             near = np.abs(points[:, axis] - wall) < band
             image = points[near].copy()
@@ -78,9 +71,14 @@ def mirrored_across_border(
 
 @njit(nogil=True, cache=True)
 def _sweep(
-    vertices: Indices, neighbors: Indices, points: Array, values: Array, gradients: Array, n: int
-) -> Array:
-    """One Jacobi sweep towards the gradients of least bending along the edges."""
+    vertices: Indices,
+    neighbors: Indices,
+    points: FloatArray,
+    values: FloatArray,
+    gradients: FloatArray,
+    n: int,
+) -> FloatArray:
+    """Make one Jacobi sweep towards the gradients of least bending along the edges."""
     system = np.zeros((n, 5))
     for t in range(vertices.shape[0]):
         for k in range(3):
@@ -112,45 +110,27 @@ def _sweep(
 
 
 def fit_gradients(
-    triangulation: RegularTriangulation, values: Array, gradients: Array, sweeps: int = 1
-) -> Array:
+    triangulation: RegularTriangulation, values: FloatArray, gradients: FloatArray, sweeps: int = 1
+) -> FloatArray:
     """Improve gradients at the sites so that the surface bends least along the edges.
-
-    Parameters
-    ----------
-    triangulation : RegularTriangulation
-        Delaunay triangulation of the sites.
-    values : ndarray, shape (n,)
-        Values at the sites.
-    gradients : ndarray, shape (n, 2)
-        First guess.
-    sweeps : int
-        Jacobi sweeps.
-
-    Returns
-    -------
-    ndarray, shape (n, 2)
-        Gradients after the sweeps.
 
     References
     ----------
     G. M. Nielson, Mathematics of Computation 40, 253 (1983).
     """
     for _ in range(sweeps):
-        gradients = _sweep(
-            triangulation.vertices,
-            triangulation.neighbors,
-            triangulation.points,
-            values,
-            gradients,
-            len(triangulation.sites),
-        )
+        gradients = _sweep(*arrays_of(triangulation), values, gradients, len(values))
     return gradients
+
+
+def arrays_of(triangulation: RegularTriangulation) -> tuple[Indices, Indices, FloatArray]:
+    """Return what kernels want to know of a triangulation."""
+    return triangulation.vertices, triangulation.neighbors, triangulation.points
 
 
 @njit(nogil=True, cache=True)
 def locate(
-    vertices: Indices, neighbors: Indices, points: Array, start: int, y: float, x: float
+    vertices: Indices, neighbors: Indices, points: FloatArray, start: int, y: float, x: float
 ) -> int:
     """Walk to the triangle that holds (y, x)."""
     t = start
@@ -178,9 +158,9 @@ def locate(
 
 @njit(nogil=True, cache=True)
 def _edge_ordinates(
-    p: Array, f: Array, g: Array, i: int, j: int, cy: float, cx: float
+    p: FloatArray, f: FloatArray, g: FloatArray, i: int, j: int, cy: float, cx: float
 ) -> tuple[float, float, float]:
-    """Bézier ordinates on edge i-j, near i and near j, and inside its patch."""
+    """Return the Bézier ordinates on edge i-j, near i and near j, and inside its patch."""
     ey = p[j, 0] - p[i, 0]
     ex = p[j, 1] - p[i, 1]
     near_i = f[i] + (g[i, 0] * ey + g[i, 1] * ex) / 3
@@ -193,8 +173,10 @@ def _edge_ordinates(
 
 
 @njit(nogil=True, cache=True)
-def _patch(p: Array, f: Array, g: Array, y: float, x: float) -> tuple[float, float, float]:
-    """Value and gradient at (y, x) of the surface over the triangle p."""
+def _patch(
+    p: FloatArray, f: FloatArray, g: FloatArray, y: float, x: float
+) -> tuple[float, float, float]:
+    """Return value and gradient at (y, x) of the surface over the triangle p."""
     cy = (p[0, 0] + p[1, 0] + p[2, 0]) / 3
     cx = (p[0, 1] + p[1, 1] + p[2, 1]) / 3
     double_area = (p[1, 0] - p[0, 0]) * (p[2, 1] - p[0, 1]) - (p[1, 1] - p[0, 1]) * (
@@ -210,25 +192,18 @@ def _patch(p: Array, f: Array, g: Array, y: float, x: float) -> tuple[float, flo
         slope[k, 1] = (p[j, 0] - p[i, 0]) / double_area
 
     # ordinates: along edge k (opposite vertex k) near its two ends, and inside its patch
-    near_first = np.empty(3)
-    near_second = np.empty(3)
-    inside = np.empty(3)
-    to_centre = np.empty(3)
+    near_first, near_second, inside = np.empty(3), np.empty(3), np.empty(3)
+    to_centre, by_centre = np.empty(3), np.empty(3)
     for k in range(3):
         near_first[k], near_second[k], inside[k] = _edge_ordinates(
             p, f, g, (k + 1) % 3, (k + 2) % 3, cy, cx
         )
         to_centre[k] = f[k] + (g[k, 0] * (cy - p[k, 0]) + g[k, 1] * (cx - p[k, 1])) / 3
-    by_centre = np.empty(3)
     for k in range(3):
         by_centre[k] = (to_centre[k] + inside[(k + 1) % 3] + inside[(k + 2) % 3]) / 3
     centre = (by_centre[0] + by_centre[1] + by_centre[2]) / 3
 
-    k = 0
-    if bary[1] < bary[k]:
-        k = 1
-    if bary[2] < bary[k]:
-        k = 2
+    k = int(np.argmin(bary))  # the patch that holds the point
     i = (k + 1) % 3
     j = (k + 2) % 3
     u = bary[i] - bary[k]
@@ -277,13 +252,13 @@ def _patch(p: Array, f: Array, g: Array, y: float, x: float) -> tuple[float, flo
 def _evaluate_blocks(
     start: int,
     stop: int,
-    queries: Array,
+    queries: FloatArray,
     vertices: Indices,
     neighbors: Indices,
-    points: Array,
-    values: Array,
-    gradients: Array,
-    out: Array,
+    points: FloatArray,
+    values: FloatArray,
+    gradients: FloatArray,
+    out: FloatArray,
 ) -> None:
     """Evaluate blocks `start` to `stop` of the queries: value, ∂/∂y, ∂/∂x."""
     n = values.shape[0]
@@ -319,8 +294,8 @@ def _evaluate_blocks(
 
 
 @njit(nogil=True, cache=True)
-def _nearest_corner(corners: Indices, points: Array, n: int, y: float, x: float) -> int:
-    """The corner nearest to (y, x) that is a site, or -1 between ghosts alone."""
+def _nearest_corner(corners: Indices, points: FloatArray, n: int, y: float, x: float) -> int:
+    """Return the corner nearest to (y, x) that is a site, or -1 between ghosts alone."""
     nearest = -1
     least = np.inf
     for a in corners:
@@ -339,12 +314,10 @@ class CloughTocher:
     ----------
     triangulation : RegularTriangulation
         Delaunay triangulation (zero weights) of the n sites.
-    values : ndarray, shape (n,)
-        Values at the sites.
-    gradients : ndarray, shape (n, 2)
-        Gradients at the sites, axis order (y, x).
+    values, gradients : ndarray, shapes (n,) and (n, 2)
+        At the sites; axis order (y, x).
     threads : int, optional
-        Threads of an evaluation; default all cores. Results do not depend on it.
+        Default: all cores. Results do not depend on it.
 
     Examples
     --------
@@ -361,8 +334,8 @@ class CloughTocher:
     def __init__(
         self,
         triangulation: RegularTriangulation,
-        values: Array,
-        gradients: Array,
+        values: FloatArray,
+        gradients: FloatArray,
         *,
         threads: int | None = None,
     ) -> None:
@@ -371,33 +344,15 @@ class CloughTocher:
         self._gradients = np.ascontiguousarray(gradients, dtype=np.float64)
         self._threads = available_threads(threads)
 
-    def __call__(self, queries: Array) -> tuple[Array, Array]:
-        """Evaluate the surface.
+    def __call__(self, queries: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return values, shape (m,), and gradients, shape (m, 2), at points (y, x).
 
-        Parameters
-        ----------
-        queries : ndarray, shape (m, 2)
-            Points (y, x); neighbours in the list should be neighbours in the plane.
-            Outside the sites' hull the nearest hull site is continued linearly.
-
-        Returns
-        -------
-        values : ndarray, shape (m,)
-        gradients : ndarray, shape (m, 2)
+        Neighbours in the list should be neighbours in the plane. Outside the sites' hull the
+        nearest hull site is continued linearly.
         """
         queries = np.ascontiguousarray(queries, dtype=np.float64)
         out = np.zeros((len(queries), 3))
-        in_ranges(
-            _evaluate_blocks,
-            -(-len(queries) // BLOCK),
-            self._threads,
-            queries,
-            self._triangulation.vertices,
-            self._triangulation.neighbors,
-            self._triangulation.points,
-            self._values,
-            self._gradients,
-            out,
-            smallest=2,
-        )
+        surface = (*arrays_of(self._triangulation), self._values, self._gradients)
+        blocks = -(-len(queries) // BLOCK)
+        in_ranges(_evaluate_blocks, blocks, self._threads, queries, *surface, out, smallest=2)
         return out[:, 0], out[:, 1:]

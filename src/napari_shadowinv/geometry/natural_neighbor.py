@@ -1,10 +1,8 @@
-"""Sibson's natural-neighbour interpolation.
+"""Sibson's natural-neighbour interpolation: `natural_neighbor`.
 
 A point that is added to a Voronoi diagram takes its cell from its neighbours; the shares
 of the area that each of them gives are the weights of their values. The result is
 continuous, smooth but at the sites, and exact for linear functions.
-
-- interpolate values at scattered sites: `natural_neighbor`
 
 References
 ----------
@@ -15,17 +13,16 @@ section III.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.threads import available_threads, in_ranges
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry.interpolation import BLOCK, locate
+from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.interpolation import BLOCK, arrays_of, locate
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 __all__ = ["natural_neighbor"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int32]
 
 _LARGEST_CAVITY = 256
 
@@ -34,7 +31,7 @@ _LARGEST_CAVITY = 256
 def _circumcentre(
     ay: float, ax: float, by: float, bx: float, cy: float, cx: float
 ) -> tuple[float, float]:
-    """Circumcentre relative to a; far away where the points are in line."""
+    """Return the circumcentre relative to a; far away where the points are in line."""
     by -= ay
     bx -= ax
     cy -= ay
@@ -48,8 +45,8 @@ def _circumcentre(
 
 
 @njit(nogil=True, cache=True)
-def _circle_holds(points: Array, corners: Indices, y: float, x: float) -> bool:
-    """Whether (y, x) lies inside the circumcircle of the counter-clockwise triangle."""
+def _circle_holds(points: FloatArray, corners: Indices, y: float, x: float) -> bool:
+    """Tell whether (y, x) lies inside the circumcircle of a counter-clockwise triangle."""
     ay = points[corners[0], 0] - y
     ax = points[corners[0], 1] - x
     by = points[corners[1], 0] - y
@@ -67,7 +64,7 @@ def _circle_holds(points: Array, corners: Indices, y: float, x: float) -> bool:
 def _cavity(
     vertices: Indices,
     neighbors: Indices,
-    points: Array,
+    points: FloatArray,
     start: int,
     y: float,
     x: float,
@@ -102,7 +99,7 @@ def _position(items: Indices, count: int, item: int) -> int:
 def _stolen_area(
     vertices: Indices,
     neighbors: Indices,
-    points: Array,
+    points: FloatArray,
     cavity: Indices,
     count: int,
     t: int,
@@ -110,12 +107,10 @@ def _stolen_area(
     y: float,
     x: float,
 ) -> tuple[int, float]:
-    """Area that the site at the end of a rim edge of the cavity gives to (y, x).
-
-    The edge is the one opposite corner k of triangle t. Around its end b lie the centre of
-    the new triangle on this edge, those of the cavity's triangles at b, and the centre
-    of the new triangle on the next rim edge.
-    """
+    """Return the end b of a rim edge of the cavity, and the area that it gives to (y, x)."""
+    # The edge is the one opposite corner k of triangle t. Around b lie the centre of the new
+    # triangle on this edge, those of the cavity's triangles at b, and the centre of the new
+    # triangle on the next rim edge.
     a = vertices[t, (k + 1) % 3]
     b = vertices[t, (k + 2) % 3]
     by = points[b, 0]
@@ -158,12 +153,12 @@ def _stolen_area(
 def _interpolate_blocks(
     start: int,
     stop: int,
-    queries: Array,
+    queries: FloatArray,
     vertices: Indices,
     neighbors: Indices,
-    points: Array,
-    values: Array,
-    out: Array,
+    points: FloatArray,
+    values: FloatArray,
+    out: FloatArray,
 ) -> None:
     """Interpolate blocks `start` to `stop` of the queries."""
     n = values.shape[0]
@@ -205,23 +200,19 @@ def natural_neighbor(
     queries: ArrayLike,
     *,
     threads: int | None = None,
-) -> Array:
-    """Interpolate values at scattered sites by Sibson's natural neighbours.
+) -> FloatArray:
+    """Interpolate values at the sites of a Delaunay triangulation (zero weights).
 
     Parameters
     ----------
     triangulation : RegularTriangulation
-        Delaunay triangulation (zero weights) of the n sites.
+        Of n sites.
     values : array_like, shape (n, ...)
         Values at the sites.
     queries : array_like, shape (m, 2)
         Points (y, x) inside the hull of the sites.
     threads : int, optional
         Default: all cores. Results do not depend on it.
-
-    Returns
-    -------
-    ndarray, shape (m, ...)
 
     Examples
     --------
@@ -236,15 +227,14 @@ def natural_neighbor(
     out = np.empty((len(points), columns.shape[1]))
     for column in range(columns.shape[1]):
         result = np.empty(len(points))
+        known = (*arrays_of(triangulation), np.ascontiguousarray(columns[:, column]))
+        blocks = -(-len(points) // BLOCK)
         in_ranges(
             _interpolate_blocks,
-            -(-len(points) // BLOCK),
+            blocks,
             available_threads(threads),
             points,
-            triangulation.vertices,
-            triangulation.neighbors,
-            triangulation.points,
-            np.ascontiguousarray(columns[:, column]),
+            *known,
             result,
             smallest=2,
         )

@@ -4,11 +4,10 @@ The power diagram of sites r_i with weights w_i gives site i the cell
 
     P_i = { r : |r - r_i|² - w_i ≤ |r - r_j|² - w_j for all j }
 
-(paper, section II.B). It is the dual of the regular triangulation: a triangle's power
+(paper, sections II.B and III.A). It is the dual of the regular triangulation: a triangle's power
 centre is a corner of three cells, an edge of the triangulation crosses the border of
-two. Each border is walked once through the pixels (see
-`napari_shadowinv.geometry.density`) and added with opposite signs to its two cells, so
-the cells tile the image to rounding.
+two. Each border is walked once through the pixels and added with opposite signs to its two
+cells, so the cells tile the image to rounding.
 
 - the cells' masses, centroids and moments of inertia, and the flux through every
   border: `PowerDiagram`
@@ -17,27 +16,31 @@ the cells tile the image to rounding.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.threads import available_threads, in_ranges
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
+from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.density import Density, walk_edge
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 __all__ = ["PowerDiagram"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int32]
-
 
 @njit(nogil=True, cache=True)
 def _power_centres(
-    start: int, stop: int, points: Array, weights: Array, n: int, vertices: Indices, centres: Array
+    start: int,
+    stop: int,
+    points: FloatArray,
+    weights: FloatArray,
+    n: int,
+    vertices: Indices,
+    centres: FloatArray,
 ) -> None:
     """Find the point of equal power distance to the three sites of each triangle."""
     for t in range(start, stop):
@@ -81,24 +84,20 @@ def _integrate_edges(
     start: int,
     stop: int,
     sides: Indices,
-    centres: Array,
-    image: Array,
-    sums: Array,
+    centres: FloatArray,
+    image: FloatArray,
+    sums: FloatArray,
     with_moments: bool,
-    integrals: Array,
+    integrals: FloatArray,
 ) -> None:
     """Walk each border; columns of `integrals`: flux, mass, moments y and x, inertia."""
     for e in range(start, stop):
         left = sides[e, 0]
         right = sides[e, 1]
+        ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
+        yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
         flux, mass, moment_y, moment_x, inertia = walk_edge(
-            image,
-            sums,
-            centres[left, 0] + 0.5,
-            centres[left, 1] + 0.5,
-            centres[right, 0] + 0.5,
-            centres[right, 1] + 0.5,
-            with_moments,
+            image, sums, ya, xa, yb, xb, with_moments
         )
         integrals[e, 0] = flux
         integrals[e, 1] = mass
@@ -109,7 +108,7 @@ def _integrate_edges(
 
 
 @njit(nogil=True, cache=True)
-def _sum_over_cells(edges: Indices, integrals: Array, column: int, sums: Array) -> None:
+def _sum_over_cells(edges: Indices, integrals: FloatArray, column: int, sums: FloatArray) -> None:
     """Add one column of the edges' integrals to the two cells of each edge."""
     n = sums.shape[0]
     for e in range(edges.shape[0]):
@@ -124,8 +123,8 @@ def _sum_over_cells(edges: Indices, integrals: Array, column: int, sums: Array) 
 
 @njit(nogil=True, cache=True)
 def _laplacian(
-    points: Array, n: int, edges: Indices, integrals: Array
-) -> tuple[Array, Indices, Indices]:
+    points: FloatArray, n: int, edges: Indices, integrals: FloatArray
+) -> tuple[FloatArray, Indices, Indices]:
     """Assemble the graph Laplacian with conductance flux / (2 |r_i - r_j|) as CSR."""
     starts = np.zeros(n + 1, np.int32)
     for i in range(n):
@@ -162,14 +161,6 @@ def _laplacian(
     return values, columns, starts
 
 
-@dataclass(frozen=True)
-class _Edges:
-    """The borders between cells and the integrals along them."""
-
-    pairs: Indices
-    integrals: Array
-
-
 class PowerDiagram:
     """The power diagram that is dual to a regular triangulation, over a density.
 
@@ -184,12 +175,7 @@ class PowerDiagram:
     with_moments : bool
         Whether centroids and moments of inertia will be asked for.
     threads : int, optional
-        Threads for the integrals; default all cores. Results do not depend on it.
-
-    References
-    ----------
-    Paper, sections II.B and III.A; C.f. Aurenhammer, Hoffmann and Aronov,
-    Algorithmica 20, 61 (1998) for the transport between the cells.
+        Default: all cores. Results do not depend on it.
 
     Examples
     --------
@@ -210,74 +196,37 @@ class PowerDiagram:
         threads: int | None = None,
     ) -> None:
         self._triangulation = triangulation
-        self._density = density
         self._with_moments = with_moments
-        self._threads = available_threads(threads)
         self.n_sites = len(triangulation.sites)
         self.sites = triangulation.sites
-        self.weights: Array = np.array(triangulation.weights[: self.n_sites])
-        self.vertices: Array = self._find_vertices()
-        self._edges = self._integrate()
+        self.vertices: FloatArray = np.empty((len(triangulation.vertices), 2))
+        threads = available_threads(threads)
+        dual = triangulation.points, triangulation.weights, self.n_sites, triangulation.vertices
+        in_ranges(_power_centres, len(self.vertices), threads, *dual, self.vertices)
+        # pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside
+        self.edges, sides = _edges_of(triangulation)
+        self._integrals = np.empty((len(sides), 5 if with_moments else 2))
+        borders = sides, self.vertices, density.image, density.sums, with_moments
+        in_ranges(_integrate_edges, len(sides), threads, *borders, self._integrals)
 
-    def _find_vertices(self) -> Array:
-        triangulation = self._triangulation
-        m = len(triangulation.vertices)
-        centres = np.empty((m, 2))
-        in_ranges(
-            _power_centres,
-            m,
-            self._threads,
-            triangulation.points,
-            triangulation.weights,
-            self.n_sites,
-            triangulation.vertices,
-            centres,
-        )
-        return centres
-
-    def _integrate(self) -> _Edges:
-        pairs, sides = self._list_edges()
-        count = len(pairs)
-        integrals = np.empty((count, 5 if self._with_moments else 2))
-        in_ranges(
-            _integrate_edges,
-            count,
-            self._threads,
-            sides,
-            self.vertices,
-            self._density.image,
-            self._density.sums,
-            self._with_moments,
-            integrals,
-        )
-        return _Edges(pairs, integrals)
-
-    def _list_edges(self) -> tuple[Indices, Indices]:
-        """The two sites of each inner edge, and the triangles left and right of it."""
-        vertices, neighbors = self._triangulation.vertices, self._triangulation.neighbors
-        most = 3 * len(vertices) // 2 + 3
-        pairs, sides = np.empty((most, 2), np.int32), np.empty((most, 2), np.int32)
-        count = _list_edges(vertices, neighbors, pairs, sides)
-        return pairs[:count], sides[:count]
-
-    def _cell_sums(self, column: int) -> Array:
+    def _cell_sums(self, column: int) -> FloatArray:
         sums = np.zeros(self.n_sites)
-        _sum_over_cells(self._edges.pairs, self._edges.integrals, column, sums)
+        _sum_over_cells(self.edges, self._integrals, column, sums)
         return sums
 
     @cached_property
-    def masses(self) -> Array:
+    def masses(self) -> FloatArray:
         """Flux in each cell, shape (n,): S(V_i) or T(P_i) of the paper."""
         return self._cell_sums(1)
 
     @cached_property
-    def _first_moments(self) -> Array:
+    def _first_moments(self) -> FloatArray:
         self._need_moments()
         corner = np.stack([self._cell_sums(2), self._cell_sums(3)], axis=1)
         return corner - 0.5 * self.masses[:, None]
 
     @cached_property
-    def centroids(self) -> Array:
+    def centroids(self) -> FloatArray:
         """Centre of mass of each cell, shape (n, 2); the site where a cell is empty."""
         filled = self.masses > 0
         centroids = np.array(self.sites)
@@ -285,14 +234,14 @@ class PowerDiagram:
         return centroids
 
     @cached_property
-    def inertia(self) -> Array:
+    def inertia(self) -> FloatArray:
         """∫ |r - r_i|² I dr over each cell about its site, shape (n,)."""
         self._need_moments()
         # the walk's moments are about the image's corner, (-0.5, -0.5)
         site = self.sites + 0.5
         corner = self._first_moments + 0.5 * self.masses[:, None]
         shifted = (site**2).sum(axis=1) * self.masses - 2 * (site * corner).sum(axis=1)
-        inertia: Array = self._cell_sums(4) + shifted
+        inertia: FloatArray = self._cell_sums(4) + shifted
         return inertia
 
     def _need_moments(self) -> None:
@@ -300,14 +249,9 @@ class PowerDiagram:
             raise ValueError("this diagram was made without moments: pass with_moments=True")
 
     @property
-    def edges(self) -> Indices:
-        """Pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside."""
-        return self._edges.pairs
-
-    @property
-    def edge_fluxes(self) -> Array:
+    def edge_fluxes(self) -> FloatArray:
         """∫ I ds along the border of each pair in `edges`, shape (e,)."""
-        return self._edges.integrals[:, 0]
+        return self._integrals[:, 0]
 
     def laplacian(self) -> csr_array:
         """Return ∂T_i/∂w_j, shape (n, n): the Hessian of the paper's Eq. 6.
@@ -316,17 +260,17 @@ class PowerDiagram:
         rows sum to zero.
         """
         values, columns, starts = _laplacian(
-            self._triangulation.points, self.n_sites, self._edges.pairs, self._edges.integrals
+            self._triangulation.points, self.n_sites, self.edges, self._integrals
         )
         return csr_array((values, columns, starts), shape=(self.n_sites, self.n_sites))
 
-    def cell(self, site: int) -> Array:
+    def cell(self, site: int) -> FloatArray:
         """Return the corners of a site's cell, counter-clockwise in (y, x), shape (k, 2).
 
         Cells at the rim reach far beyond the image. An empty cell has no corners. To be asked
         before the triangulation is updated.
         """
-        pairs, sides = self._list_edges()
+        pairs, sides = _edges_of(self._triangulation)
         around = {}
         for k in np.flatnonzero((pairs == site).any(axis=1)):
             left, right = sides[k]
@@ -340,6 +284,14 @@ class PowerDiagram:
             triangle = around[triangle]
             if triangle == first:
                 return np.array(corners)
+
+
+def _edges_of(triangulation: RegularTriangulation) -> tuple[Indices, Indices]:
+    """Return the two sites of each inner edge, and the triangles left and right of it."""
+    most = 3 * len(triangulation.vertices) // 2 + 3
+    pairs, sides = np.empty((most, 2), np.int32), np.empty((most, 2), np.int32)
+    count = _list_edges(triangulation.vertices, triangulation.neighbors, pairs, sides)
+    return pairs[:count], sides[:count]
 
 
 def power_diagram(

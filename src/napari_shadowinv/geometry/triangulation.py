@@ -1,8 +1,6 @@
 """Regular triangulations that follow their weights: the dual of a power diagram.
 
 - triangulate weighted sites, or repair for new weights or places: `RegularTriangulation`
-- raise the weights of sites with empty cells until they count:
-  `RegularTriangulation.lower_hidden`
 - sort sites so that neighbours are close in memory: `hilbert_order`
 
 A site at r with weight w owns the points x where |x - r|² - w is smallest: its power cell.
@@ -29,11 +27,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._system.threads import in_ranges
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import _flips
 from napari_shadowinv.geometry._hilbert import hilbert_permutation
-from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Mesh, neighbors_of
-from napari_shadowinv.geometry._relocation import relocate
+from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Indices, Mesh
 
 __all__ = ["RegularTriangulation", "hilbert_order"]
 
@@ -50,18 +48,10 @@ STACK_SIZE = 1 << 14
 T = TypeVar("T", bound=np.generic)
 
 
-def hilbert_order(points: ArrayLike) -> NDArray[np.int32]:
-    """Sort points along a Hilbert curve: near in the order is near in the plane.
+def hilbert_order(points: ArrayLike) -> Indices:
+    """Return the permutation that sorts points along a Hilbert curve, so that neighbours stay near.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 2)
-        Coordinates.
-
-    Returns
-    -------
-    ndarray of int32, shape (n,)
-        The permutation; points in the same cell of a 2¹⁶ × 2¹⁶ grid keep their order.
+    Points in the same cell of a 2¹⁶ × 2¹⁶ grid keep their order.
 
     Raises
     ------
@@ -73,10 +63,10 @@ def hilbert_order(points: ArrayLike) -> NDArray[np.int32]:
     >>> hilbert_order([[0.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
     array([0, 2, 1, 3], dtype=int32)
     """
-    return np.asarray(hilbert_permutation(_checked_points(points)))
+    return hilbert_permutation(_checked_points(points))
 
 
-def _checked_points(points: ArrayLike) -> NDArray[np.float64]:
+def _checked_points(points: ArrayLike) -> FloatArray:
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 2 or array.shape[0] == 0:
         raise InputError(f"sites have shape {array.shape}: expected (n, 2) with at least one site")
@@ -85,7 +75,7 @@ def _checked_points(points: ArrayLike) -> NDArray[np.float64]:
     return array
 
 
-def _checked_weights(weights: ArrayLike, n: int) -> NDArray[np.float64]:
+def _checked_weights(weights: ArrayLike, n: int) -> FloatArray:
     array = np.asarray(weights, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"weights have shape {array.shape}, there are {n} sites: expected ({n},)")
@@ -94,10 +84,8 @@ def _checked_weights(weights: ArrayLike, n: int) -> NDArray[np.float64]:
     return array
 
 
-def _with_ghosts(
-    sites: NDArray[np.float64], region: ArrayLike | None
-) -> tuple[NDArray[np.float64], float]:
-    """Sites and the corners of a distant square around them and the region, and half its side."""
+def _with_ghosts(sites: FloatArray, region: ArrayLike | None) -> tuple[FloatArray, float]:
+    """Append the corners of a distant square around sites and region; return half its side too."""
     inside = sites if region is None else np.concatenate([sites, np.asarray(region, np.float64)])
     low, high = inside.min(axis=0), inside.max(axis=0)
     extent = float((high - low).max())
@@ -124,8 +112,7 @@ class RegularTriangulation:
     Parameters
     ----------
     sites : array_like, shape (n, 2)
-        Positions (y, x), in any unit. They are triangulated in Hilbert order inside; nothing has
-        to be rearranged if they come in that order (see `hilbert_order`).
+        Positions (y, x), in any unit; fastest if they come in `hilbert_order`.
     weights : array_like, shape (n,), optional
         Weights of the power diagram, in squared units of the sites; 0 by default.
     region : array_like, shape (2, 2), optional
@@ -135,7 +122,9 @@ class RegularTriangulation:
     Raises
     ------
     InputError
-        If shapes do not match or a value is not finite.
+        Here and in the methods, if shapes do not match or a value is not finite.
+    RuntimeError
+        Likewise, if the limit of flips was reached.
 
     Notes
     -----
@@ -156,11 +145,7 @@ class RegularTriangulation:
     """
 
     def __init__(
-        self,
-        sites: ArrayLike,
-        weights: ArrayLike | None = None,
-        *,
-        region: ArrayLike | None = None,
+        self, sites: ArrayLike, weights: ArrayLike | None = None, *, region: ArrayLike | None = None
     ) -> None:
         given = _checked_points(sites)
         n = given.shape[0]
@@ -173,38 +158,38 @@ class RegularTriangulation:
         self._mesh = Mesh(
             points=points,
             weights=np.zeros(n + 4),
-            corners=np.empty(6 * n + 6, dtype=np.int32),
-            twins=np.empty(6 * n + 6, dtype=np.int32),
-            hidden=np.zeros(n, dtype=np.bool_),
-            stack=np.empty(STACK_SIZE, dtype=np.int64),
-            counters=np.zeros(N_COUNTERS, dtype=np.int64),
+            corners=np.empty(6 * n + 6, np.int32),
+            twins=np.empty(6 * n + 6, np.int32),
+            hidden=np.zeros(n, np.bool_),
+            stack=np.empty(STACK_SIZE, np.int64),
+            counters=np.zeros(N_COUNTERS, np.int64),
             scratch=np.empty(16),
         )
         self._set_weights(np.zeros(n) if weights is None else _checked_weights(weights, n))
         self._build()
 
     @cached_property
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> FloatArray:
         """Positions of the sites, then of the four ghosts, shape (n + 4, 2)."""
         return _read_only(self._in_given_order(self._mesh.points))
 
     @property
-    def sites(self) -> NDArray[np.float64]:
+    def sites(self) -> FloatArray:
         """Positions of the sites, shape (n, 2)."""
         return self.points[:-4]
 
     @cached_property
-    def weights(self) -> NDArray[np.float64]:
+    def weights(self) -> FloatArray:
         """Weights of the sites, then of the four ghosts, shape (n + 4,)."""
         return _read_only(self._in_given_order(self._mesh.weights))
 
     @cached_property
-    def hidden(self) -> NDArray[np.bool_]:
+    def hidden(self) -> BoolArray:
         """Which sites have an empty cell and are no vertex, shape (n,)."""
         return _read_only(self._in_given_order(self._mesh.hidden))
 
     @cached_property
-    def vertices(self) -> NDArray[np.int32]:
+    def vertices(self) -> Indices:
         """Rows of `points` at the corners of each triangle, shape (m, 3).
 
         Counter-clockwise in that cross(p₁ - p₀, p₂ - p₀) > 0, cross(a, b) = a₀ b₁ - a₁ b₀.
@@ -216,35 +201,25 @@ class RegularTriangulation:
         return _read_only(corners.reshape(-1, 3))
 
     @cached_property
-    def neighbors(self) -> NDArray[np.int32]:
+    def neighbors(self) -> Indices:
         """Triangle across the edge opposite to each corner, shape (m, 3); -1 if there is none."""
-        return _read_only(neighbors_of(self._mesh).reshape(-1, 3))
+        twins = self._mesh.twins[: 3 * self._mesh.counters[SIZE]]
+        return _read_only((twins // 3).reshape(-1, 3))  # -1 stays -1
 
     def update(
         self, weights: ArrayLike, *, stop_when_hidden: bool = False, threads: int = 1
     ) -> bool:
-        """Repair the triangulation for new weights.
+        """Repair the triangulation for new weights; return False if it was stopped.
 
         Parameters
         ----------
         weights : array_like, shape (n,)
             New weights of the sites.
         stop_when_hidden : bool
-            Whether to stop as soon as a site that is in the triangulation is proven hidden. It
-            then stays a valid triangulation with all those sites, irregular for now, from
-            which the next update starts.
+            Whether to stop as soon as a site that is in the triangulation is proven hidden.
+            What is left is valid and has all those sites, but is irregular until the next update.
         threads : int
             Threads that look for irregular edges; the flips themselves take one.
-
-        Returns
-        -------
-        bool
-            True if the triangulation is regular for the new weights, False if it was stopped.
-
-        Raises
-        ------
-        InputError
-            If the weights are not finite or not of shape (n,).
         """
         self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
         self._forget()
@@ -264,19 +239,9 @@ class RegularTriangulation:
     def move(self, sites: ArrayLike) -> None:
         """Repair the triangulation for new places of the sites; their weights stay.
 
-        Cheap where the neighbours of most sites stay the same, as in a step of Lloyd's; else as
-        dear as a new triangulation. Copies made before keep the old places. Of sites that come
-        to the same place with the same weight any one may become the vertex.
-
-        Parameters
-        ----------
-        sites : array_like, shape (n, 2)
-            New positions (y, x).
-
-        Raises
-        ------
-        InputError
-            If the sites are not finite or not as many as before.
+        Cheap where the neighbours of most sites stay the same, as in a Lloyd step; else as slow
+        as a new triangulation. Copies made before keep the old places. Of sites that come to the
+        same place with the same weight any one may become the vertex.
         """
         given = _checked_points(sites)
         n = self._mesh.hidden.size
@@ -288,42 +253,21 @@ class RegularTriangulation:
         self._forget()
         if same_ghosts:
             self._mesh = self._mesh._replace(points=self._mesh.points.copy())
-            if relocate(self._mesh, targets) == _flips.DONE:
+            if _flips.relocate(self._mesh, targets) == _flips.DONE:
                 return
         self._mesh = self._mesh._replace(points=points)
         self._weigh_ghosts()
         self._build()
 
-    def lower_hidden(self, weights: ArrayLike) -> NDArray[np.float64]:
+    def lower_hidden(self, weights: ArrayLike) -> FloatArray:
         """Raise the weights of hidden sites by the least that makes their cells count.
 
         The lifted heights (|r|² - w) / 2 of hidden sites are lowered to the convex hull of the
         others. The triangulation is then that of the new weights, with every site in it; the
-        cells of the raised sites have no area within rounding.
-
-        Parameters
-        ----------
-        weights : array_like, shape (n,)
-            Weights of the sites.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            The new weights. Sites at the same place get the weight of the heaviest; only one
-            of them can be in the triangulation.
-
-        Notes
-        -----
-        Where rounding of a weight would leave its site above the hull, it is raised a few
-        roundings more. In clusters so tight that the weights' rounding exceeds what separates
-        the cells, this does not settle: such sites may hide again in the next `update`.
-
-        Raises
-        ------
-        InputError
-            If the weights are not finite or not of shape (n,).
-        RuntimeError
-            If the limit of flips was reached.
+        cells of the raised sites have no area within rounding. In clusters so tight that the
+        weights' rounding exceeds what separates the cells, such sites may hide again in the next
+        `update`. Sites at the same place get the weight of the heaviest; only one of them can be
+        in the triangulation. Returns the new weights.
         """
         self.update(weights)
         ghosts = np.inf
@@ -344,16 +288,8 @@ class RegularTriangulation:
         twin._order = self._order
         twin._ghost_distance = self._ghost_distance
         twin._region = self._region
-        twin._mesh = Mesh(
-            points=self._mesh.points,
-            weights=self._mesh.weights.copy(),
-            corners=self._mesh.corners.copy(),
-            twins=self._mesh.twins.copy(),
-            hidden=self._mesh.hidden.copy(),
-            stack=self._mesh.stack.copy(),
-            counters=self._mesh.counters.copy(),
-            scratch=self._mesh.scratch.copy(),
-        )
+        # `move` copies the points before it changes them
+        twin._mesh = Mesh._make([self._mesh.points, *(array.copy() for array in self._mesh[1:])])
         return twin
 
     def _build(self) -> None:
@@ -366,7 +302,7 @@ class RegularTriangulation:
             f"{self._mesh.counters[LIMIT]} flips: please report it with the sites and weights"
         )
 
-    def _set_weights(self, weights: NDArray[np.float64]) -> None:
+    def _set_weights(self, weights: FloatArray) -> None:
         self._mesh.weights[:-4] = weights if self._order is None else weights[self._order]
         self._weigh_ghosts()
 

@@ -19,9 +19,8 @@ from napari_shadowinv.geometry.natural_neighbor import natural_neighbor
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
-from napari_shadowinv.transport.potential import potential_surface
 from napari_shadowinv.transport.sites import Level, SitePlan
-from napari_shadowinv.transport.solvers import LevelSolution
+from napari_shadowinv.transport.solvers import LevelSolution, potential_surface
 
 __all__ = ["read_centroids", "read_dual", "read_out"]
 

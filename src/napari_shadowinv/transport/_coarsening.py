@@ -1,8 +1,5 @@
 """Levels of a conductor network: groups of strongly tied nodes become single nodes.
 
-- all levels for a graph Laplacian: `build_hierarchy`
-- refuse a graph in several pieces: `require_connected`
-
 Nodes that are tied strongly have nearly the same potential, so two rounds of pairing make
 groups of about four, and the coarse network has one node per group and the sums of the
 conductances between groups: again a graph Laplacian, again planar.
@@ -21,17 +18,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry._kernel import njit
-
-__all__ = ["Hierarchy", "Network", "build_hierarchy", "require_connected"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int32]
-Offsets = NDArray[np.int64]
+from napari_shadowinv.geometry._mesh import Indices
 
 _COARSEST = 60
 _WEAKEST_TIE = 0.2
@@ -48,19 +40,19 @@ class Network(NamedTuple):
     starts: Indices
     middles: Indices
     neighbors: Indices
-    conductances: Array
-    degrees: Array
-    inverse_degrees: Array
+    conductances: FloatArray
+    degrees: FloatArray
+    inverse_degrees: FloatArray
 
 
 class Hierarchy(NamedTuple):
     """All that one cycle needs: the nodes of level k are `bounds[k]` to `bounds[k + 1]`."""
 
-    bounds: Offsets
-    twice: NDArray[np.bool_]
+    bounds: IntArray
+    twice: BoolArray
     network: Network
     parents: Indices
-    inverse: Array
+    inverse: FloatArray
 
 
 def _empty_network(nodes: int, entries: int) -> Network:
@@ -76,7 +68,7 @@ def _empty_network(nodes: int, entries: int) -> Network:
 
 @njit(nogil=True, cache=True)
 def _put_lower_first(
-    neighbors: Indices, conductances: Array, begin: int, end: int, node: int
+    neighbors: Indices, conductances: FloatArray, begin: int, end: int, node: int
 ) -> tuple[int, float]:
     """Sort a row to lower and upper neighbours; return where the upper begin, and the sum."""
     middle = begin
@@ -94,7 +86,9 @@ def _put_lower_first(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _read_laplacian(starts: Indices, columns: Indices, values: Array, network: Network) -> None:
+def _read_laplacian(
+    starts: Indices, columns: Indices, values: FloatArray, network: Network
+) -> None:
     """Take the conductors out of a sparse matrix, in any order of columns."""
     neighbors = network.neighbors
     conductances = network.conductances
@@ -119,20 +113,18 @@ def _pair(
     start: int,
     stop: int,
     weakest: float,
-    inverses: Array,
+    inverses: FloatArray,
     groups: Indices,
     first: int,
-    group_inverses: Array,
+    group_inverses: FloatArray,
 ) -> int:
-    """Group each node with a free neighbour, or with a group; groups count from `first`.
-
-    A tie is a conductance times the sum of the inverses of the two sides' degrees, where a
-    group's degree is the sum over the nodes of the level it stands for (Napov and Notay,
-    Eq. 3.6, for rows that sum to zero). The inverses are given for the nodes and found for
-    the groups. Nodes without a tie of at least `weakest` stay alone: where both sides are
-    held much more strongly by others, the sweeps do not smooth an error that differs between
-    them. Returns the number after the last group.
-    """
+    """Group each node with a free neighbour or a group; return the number after the last group."""
+    # A tie is a conductance times the sum of the inverses of the two sides' degrees, where a
+    # group's degree is the sum over the nodes of the level it stands for (Napov and Notay,
+    # Eq. 3.6, for rows that sum to zero). The inverses are given for the nodes and found for
+    # the groups. Nodes without a tie of at least `weakest` stay alone: where both sides are
+    # held much more strongly by others, the sweeps do not smooth an error that differs between
+    # them.
     # the attributes are looked up once because each look-up counts references
     starts, _, neighbors, conductances, _, _ = network
     for i in range(start, stop):
@@ -197,13 +189,7 @@ def _list_members(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _contract(
-    fine: Network,
-    start: int,
-    stop: int,
-    groups: Indices,
-    coarse: Network,
-    first: int,
-    last: int,
+    fine: Network, start: int, stop: int, groups: Indices, coarse: Network, first: int, last: int
 ) -> None:
     """Make each group one node, with the sums of the conductances between groups."""
     begins, members = _list_members(start, stop, groups, first, last)
@@ -235,28 +221,8 @@ def _contract(
         coarse.inverse_degrees[g] = 1.0 / degree
 
 
-@njit(nogil=True, cache=True)
-def _compose(start: int, stop: int, groups: Indices, parents: Indices) -> None:
-    """Replace each node's group by that group's parent."""
-    for i in range(start, stop):
-        groups[i] = parents[groups[i]]
-
-
-def build_hierarchy(laplacian: csr_array, ground: Array | None = None) -> Hierarchy:
-    """Group nodes, and groups of nodes, until few are left.
-
-    Parameters
-    ----------
-    laplacian : csr_array, shape (n, n)
-        The graph Laplacian.
-    ground : ndarray, shape (n,), optional
-        Conductance from each node to a ground at potential 0; none by default.
-
-    Raises
-    ------
-    RuntimeError
-        The graph is not connected or a conductance is not finite.
-    """
+def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> Hierarchy:
+    """Group nodes, and groups of nodes, until few are left; see `LaplacianSolver`."""
     n = int(laplacian.shape[0])
     # every level has at most three quarters of the nodes of the last, so 4 n are enough;
     # pages that are never touched take no memory
@@ -286,7 +252,7 @@ def build_hierarchy(laplacian: csr_array, ground: Array | None = None) -> Hierar
     )
 
 
-def _tie_to_ground(network: Network, start: int, ground: Array | None) -> None:
+def _tie_to_ground(network: Network, start: int, ground: FloatArray | None) -> None:
     """Add conductances to a ground at potential 0; the nodes from `start` on have them."""
     if ground is not None:
         nodes = slice(start, start + len(ground))
@@ -295,10 +261,7 @@ def _tie_to_ground(network: Network, start: int, ground: Array | None) -> None:
 
 
 def _add_level(network: Network, parents: Indices, start: int, stop: int) -> tuple[Network, int]:
-    """Pair the nodes of the last level, pair the pairs, append what results.
-
-    Returns the network, which may have moved to make room, and its new number of nodes.
-    """
+    """Pair the last level's nodes, pair the pairs; return the network and its number of nodes."""
     if stop - start > 1 and not network.degrees[start:stop].min() > 0.0:
         raise RuntimeError(_NOT_CONNECTED)
     inverses = np.empty(stop - start)
@@ -314,7 +277,7 @@ def _add_level(network: Network, parents: Indices, start: int, stop: int) -> tup
     last = _pair(pairs, 0, count, _WEAKEST_TIE, inverses, groups, stop, np.empty(count))
     network = _with_room(network, network.starts[stop] + pairs.starts[count])
     _contract(pairs, 0, count, groups, network, stop, last)
-    _compose(start, stop, parents, groups)
+    parents[start:stop] = groups[parents[start:stop]]
     return network, last
 
 
@@ -329,7 +292,7 @@ def _with_room(network: Network, entries: int) -> Network:
     )
 
 
-def _choose_second_steps(network: Network, bounds: list[int]) -> NDArray[np.bool_]:
+def _choose_second_steps(network: Network, bounds: list[int]) -> BoolArray:
     """Tell at which levels a cycle does two steps: where all visits cost less than level 0."""
     entries = np.diff(network.starts[bounds])
     twice = np.zeros(len(entries), np.bool_)
@@ -341,7 +304,7 @@ def _choose_second_steps(network: Network, bounds: list[int]) -> NDArray[np.bool
     return twice
 
 
-def _invert_coarsest(network: Network, start: int, stop: int, *, grounded: bool) -> Array:
+def _invert_coarsest(network: Network, start: int, stop: int, *, grounded: bool) -> FloatArray:
     """Invert the last level's Laplacian; without a ground, with constants made regular."""
     entries = slice(network.starts[start], network.starts[stop])
     graph = csr_array(
@@ -357,7 +320,7 @@ def _invert_coarsest(network: Network, start: int, stop: int, *, grounded: bool)
     regular = np.diag(degrees) - graph.toarray()
     if not grounded:
         regular += (degrees.mean() or 1.0) / (stop - start)
-    inverse: Array = np.linalg.inv(regular)
+    inverse: FloatArray = np.linalg.inv(regular)
     return inverse
 
 

@@ -18,17 +18,16 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.transport.newton import newton, with_full_cells
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 from napari_shadowinv.transport.sites import Level
 
 __all__ = ["blurred", "sharpen"]
 
-Array = NDArray[np.float64]
 Soften = Callable[[Level, float, int], TransportObjective]
 
 _WIDEST = 1 / 6  # of the image's longer side
@@ -45,21 +44,11 @@ _SHARES_OF_PREDICTION = (1.0, 0.5, 0.25)
 _LEAST_OF_PREDICTION = 1e-2  # of the smallest flux to reach
 
 
-def blurred(image: Array, width: float) -> Array:
-    """Let an image's flux diffuse, mirrored at the border.
+def blurred(image: FloatArray, width: float) -> FloatArray:
+    """Let a positive image's flux diffuse to a standard deviation in px, mirrored at the border.
 
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-        Positive.
-    width : float
-        Standard deviation in px.
-
-    Returns
-    -------
-    ndarray, shape (H, W)
-        Positive, with the same sum: the kernel is the discrete Gaussian, which solves the
-        diffusion equation on the pixels, and has no negative lobes at any width.
+    The kernel is the discrete Gaussian, which solves the diffusion equation on the pixels: the
+    sum stays, and there are no negative lobes at any width.
 
     References
     ----------
@@ -70,7 +59,7 @@ def blurred(image: Array, width: float) -> Array:
         waves = np.pi * np.arange(image.shape[axis]) / image.shape[axis]
         damping = np.exp(-(width**2) * (1 - np.cos(waves)))
         spectrum *= np.expand_dims(damping, 1 - axis)
-    diffused: Array = np.maximum(idctn(spectrum), image.min())
+    diffused: FloatArray = np.maximum(idctn(spectrum), image.min())
     diffused *= image.sum() / diffused.sum()
     return diffused
 
@@ -86,27 +75,10 @@ def sharpen(
 ) -> Solution:
     """Solve one level from zero weights by following the solution from a blurred image.
 
-    Parameters
-    ----------
-    level : Level
-        The sites.
-    sharp : TransportObjective
-        What is to be solved.
-    soften : callable
-        Makes the objective for the level of split pixels, the blur in those pixels, and the
-        parts of a pixel's side (see `Level.split`).
-    tolerance : float
-        Largest relative flux error allowed in any cell.
-    max_iterations : int
-        Most Newton steps, on all blurred images together.
-    report : Reporter, optional
-        Told of each step.
-
-    Returns
-    -------
-    Solution
-        Where the sharp image could not be reached, that of the sharpest one that was; the
-        reason then tells its blur. Where the sharp image was nearly solved, that solution.
+    `soften` makes the objective for the level of split pixels, the blur in those pixels, and the
+    parts of a pixel's side (see `Level.split`). The iterations count on all images together.
+    Where the sharp image could not be reached, the solution is that of the sharpest one that was,
+    and the reason tells its blur; where the sharp image was nearly solved, that solution.
     """
     solved: list[_Solved] = []
     nearest: Solution | None = None
@@ -150,7 +122,7 @@ def sharpen(
 
 
 def _parts(width: float, shape: tuple[int, int]) -> int:
-    """Return into how many parts the side of a pixel is split for a blur of so many px."""
+    """Return into how many parts a pixel's side is split for a blur of so many px."""
     parts = 1
     while (
         0 < width * parts < _SMOOTH
@@ -165,7 +137,7 @@ class _Solved(NamedTuple):
     """A blur in px and the weights that solve the image with it."""
 
     width: float
-    weights: Array
+    weights: FloatArray
 
 
 def _next_width(
@@ -183,7 +155,7 @@ def _next_width(
 
 def _starts(
     objective: TransportObjective, level: Level, width: float, solved: list[_Solved]
-) -> Iterator[Array]:
+) -> Iterator[FloatArray]:
     """Yield the weights to start from, the most promising first."""
     if not solved:
         yield np.zeros(len(level.sites))
@@ -204,7 +176,7 @@ def _starts(
     yield last.weights
 
 
-def _same_moments(level: Level, image: Array) -> Array:
+def _same_moments(level: Level, image: FloatArray) -> FloatArray:
     """Return the weights of the affine map that gives the source the image's first two moments."""
     pixels = np.indices(image.shape).reshape(2, -1).T.astype(np.float64)
     centre, spread = _moments(level.sites, level.mass)
@@ -218,7 +190,7 @@ def _same_moments(level: Level, image: Array) -> Array:
     return np.asarray(stretch - 2 * (away * (image_centre - centre)).sum(axis=1))
 
 
-def _moments(points: Array, flux: Array) -> tuple[Array, Array]:
+def _moments(points: FloatArray, flux: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the centre of flux and the covariance, that of a pixel included."""
     share = (flux / flux.sum())[:, None]
     centre = (share * points).sum(axis=0)
@@ -226,17 +198,14 @@ def _moments(points: Array, flux: Array) -> tuple[Array, Array]:
     return centre, np.einsum("ni,nj->ij", share * away, away) + np.eye(2) / 12
 
 
-def _square_root(matrix: Array) -> Array:
+def _square_root(matrix: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(matrix)
-    root: Array = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
+    root: FloatArray = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
     return root
 
 
 def _blurred_answer(
-    sharp: TransportObjective,
-    solved: list[_Solved],
-    level: Level,
-    tolerance: float,
+    sharp: TransportObjective, solved: list[_Solved], level: Level, tolerance: float
 ) -> Solution:
     """Return the sharpest solution that was found, and how far it is from the sharp image's."""
     width, weights = solved[-1] if solved else _Solved(np.inf, np.zeros(len(level.sites)))

@@ -10,24 +10,21 @@ potential runs on smoothly across the edge.
 
 - the beam in the margin: `Margin`
 - flux that crosses each side of the image: `edge_flux`
-- the transport with this boundary: `napari_shadowinv.transport.open_objective`
+- the transport with this boundary: `napari_shadowinv.transport.objective.OpenObjective`
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.geometry.density import split_pixels
 
 __all__ = ["Margin", "edge_flux"]
-
-Array = NDArray[np.float64]
 
 _SIDES = ("top", "bottom", "left", "right")
 
@@ -44,22 +41,12 @@ class Margin:
         Pixels m on each side.
     """
 
-    beam: Array
+    beam: FloatArray
     width: int
 
     @classmethod
-    def around(cls, source: Array, width: int, mask: NDArray[np.bool_] | None = None) -> Margin:
-        """Continue a source beyond its edge by its nearest usable pixel.
-
-        Parameters
-        ----------
-        source : ndarray, shape (H, W)
-            Positive somewhere.
-        width : int
-            Pixels to add on each side.
-        mask : ndarray of bool, shape (H, W), optional
-            True where the source can be relied on.
-        """
+    def around(cls, source: FloatArray, width: int, mask: BoolArray | None = None) -> Margin:
+        """Continue a source by its nearest positive pixel, of those in the mask if there is one."""
         usable = source > 0 if mask is None else mask & (source > 0)
         rows, columns = distance_transform_edt(
             np.pad(~usable, width, constant_values=True),
@@ -75,36 +62,28 @@ class Margin:
         """Return the same beam for pixels that are split into factor × factor."""
         return Margin(split_pixels(self.beam, factor), factor * self.width)
 
-    def within(self, values: Array) -> Array:
+    def within(self, values: FloatArray) -> FloatArray:
         """Return the part of an array that belongs to the image; its last axes are y and x."""
         m = self.width
         return values[..., m:-m, m:-m]
 
-    def parts(self, source: Array) -> tuple[Array, Array]:
+    def parts(self, source: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return a source of the image, and the beam of the margin, each alone in the whole."""
         image_part = np.zeros_like(self.beam)
         self.within(image_part)[:] = source
         return image_part, np.where(self.beyond, self.beam, 0)
 
     @cached_property
-    def beyond(self) -> NDArray[np.bool_]:
+    def beyond(self) -> BoolArray:
         """Where the margin is, shape (H + 2 m, W + 2 m)."""
         beyond = np.ones(self.beam.shape, bool)
         self.within(beyond)[:] = False
         return beyond
 
-    def edge_distance(self, points: NDArray[Any]) -> Array:
-        """How far inside each side of the image points lie, px.
+    def edge_distance(self, points: AnyArray) -> FloatArray:
+        """Return how far inside each side points (y, x) of the whole lie, px; negative beyond.
 
-        Parameters
-        ----------
-        points : ndarray, shape (..., 2)
-            Positions (y, x), counted from the margin's corner.
-
-        Returns
-        -------
-        ndarray, shape (..., 4)
-            From top, bottom, left and right; negative beyond.
+        The last axis counts top, bottom, left and right, shape (..., 4).
         """
         first = self.width - 0.5
         last = np.array(self.beam.shape) - 1 - first
@@ -113,30 +92,18 @@ class Margin:
 
 
 def edge_flux(
-    left_behind: Array, arrived: Array, margin: Margin
+    left_behind: FloatArray, arrived: FloatArray, margin: Margin
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Sort the flux that has crossed the image's edge by the nearest side.
 
-    Parameters
-    ----------
-    left_behind : ndarray, shape (H + 2 m, W + 2 m)
-        Where the image's share of the source has landed.
-    arrived : ndarray, shape (H + 2 m, W + 2 m)
-        Where the margin's share has landed.
-    margin : Margin
-        The beam.
-
-    Returns
-    -------
-    left, entered : dict of str to float
-        For each of the sides top, bottom, left and right the flux, as a share of the source's
-        flux in the image.
+    The image's share of the source has landed as `left_behind`, the margin's as `arrived`.
+    Returns what left and what entered at each side, as a share of the source's flux in the image.
     """
     pixels = np.moveaxis(np.indices(margin.beam.shape), 0, -1)
     nearest = margin.edge_distance(pixels).argmin(axis=-1)
     total = margin.within(margin.beam).sum()
 
-    def by_side(flux: Array) -> dict[str, float]:
+    def by_side(flux: FloatArray) -> dict[str, float]:
         shares = np.bincount(nearest.ravel(), flux.ravel(), minlength=4) / total
         return dict(zip(_SIDES, shares.tolist(), strict=True))
 

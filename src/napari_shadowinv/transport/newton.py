@@ -14,15 +14,14 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 
 __all__ = ["SHORTEST_STEP", "newton", "with_full_cells"]
 
-Array = NDArray[np.float64]
 
 SHORTEST_STEP = 1e-7
 
@@ -34,7 +33,7 @@ _LEAST_START = 1e-12  # of a mean cell's flux
 
 def newton(
     objective: TransportObjective,
-    weights: Array,
+    weights: FloatArray,
     *,
     tolerance: float,
     max_iterations: int,
@@ -43,26 +42,9 @@ def newton(
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
 
-    It gives up early where the error has not halved in many steps: the start was a bad one.
-
-    Parameters
-    ----------
-    objective : TransportObjective
-        The problem.
-    weights : ndarray, shape (n,)
-        Start; every cell must hold flux.
-    tolerance : float
-        Largest relative flux error allowed in any cell.
-    max_iterations : int
-        Most steps.
-    shortest_step : float
-        It gives up where it would have to go less than this share of Newton's step.
-    report : Reporter, optional
-        Told of each step.
-
-    Returns
-    -------
-    Solution
+    Every cell must hold flux at the start. It gives up where the error has not halved in many
+    steps (the start was a bad one), and where less than `shortest_step` of Newton's step would
+    be possible. The tolerance is the largest relative flux error of a cell.
     """
     mass = objective.mass
     diagram = objective.diagram(weights)
@@ -84,15 +66,8 @@ def newton(
             reason = f"Newton's system cannot be solved: {error}"
             break
         del laplacian
-        damped = _damped_step(
-            objective,
-            weights,
-            step,
-            gap,
-            keep * mass.mean(),
-            (first, shortest_step),
-            alive,
-        )
+        shares = (first, shortest_step)
+        damped = _damped_step(objective, weights, step, gap, keep * mass.mean(), shares, alive)
         if damped is None:
             reason = "no step along Newton's direction lowers the error without emptying a cell"
             break
@@ -110,13 +85,13 @@ def newton(
 
 def _damped_step(
     objective: TransportObjective,
-    weights: Array,
-    step: Array,
-    gap: Array,
+    weights: FloatArray,
+    step: FloatArray,
+    gap: FloatArray,
     least: float,
     shares: tuple[float, float],
     alive: Callable[[], None],
-) -> tuple[Array, PowerDiagram, float] | None:
+) -> tuple[FloatArray, PowerDiagram, float] | None:
     """Halve the share of the step until all cells keep some flux and the error falls."""
     error = _length(gap)
     share, shortest = shares
@@ -133,27 +108,16 @@ def _damped_step(
     return None
 
 
-def _length(vector: Array) -> float:
+def _length(vector: FloatArray) -> float:
     """Return the length without BLAS, whose idle threads spin and whose sums depend on them."""
     return float(np.sqrt(np.sum(vector * vector)))
 
 
-def with_full_cells(objective: TransportObjective, weights: Array) -> Array:
+def with_full_cells(objective: TransportObjective, weights: FloatArray) -> FloatArray:
     """Find weights near the given ones for which every cell holds some flux.
 
     Hidden sites are lowered to where they just show; then a little of the zero weights,
     for which every cell is round and full, is mixed in.
-
-    Parameters
-    ----------
-    objective : TransportObjective
-        The problem.
-    weights : ndarray, shape (n,)
-        Any weights, px².
-
-    Returns
-    -------
-    ndarray, shape (n,)
     """
     shown = objective.triangulation.lower_hidden(weights)
     for share in _SHARES_OF_START:

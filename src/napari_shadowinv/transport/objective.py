@@ -3,7 +3,8 @@
     f(w) = -Σ_i [ w_i S_i + ∫_{P_i} (|r - r_i|² - w_i) I dr ],
     ∂f/∂w_i = T_i - S_i,   ∂²f/∂w_i∂w_j = -∫_{P_i ∩ P_j} I ds / (2 |r_i - r_j|)
 
-- f, its gradient and its Hessian at given weights: `TransportObjective`
+- f, its gradient and its Hessian at given weights: `TransportObjective`; where flux may cross
+  the image's edge: `OpenObjective`
 - what a solver returns: `Solution`
 
 References
@@ -16,43 +17,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.spatial import KDTree
 
 from napari_shadowinv._system.threads import available_threads
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.linear import solve_laplacian
+from napari_shadowinv.transport.margin import Margin
+from napari_shadowinv.transport.sites import Level
 
-__all__ = ["Solution", "TransportObjective"]
-
-Array = NDArray[np.float64]
+__all__ = ["OpenObjective", "Solution", "TransportObjective"]
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Weights of one level and how they were reached.
+    """Weights of one level and how they were reached."""
 
-    Attributes
-    ----------
-    weights : ndarray, shape (n,)
-        px²; of mean zero, but where the boundary is free.
-    residual : float
-        Largest relative flux error of a cell.
-    iterations : int
-        Steps of the solver.
-    converged : bool
-        Whether the residual is within the tolerance.
-    reason : str
-        Why it did not converge; empty if it did.
-    """
-
-    weights: Array
-    residual: float
+    weights: FloatArray  # shape (n,), px²; of mean zero, but where the boundary is free
+    residual: float  # largest relative flux error of a cell
     iterations: int
-    converged: bool
-    reason: str = ""
+    converged: bool  # whether the residual is within the tolerance
+    reason: str = ""  # why it did not converge
 
 
 class TransportObjective:
@@ -67,13 +55,13 @@ class TransportObjective:
     image : Density
         The image.
     threads : int, optional
-        Threads of the kernels; results do not depend on it.
+        Default: all cores. Results do not depend on it.
     """
 
     def __init__(
         self,
         triangulation: RegularTriangulation,
-        mass: Array,
+        mass: FloatArray,
         image: Density,
         *,
         threads: int | None = None,
@@ -83,7 +71,7 @@ class TransportObjective:
         self.image = image
         self.threads = threads
 
-    def diagram(self, weights: Array, *, with_moments: bool = False) -> PowerDiagram:
+    def diagram(self, weights: FloatArray, *, with_moments: bool = False) -> PowerDiagram:
         """Return the power diagram for `weights`; empty cells are allowed."""
         self.triangulation.update(weights, threads=available_threads(self.threads))
         return PowerDiagram(
@@ -93,63 +81,91 @@ class TransportObjective:
             threads=self.threads,
         )
 
-    def diagram_if_full(self, weights: Array) -> PowerDiagram | None:
+    def diagram_if_full(self, weights: FloatArray) -> PowerDiagram | None:
         """Return the power diagram for `weights`, or None as soon as a cell proves empty."""
         threads = available_threads(self.threads)
         if not self.triangulation.update(weights, stop_when_hidden=True, threads=threads):
             return None
         return PowerDiagram(self.triangulation, self.image_for(weights), threads=self.threads)
 
-    def image_for(self, weights: Array) -> Density:
+    def image_for(self, weights: FloatArray) -> Density:
         """Return the image that the cells divide among themselves."""
         return self.image
 
     def newton_step(
-        self, laplacian: csr_array, weights: Array, gap: Array, tolerance: float
-    ) -> Array:
-        """Return the change of the weights that closes the gap to first order.
+        self, laplacian: csr_array, weights: FloatArray, gap: FloatArray, tolerance: float
+    ) -> FloatArray:
+        """Return the change of the weights that fills what each cell lacks to first order.
 
-        Parameters
-        ----------
-        laplacian : csr_array, shape (n, n)
-            Of the diagram for these weights.
-        weights : ndarray, shape (n,)
-            Where the step starts, px².
-        gap : ndarray, shape (n,)
-            Flux that each cell lacks.
-        tolerance : float
-            Relative residual of the linear system.
-
-        Raises
-        ------
-        RuntimeError
-            The cells fall into groups with no flux between them.
+        The Laplacian is that of the diagram for these weights. Raises a RuntimeError where the
+        cells fall into groups with no flux between them.
         """
         return solve_laplacian(laplacian, gap, tolerance, available_threads(self.threads))
 
-    def in_gauge(self, weights: Array) -> Array:
+    def in_gauge(self, weights: FloatArray) -> FloatArray:
         """Fix the constant that the weights are known up to: their mean is zero."""
-        centred: Array = weights - weights.mean()
+        centred: FloatArray = weights - weights.mean()
         return centred
 
-    def value_and_gradient(self, weights: Array) -> tuple[float, Array]:
-        """Return f(w) and its gradient T - S (paper, Eqs. 5 and 6).
-
-        Parameters
-        ----------
-        weights : ndarray, shape (n,)
-            Weights in px².
-
-        Returns
-        -------
-        value : float
-        gradient : ndarray, shape (n,)
-        """
+    def value_and_gradient(self, weights: FloatArray) -> tuple[float, FloatArray]:
+        """Return f(w) and its gradient T - S (paper, Eqs. 5 and 6)."""
         diagram = self.diagram(weights, with_moments=True)
         gradient = diagram.masses - self.mass
-        value = float(np.sum(weights * gradient - diagram.inertia))
-        return value, gradient
+        return float(np.sum(weights * gradient - diagram.inertia)), gradient
 
     def residual(self, diagram: PowerDiagram) -> float:
         """Return the largest relative flux error of a cell, max |T - S| / S."""
         return float(np.max(np.abs(diagram.masses - self.mass) / self.mass))
+
+
+class OpenObjective(TransportObjective):
+    """The function for a level over image and margin, which receives what the potential asks for.
+
+    The decay length ℓ is in px; see `napari_shadowinv.transport.margin`.
+    """
+
+    def __init__(
+        self,
+        level: Level,
+        image: FloatArray,
+        margin: Margin,
+        decay_length: float,
+        *,
+        threads: int | None = None,
+    ) -> None:
+        self._pixels = margin.beam.copy()
+        margin.within(self._pixels)[:] = image
+        super().__init__(
+            level.triangulation.copy(),
+            level.mass,
+            Density.from_image(self._pixels),
+            threads=threads,
+        )
+        self._beyond = np.nonzero(margin.beyond)
+        self._beam = margin.beam[self._beyond]
+        self._site = KDTree(level.sites).query(
+            np.stack(self._beyond, axis=1), workers=available_threads(threads)
+        )[1]
+        self._gain = 0.5 / decay_length**2  # the potential is half the weight
+
+    def image_for(self, weights: FloatArray) -> Density:
+        """Return the image with what arrives around it."""
+        excess = self._gain * weights[self._site]
+        # 1 + x where that is more than 1, else eˣ, which is never negative
+        share = np.where(excess > 0, 1 + excess, np.exp(np.minimum(excess, 0)))
+        self._pixels[self._beyond] = self._beam * share
+        return Density.from_image(self._pixels)
+
+    def newton_step(
+        self, laplacian: csr_array, weights: FloatArray, gap: FloatArray, tolerance: float
+    ) -> FloatArray:
+        """Take into account that more weight in the margin brings more flux."""
+        excess = self._gain * weights[self._site]
+        slope = self._gain * self._beam * np.exp(np.minimum(excess, 0))
+        ground = np.bincount(self._site, slope, len(weights)).astype(np.float64)
+        threads = available_threads(self.threads)
+        return solve_laplacian(laplacian, gap, tolerance, threads, ground=ground)
+
+    def in_gauge(self, weights: FloatArray) -> FloatArray:
+        """Return the weights as they are: far outside they are zero."""
+        return weights

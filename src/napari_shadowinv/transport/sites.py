@@ -2,7 +2,7 @@
 
 - drop sites by rejection: `sample_sites`
 - even them out: `lloyd`
-- all levels of a multilevel solution, ready to use: `plan_sites`
+- all levels of a multilevel solution, ready to use: `plan_levels`
 
 References
 ----------
@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._system.threads import available_threads
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry._kernel import njit
+from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import mirrored_across_border
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
@@ -32,7 +34,6 @@ from napari_shadowinv.transport.margin import Margin
 
 __all__ = ["Level", "SitePlan", "lloyd", "plan_levels", "sample_sites"]
 
-Array = NDArray[np.float64]
 
 COARSEST = 600  # sites with which the solver can start from zero weights
 RATIO = 4  # sites of a level per site of the next coarser one
@@ -43,24 +44,14 @@ _MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between site
 
 @dataclass(frozen=True)
 class Mirrored:
-    """Sites and the mirror images of those near the image's border.
-
-    Attributes
-    ----------
-    triangulation : RegularTriangulation
-        Delaunay triangulation of sites and mirror images; it covers the whole image.
-    origin : ndarray of int32, shape (n + k,)
-        The site that each point is, or is the mirror image of.
-    sense : ndarray of int8, shape (n + k, 2)
-        -1 for the axes along which a point was mirrored, else 1.
-    """
+    """Sites and the mirror images of those near the image's border, which cover the image."""
 
     triangulation: RegularTriangulation
-    origin: NDArray[np.int32]
-    sense: NDArray[np.int8]
+    origin: Indices  # the site that each point is, or is the mirror image of
+    sense: NDArray[np.int8]  # (y, x): -1 for the axes along which a point was mirrored, else 1
 
     @classmethod
-    def from_sites(cls, sites: Array, shape: tuple[int, int]) -> Mirrored:
+    def from_sites(cls, sites: FloatArray, shape: tuple[int, int]) -> Mirrored:
         """Mirror the sites of an image of shape (H, W)."""
         band = _MIRROR_BAND * _spacing(shape, len(sites))
         images, origin, sense = mirrored_across_border(sites, shape, band)
@@ -69,9 +60,7 @@ class Mirrored:
         origins = np.concatenate([np.arange(len(sites)), origin])[order]
         senses = np.concatenate([np.ones_like(sites), sense])[order]
         return cls(
-            RegularTriangulation(points[order]),
-            origins.astype(np.int32),
-            senses.astype(np.int8),
+            RegularTriangulation(points[order]), origins.astype(np.int32), senses.astype(np.int8)
         )
 
 
@@ -95,9 +84,9 @@ class Level:
         Lloyd steps that were made.
     """
 
-    sites: Array
-    mass: Array
-    centroids: Array
+    sites: FloatArray
+    mass: FloatArray
+    centroids: FloatArray
     triangulation: RegularTriangulation
     shape: tuple[int, int]
     lloyd_iterations: int
@@ -113,18 +102,7 @@ class Level:
         return Mirrored.from_sites(self.sites, self.shape)
 
     def split(self, factor: int) -> Level:
-        """Return the same sites for an image whose pixels are split.
-
-        Parameters
-        ----------
-        factor : int
-            Each pixel becomes factor × factor.
-
-        Returns
-        -------
-        Level
-            Positions count in the smaller pixels.
-        """
+        """Return the same sites, in px of an image whose pixels are split into factor × factor."""
         if factor == 1:
             return self
         height, width = factor * self.shape[0], factor * self.shape[1]
@@ -158,9 +136,9 @@ class SitePlan:
         Flux of the source that the levels' masses count as 1.
     """
 
-    source: Array
+    source: FloatArray
     levels: tuple[Level, ...]
-    mask: NDArray[np.bool_] | None = None
+    mask: BoolArray | None = None
     margin: Margin | None = None
     unit: float = 1.0
 
@@ -169,26 +147,23 @@ class SitePlan:
         """Pixels by which the levels' coordinates exceed those of the image."""
         return 0 if self.margin is None else self.margin.width
 
-    def within(self, values: Array) -> Array:
+    def within(self, values: FloatArray) -> FloatArray:
         """Return the image's part of an array that covers what the levels cover."""
         return values if self.margin is None else self.margin.within(values)
 
 
 @njit(nogil=True, cache=True)
-def _accepted(source: Array, first: int, count: int, shift: Array, sites: Array) -> int:
-    """Throw points of an even sequence at the source; keep them by its brightness.
-
-    The positions are the Kronecker sequence of the real root of x³ = x + 1, which leaves
-    fewer gaps and clumps than independent random points; the golden ratio's decides
-    what to keep.
-    """
+def _accepted(source: FloatArray, shift: FloatArray, sites: FloatArray) -> None:
+    """Throw points of an even sequence at the source; keep them by its brightness."""
+    # The positions are the Kronecker sequence of the real root of x³ = x + 1, which leaves
+    # fewer gaps and clumps than independent random points; the golden ratio's decides
+    # what to keep.
     root = 1.3247179572447460
     golden = 1.6180339887498949
     height, width = source.shape
     brightest = source.max()
-    kept = 0
-    number = first
-    while kept < count:
+    kept = number = 0
+    while kept < len(sites):
         number += 1
         u = (shift[0] + number / root) % 1.0
         v = (shift[1] + number / root**2) % 1.0
@@ -199,25 +174,12 @@ def _accepted(source: Array, first: int, count: int, shift: Array, sites: Array)
             sites[kept, 0] = y - 0.5
             sites[kept, 1] = x - 0.5
             kept += 1
-    return number
 
 
-def sample_sites(source: Array, n_sites: int, seed: int = 0) -> Array:
+def sample_sites(source: FloatArray, n_sites: int, seed: int = 0) -> FloatArray:
     """Deploy sites on the source by rejection: bright places keep more of them.
 
-    Parameters
-    ----------
-    source : ndarray, shape (H, W)
-        Non-negative, with some positive pixel.
-    n_sites : int
-        How many.
-    seed : int
-        Shifts the sequence of positions.
-
-    Returns
-    -------
-    ndarray, shape (n_sites, 2)
-        Positions (y, x), in the order of a Hilbert curve.
+    The seed shifts the sequence of positions. They come in the order of a Hilbert curve.
 
     References
     ----------
@@ -226,7 +188,7 @@ def sample_sites(source: Array, n_sites: int, seed: int = 0) -> Array:
     """
     sites = np.empty((n_sites, 2))
     shift = np.random.default_rng(seed).random(3)
-    _accepted(np.ascontiguousarray(source, dtype=np.float64), 0, n_sites, shift, sites)
+    _accepted(np.ascontiguousarray(source, dtype=np.float64), shift, sites)
     return np.ascontiguousarray(sites[hilbert_order(sites)])
 
 
@@ -241,28 +203,10 @@ def lloyd(
 ) -> tuple[PowerDiagram, int]:
     """Move each site to the centroid of its Voronoi cell, again and again.
 
-    Parameters
-    ----------
-    triangulation : RegularTriangulation
-        Of the sites, without weights; it is moved along with them.
-    source : Density
-        Weighs the centroids.
-    iterations : int
-        Most steps.
-    tolerance : float
-        The steps end when the root mean square distance of sites from centroids is below
-        this, in units of the mean spacing of the sites.
-    threads : int, optional
-        Threads of the kernels.
-    report : callable, optional
-        Told before each step how many were made, and the number of sites.
-
-    Returns
-    -------
-    diagram : PowerDiagram
-        Of the sites where they are now, with moments.
-    steps : int
-        Steps that were made.
+    The triangulation, without weights, is moved along with the sites. The steps end when the
+    root mean square distance of sites from centroids is below the tolerance, in units of the
+    mean spacing of the sites. The report is told before each step how many were made, and the
+    number of sites. Returns the diagram with moments, and the steps that were made.
 
     References
     ----------
@@ -288,7 +232,7 @@ def _spacing(shape: tuple[int, int], n: int) -> float:
 
 
 def plan_levels(
-    source: Array,
+    source: FloatArray,
     n_sites: int,
     *,
     lloyd_iterations: int,
@@ -297,23 +241,9 @@ def plan_levels(
     threads: int | None = None,
     report: Reporter | None = None,
 ) -> SitePlan:
-    """Spread the sites of all levels over a source.
+    """Spread the sites of all levels over a source; the finest has `n_sites`, each other a quarter.
 
-    Parameters
-    ----------
-    source : ndarray, shape (H, W)
-        The undisturbed beam.
-    n_sites : int
-        Sites of the finest level; each coarser one has a quarter.
-    lloyd_iterations, lloyd_tolerance, seed, threads
-        See `lloyd` and `sample_sites`.
-    report : Reporter, optional
-        Told of each step of the finest level, with one thread of all levels.
-
-    Returns
-    -------
-    SitePlan
-        Levels with their masses and triangulations.
+    The report is told of each step of the finest level, with one thread of all levels.
     """
     density = Density.from_image(source)
     counts = [n_sites]
@@ -332,14 +262,8 @@ def plan_levels(
             threads=threads,
             report=tell,
         )
-        return Level(
-            sites=triangulation.sites,
-            mass=diagram.masses,
-            centroids=diagram.centroids,
-            triangulation=triangulation,
-            shape=density.shape,
-            lloyd_iterations=steps,
-        )
+        sites, masses, centroids = triangulation.sites, diagram.masses, diagram.centroids
+        return Level(sites, masses, centroids, triangulation, density.shape, steps)
 
     def tell(step: int, count: int) -> None:
         if report is not None:

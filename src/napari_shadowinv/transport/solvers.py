@@ -1,6 +1,8 @@
 """Finding the weights of all levels, coarse to fine.
 
 - with the solver, tolerance and limits that the options name: `solve`
+- from the weights of the sites to a smooth potential everywhere: `potential_surface`
+- the factor on an image of unknown exposure: `fitted_flux`
 
 References
 ----------
@@ -13,23 +15,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density, split_pixels
+from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.transport.continuation import blurred, sharpen
-from napari_shadowinv.transport.descent import lbfgs, quasi_newton
+from napari_shadowinv.transport.descent import descend
 from napari_shadowinv.transport.margin import Margin
 from napari_shadowinv.transport.newton import newton, with_full_cells
-from napari_shadowinv.transport.objective import Solution, TransportObjective
-from napari_shadowinv.transport.open_objective import OpenObjective
-from napari_shadowinv.transport.potential import potential_surface
+from napari_shadowinv.transport.objective import OpenObjective, Solution, TransportObjective
 from napari_shadowinv.transport.sites import Level
 
-__all__ = ["LevelSolution", "fitted_flux", "solve"]
+__all__ = ["LevelSolution", "fitted_flux", "potential_surface", "solve"]
 
-Array = NDArray[np.float64]
 
 _COARSE_TOLERANCE = 3e-2
 _STALLED = 0.1  # a residual above this is no solution of anything
@@ -50,16 +50,13 @@ class LevelSolution(Solution):
         What each cell holds of the image.
     displacement : ndarray, shape (n, 2)
         Centroid of each cell in the image minus that of the same site's cell in the
-        source, px. (The paper subtracts the site, which is the same after enough Lloyd
-        steps; with the centroid an image that equals its source gives exactly zero.)
-
-    References
-    ----------
-    Paper, lines 21–23 of its algorithm.
+        source, px. (The paper, in lines 21–23 of its algorithm, subtracts the site, which is the
+        same after enough Lloyd steps; with the centroid an image that equals its source gives
+        exactly zero.)
     """
 
-    flux: Array
-    displacement: Array
+    flux: FloatArray
+    displacement: FloatArray
 
     @classmethod
     def of_level(
@@ -67,20 +64,17 @@ class LevelSolution(Solution):
     ) -> LevelSolution:
         """Add what the cells hold to a solution that `objective` has arrived at."""
         diagram = objective.diagram(solution.weights, with_moments=True)
-        return cls(
-            **vars(solution),
-            flux=diagram.masses,
-            displacement=diagram.centroids - level.centroids,
-        )
+        displacement = diagram.centroids - level.centroids
+        return cls(**vars(solution), flux=diagram.masses, displacement=displacement)
 
 
 def solve(
     levels: tuple[Level, ...],
-    image: Array,
+    image: FloatArray,
     options: InversionOptions,
     report: Reporter | None = None,
     *,
-    start: Array | None = None,
+    start: FloatArray | None = None,
     margin: Margin | None = None,
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
@@ -94,9 +88,7 @@ def solve(
     image : ndarray, shape (H, W)
         Positive everywhere; without a `margin` with the flux of the source.
     options : InversionOptions
-        Solver, stages, tolerance, most iterations, threads.
-    report : Reporter, optional
-        Told of each step.
+        Solver, stages, tolerance, most iterations, threads, decay length.
     start : ndarray, shape (n,), optional
         Weights of the finest level that solve a similar image, px². Where they lead nowhere
         they have no influence on the answer.
@@ -108,17 +100,12 @@ def solve(
     list of LevelSolution
         One for each level that was tried, and for the finest one tried afresh where a level
         led nowhere; the last is the answer.
-
-    Raises
-    ------
-    InputError
-        If the solver does not fit in memory.
     """
     if options.stages == "single":
         levels = levels[-1:]
     target = _Target(image, margin, options)
     if start is not None:
-        nearby = _solve_from(start, levels[-1], target, options, report)
+        nearby = _solve_from(start, levels[-1], target, report)
         if nearby is not None:
             return [nearby]
     by_newton = options.solver == "newton"
@@ -130,11 +117,9 @@ def solve(
         if number == 0 and by_newton:
             solution = target.sharpened(level, tolerance, report)
         else:
-            weights = (
-                _prolong(levels[number - 1], solutions[-1], level, options.threads)
-                if number > 0
-                else np.zeros(len(level.sites))
-            )
+            weights = np.zeros(len(level.sites))
+            if number > 0:
+                weights = _prolong(levels[number - 1], solutions[-1], level, options.threads)
             solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > _STALLED and len(levels) > 1:
@@ -154,7 +139,7 @@ def _afresh(
 
 def fitted_flux(
     levels: tuple[Level, ...],
-    image: Array,
+    image: FloatArray,
     margin: Margin,
     options: InversionOptions,
     report: Reporter | None = None,
@@ -163,16 +148,7 @@ def fitted_flux(
 
     A wrong factor drives flux across the whole edge: the displacement there grows in
     proportion to the error, on top of what the object does. Few sites suffice to see it.
-
-    Parameters
-    ----------
-    levels, image, margin, options, report
-        See `solve`; the image with the flux of the source.
-
-    Returns
-    -------
-    float
-        About 1.
+    The image comes with the flux of the source.
     """
     few = tuple(level for level in levels if len(level.sites) <= _SITES_OF_FIT) or levels[:1]
     factor = 1.0
@@ -196,13 +172,10 @@ def _move_at_edge(level: Level, solution: LevelSolution, margin: Margin) -> floa
 
 
 def _solve_from(
-    start: Array,
-    level: Level,
-    target: _Target,
-    options: InversionOptions,
-    report: Reporter | None,
+    start: FloatArray, level: Level, target: _Target, report: Reporter | None
 ) -> LevelSolution | None:
     """Solve one level from given weights, or return None where that gets nowhere soon."""
+    options = target.options
     objective = target.objective(level)
     if options.solver == "newton":
         shown = objective.triangulation.update(start, stop_when_hidden=True)
@@ -223,7 +196,7 @@ def _solve_from(
 class _Target:
     """Where the flux goes."""
 
-    image: Array
+    image: FloatArray
     margin: Margin | None
     options: InversionOptions
 
@@ -258,25 +231,45 @@ class _Target:
 
 def _solve_level(
     objective: TransportObjective,
-    weights: Array,
+    weights: FloatArray,
     options: InversionOptions,
     tolerance: float,
     report: Reporter | None,
 ) -> Solution:
     """Run the solver that the options name on one level."""
-    method = {"newton": newton, "lbfgs": lbfgs, "quasi-newton": quasi_newton}[options.solver]
+    most = options.max_iterations
     if options.solver == "newton":
-        weights = with_full_cells(objective, weights)
-    return method(
-        objective,
-        weights,
-        tolerance=tolerance,
-        max_iterations=options.max_iterations,
-        report=report,
+        start = with_full_cells(objective, weights)
+        return newton(objective, start, tolerance=tolerance, max_iterations=most, report=report)
+    return descend(
+        objective, weights, options.solver, tolerance=tolerance, max_iterations=most, report=report
     )
 
 
-def _prolong(coarse: Level, solution: LevelSolution, fine: Level, threads: int | None) -> Array:
+def _prolong(
+    coarse: Level, solution: LevelSolution, fine: Level, threads: int | None
+) -> FloatArray:
     """Evaluate the coarse potential at the fine sites."""
     surface = potential_surface(coarse, solution.weights, solution.displacement, threads=threads)
     return 2 * surface(fine.sites)[0]
+
+
+def potential_surface(
+    level: Level, weights: FloatArray, displacement: FloatArray, *, threads: int | None = None
+) -> CloughTocher:
+    """Lay a C¹ surface through the potential at the sites (px²).
+
+    In the optimum the image of site i lies at r_i - ½ ∇w, so half the weights are the
+    normalised deflection potential at the sites, and minus the displacements of the cells'
+    centroids (px) are, nearly, its gradients. No flux crosses the border of the image, so the
+    potential is level across it, and its mirror image continues it smoothly.
+    """
+    mirrored = level.mirrored
+    potential = 0.5 * weights
+    gradient = fit_gradients(level.triangulation, potential, -displacement)
+    return CloughTocher(
+        mirrored.triangulation,
+        potential[mirrored.origin],
+        mirrored.sense * gradient[mirrored.origin],
+        threads=threads,
+    )
