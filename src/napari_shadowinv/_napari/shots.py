@@ -25,6 +25,7 @@ from napari_shadowinv._napari.lazy import lazy_stack
 from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
+from napari_shadowinv.io.formats import RADIOGRAPH_SUFFIXES
 
 if TYPE_CHECKING:
     from napari_shadowinv.io import Radiograph
@@ -33,17 +34,11 @@ if TYPE_CHECKING:
     Setup = ProtonSetup | OpticalSetup
 
 __all__ = [
-    "IMAGE_SUFFIXES",
     "images_in",
     "radiograph_layers",
     "shot_layer",
     "stack_layers",
 ]
-
-_PICTURES = {".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg"}
-_NUMBERS = {".npy", ".mat", ".txt", ".csv", ".dat", ".asc", ".h5", ".hdf5"}
-_CAMERAS = {".b16", ".spe"}
-IMAGE_SUFFIXES = frozenset(_PICTURES | _NUMBERS | _CAMERAS)
 
 
 def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
@@ -167,7 +162,7 @@ def images_in(folder: Path) -> list[Path]:
     files = [
         path
         for path in folder.iterdir()
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and path.name[0] != "."
+        if path.suffix.lower() in RADIOGRAPH_SUFFIXES and path.is_file() and path.name[0] != "."
     ]
     counts = Counter(path.suffix.lower() for path in files)
     if not counts:

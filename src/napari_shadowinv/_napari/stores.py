@@ -28,6 +28,7 @@ from napari_shadowinv._napari.layers import (
 )
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.io.formats import RESULT
 
 if TYPE_CHECKING:
     import xarray
@@ -66,7 +67,7 @@ def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
         If there is no such store or no shot in it is done.
     """
     dataset = opened_store(path)
-    name = name or path.name.removesuffix(".zarr").removesuffix(".shadowinv")
+    name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
     return _StoreLayers(path, dataset, name).layers()
 
 

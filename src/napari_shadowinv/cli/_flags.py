@@ -19,6 +19,8 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from napari_shadowinv.io.formats import IMAGE_TITLES
+
 _FILTERS = "Filters before the inversion"
 _BOUNDARY = "Flux across the image edge (docs/boundary.md)"
 _ESTIMATES = "Source estimated from the image (docs/sources.md)"
@@ -32,10 +34,7 @@ def given(**flags: Any) -> dict[str, Any]:
 ImageFile = Annotated[
     Path,
     Argument(
-        help=(
-            "TIFF, PNG, BMP, JPEG, NPY, MATLAB, text, PCO .b16, SPE or HDF5 (pradformat, or with "
-            "--variable)."
-        ),
+        help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.",
         show_default=False,
     ),
 ]

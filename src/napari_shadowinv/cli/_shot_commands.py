@@ -59,7 +59,6 @@ from napari_shadowinv.cli._inputs import (
     setup_from,
 )
 from napari_shadowinv.cli._outputs import (
-    FIGURE_SUFFIXES,
     check_outputs,
     check_setup,
     make_folder,
@@ -147,10 +146,10 @@ def invert(
     and a figure next to it.
     """
     from napari_shadowinv.cli._choices import TABLE, choices_from
-    from napari_shadowinv.io.writing import RESULT_SUFFIXES
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
 
     result, figure = result_and_figure(image, out, report)
-    check_outputs({result: RESULT_SUFFIXES, figure: FIGURE_SUFFIXES}, overwrite)
+    check_outputs({result: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
     protect([result, figure], [image, source, mask, setup, options, source_mask])
     transport = given(n_sites=n_sites, threads=threads, seed=seed)
     edge = given(boundary=boundary, margin=margin, flux=flux)
@@ -287,10 +286,10 @@ def forward(
     the source is uniform.
     """
     from napari_shadowinv.io import read_radiograph, write
-    from napari_shadowinv.io.writing import IMAGE_SUFFIXES
+    from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
 
-    path = Path(f"{field.stem}_image.tif") if out is None else out
-    check_outputs({path: IMAGE_SUFFIXES}, overwrite)
+    path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
+    check_outputs({path: tuple(IMAGE_WRITERS)}, overwrite)
     protect([path], [field, source, setup, made_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")
