@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.files import check_output, kind_of, replacing, sha256
+from napari_shadowinv.io.files import check_output, replacing, sha256
+from napari_shadowinv.io.formats import kind_of
 
 
 def test_checksum_is_sha256_of_content(tmp_path: Path) -> None:

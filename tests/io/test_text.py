@@ -5,7 +5,7 @@ import pytest
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read_radiograph
-from napari_shadowinv.io.files import kind_of
+from napari_shadowinv.io.formats import kind_of
 from napari_shadowinv.physics.setup import ProtonSetup
 
 VALUES = np.random.default_rng(3).normal(0, 1e3, (5, 7))

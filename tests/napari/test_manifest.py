@@ -22,6 +22,33 @@ def test_it_is_valid_and_each_command_can_be_imported() -> None:
     assert found.name == "napari-shadowinv"
 
 
+def test_its_readers_and_writers_are_those_of_the_registry() -> None:
+    from napari_shadowinv.io import formats
+
+    found = manifest().contributions
+    (reader,) = found.readers
+    readable = {end for each in formats.FORMATS if each.reader for end in each.suffixes}
+    assert sorted(reader.filename_patterns) == sorted(
+        f"*{suffix}" for suffix in readable - formats.OPENED_BY_NAPARI
+    )
+    # A store is a folder, and folders are offered whatever their name.
+    assert reader.accepts_directories
+    written = [suffix for writer in found.writers for suffix in writer.filename_extensions]
+    writers = {each.suffix for each in formats.FORMATS if each.result_writer}
+    assert sorted(written) == sorted(writers)
+
+
+def test_napari_itself_opens_what_is_left_to_it() -> None:
+    import napari_builtins
+    from npe2 import PluginManifest
+
+    from napari_shadowinv.io.formats import OPENED_BY_NAPARI
+
+    own = PluginManifest.from_file(Path(napari_builtins.__file__).with_name("builtins.yaml"))
+    patterns = {name for reader in own.contributions.readers for name in reader.filename_patterns}
+    assert {f"*{suffix}" for suffix in OPENED_BY_NAPARI} <= patterns
+
+
 def test_its_menus_exist() -> None:
     from napari._app_model.constants._menus import MenuId
 

@@ -1,8 +1,8 @@
 """What napari opens with this plugin: `get_reader`.
 
-Results (``.shadowinv``, stores ``.shadowinv.zarr``), pradformat, and the radiographs that napari
-itself cannot read; folders and lists of shots become one lazy stack. Asking whether a file can
-be read imports neither napari nor a compiler and reads a header at most.
+Results, stores of many shots, pradformat, and the radiographs that napari itself cannot read;
+folders and lists of shots become one lazy stack. Asking whether a file can be read imports neither
+napari nor a compiler and reads a header at most.
 """
 
 from __future__ import annotations
@@ -15,35 +15,21 @@ from typing import TYPE_CHECKING, Any
 from napari_shadowinv._napari.notifications import notify_errors, show_caution
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, STORE
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
 
 __all__ = ["get_reader", "read_paths"]
 
-_STORE_SUFFIX = ".shadowinv.zarr"
-_RESULT_SUFFIX = ".shadowinv"
-_HDF5_SUFFIXES = (".h5", ".hdf5")
-
 ReaderFunction = Callable[[str | Sequence[str]], "list[Any]"]
 
 
 def get_reader(path: str | Sequence[str]) -> ReaderFunction | None:
-    """Return what reads a path, None if this plugin cannot.
-
-    Parameters
-    ----------
-    path : str or sequence of str
-        A file, a folder, a pattern with ``*``, or a list of files to be stacked.
-
-    Returns
-    -------
-    callable or None
-        `read_paths`.
-    """
+    """Return what reads a file, folder, pattern with ``*`` or list of files, or None."""
     if not isinstance(path, str):
         return read_paths if path and all(_is_image_name(Path(item)) for item in path) else None
-    if path.endswith(_STORE_SUFFIX) or Path(path).suffix.lower() == _RESULT_SUFFIX:
+    if path.endswith(STORE.suffix) or Path(path).suffix.lower() in RESULT.suffixes:
         return read_paths
     if "*" in path:
         return read_paths if any(map(_is_image_name, _matches(path))) else None
@@ -55,15 +41,13 @@ def _can_read(path: Path) -> bool:
 
     if path.is_dir():
         return bool(images_in(path))
-    if path.suffix.lower() in _HDF5_SUFFIXES:
+    if path.suffix.lower() in PRADFORMAT.suffixes:
         return _is_ours(path)
     return _is_image_name(path)
 
 
 def _is_image_name(path: Path) -> bool:
-    from napari_shadowinv._napari.shots import IMAGE_SUFFIXES
-
-    return path.suffix.lower() in IMAGE_SUFFIXES
+    return path.suffix.lower() in RADIOGRAPH_SUFFIXES
 
 
 def _is_ours(path: Path) -> bool:
@@ -78,28 +62,12 @@ def _is_ours(path: Path) -> bool:
 
 @notify_errors(otherwise=lambda: [(None,)])  # napari's sign for: dealt with, and nothing to add
 def read_paths(path: str | Sequence[str]) -> list[Any]:
-    """Read a file, a folder or a list of files as layers.
-
-    Parameters
-    ----------
-    path : str or sequence of str
-        As for `get_reader`.
-
-    Returns
-    -------
-    list of (data, keywords, layer type)
-        The layers.
-
-    Raises
-    ------
-    FileFormatError, InputError
-        If a file cannot be read; in a window, the user is told instead.
-    """
+    """Read what `get_reader` accepts as layers; in a window, the user is told of errors."""
     from napari_shadowinv._napari.shots import images_in, stack_layers
 
     if not isinstance(path, str):
         return list(stack_layers([Path(item) for item in path]))
-    if path.rstrip("/").endswith(_STORE_SUFFIX):
+    if path.rstrip("/").endswith(STORE.suffix):
         from napari_shadowinv._napari.stores import follow_once_added, store_layers
 
         layers = store_layers(Path(path))

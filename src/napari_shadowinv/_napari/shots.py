@@ -26,23 +26,18 @@ from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
+from napari_shadowinv.io.formats import RADIOGRAPH_SUFFIXES
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
-    "IMAGE_SUFFIXES",
     "images_in",
     "lazy_stack",
     "radiograph_layers",
     "shot_layer",
     "stack_layers",
 ]
-
-_PICTURES = {".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg"}
-_NUMBERS = {".npy", ".mat", ".txt", ".csv", ".dat", ".asc", ".h5", ".hdf5"}
-_CAMERAS = {".b16", ".spe"}
-IMAGE_SUFFIXES = frozenset(_PICTURES | _NUMBERS | _CAMERAS)
 
 
 def radiograph_layers(shot: io.Radiograph, name: str = "") -> list[FullLayerData]:
@@ -120,7 +115,7 @@ def images_in(folder: Path) -> list[Path]:
     files = [
         path
         for path in folder.iterdir()
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and path.name[0] != "."
+        if path.suffix.lower() in RADIOGRAPH_SUFFIXES and path.is_file() and path.name[0] != "."
     ]
     counts = Counter(path.suffix.lower() for path in files)
     if not counts:

@@ -24,6 +24,7 @@ from napari_shadowinv._napari.layers import FullLayerData, at_shot, dataset_laye
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.io.formats import RESULT
 
 if TYPE_CHECKING:
     import xarray
@@ -35,7 +36,7 @@ __all__ = ["follow_once_added", "follow_shots", "store_layers"]
 def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot."""
     dataset = _opened(path)
-    name = name or path.name.removesuffix(".zarr").removesuffix(".shadowinv")
+    name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
     setup = setup_from_dataset(dataset)
     frame = frame_for(dataset["displacement"].shape, setup)
     facts = {"store": str(path), "shots": _shot_names(dataset)}

@@ -3,8 +3,8 @@
 - all of the result: `write_result`; its field for other codes: `write_pradformat`; its sites:
   `write_sites`
 
-A part of a result's layers stands for all of it. Each file is written whole, beside the one
-that it replaces; napari's own dialog asks before.
+A part of a result's layers stands for all of it; other layers are left out. Each file is written
+whole, beside the one that it replaces; napari's own dialog asks before.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.formats import PRADFORMAT, RESULT, SITES, Format
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layer_metadata import Result
@@ -25,93 +26,36 @@ __all__ = ["write_pradformat", "write_result", "write_sites"]
 
 
 def write_result(path: str, layers: Sequence[FullLayerData]) -> list[str]:
-    """Write all of a result, and how its layers look, as ``.shadowinv``.
-
-    Parameters
-    ----------
-    path : str
-        The file.
-    layers : sequence of (data, keywords, layer type)
-        Layers of one result; others are left out, and the user is told.
-
-    Returns
-    -------
-    list of str
-        The file.
-
-    Raises
-    ------
-    FileFormatError
-        If there is no layer of a result, there are layers of several, or the file cannot be
-        written.
-    """
-    return _write(path, layers, (".shadowinv",))
+    """Write all of a result, and how its layers look, as ``.shadowinv``."""
+    return _write(path, layers, RESULT)
 
 
 def write_pradformat(path: str, layers: Sequence[FullLayerData]) -> list[str]:
-    """Write a result's potential and deflection as a pradformat inversion.
-
-    Parameters
-    ----------
-    path, layers
-        See `write_result`.
-
-    Returns
-    -------
-    list of str
-        The file.
-
-    Raises
-    ------
-    FileFormatError
-        As `write_result`, and if the result is not that of a particle beam.
-    """
-    return _write(path, layers, (".h5", ".hdf5"))
+    """Write a result's potential and deflection as a pradformat inversion."""
+    return _write(path, layers, PRADFORMAT)
 
 
 def write_sites(path: str, layers: Sequence[FullLayerData]) -> list[str]:
-    """Write the sites of a result, all of them, with weight, mass and displacement, as CSV.
-
-    Parameters
-    ----------
-    path, layers
-        See `write_result`.
-
-    Returns
-    -------
-    list of str
-        The file.
-
-    Raises
-    ------
-    FileFormatError
-        As `write_result`, and if the result has no sites.
-    """
-    return _write(path, layers, (".csv",))
+    """Write the sites of a result, all of them, with weight, mass and displacement, as CSV."""
+    return _write(path, layers, SITES)
 
 
-def _write(path: str, layers: Sequence[FullLayerData], suffixes: tuple[str, ...]) -> list[str]:
-    try:
-        return _write_result(path, layers, suffixes)
-    except InputError as error:
-        # napari takes any ValueError of a writer for "no writer", and swallows what it says.
-        raise FileFormatError(str(error)) from error
-
-
-def _write_result(
-    path: str, layers: Sequence[FullLayerData], suffixes: tuple[str, ...]
-) -> list[str]:
+def _write(path: str, layers: Sequence[FullLayerData], form: Format) -> list[str]:
     from napari_shadowinv._napari.layer_state import dataset_of_layers
     from napari_shadowinv.io import write
 
-    own, result = _one_result(layers)
-    _warn_of_changes(own, result)
-    target = Path(path)
-    is_named = target.suffix.lower() in suffixes
-    if not is_named:
-        target = target.with_name(target.name + suffixes[0])
-    # napari's dialog asked about the name that was typed in, not about a longer one.
-    return [str(write(target, dataset_of_layers(own, result), overwrite=is_named))]
+    try:
+        own, result = _one_result(layers)
+        _warn_of_changes(own, result)
+        target = Path(path)
+        is_named = target.suffix.lower() in form.suffixes
+        if not is_named:
+            target = target.with_name(target.name + form.suffix)
+        # napari's dialog asked about the name that was typed in, not about a longer one.
+        return [str(write(target, dataset_of_layers(own, result), overwrite=is_named))]
+    except InputError as error:
+        # napari takes any ValueError of a writer for "no writer", and swallows what it says.
+        raise FileFormatError(str(error)) from error
 
 
 def _one_result(layers: Sequence[FullLayerData]) -> tuple[list[FullLayerData], Result]:

@@ -54,6 +54,7 @@ def write_demo(
 ) -> list[Path]:
     """Write the result, its figure, and the fields side by side."""
     from napari_shadowinv.io import write
+    from napari_shadowinv.io.formats import PNG, RESULT
     from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
 
     caption = "Errors: " + "; ".join(
@@ -62,9 +63,9 @@ def write_demo(
     comparison = comparison_figure(fields, setup, title="True and retrieved", caption=caption)
     report = report_figure(inversion, setup, title=f"Demo {name}")
     return [
-        write(folder / f"{name}.shadowinv", inversion, setup=setup, overwrite=True),
-        save_figure(folder / f"{name}.png", report, overwrite=True),
-        save_figure(folder / f"{name}_comparison.png", comparison, overwrite=True),
+        write(folder / f"{name}{RESULT.suffix}", inversion, setup=setup, overwrite=True),
+        save_figure(folder / f"{name}{PNG.suffix}", report, overwrite=True),
+        save_figure(folder / f"{name}_comparison{PNG.suffix}", comparison, overwrite=True),
     ]
 
 

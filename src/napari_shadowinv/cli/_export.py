@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv.cli._outputs import make_folder, protect_store
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 
 if TYPE_CHECKING:
     import xarray
@@ -121,7 +122,7 @@ def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[tuple[
                 if component:
                     plane = plane.sel(component=component)
                 suffix = f"{variable}_{component}" if component else variable
-                yield f"{_stem(shot)}_{suffix}.tif", plane
+                yield f"{_stem(shot)}_{suffix}{TIFF.suffix}", plane
 
 
 def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
@@ -131,7 +132,10 @@ def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
     check_pradformat_setup(setup_from_dataset(dataset))
     for index in range(dataset.sizes["shot"]):
         shot = dataset.isel(shot=index)
-        yield f"{_stem(shot)}.h5", shot.assign_attrs(input_file=str(shot["name"].values))
+        yield (
+            f"{_stem(shot)}{PRADFORMAT.suffix}",
+            shot.assign_attrs(input_file=str(shot["name"].values)),
+        )
 
 
 def _write(path: Path, content: Any, overwrite: bool) -> Path:
@@ -140,7 +144,7 @@ def _write(path: Path, content: Any, overwrite: bool) -> Path:
     from napari_shadowinv.inversion.labels import setup_from_dataset
     from napari_shadowinv.io import write
 
-    if path.suffix == ".h5":
+    if path.suffix in PRADFORMAT.suffixes:
         return write(path, content.load(), overwrite=overwrite)
     setup = setup_from_dataset(content.to_dataset(name="plane").assign_attrs(content.attrs))
     return write(path, np.asarray(content.values, dtype=float), setup=setup, overwrite=overwrite)

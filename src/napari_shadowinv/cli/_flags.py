@@ -19,6 +19,7 @@ from typer import Argument, Option
 
 from napari_shadowinv._system.validation import nearest, validated
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import ESTIMATES, STEPS, Recipe, Step
 
@@ -29,10 +30,7 @@ _OPTIONS = "Options of the inversion"
 ImageFile = Annotated[
     Path,
     Argument(
-        help=(
-            "TIFF, PNG, BMP, JPEG, NPY, MATLAB, text, PCO .b16, SPE or HDF5 (pradformat, or with "
-            "--variable)."
-        ),
+        help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.",
         show_default=False,
     ),
 ]

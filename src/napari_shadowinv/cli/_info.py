@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv.io import Radiograph
+    from napari_shadowinv.io.formats import Format
     from napari_shadowinv.preprocessing import Provenance
 
 
@@ -37,26 +38,24 @@ def described(path: Path, variable: str | None = None) -> Table:
 def _rows(path: Path, variable: str | None) -> Rows:
     from napari_shadowinv.cli._batch import store_rows
     from napari_shadowinv.io import Radiograph, is_stack, read
-    from napari_shadowinv.io.arrays import read_npy
-    from napari_shadowinv.io.files import kind_of
+    from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.hdf5 import read_hdf5
-    from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5
+    from napari_shadowinv.io.images import read_npy
 
     if is_stack(path):
         return store_rows(path)
-    kind = kind_of(path)
-    is_mat = is_mat73(path) if kind == "hdf5" else kind == "mat" and not is_other_hdf5(path)
-    if is_mat:
+    found = format_of(path)
+    if found.name == "mat":
         return _matlab_rows(path, variable)
-    if variable is not None and kind in ("hdf5", "mat"):
+    if variable is not None and found.named_reader:
         array = read_hdf5(path, variable)
         return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
-    if kind == "npy" and variable is None:
+    if found.name == "npy" and variable is None:
         return [("kind", "NPY array"), *_array_rows(read_npy(path))]
-    if kind == "text" or variable is not None:
+    if found.name == "text" or variable is not None:
         return _radiograph_rows(read(path, variable=variable))
-    if kind not in ("hdf5", "mat"):
-        return _picture_rows(path, kind)
+    if "result" not in found.holds:
+        return _picture_rows(path, found)
     content = read(path)
     if isinstance(content, Radiograph):
         return _radiograph_rows(content)
@@ -80,13 +79,12 @@ def _matlab_rows(path: Path, variable: str | None) -> Rows:
     return [*rows, ("image", metadata["variable"]), *_array_rows(array)]
 
 
-def _picture_rows(path: Path, kind: str) -> Rows:
+def _picture_rows(path: Path, found: Format) -> Rows:
     from napari_shadowinv.io.colours import film_warnings
-    from napari_shadowinv.io.images import read_picture
 
-    array, metadata = read_picture(path, kind)
+    array, metadata = found.read(path)
     warnings = film_warnings(array, None) if array.ndim == 2 else ()
-    rows = [("kind", f"{kind.upper()} picture, {metadata['bits']} bits per sample")]
+    rows = [("kind", f"{found.name.upper()} picture, {metadata['bits']} bits per sample")]
     if array.ndim == 3:
         rows.append(
             (

@@ -128,13 +128,13 @@ def field_from(path: Path, variable: str | None = None) -> Field:
     """Displacement from a result, or from an array of px or px²."""
     from napari_shadowinv.inversion.labels import setup_from_dataset
     from napari_shadowinv.io import read_dataset
-    from napari_shadowinv.io.arrays import read_npy
-    from napari_shadowinv.io.files import kind_of
+    from napari_shadowinv.io.formats import kind_of
+    from napari_shadowinv.io.images import read_npy
 
     kind = kind_of(path)
     if variable is not None or kind == "mat":
         return Field(_displacement(path, _named_array(path, variable)))
-    if kind == "hdf5":
+    if kind in ("hdf5", "shadowinv"):
         dataset = read_dataset(path)
         source = dataset["source"].values if "source" in dataset else None
         return Field(dataset["displacement"].values, source, setup_from_dataset(dataset))
@@ -146,11 +146,10 @@ def field_from(path: Path, variable: str | None = None) -> Field:
 def _named_array(path: Path, variable: str | None) -> NDArray[Any]:
     """Plane of a MATLAB file, or array of any HDF5 file."""
     from napari_shadowinv.io import read_radiograph
-    from napari_shadowinv.io.files import kind_of
+    from napari_shadowinv.io.formats import kind_of
     from napari_shadowinv.io.hdf5 import read_hdf5
-    from napari_shadowinv.io.matlab import is_mat73
 
-    if variable is not None and kind_of(path) == "hdf5" and not is_mat73(path):
+    if variable is not None and kind_of(path) in ("hdf5", "shadowinv"):
         return read_hdf5(path, variable)
     return read_radiograph(path, variable=variable).image
 

@@ -7,25 +7,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Radiograph
 
-FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
-
 
 def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:
     """Choose the names of result and figure; the figure never takes the image's name."""
     if not image.stem:
         raise InputError(f"{image} is a folder: expected an image; give the name of a file")
-    result = Path(f"{image.stem}.shadowinv") if out is None else out
+    result = Path(f"{image.stem}{RESULT.suffix}") if out is None else out
     if report is not None:
         return result, report
-    figure = result.with_suffix(".png")
+    figure = result.with_suffix(PNG.suffix)
     if _is_same(figure, image):
-        figure = result.with_name(f"{result.stem}_report.png")
+        figure = result.with_name(f"{result.stem}_report{PNG.suffix}")
     return result, figure
 
 
@@ -62,7 +61,7 @@ def check_setup(result: Path, setup: Setup | None) -> None:
     """Refuse a setup that the result's format cannot keep."""
     from napari_shadowinv.io.pradformat import check_pradformat_setup
 
-    if result.suffix.lower() in (".h5", ".hdf5"):
+    if result.suffix.lower() in PRADFORMAT.suffixes:
         check_pradformat_setup(setup)
 
 

@@ -42,7 +42,6 @@ from napari_shadowinv.cli._inputs import (
     source_from,
 )
 from napari_shadowinv.cli._outputs import (
-    FIGURE_SUFFIXES,
     check_outputs,
     check_setup,
     make_folder,
@@ -121,11 +120,11 @@ def invert(
     Writes potential, displacement, re-projection, residual and all options to one file,
     and a figure next to it.
     """
-    from napari_shadowinv.io.writing import RESULT_SUFFIXES
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
     from napari_shadowinv.pipeline import write_recipe
 
     result, figure = result_and_figure(image, out, report)
-    outputs = {result: RESULT_SUFFIXES, figure: FIGURE_SUFFIXES}
+    outputs = {result: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
     check_outputs(outputs, overwrite)
@@ -244,10 +243,10 @@ def forward(
     the source is uniform.
     """
     from napari_shadowinv.io import read_radiograph, write
-    from napari_shadowinv.io.writing import IMAGE_SUFFIXES
+    from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
 
-    path = Path(f"{field.stem}_image.tif") if out is None else out
-    check_outputs({path: IMAGE_SUFFIXES}, overwrite)
+    path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
+    check_outputs({path: tuple(IMAGE_WRITERS)}, overwrite)
     protect([path], [field, source, setup, made_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")

@@ -181,10 +181,10 @@ def export(
 ) -> None:
     """Write shots of a store in another format."""
     from napari_shadowinv.cli._export import export_shots
-    from napari_shadowinv.io.store import STORE_SUFFIX
+    from napari_shadowinv.io.formats import SITES, STORE
 
-    stem = store.name.removesuffix(STORE_SUFFIX)
-    target = Path(f"{stem}.csv" if form == "csv" else stem) if out is None else out
+    stem = store.name.removesuffix(STORE.suffix)
+    target = Path(f"{stem}{SITES.suffix}" if form == "csv" else stem) if out is None else out
     names = [name.strip() for name in variables.split(",")]
     written = export_shots(store, target, form, shots, names, overwrite)
     if not quiet:

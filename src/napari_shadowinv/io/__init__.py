@@ -5,23 +5,10 @@
 - write a result or an image: `write`; check the path beforehand: `check_output`
 - results of many shots in one store: `read_stack`; tell it from other folders: `is_stack`
 - write a file of your own, whole or not at all: `replacing`
+- every format, and how to add one: `napari_shadowinv.io.formats`
 """
 
-from napari_shadowinv.io.files import check_output, replacing
-from napari_shadowinv.io.reading import read, read_dataset, read_radiograph, read_toml
-from napari_shadowinv.io.store import is_stack, read_stack
-from napari_shadowinv.io.writing import write
-from napari_shadowinv.preprocessing import Radiograph
+import lazy_loader
 
-__all__ = [
-    "Radiograph",
-    "check_output",
-    "is_stack",
-    "read",
-    "read_dataset",
-    "read_radiograph",
-    "read_stack",
-    "read_toml",
-    "replacing",
-    "write",
-]
+# The command's help lists the formats without numpy.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

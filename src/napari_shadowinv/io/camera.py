@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.safety import check_size
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.size_checks import check_promise
+from napari_shadowinv.io.files import check_promise
 
 __all__ = ["read_b16", "read_spe"]
 
@@ -36,26 +36,8 @@ _SPE_REGION = re.compile(rb'<DataBlock\b[^>]*\btype="Region"[^>]*>')
 _LONGEST_FOOTER = 2_000_000
 
 
-def read_b16(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Read a frame of a PCO camera.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    array : ndarray of uint16, shape (H, W)
-        Counts.
-    metadata : dict
-        ``bits``.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged or truncated, or of a colour camera.
-    """
+def read_b16(path: Path) -> tuple[AnyArray, dict[str, Any]]:
+    """Read a frame of a PCO camera: counts as uint16, shape (H, W), and ``bits``."""
     with path.open("rb") as file:
         header = file.read(_B16_EXTENDED_HEADER)
     check_promise(path, "PCO", _B16_HEADER, len(header))
@@ -74,25 +56,10 @@ def read_b16(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
     return _frame(path, "PCO", start, (height, width), np.dtype("<u2")), {"bits": 16}
 
 
-def read_spe(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+def read_spe(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Read the only frame of a file of WinSpec, WinView or LightField.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    array : ndarray, shape (H, W)
-        Counts in the file's own dtype.
-    metadata : dict
-        ``bits``; ``version`` of the format.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged, truncated or no SPE, or holds several frames or regions.
+    Returns counts in the file's own dtype, shape (H, W), with ``bits`` and ``version``.
     """
     with path.open("rb") as file:
         header = file.read(_SPE_HEADER)
@@ -136,7 +103,7 @@ def _check_footer(path: Path, start: int) -> None:
 
 def _frame(
     path: Path, header: str, start: int, shape: tuple[int, int], dtype: np.dtype[Any]
-) -> NDArray[Any]:
+) -> AnyArray:
     height, width = shape
     if min(shape) < 1:
         raise FileFormatError(

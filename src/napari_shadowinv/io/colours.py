@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 
 __all__ = ["CHANNELS", "film_warnings", "to_grey"]
@@ -19,29 +18,12 @@ CHANNELS = ("red", "green", "blue", "mean")
 _RIM, _AS_BRIGHT, _DARKER = 0.05, 0.9, 0.8
 
 
-def to_grey(
-    array: NDArray[Any], channel: str | int | None, where: str | Path
-) -> NDArray[np.float64]:
-    """Reduce an image with channels to one plane, as the user says.
+def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> FloatArray:
+    """Reduce an image to one plane of float64: the channel that the user chose of a colour image.
 
-    Parameters
-    ----------
-    array : ndarray, shape (H, W) or (H, W, C)
-        Grey, grey and alpha (C = 2), RGB (3) or RGBA (4) image. Alpha counts as no channel.
-    channel : {"red", "green", "blue", "mean"} or int or None
-        What to take of a colour image; a grey one is taken as it is.
-    where : str or Path
-        Name of the image in messages.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        The plane.
-
-    Raises
-    ------
-    InputError
-        If the channels differ and none was chosen, or there is no such channel.
+    An `array` of shape (H, W, C) is grey and alpha (C = 2), RGB (3) or RGBA (4); alpha counts as
+    no channel. Raises `InputError`, about the image `where`, if the channels differ and none was
+    chosen, or there is no such channel.
     """
     if array.ndim == 2:
         return np.ascontiguousarray(array, dtype=np.float64)
@@ -73,22 +55,12 @@ def _channel_index(channel: str | int, count: int, where: str | Path) -> int:
     return index
 
 
-def film_warnings(array: NDArray[Any], channel: str | int | None) -> tuple[str, ...]:
+def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[str, ...]:
     """Warn of a picture that may be a scan of film, whose grey levels fall with dose.
 
-    Parameters
-    ----------
-    array : ndarray, shape (H, W) or (H, W, C)
-        The picture as it is stored.
-    channel : {"red", "green", "blue", "mean"} or int or None
-        What is taken of a colour image.
-
-    Returns
-    -------
-    tuple of str
-        A sentence if it is a colour image, or if its rim is as bright as anything in it and the
-        middle clearly darker, as where only the middle of a film was exposed; else none. Light
-        or particles that are deflected out of the middle make something else brighter.
+    That is a colour picture, or one whose rim is as bright as anything in it and the middle clearly
+    darker, as where only the middle of a film was exposed. Light or particles that are deflected
+    out of the middle make something else brighter.
     """
     grey = to_grey(array, "mean", "")
     is_colour = array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, ""))
@@ -107,7 +79,7 @@ def film_warnings(array: NDArray[Any], channel: str | int | None) -> tuple[str, 
     return ()
 
 
-def _is_lit_around(image: NDArray[np.float64]) -> bool:
+def _is_lit_around(image: FloatArray) -> bool:
     """Whether all four sides are as bright as the brightest part, and the middle is darker."""
     height, width = image.shape
     rim = max(1, round(_RIM * min(height, width)))

@@ -1,15 +1,14 @@
 """What every file needs, whatever its format.
 
-- tell the kind of a file from its first bytes: `kind_of`
 - its fingerprint: `sha256`; its name as text: `text_of`
 - order many, shot 2 before shot 10: `in_counting_order`
+- refuse a header that promises more than there is: `check_promise`
 - refuse an output before hours of work: `check_output`, `check_folder_of`
 - write all of a file or nothing: `replacing`
 """
 
 from __future__ import annotations
 
-import codecs
 import errno
 import hashlib
 import os
@@ -20,141 +19,36 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from napari_shadowinv._system.interrupts import interrupts_put_off
-from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv.errors import FileFormatError
 
 __all__ = [
-    "READABLE",
+    "DEFLATE_RATIO",
     "check_folder_of",
     "check_output",
+    "check_promise",
     "in_counting_order",
-    "kind_of",
     "replacing",
     "sha256",
     "text_of",
 ]
 
-READABLE = (
-    "TIFF, PNG, BMP, JPEG, NPY, MATLAB, PCO .b16, Princeton .spe, pradformat HDF5, .shadowinv, "
-    "or numbers as .txt, .csv or .dat"
-)
-
-_READABLE_SIGNATURES: dict[bytes, str] = {
-    b"II*\x00": "tiff",
-    b"MM\x00*": "tiff",
-    b"II+\x00": "tiff",
-    b"MM\x00+": "tiff",
-    b"\x89PNG\r\n\x1a\n": "png",
-    b"BM": "bmp",
-    b"\xff\xd8\xff": "jpeg",
-    b"\x93NUMPY": "npy",
-    b"\x89HDF\r\n\x1a\n": "hdf5",
-    b"MATLAB": "mat",
-    b"PCO-": "b16",
-    b"pco-": "b16",
-}
-
-_TEXT_SUFFIXES = (".txt", ".csv", ".dat", ".asc")
-
-# Where Princeton's header keeps two numbers that are always the same, and these.
-_SPE_MARKS = ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55"))
+DEFLATE_RATIO = 1040
+"""The most that zlib can pack into one byte, a little rounded up."""
 
 # The disk is full, the quota used up, or the file longer than is allowed.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
-_OTHER_SIGNATURES: dict[bytes, str] = {
-    b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
-    b"\x1f\x8b": "a gzip archive",
-    b"%PDF": "a PDF document",
-    b"GIF8": "a GIF picture",
-    b"SIMPLE  =": "a FITS file",
-    b"CDF": "a NetCDF 3 file",
-}
 
+def check_promise(path: Path, header: str, promised: int, held: int) -> None:
+    """Refuse a file whose `header` promises more bytes than it holds, before memory is asked for.
 
-@refusing_damage
-def kind_of(path: Path) -> str:
-    """Tell the kind of a file from its content; its name may lie.
-
-    Numbers as text have no mark: they need one of the usual endings too.
-
-    Parameters
-    ----------
-    path : str or Path
-        A file.
-
-    Returns
-    -------
-    str
-        ``"tiff"``, ``"png"``, ``"bmp"``, ``"jpeg"``, ``"npy"``, ``"hdf5"``, ``"mat"``, ``"b16"``,
-        ``"spe"`` or ``"text"``.
-
-    Raises
-    ------
-    FileFormatError
-        If there is no such file, it cannot be opened, is empty, or of another kind.
+    How much may be asked for at all is another question: `napari_shadowinv._system.safety`.
     """
-    head = _first_bytes(path)
-    if not head:
-        raise FileFormatError(f"{path} is empty (0 bytes): expected {READABLE}; copy it again")
-    for signature, kind in _READABLE_SIGNATURES.items():
-        if head.startswith(signature):
-            return kind
-    if is_spe(path):
-        return "spe"
-    if path.suffix.lower() in _TEXT_SUFFIXES and _is_text(head):
-        return "text"
-    raise FileFormatError(
-        f"{path} is {_describe(head)}: expected {READABLE}; export the image to one of these"
-    )
-
-
-def is_spe(path: Path) -> bool:
-    """Tell whether a file is SPE by the marks inside its header, or else by its name.
-
-    Parameters
-    ----------
-    path : Path
-        A file.
-
-    Returns
-    -------
-    bool
-        True for a file with either mark, and for one that is named ``.spe`` and no text: the
-        oldest programs left the marks out.
-    """
-    with path.open("rb") as file:
-        head = file.read(4100)
-    marked = any(head[at : at + len(mark)] == mark for at, mark in _SPE_MARKS)
-    return marked or (path.suffix.lower() == ".spe" and not _is_text(head[:64]))
-
-
-def _first_bytes(path: Path, count: int = 64) -> bytes:
-    check_regular(path, f"a file ({READABLE})")
-    with path.open("rb") as file:
-        return file.read(count)
-
-
-def _describe(head: bytes) -> str:
-    for signature, text in _OTHER_SIGNATURES.items():
-        if head.startswith(signature):
-            return text
-    return "a text file" if _is_text(head) else "not in a recognised image format"
-
-
-def _is_text(head: bytes) -> bool:
-    try:
-        # Incremental, because the last character may have been cut in two.
-        text = codecs.getincrementaldecoder("utf-8-sig")().decode(head)
-    except UnicodeDecodeError:
-        # Comments that Windows wrote, such as µm in latin-1.
-        text = head.decode("latin-1")
-        return _is_plain(text) and text[0] in "#%"
-    return _is_plain(text)
-
-
-def _is_plain(text: str) -> bool:
-    return all(character.isprintable() or character.isspace() for character in text)
+    if promised > held:
+        raise FileFormatError(
+            f"{path} is damaged or truncated: its {header} header implies {promised} bytes, but "
+            f"at most {held} are present; copy it again"
+        )
 
 
 def sha256(path: str | Path) -> str:
@@ -168,32 +62,14 @@ def text_of(path: str | Path) -> str:
 
     Names that are no text in this system's encoding, as an old disk may hold them, show the
     bytes that are not understood.
-
-    Parameters
-    ----------
-    path : str or Path
-        A path or a name.
-
-    Returns
-    -------
-    str
     """
     return os.fsencode(path).decode("utf-8", errors="backslashreplace")
 
 
 def in_counting_order(paths: Iterable[Path]) -> list[Path]:
-    """Sort files as one counts, folder by folder.
+    """Sort files as one counts, folder by folder: numbers in names count by their value.
 
-    Parameters
-    ----------
-    paths : iterable of Path
-        Files.
-
-    Returns
-    -------
-    list of Path
-        The same; numbers in their names, and in those of their folders, count by their value.
-        Upper and lower case are the same but for names that differ in nothing else.
+    Upper and lower case are the same but for names that differ in nothing else.
 
     Examples
     --------
@@ -252,18 +128,7 @@ def check_output(
 
 
 def check_folder_of(path: Path) -> None:
-    """Refuse a path that has no folder to lie in, or one that nothing can be written to.
-
-    Parameters
-    ----------
-    path : Path
-        The file or folder to be made later.
-
-    Raises
-    ------
-    FileFormatError
-        If its folder is missing or read-only.
-    """
+    """Refuse a path that has no folder to lie in, or one that nothing can be written to."""
     if not path.parent.is_dir():
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} does not exist; create it first"
@@ -314,7 +179,9 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         # Someone else may have written the file during the work.
         check_output(path, overwrite)
         with interrupts_put_off():
-            _flush(temporary)
+            # Only when the disk has the file is it known that there was room for it.
+            with temporary.open("rb+") as file:
+                os.fsync(file.fileno())
             os.replace(temporary, path)
     except OSError as error:
         if error.errno not in _NO_ROOM:
@@ -327,9 +194,3 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         # A second Ctrl-C must not leave the half of it behind.
         with interrupts_put_off():
             temporary.unlink(missing_ok=True)
-
-
-def _flush(path: Path) -> None:
-    """Wait until the disk has a file; only then is it known that there was room for it."""
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())

@@ -1,6 +1,6 @@
 """Any HDF5 file, for its arrays by name.
 
-- the array that the user names: `read_hdf5`
+- the array that the user names: `read_hdf5`, as an image `read_plane`
 - what there is to choose from: `held_arrays`
 - for a module that knows the layout: an item by its name, `member`; the values of an array,
   `load_dataset`; all arrays at once, `check_arrays`
@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.safety import check_size, refusing_damage
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.size_checks import DEFLATE_RATIO, check_promise
+from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
 __all__ = [
     "check_arrays",
@@ -36,6 +36,7 @@ __all__ = [
     "member",
     "members",
     "read_hdf5",
+    "read_plane",
 ]
 
 # Whoever has more than that to choose from knows what is in the file.
@@ -44,28 +45,10 @@ _MOST_LINKS = 16
 
 
 def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
-    """Return an item by its name, without leaving the file.
+    """Return an item by its name, with those of its groups, without leaving the file.
 
-    Parameters
-    ----------
-    path : Path
-        The file, for the message.
-    group : h5py.Group
-        Where to look.
-    name : str
-        The item, with the names of the groups that it is in.
-    depth : int
-        How many links led here.
-
-    Returns
-    -------
-    h5py.Dataset or h5py.Group or None
-        None if there is no such item.
-
-    Raises
-    ------
-    FileFormatError
-        If the name leads into another file.
+    None if there is no such item; `FileFormatError`, about `path`, if the name leads into another
+    file. `depth` counts the links that led here.
     """
     import h5py
 
@@ -102,26 +85,11 @@ def members(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
             yield name, group[name]
 
 
-def load_dataset(path: Path, dataset: Any) -> NDArray[Any]:
+def load_dataset(path: Path, dataset: Any) -> AnyArray:
     """Return the values of an array that the file really holds.
 
-    Parameters
-    ----------
-    path : Path
-        The file, for the message.
-    dataset : h5py.Dataset
-        The array. HDF5 would fill what was never written with zeros.
-
-    Returns
-    -------
-    ndarray
-        Its values.
-
-    Raises
-    ------
-    FileFormatError
-        If its shape promises more than is stored or fits into memory, or its values lie in
-        another file.
+    HDF5 would fill what was never written with zeros: an array whose shape promises more than is
+    stored or fits into memory is refused, and so are values in another file.
     """
     check_size(path, _unfolded(path, dataset))
     _check_promise(path, dataset)
@@ -149,18 +117,7 @@ def _unfolded(path: Path, dataset: Any) -> int:
 
 
 def check_arrays(path: Path) -> None:
-    """Refuse a file whose arrays lie in other files or do not fit into memory together.
-
-    Parameters
-    ----------
-    path : Path
-        An HDF5 file that is to be read as a whole.
-
-    Raises
-    ------
-    FileFormatError
-        If it is so, or some array is larger than it can be.
-    """
+    """Refuse a file whose arrays lie in other files or do not fit into memory together."""
     import h5py
 
     total = 0
@@ -186,24 +143,9 @@ def _all_datasets(path: Path, group: Any) -> Iterator[Any]:
 
 @contextmanager
 def hdf5_in_memory(path: Path) -> Iterator[BytesIO]:
-    """Make an HDF5 file in memory, and write it to the disk in one go.
+    """Make an HDF5 file in memory, and write it to the disk in one go when the block ends well.
 
     The HDF5 library ends the process where it cannot write: a full disk, a quota.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Yields
-    ------
-    BytesIO
-        What h5py and h5netcdf take for a file. It is written when the block ends well.
-
-    Raises
-    ------
-    OSError
-        If there is no room for it.
     """
     content = BytesIO()
     yield content
@@ -211,65 +153,34 @@ def hdf5_in_memory(path: Path) -> Iterator[BytesIO]:
 
 
 @refusing_damage
-def read_hdf5(path: Path, name: str) -> NDArray[Any]:
-    """Read one array.
-
-    Parameters
-    ----------
-    path : Path
-        An HDF5 file.
-    name : str
-        The dataset, with the names of the groups that it is in: ``"shots/3/image"``.
-
-    Returns
-    -------
-    ndarray
-        The array as it is stored.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged.
-    InputError
-        If there is no such array of numbers; the message lists those that there are.
-    """
+def read_hdf5(path: Path, name: str) -> AnyArray:
+    """Read one array by its name, with those of its groups: ``shots/3/image``."""
     import h5py
 
     with h5py.File(path, "r") as file:
         item = member(path, file, name)
         if isinstance(item, h5py.Dataset) and _is_numeric(item):
             return load_dataset(path, item)
-        held = ", ".join(_listed(path, file)) or "none"
+        held = ", ".join(held_arrays(path, file)) or "none"
     raise InputError(f"{path} has no array {name!r}: it holds {held}")
 
 
-@refusing_damage
-def held_arrays(path: Path) -> list[str]:
-    """Name the images that a file holds, each with its shape and type.
+def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
+    """Read one array as an image, whatever else the file is."""
+    array = read_hdf5(path, name)
+    if array.ndim != 2 or array.size == 0:
+        raise FileFormatError(
+            f"{path} holds {name!r} with shape {array.shape}: expected an image of shape "
+            "(height, width); choose or save one plane"
+        )
+    return array, {"kind": "hdf5", "variable": name}
 
-    Parameters
-    ----------
-    path : Path
-        An HDF5 file.
 
-    Returns
-    -------
-    list of str
-        Such as ``"'shot' (480×640 uint16)"``; groups inside groups are not searched, and a
-        long list is cut.
+def held_arrays(path: Path, file: Any) -> list[str]:
+    """Name the images of an open file, with shape and type: ``'shot' (480×640 uint16)``.
 
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged.
+    Groups inside groups are not searched, and a long list is cut.
     """
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return _listed(path, file)
-
-
-def _listed(path: Path, file: Any) -> list[str]:
     found = [
         f"{name!r} ({'×'.join(map(str, item.shape))} {item.dtype})"
         for name, item in itertools.islice(_items(path, file), 10 * _MOST_LISTED)

@@ -1,85 +1,51 @@
-"""Pictures: TIFF with 8, 16 or 32 bits, PNG, BMP and JPEG.
+"""Pictures (TIFF with 8, 16 or 32 bits, PNG, BMP, JPEG) and numpy's arrays, one plane each.
 
-- read one of these, or a plane of another family of formats: `read_picture`
+- read one, with its bits per sample: `read_tiff`, `read_png`, `read_eight_bits`, `read_npy_plane`
+- an array of any shape: `read_npy`; pickled objects are refused
 - a page of a TIFF that holds many: `tiff_pages`, `read_tiff_page`
-- write a plane: `write_tiff`, `write_png`
+- write a plane: `write_tiff`, `write_png`, `write_npy`
 """
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.safety import check_regular, check_size, refusing_damage
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.camera import read_b16, read_spe
 from napari_shadowinv.io.colours import film_warnings, to_grey
-from napari_shadowinv.io.matlab import read_mat
-from napari_shadowinv.io.size_checks import DEFLATE_RATIO, check_promise
-from napari_shadowinv.io.text import read_text
+from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
-__all__ = ["PICTURES", "read_picture", "read_tiff_page", "tiff_pages", "write_png", "write_tiff"]
-
-PICTURES = ("tiff", "png", "bmp", "jpeg")
-"""Kinds of `kind_of` that a scanner may have written."""
-
-
-@refusing_damage
-def read_picture(path: Path, kind: str) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Read a picture as it is stored.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    kind : str
-        What `kind_of` said.
-
-    Returns
-    -------
-    array : ndarray, shape (H, W) or (H, W, C)
-        Pixels in the file's own dtype.
-    metadata : dict
-        ``bits``: bits per sample.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged or holds anything else than one picture.
-    """
-    array, metadata = _reader(kind)(path)
-    _check(path, kind, array)
-    return array, metadata
-
+__all__ = [
+    "read_eight_bits",
+    "read_npy",
+    "read_npy_plane",
+    "read_png",
+    "read_tiff",
+    "read_tiff_page",
+    "tiff_pages",
+    "write_npy",
+    "write_png",
+    "write_tiff",
+]
 
 # LZW at its best packs two and a half times as well as zlib.
 _TIFF_RATIO = 3 * DEFLATE_RATIO
 
 
-def _reader(kind: str) -> Callable[[Path], tuple[NDArray[Any], dict[str, Any]]]:
-    readers: dict[str, Callable[[Path], tuple[NDArray[Any], dict[str, Any]]]] = {
-        "tiff": _read_tiff,
-        "png": _read_png,
-        "mat": read_mat,
-        "text": read_text,
-        "b16": read_b16,
-        "spe": read_spe,
-    }
-    return readers.get(kind, _read_eight_bits)
-
-
-def _check(path: Path, kind: str, array: NDArray[Any]) -> None:
+def _check(path: Path, name: str, array: AnyArray) -> None:
     is_picture = array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (2, 3, 4))
     if not is_picture or array.size == 0:
         raise FileFormatError(
-            f"{path} holds a {kind.upper()} array of shape {array.shape}: expected one picture, "
+            f"{path} holds a {name} array of shape {array.shape}: expected one picture, "
             "(height, width) or with 3 or 4 colour channels last; save one plane"
         )
     if array.dtype.kind not in "buif":
@@ -89,21 +55,23 @@ def _check(path: Path, kind: str, array: NDArray[Any]) -> None:
 
 
 @contextmanager
-def _silent(name: str) -> Iterator[None]:
-    """Keep a decoder's own log lines off the terminal: the error says it once."""
-    logger = logging.getLogger(name)
+def _opened(path: Path) -> Iterator[Any]:
+    """A TIFF; the decoder's log lines stay off the terminal, because the error says it once."""
+    import tifffile
+
+    logger = logging.getLogger("tifffile")
     before = logger.disabled
     logger.disabled = True
     try:
-        yield
+        with tifffile.TiffFile(path) as tiff:
+            yield tiff
     finally:
         logger.disabled = before
 
 
-def _read_tiff(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
-    import tifffile
-
-    with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
+def read_tiff(path: Path) -> tuple[AnyArray, dict[str, Any]]:
+    """Read a TIFF with one page."""
+    with _opened(path) as tiff:
         if len(tiff.pages) != 1:
             raise FileFormatError(
                 f"{path} has {len(tiff.pages)} pages: expected one radiograph per file; save the "
@@ -112,84 +80,40 @@ def _read_tiff(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
         return _read_page(path, tiff.pages[0].aspage())
 
 
-def _read_page(path: Path, page: Any) -> tuple[NDArray[Any], dict[str, Any]]:
-    import tifffile
-
+def _read_page(path: Path, page: Any) -> tuple[AnyArray, dict[str, Any]]:
     _check_complete(path, page)
     array = _decode(path, page)
-    if page.photometric == tifffile.PHOTOMETRIC.PALETTE and page.colormap is not None:
-        array = _apply_palette(array, page.colormap)
-    if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and array.dtype.kind == "u":
+    if page.photometric.name == "PALETTE" and page.colormap is not None:
+        array = np.moveaxis(page.colormap[:, array], 0, -1)
+    if page.photometric.name == "MINISWHITE" and array.dtype.kind == "u":
         # The format says that 0 is the brightest value here.
         array = (2**page.bitspersample - 1 - array).astype(array.dtype)
     if array.ndim == 3 and page.axes in ("SYX", "CYX"):
         array = np.moveaxis(array, 0, -1)
+    _check(path, "TIFF", array)
     return array, {"bits": int(page.bitspersample)}
 
 
 @refusing_damage
 def tiff_pages(path: Path) -> int:
-    """Return how many pages a TIFF has.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    int
-        1 for an ordinary picture.
-
-    Raises
-    ------
-    FileFormatError
-        If the chain of pages is damaged.
-    """
-    import tifffile
-
-    with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
+    """Return how many pages a TIFF has."""
+    with _opened(path) as tiff:
         return len(tiff.pages)
 
 
 @refusing_damage
 def read_tiff_page(
     path: Path, number: int, *, channel: str | int | None = None
-) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Read one page of a TIFF that holds many.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    number : int
-        Which page, from 0.
-    channel : {"red", "green", "blue", "mean"} or int, optional
-        What to take of a colour image.
-
-    Returns
-    -------
-    image : ndarray, shape (H, W)
-        Its pixels.
-    warnings : tuple of str
-        See `Radiograph`.
-
-    Raises
-    ------
-    FileFormatError, InputError
-        If the page is damaged, or has colours.
-    """
-    import tifffile
-
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Read page `number`, from 0, of a TIFF that holds many, with warnings as of a `Radiograph`."""
     check_regular(path, "a TIFF")
-    with _silent("tifffile"), tifffile.TiffFile(path) as tiff:
+    with _opened(path) as tiff:
         array, _ = _read_page(path, tiff.pages[number].aspage())
-    _check(path, "tiff", array)
     where = f"page {number} of {path}"
     return to_grey(array, channel, where), film_warnings(array, channel)
 
 
-def _decode(path: Path, page: Any) -> NDArray[Any]:
+def _decode(path: Path, page: Any) -> AnyArray:
     try:
         return np.asarray(page.asarray())
     except ValueError as error:
@@ -226,11 +150,8 @@ def _check_complete(path: Path, page: Any) -> None:
     check_size(path, max(page.size, math.prod(page.chunks)) * max(8, page.dtype.itemsize))
 
 
-def _apply_palette(array: NDArray[Any], palette: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    return np.moveaxis(palette[:, array], 0, -1)
-
-
-def _read_png(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+def read_png(path: Path) -> tuple[AnyArray, dict[str, Any]]:
+    """Read a PNG; colours with 16 bits are refused."""
     with path.open("rb") as file:
         bits = file.read(25)[24]
     array = _read_with_pillow(path)
@@ -239,14 +160,18 @@ def _read_png(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
             f"{path} is a colour PNG with 16 bits per channel, which would be reduced to 8 bits: "
             "expected a greyscale PNG or a TIFF; save it as TIFF"
         )
+    _check(path, "PNG", array)
     return array, {"bits": bits}
 
 
-def _read_eight_bits(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
-    return _read_with_pillow(path), {"bits": 8}
+def read_eight_bits(path: Path) -> tuple[AnyArray, dict[str, Any]]:
+    """Read a picture whose format has 8 bits per sample."""
+    array = _read_with_pillow(path)
+    _check(path, "picture's", array)
+    return array, {"bits": 8}
 
 
-def _read_with_pillow(path: Path, index: int = 0) -> NDArray[Any]:
+def _read_with_pillow(path: Path, index: int = 0) -> AnyArray:
     import imageio.v3 as iio
 
     # A file object, because imageio would believe the name.
@@ -258,18 +183,49 @@ def _read_with_pillow(path: Path, index: int = 0) -> NDArray[Any]:
         return np.asarray(picture.read(index=index))
 
 
-def write_tiff(path: Path, plane: NDArray[Any], pixel_size: float | None = None) -> None:
-    """Write a plane as float32 TIFF.
+@refusing_damage
+def read_npy(path: Path) -> AnyArray:
+    """Read an array of real numbers, of any shape and in its own dtype."""
+    # Mapped first: a header that promises too much then fails before memory is asked for.
+    try:
+        mapped = np.load(path, allow_pickle=False, mmap_mode="r")
+    except ValueError as error:
+        if "Python objects" not in str(error):
+            raise
+        raise FileFormatError(
+            f"{path} contains Python objects: expected an array of numbers; save it again with "
+            "array.astype(float)"
+        ) from error
+    check_size(path, mapped.size * max(8, mapped.dtype.itemsize))
+    array = np.array(mapped)
+    if array.dtype.kind not in "buif":
+        raise FileFormatError(
+            f"{path} holds {array.dtype} values: expected whole or real numbers; convert them"
+        )
+    return array
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    plane : ndarray, shape (H, W)
-        The values, kept as they are.
-    pixel_size : float, optional
-        Width of a pixel in metres, stored as the resolution.
-    """
+
+def read_npy_plane(path: Path) -> tuple[AnyArray, dict[str, Any]]:
+    """Read an image; arrays of other shapes are refused."""
+    array = read_npy(path)
+    if array.ndim != 2 or array.size == 0:
+        raise FileFormatError(
+            f"{path} holds an array of shape {array.shape}: expected an image of shape "
+            "(height, width); save one plane of it"
+        )
+    return array, {}
+
+
+def write_npy(path: Path, array: AnyArray, pixel_size: float | None = None) -> None:
+    """Write an array as it is; the format does not keep the size of a pixel."""
+    content = BytesIO()
+    np.save(content, array, allow_pickle=False)
+    # Numpy does not tell why it cannot write to a file.
+    path.write_bytes(content.getbuffer())
+
+
+def write_tiff(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
+    """Write a plane as float32 TIFF, the width of a pixel (m) as its resolution."""
     import tifffile
 
     options: dict[str, Any] = {}
@@ -279,25 +235,13 @@ def write_tiff(path: Path, plane: NDArray[Any], pixel_size: float | None = None)
     tifffile.imwrite(path, np.asarray(plane, dtype=np.float32), photometric="minisblack", **options)
 
 
-def write_png(path: Path, plane: NDArray[Any]) -> float:
-    """Write a plane as a grey PNG with 16 bits, its largest value white.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    plane : ndarray, shape (H, W)
-        The values; negative ones become black.
-
-    Returns
-    -------
-    float
-        What one grey level stands for.
-    """
-    import imageio.v3 as iio
+def write_png(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
+    """Write a plane with 16 bits, its largest value white, negative ones black."""
+    from PIL import Image
 
     level = max(float(np.max(plane)), 0.0) / 65535 or 1.0
     grey = np.clip(np.rint(np.asarray(plane) / level), 0, 65535).astype(np.uint16)
-    # A file that imageio cannot write to complains once more when Python clears up.
-    path.write_bytes(iio.imwrite("<bytes>", grey, extension=".png", plugin="pillow"))
-    return level
+    content = BytesIO()
+    Image.fromarray(grey).save(content, "PNG")
+    # Only when all of it is there: a full disk then gives one plain error.
+    path.write_bytes(content.getbuffer())

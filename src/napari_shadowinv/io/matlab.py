@@ -2,105 +2,122 @@
 
 - the one image of a file, or the variable that the user names: `read_mat`
 - what there is to choose from: `mat_variables`
-- tell MATLAB 7.3 from other HDF5 files: `is_mat73`, `is_other_hdf5`
+- tell MATLAB 7.3 from other HDF5 files: `is_matlab`
 
 An image is a numeric array with two rows and two columns at least, so that scalars and
 vectors beside it do not count. Fields of structs and entries of cells are not searched.
+
+scipy's reader of MATLAB's own layout asks for the memory that a damaged length names, and a damaged
+type crashes it together with the whole program; so planes of numbers, all that is needed, are read
+here.
+
+References
+----------
+MathWorks, MAT-File Format (2019).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+import math
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv._system.safety import check_size, refusing_damage
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 from napari_shadowinv.io.hdf5 import load_dataset, member, members
-from napari_shadowinv.io.mat5 import Variable, variables_5
 
-__all__ = ["is_mat73", "is_other_hdf5", "mat_variables", "read_mat"]
+__all__ = ["Variable", "is_matlab", "mat_variables", "read_mat"]
 
 _HDF5_OFFSET = 512
 # Attributes of pradformat and of .shadowinv, which MATLAB's save does not write.
 _FOREIGN_MARKS = {"object_type", "format"}
+_HEADER = 128
+_MATRIX, _COMPRESSED = 14, 15
+_COMPLEX, _LOGICAL = 0x0800, 0x0200
+# Enough for a variable's flags, dimensions and name.
+_PREAMBLE = 1024
+
+_CLASSES = {
+    1: "cell",
+    2: "struct",
+    3: "object",
+    4: "char",
+    5: "sparse",
+    6: "double",
+    7: "single",
+    8: "int8",
+    9: "uint8",
+    10: "int16",
+    11: "uint16",
+    12: "int32",
+    13: "uint32",
+    14: "int64",
+    15: "uint64",
+    16: "function handle",
+}
+_DTYPES = {"double": "f8", "single": "f4", "logical": "?"}
+# Types of the values as they are kept.
+_STORED = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
+_Bytes: TypeAlias = bytes | memoryview
+_NUMERIC = {name for number, name in _CLASSES.items() if 6 <= number <= 15} | {"logical"}
 
 
-def _is_foreign(attributes: Container[str]) -> bool:
-    # by name: walking all attributes of a damaged file may never end
-    return any(mark in attributes for mark in _FOREIGN_MARKS)
+@dataclass(frozen=True)
+class Variable:
+    """An array in a MAT-file, read when `load` is called; the shape is as MATLAB shows it."""
+
+    name: str
+    shape: tuple[int, ...]
+    type: str
+    load: Callable[[], AnyArray]
+
+    @property
+    def is_image(self) -> bool:
+        return self.type in _NUMERIC and len(self.shape) == 2 and min(self.shape) >= 2
+
+    def __str__(self) -> str:
+        return f"'{self.name}' ({'×'.join(map(str, self.shape))} {self.type})"
 
 
-@refusing_damage
-def is_mat73(path: Path) -> bool:
-    """Tell whether an HDF5 file is one of MATLAB's, though it begins as plain HDF5.
-
-    Parameters
-    ----------
-    path : Path
-        A file that begins as HDF5.
-
-    Returns
-    -------
-    bool
-        True if its arrays carry MATLAB's marks and it is no file of pradformat.
-    """
+def is_matlab(path: Path) -> bool:
+    """Tell whether a file that begins as MATLAB's, or as HDF5, is one of MATLAB's."""
     import h5py
 
+    with path.open("rb") as file:
+        is_named = file.read(6) == b"MATLAB"
+    if is_named and not h5py.is_hdf5(path):
+        return True
     with h5py.File(path, "r") as file:
-        marked = any("MATLAB_class" in item.attrs for _, item in members(path, file))
-        return marked and not _is_foreign(file.attrs)
+        # By name: walking all attributes of a damaged file may never end.
+        if any(mark in file.attrs for mark in _FOREIGN_MARKS):
+            return False
+        return is_named or any("MATLAB_class" in item.attrs for _, item in members(path, file))
 
 
-@refusing_damage
-def is_other_hdf5(path: Path) -> bool:
-    """Tell whether a file is HDF5 of another family, though it begins as MATLAB's.
+def read_mat(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:
+    """Read the image of a MAT-file, rows first as MATLAB shows it, in the file's own dtype.
 
-    Parameters
-    ----------
-    path : Path
-        A file that begins with MATLAB's name.
-
-    Returns
-    -------
-    bool
-        True if it carries the marks of pradformat or of a ``.shadowinv`` result.
-    """
-    import h5py
-
-    if not h5py.is_hdf5(path):
-        return False
-    with h5py.File(path, "r") as file:
-        return _is_foreign(file.attrs)
-
-
-@refusing_damage
-def read_mat(path: Path, variable: str | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Read an image from a MAT-file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    variable : str, optional
-        Name of the array; not needed if the file holds one image only.
-
-    Returns
-    -------
-    array : ndarray, shape (H, W)
-        The array, rows first as MATLAB shows it, in the file's own dtype.
-    metadata : dict
-        ``variable``: its name; ``bits``: bits per value.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged or holds no image.
-    InputError
-        If it holds several and none was named, or the name is not that of an image.
+    The name of the variable is not needed if the file holds one image only; `InputError` if it
+    holds several and none was named, or the name is not that of an image.
     """
     chosen = _choose(path, mat_variables(path), variable)
     array = chosen.load()
@@ -114,30 +131,13 @@ def read_mat(path: Path, variable: str | None = None) -> tuple[NDArray[Any], dic
 
 @refusing_damage
 def mat_variables(path: Path) -> list[Variable]:
-    """List the variables of a MAT-file, without their values.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    list of Variable
-        In the file's order; `Variable.is_image` tells which could be an image.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged.
-    """
-    return _variables_73(path) if _is_hdf5(path) else variables_5(path)
-
-
-def _is_hdf5(path: Path) -> bool:
+    """List the variables of a MAT-file in its order, without their values."""
     with path.open("rb") as file:
         head = file.read(_HDF5_OFFSET + 4)
-    return b"\x89HDF" in (head[:4], head[_HDF5_OFFSET:]) or head.startswith(b"MATLAB 7.3")
+        if b"\x89HDF" not in (head[:4], head[_HDF5_OFFSET:]) and head[:10] != b"MATLAB 7.3":
+            file.seek(0)
+            return list(_variables_5(path, file))
+    return _variables_73(path)
 
 
 def _choose(path: Path, variables: list[Variable], name: str | None) -> Variable:
@@ -186,11 +186,102 @@ def _described(path: Path, name: str, item: Any) -> Variable:
     return Variable(name, item.shape[::-1], type_name, _loader_73(path, name))
 
 
-def _loader_73(path: Path, name: str) -> Callable[[], NDArray[Any]]:
-    def load() -> NDArray[Any]:
+def _loader_73(path: Path, name: str) -> Callable[[], AnyArray]:
+    def load() -> AnyArray:
         import h5py
 
         with h5py.File(path, "r") as file:
             return load_dataset(path, member(path, file, name)).T
 
     return load
+
+
+def _variables_5(path: Path, file: BinaryIO) -> Iterator[Variable]:
+    """Variables of MATLAB's own layout: their headers are read, not yet their values."""
+    size = path.stat().st_size
+    order = _order(file)
+    start = _HEADER
+    while start < size:
+        file.seek(start)
+        kind, count = struct.unpack(f"{order}II", file.read(8))
+        check_promise(path, "MATLAB", start + 8 + count, size)
+        body = file.read(min(count, _PREAMBLE))
+        if kind == _COMPRESSED:
+            body = zlib.decompressobj().decompress(body, _PREAMBLE)
+            kind, inner = struct.unpack(f"{order}II", body[:8])
+            check_promise(path, "MATLAB", inner, DEFLATE_RATIO * count)
+            body = body[8:]
+        if kind == _MATRIX:
+            name, shape, type_name, _ = _preamble(body, order)
+            check_promise(path, "MATLAB", math.prod(shape), DEFLATE_RATIO * count)
+            if name:
+                yield Variable(name, shape, type_name, _loader(path, start, count, shape))
+        start += 8 + count
+
+
+def _order(file: BinaryIO) -> str:
+    order = {b"IM": "<", b"MI": ">"}.get(file.read(_HEADER)[126:])
+    if order is None:
+        raise ValueError("no byte order in its header")
+    return order
+
+
+def _preamble(body: _Bytes, order: str) -> tuple[str, tuple[int, ...], str, int]:
+    """Name, shape and class of a variable, and where its values begin."""
+    flags = struct.unpack_from(f"{order}I", body, 8)[0]
+    type_name = "logical" if flags & _LOGICAL else _CLASSES.get(flags & 0xFF, "object")
+    if type_name == "object":
+        # Opaque objects have no dimensions here.
+        return "an object", (), type_name, 0
+    if flags & _COMPLEX:
+        type_name = f"complex {type_name}"
+    _, dims, after = _field(body, 16, order)
+    shape = struct.unpack(f"{order}{len(dims) // 4}i", dims)
+    if len(shape) < 2 or min(shape) < 0:
+        raise ValueError("shape")
+    _, name, after = _field(body, after, order)
+    return bytes(name).decode("latin-1"), shape, type_name, after
+
+
+def _field(body: _Bytes, start: int, order: str) -> tuple[int, _Bytes, int]:
+    """Type and content of a data element, and where the next begins."""
+    (kind,) = struct.unpack_from(f"{order}I", body, start)
+    # Short elements share their tag.
+    short = kind >> 16
+    count = short or struct.unpack_from(f"{order}I", body, start + 4)[0]
+    start += 4 if short else 8
+    if (short > 4) or start + count > len(body):
+        raise ValueError("element beyond its place")
+    return kind & 0xFFFF, body[start : start + count], start + (4 if short else -(-count // 8) * 8)
+
+
+def _loader(path: Path, start: int, count: int, shape: tuple[int, ...]) -> Callable[[], AnyArray]:
+    def load() -> AnyArray:
+        check_size(path, 8 * math.prod(shape))
+        with path.open("rb") as file:
+            order = _order(file)
+            file.seek(start)
+            (kind,) = struct.unpack(f"{order}I4x", file.read(8))
+            body = file.read(count)
+        return _values(_unpacked(path, body, order) if kind == _COMPRESSED else body, order)
+
+    return load
+
+
+def _unpacked(path: Path, packed: bytes, order: str) -> bytes:
+    unpacker = zlib.decompressobj()
+    count = struct.unpack(f"{order}4xI", unpacker.decompress(packed, 8))[0]
+    check_size(path, count)
+    body = unpacker.decompress(unpacker.unconsumed_tail, max(count, 1))
+    check_promise(path, "MATLAB", count, len(body))
+    return body
+
+
+def _values(body: bytes, order: str) -> AnyArray:
+    """Read a plane of numbers, which MATLAB keeps column after column."""
+    view = memoryview(body)
+    _, shape, type_name, start = _preamble(view, order)
+    kind, content, _ = _field(view, start, order)
+    stored = np.frombuffer(content, dtype=np.dtype(f"{order}{_STORED[kind]}"))
+    # Whole numbers are kept in as few bytes as they need.
+    return stored.reshape(shape, order="F").astype(_DTYPES.get(type_name, type_name), copy=False)

@@ -19,11 +19,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._system.safety import check_regular, refusing_damage
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import FORMAT, dataset_from_field
+from napari_shadowinv.inversion.labels import (
+    FORMAT,
+    dataset_from_field,
+    setup_from_dataset,
+)
+from napari_shadowinv.inversion.result import provenance_of
+from napari_shadowinv.io.dataset import require
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
 
 if TYPE_CHECKING:
@@ -33,7 +39,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.preprocessing import Provenance
 
 __all__ = [
-    "VERSION",
     "check_pradformat_setup",
     "is_ours",
     "is_result",
@@ -41,7 +46,7 @@ __all__ = [
     "write_pradformat",
 ]
 
-VERSION = "0.2.0"
+_VERSION = "0.2.0"
 
 _EV_PER_MEV = 1e6
 
@@ -55,46 +60,18 @@ _SYMBOLS: dict[Species, str] = {
 }
 
 
-@refusing_damage
 def is_result(path: Path) -> bool:
-    """Tell whether an HDF5 file is a ``.shadowinv`` result, whatever its name.
+    """Tell whether a file that begins as HDF5 or MATLAB's is a ``.shadowinv`` result."""
+    import h5py
 
-    Parameters
-    ----------
-    path : Path
-        An HDF5 file.
-
-    Returns
-    -------
-    bool
-        False for any other HDF5 file.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged.
-    """
+    if not h5py.is_hdf5(path):
+        return False
     return str(_root_attributes(path).get("format", "")).startswith(FORMAT)
 
 
 @refusing_damage
 def is_ours(path: Path) -> bool:
-    """Tell whether an HDF5 file is a ``.shadowinv`` result or pradformat; much else is HDF5 too.
-
-    Parameters
-    ----------
-    path : Path
-        A file.
-
-    Returns
-    -------
-    bool
-
-    Raises
-    ------
-    FileFormatError
-        If it is no regular file, or damaged.
-    """
+    """Tell whether an HDF5 file is a ``.shadowinv`` result or pradformat; much else is HDF5 too."""
     check_regular(path, "an HDF5 file")
     attributes = _root_attributes(path)
     return "format" in attributes or attributes.get("object_type") in ("radiograph", "inversion")
@@ -146,27 +123,15 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-@refusing_damage
-def read_pradformat(path: Path) -> tuple[NDArray[Any], dict[str, Any]] | xarray.Dataset:
+def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Dataset:
     """Read a radiograph, or a potential or field that some code retrieved.
 
-    Parameters
-    ----------
-    path : Path
-        A pradformat file with object type "radiograph" or "inversion".
-
-    Returns
-    -------
-    (ndarray, dict) or xarray.Dataset
-        For a radiograph, the image and what the file says: ``geometry`` holds the fields of
-        a setup of particles that it knows. For an inversion, a dataset with displacement and,
-        where given, potential, in pixels and in SI units.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is no pradformat file, of another object type, incomplete or damaged.
+    A radiograph gives the image and what the file says, in ``geometry`` the fields of `Setup`
+    that it knows; an inversion a dataset with displacement and, where given, potential, in pixels
+    and in SI units.
     """
+    import h5py
+
     attributes = _root_attributes(path)
     kind = attributes.get("object_type")
     if kind == "radiograph":
@@ -177,11 +142,13 @@ def read_pradformat(path: Path) -> tuple[NDArray[Any], dict[str, Any]] | xarray.
                 f"{path} is a pradformat radiograph with {found}: expected a dataset 'image' of "
                 "shape (height, width); export it again"
             )
-        return image, {**attributes, "geometry": _geometry(path, attributes, "pixel_width")}
+        geometry = _geometry(path, attributes, "pixel_width")
+        return image, {**attributes, "kind": "pradformat", "geometry": geometry}
     if kind == "inversion":
         return _read_inversion(path, attributes)
     found = f"the object type {kind!r}" if kind else "no attribute 'object_type'"
-    held = ", ".join(held_arrays(path))
+    with h5py.File(path, "r") as file:
+        held = ", ".join(held_arrays(path, file))
     advice = f"name one of its arrays with variable, of {held}" if held else "export it as TIFF"
     raise FileFormatError(
         f"{path} is an HDF5 file with {found}: expected a pradformat radiograph or inversion, or "
@@ -189,7 +156,7 @@ def read_pradformat(path: Path) -> tuple[NDArray[Any], dict[str, Any]] | xarray.
     )
 
 
-def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -257,63 +224,24 @@ def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
     return dataset_from_field(displacement, potential, setup, attributes={"format": "pradformat"})
 
 
-def write_pradformat(
-    path: Path,
-    displacement: ArrayLike,
-    potential: ArrayLike,
-    setup: Setup | None,
-    *,
-    provenance: Provenance | None = None,
-) -> None:
-    """Write a potential and its deflection angles as a pradformat "simple inversion".
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    displacement : array_like, shape (2, H, W)
-        Displacement in px, axis order (y, x).
-    potential : array_like, shape (H, W)
-        Normalised potential in px².
-    setup : Setup
-        The experiment; the format needs all of it.
-    provenance : Provenance, optional
-        How the result was made.
-
-    Raises
-    ------
-    InputError
-        If the setup is missing or that of a light beam.
-    """
+def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
+    """Write a result's potential and deflection angles as a pradformat "simple inversion"."""
     import h5py
 
-    particles = check_pradformat_setup(setup)
-    angle = particles.deflection_angle(displacement)
-    datasets = {"phi": -particles.potential(potential), "defl_ax1": angle[0], "defl_ax2": angle[1]}
+    require(dataset, ("displacement", "potential"))
+    setup = check_pradformat_setup(setup_from_dataset(dataset))
+    angle = setup.deflection_angle(dataset["displacement"].values)
+    potential = -setup.potential(dataset["potential"].values)
+    datasets = {"phi": potential, "defl_ax1": angle[0], "defl_ax2": angle[1]}
     with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
         for name, values in datasets.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
-        file.attrs.update(_inversion_attributes(particles, provenance))
+        attributes = _inversion_attributes(setup, provenance_of(dataset))
+        file.attrs.update(attributes)
 
 
 def check_pradformat_setup(setup: Setup | None) -> Setup:
-    """Refuse a setup that a pradformat inversion cannot be written with.
-
-    Parameters
-    ----------
-    setup : Setup or None
-        What is known of the experiment.
-
-    Returns
-    -------
-    Setup
-        The same.
-
-    Raises
-    ------
-    InputError
-        If the setup is missing or that of a light beam.
-    """
+    """Refuse a setup that a pradformat inversion cannot be written with; the format needs all."""
     if setup is None or not setup.in_pradformat:
         found = "none" if setup is None else f"kind '{setup.kind}'"
         raise InputError(
@@ -327,7 +255,7 @@ def _inversion_attributes(setup: Any, provenance: Provenance | None) -> dict[str
     attributes: dict[str, Any] = {
         "object_type": "inversion",
         "inversion_type": "simple",
-        "pradformat_version": VERSION,
+        "pradformat_version": _VERSION,
         "dr": setup.object_pixel_size,
         "source_object_dist": setup.source_object_distance,
         "object_image_dist": setup.object_image_distance,

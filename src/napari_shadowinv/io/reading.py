@@ -8,23 +8,17 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.arrays import read_npy
 from napari_shadowinv.io.colours import film_warnings, to_grey
-from napari_shadowinv.io.dataset import read_result
-from napari_shadowinv.io.files import kind_of, sha256
-from napari_shadowinv.io.hdf5 import read_hdf5
-from napari_shadowinv.io.images import PICTURES, read_picture
-from napari_shadowinv.io.matlab import is_mat73, is_other_hdf5, read_mat
-from napari_shadowinv.io.pradformat import is_result, read_pradformat
+from napari_shadowinv.io.files import sha256
+from napari_shadowinv.io.formats import Format, format_of
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.preprocessing import Radiograph
 
@@ -33,7 +27,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["read", "read_dataset", "read_radiograph", "read_toml"]
+__all__ = ["Radiograph", "read", "read_dataset", "read_radiograph", "read_toml"]
 
 _COMPLETE = {"energy", "source_object_distance", "object_image_distance"}
 
@@ -47,9 +41,9 @@ def read(
     Parameters
     ----------
     path : str or Path
-        TIFF (8, 16 or 32 bits, one page), PNG, BMP, JPEG, NPY, MATLAB (version 5 to 7.3),
-        PCO ``.b16``, Princeton ``.spe`` (one frame), numbers as text (``.txt``, ``.csv``,
-        ``.dat``), a pradformat radiograph or inversion, a ``.shadowinv`` result, or a
+        A file of any format in `napari_shadowinv.io.formats`: TIFF (8, 16 or 32 bits, one page)
+        and other pictures, NPY, MATLAB (version 5 to 7.3), frames of cameras (one each), numbers
+        as text, a pradformat radiograph or inversion, a ``.shadowinv`` result; or a
         ``.shadowinv.zarr`` store of many shots, which is read lazily.
     channel : {"red", "green", "blue", "mean"} or int, optional
         What to take of a colour image. An image whose channels are all equal is grey
@@ -73,61 +67,24 @@ def read(
     """
     if is_stack(path):
         return read_stack(path)
-    kind = _family(path)
-    if kind == "mat":
-        return _radiograph(path, kind, *read_mat(path, variable))
-    if variable is not None and kind != "hdf5":
+    found = format_of(path)
+    if variable is not None and not found.named_reader:
         raise InputError(
-            f"{path} is neither a MATLAB nor an HDF5 file (its kind is {kind!r}): variable "
+            f"{path} is neither a MATLAB nor an HDF5 file (its kind is {found.name!r}): variable "
             f"{variable!r} does not apply; leave it out"
         )
-    if variable is not None:
-        return _named_plane(path, variable)
-    if kind == "hdf5":
-        content = read_result(path) if is_result(path) else read_pradformat(path)
-        if not isinstance(content, tuple):
-            return content
-        return _radiograph(path, "pradformat", *content)
-    if kind == "npy":
-        array = read_npy(path)
-        if array.ndim != 2 or array.size == 0:
-            raise FileFormatError(
-                f"{path} holds an array of shape {array.shape}: expected an image of shape "
-                "(height, width); save one plane of it"
-            )
-        return _radiograph(path, kind, array, {})
-    array, metadata = read_picture(path, kind)
-    grey = to_grey(array, channel, path)
-    if array.ndim == 3 and channel is not None:
-        metadata["channel"] = channel
-    shot = _radiograph(path, kind, grey, {"dtype": str(array.dtype), **metadata})
-    return replace(shot, warnings=film_warnings(array, channel)) if kind in PICTURES else shot
+    content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = found.read(path, variable)
+    if not isinstance(content, tuple):
+        return content
+    array, metadata = content
+    return _radiograph(path, found, array, metadata, channel)
 
 
-def _named_plane(path: Path, variable: str) -> Radiograph:
-    """One array of an HDF5 file, whatever else the file is."""
-    array = read_hdf5(path, variable)
-    if array.ndim != 2 or array.size == 0:
-        raise FileFormatError(
-            f"{path} holds {variable!r} with shape {array.shape}: expected an image of shape "
-            "(height, width); choose or save one plane"
-        )
-    return _radiograph(path, "hdf5", array, {"variable": variable})
-
-
-def _family(path: Path) -> str:
-    """Kind of a file, with MATLAB's HDF5 told from other HDF5 by what is in it."""
-    kind = kind_of(path)
-    if kind == "hdf5" and is_mat73(path):
-        return "mat"
-    if kind == "mat" and is_other_hdf5(path):
-        return "hdf5"
-    return kind
-
-
-def _radiograph(path: Path, kind: str, array: NDArray[Any], metadata: dict[str, Any]) -> Radiograph:
+def _radiograph(
+    path: Path, found: Format, array: AnyArray, metadata: dict[str, Any], channel: str | int | None
+) -> Radiograph:
     described = {
-        "kind": kind,
+        "kind": found.name,
         "dtype": str(array.dtype),
         "bits": 8 * array.dtype.itemsize,
         "sha256": sha256(path),
@@ -137,20 +94,22 @@ def _radiograph(path: Path, kind: str, array: NDArray[Any], metadata: dict[str, 
         raise FileFormatError(
             f"{path} holds {array.dtype} pixels: expected whole or real numbers; convert them"
         )
-    if not np.isfinite(array).any():
+    image = to_grey(array, channel, path)
+    if not np.isfinite(image).any():
         raise FileFormatError(
             f"{path} holds no finite pixel: expected an image; check how the file was saved"
         )
-    source, mask = metadata.get("source"), metadata.get("mask")
+    if array.ndim == 3 and channel is not None:
+        described["channel"] = channel
+    source, mask = described.pop("source", None), described.pop("mask", None)
     return Radiograph(
-        image=np.ascontiguousarray(array, dtype=np.float64),
+        image=image,
         setup=_complete_setup(path, metadata.get("geometry", {})),
         path=path,
-        metadata={
-            name: value for name, value in described.items() if name not in ("source", "mask")
-        },
+        metadata=described,
         source=None if source is None else np.ascontiguousarray(source, dtype=np.float64),
         mask=mask,
+        warnings=film_warnings(array, channel) if found.is_scan else (),
     )
 
 
@@ -213,8 +172,7 @@ def read_dataset(path: str | Path) -> xarray.Dataset:
     FileFormatError
         As `read`, and if the file holds an image.
     """
-    path = Path(path)
-    content = read(path) if is_stack(path) or kind_of(path) == "hdf5" else None
+    content = read(path) if is_stack(path) or "result" in format_of(path).holds else None
     if content is None or isinstance(content, Radiograph):
         raise FileFormatError(
             f"{path} is an image: expected the result of an inversion, .shadowinv or pradformat"

@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.labels import setup_from_dataset, variable_labels
 from napari_shadowinv.io.files import check_folder_of
+from napari_shadowinv.io.formats import STORE
 
 if TYPE_CHECKING:
     import xarray
@@ -48,7 +49,7 @@ __all__ = [
 ]
 
 FORMAT = "shadowinv stack"
-STORE_SUFFIX = ".shadowinv.zarr"
+STORE_SUFFIX = STORE.suffix
 # One number for each shot, gathered when a run ends.
 SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
     "converged": (bool, {"units": "1", "long_name": "Flux residual is below the tolerance"}),
@@ -70,23 +71,7 @@ class StoreError(OSError):
 
 
 def check_store_path(path: str | Path) -> Path:
-    """Refuse a path that can be no store, before any work.
-
-    Parameters
-    ----------
-    path : str or Path
-        A folder that is there or is to be made, ``name.shadowinv.zarr``.
-
-    Returns
-    -------
-    Path
-        The same, absolute.
-
-    Raises
-    ------
-    FileFormatError
-        If it has another ending, cannot be written, or is something else already.
-    """
+    """Refuse a path that can be no store, before any work; return it absolute."""
     path = Path(path)
     if not path.name.endswith(STORE_SUFFIX) or path.name == STORE_SUFFIX:
         raise FileFormatError(
@@ -126,14 +111,8 @@ def store_error(path: Path, error: OSError) -> StoreError:
 class ShotWriter:
     """Writes shots into a store that is there; it can be sent to a worker.
 
-    Attributes
-    ----------
-    path : Path
-        The store.
-    store_id : str
-        Which store it must be: another one may have taken its place.
-    shots : int
-        How many it has: it may have been shorter when this process opened it before.
+    Another store may have taken its place, which `store_id` shows, or it may have had fewer `shots`
+    when this process opened it before.
     """
 
     path: Path
@@ -141,21 +120,9 @@ class ShotWriter:
     shots: int
 
     def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
-        """Write a shot; it is done when this returns.
+        """Write a shot, its variables and how it went; it is done when this returns.
 
-        Parameters
-        ----------
-        index : int
-            Which.
-        arrays : mapping of str to array
-            Its variables.
-        report : mapping
-            How it went.
-
-        Raises
-        ------
-        StoreError
-            If the store cannot be written or has been replaced; the shot is pending then.
+        It is still pending after a `StoreError`: the store cannot be written, or was replaced.
         """
         self._commit(index, arrays, report, DONE)
 
@@ -201,18 +168,7 @@ def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
 
 
 class StackStore:
-    """A store as a run sees it: what is done, failed, pending.
-
-    Parameters
-    ----------
-    path : Path
-        The store.
-
-    Raises
-    ------
-    FileFormatError
-        If it is no store, or is damaged.
-    """
+    """A store as a run sees it: what is done, failed, pending."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -233,7 +189,7 @@ class StackStore:
         """What workers write to it with."""
         return ShotWriter(self.path, self.attributes["store_id"], len(self.names))
 
-    def statuses(self) -> NDArray[np.int8]:
+    def statuses(self) -> AnyArray:
         """Return the status of each shot, shape (shot,): PENDING, DONE or FAILED."""
         return self._values("status")
 
@@ -242,26 +198,14 @@ class StackStore:
         return _parsed(self.path, [str(self._values("report", index))])[0]
 
     def reports(self) -> Sequence[dict[str, Any]]:
-        """Return how each shot went.
-
-        Raises
-        ------
-        FileFormatError
-            If the reports are damaged.
-        """
+        """Return how each shot went."""
         return _parsed(self.path, self._values("report").tolist())
 
-    def _values(self, name: str, which: Any = ...) -> NDArray[Any]:
-        return _values(self.path, self._arrays, name, which)
+    def _values(self, name: str, which: Any = ...) -> AnyArray:
+        return _values(self.path, self._arrays[name], which)
 
     def summarise(self) -> None:
-        """Gather numbers of each shot from their reports, for those who open the store.
-
-        Raises
-        ------
-        StoreError
-            If it cannot be written.
-        """
+        """Gather numbers of each shot from their reports, for those who open the store."""
         reports = self.reports()
         group = self.writer.arrays()
         try:
@@ -297,8 +241,8 @@ def _readable(path: Path) -> dict[str, Any]:
 
 
 @refusing_damage
-def _values(path: Path, arrays: Mapping[str, Any], name: str, which: Any) -> NDArray[Any]:
-    return np.asarray(arrays[name][which])
+def _values(path: Path, array: Any, which: Any) -> AnyArray:
+    return np.asarray(array[which])
 
 
 @refusing_damage
@@ -362,5 +306,5 @@ def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
     return dataset.assign(found)
 
 
-def _field_of_block(block: NDArray[Any], name: str, setup: Any) -> NDArray[np.float64]:
+def _field_of_block(block: AnyArray, name: str, setup: Any) -> FloatArray:
     return np.stack([setup.field_in_si(name, values) for values in block])

@@ -19,7 +19,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore
 
 from napari_shadowinv._system.safety import check_regular, check_size, small_text
-from napari_shadowinv.io.size_checks import check_promise
+from napari_shadowinv.io.files import check_promise
 
 __all__ = ["CheckedStore"]
 
@@ -38,15 +38,7 @@ class _Chunk(NamedTuple):
 
 
 class CheckedStore(LocalStore):
-    """A folder that is only read, and never more of it than is there.
-
-    Parameters
-    ----------
-    root : Path
-        The folder.
-    read_only : bool
-        As Zarr asks for it; it is true all the same.
-    """
+    """A folder that is only read, whatever Zarr asks for, and never more of it than is there."""
 
     def __init__(self, root: Path, *, read_only: bool = True) -> None:
         super().__init__(root, read_only=True)

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.interrupts import interrupts_put_off
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.io.store import (
@@ -47,22 +47,14 @@ _SMALL = 64  # values that are not worth compressing
 class Variable:
     """What a store shall hold under one name.
 
-    Attributes
-    ----------
-    dims : tuple of str
-        Dimensions; ``shot`` first where there is one value for each shot.
-    dtype : numpy.dtype or str
-        Type of the values.
-    attributes : mapping
-        ``units`` and ``long_name``.
-    values : ndarray, optional
-        Written at once; else shot by shot.
+    Without `values`, which are written at once, it is written shot by shot. `attributes` are its
+    units and long name.
     """
 
     dims: tuple[str, ...]
     dtype: Any
     attributes: Mapping[str, Any]
-    values: NDArray[Any] | None = None
+    values: AnyArray | None = None
 
     @property
     def along_shots(self) -> bool:
@@ -72,17 +64,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a store shall hold.
-
-    Attributes
-    ----------
-    sizes : mapping of str to int
-        Length of each dimension.
-    variables, coordinates : mapping of str to Variable
-        The arrays.
-    attributes : mapping
-        What is known about all shots.
-    """
+    """What a store shall hold: arrays, the length of each dimension, facts about all shots."""
 
     sizes: Mapping[str, int]
     variables: Mapping[str, Variable]
@@ -93,25 +75,8 @@ class Contents:
 def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> StackStore:
     """Make a store, all its shots pending; it appears whole or not at all.
 
-    Parameters
-    ----------
-    path : Path
-        The folder to make.
-    contents : Contents
-        What it shall hold.
-    overwrite : bool
-        Whether a store that is there may be replaced.
-
-    Returns
-    -------
-    StackStore
-
-    Raises
-    ------
-    FileFormatError
-        If there is one and it must not be replaced.
-    StoreError
-        If it cannot be written.
+    `FileFormatError` if there is one and it must not be replaced, `StoreError` if it cannot be
+    written.
     """
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
@@ -135,31 +100,12 @@ def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> 
 
 
 def grow_store(
-    path: Path, length: int, values: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
+    path: Path, length: int, values: Mapping[str, AnyArray], attributes: Mapping[str, Any]
 ) -> StackStore:
     """Make room for more shots at the end of a store, all of them pending.
 
-    Whoever is killed on the way leaves the store as it was: it can be read, and be grown again.
-
-    Parameters
-    ----------
-    path : Path
-        The store.
-    length : int
-        How many shots it shall have.
-    values : mapping of str to ndarray, shape (length,)
-        The coordinates of all of them, by name.
-    attributes : mapping
-        What is to be replaced of the attributes.
-
-    Returns
-    -------
-    StackStore
-
-    Raises
-    ------
-    StoreError
-        If it cannot be written; the store is as before then.
+    The coordinates, `values`, are those of all `length` shots. A process killed while extending
+    the store leaves it unchanged: it can be read, and be extended again; so does a `StoreError`.
     """
     import zarr
 
@@ -231,7 +177,7 @@ def _own_variables(shots: int) -> dict[str, Variable]:
         "report": Variable(("shot",), str, report),
     }
     for name, (kind, labels) in SUMMARY.items():
-        nothing: NDArray[Any] = np.full(shots, np.nan if kind is float else 0, dtype=kind)
+        nothing: AnyArray = np.full(shots, np.nan if kind is float else 0, dtype=kind)
         own[name] = Variable(("shot",), np.dtype(kind), labels, nothing)
     return own
 

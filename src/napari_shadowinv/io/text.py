@@ -33,9 +33,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.safety import check_size
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 
 __all__ = ["read_text"]
@@ -85,28 +85,13 @@ _BLOCK = re.compile(r"^[#%]\s*(flux2D|flux2D_ref|mask)\s*(?:\(\s*(\d+)\s*,\s*(\d
 _SELECTED = re.compile(r"^[#%]\s*([xy])-mask\s+([\d.]+)\s*%?\s*-\s*([\d.]+)")
 
 
-def read_text(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
-    """Read an image from lines of numbers.
+def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
+    """Read an image from lines of numbers, the first line on top.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    array : ndarray of float64, shape (H, W)
-        The numbers, the first line on top.
-    metadata : dict
-        ``bits``; ``geometry``, the fields of a setup that the comments tell; and, where
-        the file holds them, ``source``, the image without the object, and ``mask``, True where
-        a pixel can be used.
-
-    Raises
-    ------
-    FileFormatError
-        If a line is no row of numbers or longer or shorter than the first; the message
-        tells which. The same if the header tells other blocks than there are.
+    The metadata hold ``bits``; ``geometry``, the fields of a setup that the comments tell;
+    and, where the file holds them, ``source``, the image without the object, and ``mask``, True
+    where a pixel can be used. A line that is no row of numbers, or is longer or shorter than the
+    first, is refused by its number, and so is a header that tells other blocks than there are.
     """
     # Once to find mistakes, once to keep: a bad file never fills the memory.
     height = 0
@@ -154,10 +139,10 @@ def _check_blocks(path: Path, blocks: dict[str, tuple[int, int]], found: tuple[i
 
 def _split(
     path: Path,
-    stacked: NDArray[np.float64],
+    stacked: FloatArray,
     blocks: dict[str, tuple[int, int]],
     selected: dict[str, tuple[float, float]],
-) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
+) -> tuple[FloatArray, dict[str, AnyArray]]:
     """Return the image of several blocks, and source and mask where there are some."""
     planes = dict(zip(blocks, np.split(stacked, len(blocks)), strict=True))
     image, parts = planes["flux2D"], {}
@@ -183,7 +168,7 @@ def _part(share: tuple[float, float] | None, length: int) -> slice:
     return slice(round(first * length / 100), round(last * length / 100))
 
 
-def _filled(path: Path, height: int, width: int) -> NDArray[np.float64]:
+def _filled(path: Path, height: int, width: int) -> FloatArray:
     if not height:
         raise FileFormatError(
             f"{path} holds no numbers: expected one row of pixels per line; export the image again"
@@ -225,7 +210,7 @@ def _decoded(raw: bytes) -> str:
         return raw.decode("latin-1")
 
 
-def _row(path: Path, number: int, line: str, width: int | None) -> NDArray[np.float64]:
+def _row(path: Path, number: int, line: str, width: int | None) -> FloatArray:
     words = line.rstrip(",").split("," if "," in line else None)
     if width is not None and len(words) != width:
         raise FileFormatError(

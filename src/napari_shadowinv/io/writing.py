@@ -7,19 +7,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import setup_from_dataset
-from napari_shadowinv.inversion.result import provenance_of
-from napari_shadowinv.io.arrays import write_npy
-from napari_shadowinv.io.dataset import write_result
 from napari_shadowinv.io.files import check_output, replacing
-from napari_shadowinv.io.images import write_png, write_tiff
-from napari_shadowinv.io.pradformat import write_pradformat
+from napari_shadowinv.io.formats import IMAGE_WRITERS, RESULT_WRITERS, function
 
 if TYPE_CHECKING:
     import xarray
@@ -28,17 +23,12 @@ if TYPE_CHECKING:
     from napari_shadowinv.inversion.error_bars import Uncertainty
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["IMAGE_SUFFIXES", "RESULT_SUFFIXES", "write"]
-
-RESULT_SUFFIXES = (".shadowinv", ".h5", ".hdf5", ".csv")
-IMAGE_SUFFIXES = (".tif", ".tiff", ".npy", ".png")
-
-_SITE_COLUMNS = "y_px,x_px,weight_px2,mass,flux,displacement_y_px,displacement_x_px"
+__all__ = ["write"]
 
 
 def write(
     path: str | Path,
-    result: Inversion | Uncertainty | xarray.Dataset | NDArray[Any],
+    result: Inversion | Uncertainty | xarray.Dataset | AnyArray,
     *,
     setup: Setup | None = None,
     overwrite: bool = False,
@@ -79,7 +69,7 @@ def write(
     'ones.tif'
     """
     is_image = isinstance(result, np.ndarray)
-    check_output(path, overwrite, suffixes=IMAGE_SUFFIXES if is_image else RESULT_SUFFIXES)
+    check_output(path, overwrite, suffixes=IMAGE_WRITERS if is_image else RESULT_WRITERS)
     with replacing(path, overwrite) as temporary:
         if isinstance(result, np.ndarray):
             _write_image(temporary, result, setup)
@@ -98,42 +88,11 @@ def _dataset(
 
 
 def _write_result(path: Path, dataset: xarray.Dataset) -> None:
-    if path.suffix.lower() == ".shadowinv":
-        write_result(path, dataset)
-    elif path.suffix.lower() == ".csv":
-        _write_sites(path, dataset)
-    else:
-        _require(dataset, ("displacement", "potential"))
-        write_pradformat(
-            path,
-            dataset["displacement"].values,
-            dataset["potential"].values,
-            setup_from_dataset(dataset),
-            provenance=provenance_of(dataset),
-        )
+    function(RESULT_WRITERS[path.suffix.lower()])(path, dataset)
 
 
-def _write_sites(path: Path, dataset: xarray.Dataset) -> None:
-    names = ("sites", "weights", "site_mass", "site_flux", "site_displacement")
-    _require(dataset, names)
-    columns = np.column_stack([dataset[name].values for name in names])
-    np.savetxt(path, columns, delimiter=",", header=_SITE_COLUMNS, comments="", fmt="%.17g")
-
-
-def _require(dataset: xarray.Dataset, names: tuple[str, ...]) -> None:
-    missing = [name for name in names if name not in dataset.variables]
-    if missing:
-        raise InputError(
-            f"dataset has no {', '.join(map(repr, missing))}: expected the result of an inversion"
-        )
-
-
-def _write_image(path: Path, plane: NDArray[Any], setup: Setup | None) -> None:
+def _write_image(path: Path, plane: AnyArray, setup: Setup | None) -> None:
     if plane.ndim != 2 or plane.size == 0:
         raise InputError(f"image has shape {plane.shape}: expected (height, width)")
-    if path.suffix.lower() == ".npy":
-        write_npy(path, plane)
-    elif path.suffix.lower() == ".png":
-        write_png(path, plane)
-    else:
-        write_tiff(path, plane, None if setup is None else setup.object_pixel_size)
+    pixel_size = None if setup is None else setup.object_pixel_size
+    function(IMAGE_WRITERS[path.suffix.lower()])(path, plane, pixel_size)

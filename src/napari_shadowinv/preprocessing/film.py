@@ -17,6 +17,7 @@ Medical Physics 32, 2245 (2005).
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,8 +26,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.film_table import read_film_table
+from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv.errors import FileFormatError, InputError
 
 __all__ = ["Calibration", "DoseMap", "dose", "net_optical_density"]
 
@@ -116,14 +117,22 @@ class Calibration:
         Parameters
         ----------
         path : str or Path
-            The table, as `read_film_table` reads it.
+            Comma-separated values. The first line names the columns: one holds "dose" but not
+            "log", others begin with "red", "green" and "blue"; the rest is ignored. A second
+            line may tell units; doses are in Gy.
         background : array_like, shape (3,), optional
             Pixel of unexposed film.
         dose_range : tuple of float
             Smallest and largest dose in Gy of the rows to use. Tables are often continued by
             extrapolation; leave that part out here.
+
+        Raises
+        ------
+        FileFormatError
+            If the file is missing, has no such columns, or a row holds anything but numbers;
+            the message tells the line.
         """
-        table = read_film_table(path)
+        table = _rows(path)
         used = table[(table[:, 0] >= dose_range[0]) & (table[:, 0] <= dose_range[1])]
         if len(used) < 2:
             raise InputError(
@@ -295,3 +304,36 @@ def dose(
     slack = 1e-12
     outside = (density < known[0] - slack) | (density > known[-1] + slack)
     return DoseMap(10 ** np.interp(density, known, np.log10(doses)), outside)
+
+
+@refusing_damage
+def _rows(path: Path) -> FloatArray:
+    """Dose and red, green and blue pixel of every film in a table, shape (n, 4)."""
+    text = small_text(path, "a calibration table, comma-separated values", "utf-8-sig")
+    lines = list(csv.reader(text.splitlines()))
+    columns = _columns(path, [name.strip().lower() for name in lines[0]] if lines else [])
+    rows: list[list[float]] = []
+    for number, cells in enumerate(lines[1:], start=2):
+        picked = [cells[column] if column < len(cells) else "" for column in columns]
+        try:
+            rows.append([float(cell) for cell in picked])
+        except ValueError:
+            has_units = number == 2
+            if any(cell.strip() for cell in cells) and not has_units:
+                raise FileFormatError(
+                    f"{path}, line {number} has {', '.join(map(repr, picked))[:80]}: expected a "
+                    "dose and three pixels as numbers; correct it"
+                ) from None
+    return np.array(rows, dtype=np.float64).reshape(-1, 4)
+
+
+def _columns(path: Path, names: list[str]) -> list[int]:
+    found = [[at for at, name in enumerate(names) if "dose" in name and "log" not in name]]
+    for colour in ("red", "green", "blue"):
+        found.append([at for at, name in enumerate(names) if name.startswith(colour)])
+    if not all(found):
+        raise FileFormatError(
+            f"{path} has the columns {', '.join(map(repr, names)) or 'none'}: expected one with "
+            "'dose', and columns whose names begin with 'red', 'green' and 'blue'"
+        )
+    return [candidates[0] for candidates in found]

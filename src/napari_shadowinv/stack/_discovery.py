@@ -161,7 +161,7 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
 
 
 def _page_count(path: Path) -> int:
-    from napari_shadowinv.io.files import kind_of
+    from napari_shadowinv.io.formats import kind_of
     from napari_shadowinv.io.images import tiff_pages
 
     return tiff_pages(path) if kind_of(path) == "tiff" else 1

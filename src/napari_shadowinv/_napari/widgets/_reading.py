@@ -15,11 +15,11 @@ from napari_shadowinv._napari.layer_metadata import mark_of
 from napari_shadowinv._napari.widgets._picking import kind_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.colours import film_warnings
+from napari_shadowinv.io.formats import SCAN_SUFFIXES
 
 __all__ = ["crop_of", "image_of", "mask_of", "shown_plane", "stack_of", "warnings_of"]
 
 Mask = NDArray[np.bool_]
-_PICTURES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
 
 def image_of(layer: Any | None, role: str = "image") -> Any:
@@ -136,7 +136,7 @@ def warnings_of(layer: Any) -> tuple[str, ...]:
     """
     known = mark_of(layer)
     path = str(layer.source.path or "").lower()
-    if known or not path.endswith(_PICTURES) or not isinstance(layer.data, np.ndarray):
+    if known or not path.endswith(tuple(SCAN_SUFFIXES)) or not isinstance(layer.data, np.ndarray):
         return tuple(known.get("warnings", ()))
     return film_warnings(layer.data, None)
 

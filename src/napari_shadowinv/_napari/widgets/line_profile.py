@@ -271,12 +271,13 @@ class LineProfile(Docked):
     @notify_errors
     def _export(self) -> None:
         from napari_shadowinv.io import replacing
+        from napari_shadowinv.io.formats import SITES
 
         text = self.table()
         name, _ = QFileDialog.getSaveFileName(self, "Export CSV", "profile.csv", "CSV (*.csv)")
         if not name:
             return
-        path = Path(name) if Path(name).suffix else Path(name).with_suffix(".csv")
+        path = Path(name) if Path(name).suffix else Path(name).with_suffix(SITES.suffix)
         with replacing(path, overwrite=str(path) == name) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
         tell_info(f"Wrote {path}")

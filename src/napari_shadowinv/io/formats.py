@@ -1,0 +1,304 @@
+"""Formats of files: how each is named, recognised, read and written.
+
+- every format, once: `FORMATS`, in the order in which they are tried; one of them: `Format`
+- the format of a file, by its content: `format_of`, or its name alone: `kind_of`
+
+A new format takes a reader and an entry in `FORMATS`; `napari.yaml` lists the endings once more,
+and a test compares the two. Functions are given as ``module:name``, because the command's help
+lists the formats and must not wait for numpy.
+"""
+
+from __future__ import annotations
+
+import codecs
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any, Literal
+
+from napari_shadowinv._system.safety import check_regular, refusing_damage
+from napari_shadowinv.errors import FileFormatError
+
+__all__ = [
+    "FIGURE_SUFFIXES",
+    "FORMATS",
+    "IMAGE_TITLES",
+    "IMAGE_WRITERS",
+    "OPENED_BY_NAPARI",
+    "RADIOGRAPH_SUFFIXES",
+    "READABLE",
+    "RESULT_WRITERS",
+    "SCAN_SUFFIXES",
+    "Format",
+    "format_of",
+    "function",
+    "kind_of",
+]
+
+# How much of a file holds every mark, and how much shows what a file without one is.
+_HEAD, _SEEN = 4100, 64
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of files.
+
+    Attributes
+    ----------
+    name : str
+        What `kind_of` answers, and what ``Radiograph.metadata["kind"]`` says.
+    suffixes : tuple of str
+        Endings of its files, in lower case; the usual one first.
+    title : str
+        How messages and the command's help name it; empty if it cannot be read from a file.
+    marks : tuple of (int, bytes)
+        Where its files hold which bytes; one of them is enough.
+    test : str
+        Function of the path that tells whether a file with a mark is of this format, where others
+        begin the same way. Default: it is.
+    unmarked : {"text", "binary", ""}
+        What a file without a mark must look like, if its ending is enough otherwise.
+    holds : tuple of {"image", "result"}
+        What can be read from it.
+    reader : str
+        Function of the path that returns the image and its metadata, or a dataset. An entry of
+        the metadata replaces what `read` says of any file.
+    named_reader : str
+        The same, of the path and the name of an array.
+    image_writer, result_writer : str
+        Functions of the path, and of an image and its pixel size (m) or None, or of a dataset.
+    is_scan : bool
+        Whether it may be a scan of film, whose grey levels fall with dose.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    title: str = ""
+    marks: tuple[tuple[int, bytes], ...] = ()
+    test: str = ""
+    unmarked: Literal["text", "binary", ""] = ""
+    holds: tuple[Literal["image", "result"], ...] = ("image",)
+    reader: str = ""
+    named_reader: str = ""
+    image_writer: str = ""
+    result_writer: str = ""
+    is_scan: bool = False
+
+    @property
+    def suffix(self) -> str:
+        """The usual ending."""
+        return self.suffixes[0]
+
+    def read(self, path: Path, variable: str | None = None) -> Any:
+        """Return what a file holds, or one of its arrays; see `reader` and `named_reader`."""
+        if variable is not None:
+            return function(self.named_reader)(path, variable)
+        return function(self.reader)(path)
+
+    def fits(self, path: Path, head: bytes) -> bool:
+        """Tell whether a file that begins with `head` is of this format."""
+        if any(head[at : at + len(mark)] == mark for at, mark in self.marks):
+            return not self.test or bool(function(self.test)(path))
+        found = "text" if _is_text(head[:_SEEN]) else "binary"
+        return found == self.unmarked and path.suffix.lower() in self.suffixes
+
+
+def function(reference: str) -> Callable[..., Any]:
+    """Import the function that a format names."""
+    found: Callable[..., Any] = resolve_name(f"napari_shadowinv.io.{reference}")
+    return found
+
+
+# MATLAB 7.3 is HDF5 behind a header of its own, which other programs keep when they add to a file.
+_HDF5 = ((0, b"\x89HDF\r\n\x1a\n"), (0, b"MATLAB"))
+
+TIFF = Format(
+    "tiff",
+    (".tif", ".tiff"),
+    "TIFF",
+    ((0, b"II*\x00"), (0, b"MM\x00*"), (0, b"II+\x00"), (0, b"MM\x00+")),
+    reader="images:read_tiff",
+    image_writer="images:write_tiff",
+    is_scan=True,
+)
+PNG = Format(
+    "png",
+    (".png",),
+    "PNG",
+    ((0, b"\x89PNG\r\n\x1a\n"),),
+    reader="images:read_png",
+    image_writer="images:write_png",
+    is_scan=True,
+)
+BMP = Format("bmp", (".bmp",), "BMP", ((0, b"BM"),), reader="images:read_eight_bits", is_scan=True)
+JPEG = Format(
+    "jpeg",
+    (".jpg", ".jpeg"),
+    "JPEG",
+    ((0, b"\xff\xd8\xff"),),
+    reader="images:read_eight_bits",
+    is_scan=True,
+)
+NPY = Format(
+    "npy",
+    (".npy",),
+    "NPY",
+    ((0, b"\x93NUMPY"),),
+    reader="images:read_npy_plane",
+    image_writer="images:write_npy",
+)
+MATLAB = Format(
+    "mat",
+    (".mat",),
+    "MATLAB",
+    _HDF5,
+    test="matlab:is_matlab",
+    reader="matlab:read_mat",
+    named_reader="matlab:read_mat",
+)
+PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader="camera:read_b16")
+RESULT = Format(
+    "shadowinv",
+    (".shadowinv",),
+    ".shadowinv",
+    _HDF5,
+    test="pradformat:is_result",
+    holds=("result",),
+    reader="dataset:read_result",
+    named_reader="hdf5:read_plane",
+    result_writer="dataset:write_result",
+)
+# The reader of all other HDF5 files: it says which array can be named.
+PRADFORMAT = Format(
+    "hdf5",
+    (".h5", ".hdf5"),
+    "pradformat HDF5",
+    _HDF5,
+    holds=("image", "result"),
+    reader="pradformat:read_pradformat",
+    named_reader="hdf5:read_plane",
+    result_writer="pradformat:write_pradformat",
+)
+# The oldest programs left the marks out.
+SPE = Format(
+    "spe",
+    (".spe",),
+    "Princeton .spe",
+    ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55")),
+    unmarked="binary",
+    reader="camera:read_spe",
+)
+SITES = Format("sites", (".csv",), holds=(), result_writer="dataset:write_sites")
+TEXT = Format(
+    "text",
+    (".txt", SITES.suffix, ".dat", ".asc"),
+    "numbers as .txt, .csv or .dat",
+    unmarked="text",
+    reader="text:read_text",
+)
+STORE = Format("store", (".shadowinv.zarr",), holds=("result",))
+
+FORMATS = (TIFF, PNG, BMP, JPEG, NPY, PCO, MATLAB, RESULT, PRADFORMAT, SPE, TEXT, SITES, STORE)
+
+
+def _listed(titles: Iterable[str]) -> str:
+    *most, last = filter(None, titles)
+    return f"{', '.join(most)}, or {last}"
+
+
+def _suffixes(formats: Iterable[Format]) -> frozenset[str]:
+    return frozenset(suffix for each in formats for suffix in each.suffixes)
+
+
+READABLE = _listed(each.title for each in FORMATS)
+"""The formats of files in words."""
+IMAGE_TITLES = _listed(each.title for each in FORMATS if "image" in each.holds)
+"""Those of images."""
+RADIOGRAPH_SUFFIXES = _suffixes(each for each in FORMATS if "image" in each.holds)
+"""Endings of files that may be shots."""
+SCAN_SUFFIXES = _suffixes(each for each in FORMATS if each.is_scan)
+"""Endings of pictures that may be scans of film."""
+OPENED_BY_NAPARI = SCAN_SUFFIXES | {".npy", SITES.suffix}
+"""Endings that napari opens itself: the manifest leaves them out, so that nobody has to choose."""
+IMAGE_WRITERS = {
+    suffix: each.image_writer for each in FORMATS for suffix in each.suffixes if each.image_writer
+}
+"""What writes an image, by the ending."""
+RESULT_WRITERS = {
+    suffix: each.result_writer for each in FORMATS for suffix in each.suffixes if each.result_writer
+}
+"""What writes a result, by the ending."""
+FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
+"""Endings of figures, the usual one first."""
+
+_OTHERS = {
+    b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
+    b"\x1f\x8b": "a gzip archive",
+    b"%PDF": "a PDF document",
+    b"GIF8": "a GIF picture",
+    b"SIMPLE  =": "a FITS file",
+    b"CDF": "a NetCDF 3 file",
+}
+
+
+@refusing_damage
+def format_of(path: Path) -> Format:
+    """Tell the format of a file from its content; its name may lie.
+
+    Numbers as text have no mark: they need one of the usual endings too.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file.
+
+    Returns
+    -------
+    Format
+        One of `FORMATS`.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no such file, it cannot be opened, is empty, or of another kind.
+    """
+    check_regular(path, f"a file ({READABLE})")
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if not head:
+        raise FileFormatError(f"{path} is empty (0 bytes): expected {READABLE}; copy it again")
+    for each in FORMATS:
+        if each.fits(path, head):
+            return each
+    raise FileFormatError(
+        f"{path} is {_describe(head[:_SEEN])}: expected {READABLE}; export the image to one of "
+        "these"
+    )
+
+
+def kind_of(path: str | Path) -> str:
+    """Return the name of a file's format; see `format_of`."""
+    return format_of(path).name
+
+
+def _describe(head: bytes) -> str:
+    for mark, text in _OTHERS.items():
+        if head.startswith(mark):
+            return text
+    return "a text file" if _is_text(head) else "not in a recognised image format"
+
+
+def _is_text(head: bytes) -> bool:
+    try:
+        # Incremental, because the last character may have been cut in two.
+        text = codecs.getincrementaldecoder("utf-8-sig")().decode(head)
+    except UnicodeDecodeError:
+        # Comments that Windows wrote, such as µm in latin-1.
+        text = head.decode("latin-1")
+        return _is_plain(text) and text[0] in "#%"
+    return _is_plain(text)
+
+
+def _is_plain(text: str) -> bool:
+    return all(character.isprintable() or character.isspace() for character in text)
