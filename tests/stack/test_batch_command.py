@@ -465,7 +465,7 @@ def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
         import time
         from concurrent.futures import ThreadPoolExecutor
         from pathlib import Path
-        from napari_shadowinv.io import store_layoutasstore
+        from napari_shadowinv.io import store_layout as store
 
         create = store._create_array
         pool = ThreadPoolExecutor(1)

@@ -46,7 +46,7 @@ from napari_shadowinv.transport.solvers import LevelSolution, solve
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["Uncertainty", "uncertainty"]
 
@@ -105,7 +105,7 @@ class Uncertainty:
 
     def to_dataset(
         self,
-        setup: ProtonSetup | OpticalSetup | None = None,
+        setup: Setup | None = None,
         *,
         attributes: Mapping[str, str] | None = None,
     ) -> xarray.Dataset:

@@ -28,7 +28,7 @@ from napari_shadowinv.stack._worker import Beam, Work
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing.recipes import Filter
 
 __all__ = ["invert_stack"]
@@ -43,7 +43,7 @@ def invert_stack(
     source: Any = None,
     mask: ArrayLike | None = None,
     options: InversionOptions | None = None,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     filters: Sequence[Filter] = (),
     source_mask: ArrayLike | None = None,
     variables: Collection[str] | None = None,
@@ -66,7 +66,7 @@ def invert_stack(
         The pixels that can be used, the same in all shots; see `napari_shadowinv.invert`.
     options : InversionOptions, optional
         Choices. If `threads` is None, all shots that are inverted at once share the cores.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Adds fields in SI units.
     filters : sequence of Filter, optional
         Filters of `napari_shadowinv.preprocessing` for each shot, in their order. A measured

@@ -36,7 +36,7 @@ from napari_shadowinv.stack._tasks import Settings, ShotOutcome, run_shots
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing.recipes import Filter
 
 __all__ = ["STORED", "RunProgress", "ShotOutcome", "run_stack"]
@@ -83,7 +83,7 @@ def run_stack(
     source: Any = None,
     mask: ArrayLike | None = None,
     options: InversionOptions | None = None,
-    setup: ProtonSetup | OpticalSetup | None = None,
+    setup: Setup | None = None,
     filters: Sequence[Filter] = (),
     source_mask: ArrayLike | None = None,
     variables: Collection[str] = STORED,

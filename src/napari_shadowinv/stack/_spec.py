@@ -30,7 +30,7 @@ from napari_shadowinv.stack._references import Reader, Shot, described_reader
 from napari_shadowinv.stack._worker import Beam, Work, shared_plan, threads_here
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "Stack",
@@ -60,7 +60,7 @@ class Stack:
         The pixels that can be used.
     options : InversionOptions
         Choices.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         For fields in SI units.
     variables : tuple of str
         The variables that are wanted.
@@ -79,7 +79,7 @@ class Stack:
     sources: Shots | None
     mask: NDArray[np.bool_] | None
     options: InversionOptions
-    setup: ProtonSetup | OpticalSetup | None
+    setup: Setup | None
     variables: tuple[str, ...]
     preparation: Preparation
     warm_start: int = 1
@@ -136,7 +136,7 @@ def describe_stack(
     source: Any,
     mask: ArrayLike | None,
     options: InversionOptions | None,
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
     variables: Collection[str] | None,
     reader: Reader,
     warm_start: int,
@@ -218,7 +218,7 @@ def describe_stack(
 def _checked_variables(
     wanted: Collection[str] | None,
     options: InversionOptions,
-    setup: ProtonSetup | OpticalSetup | None,
+    setup: Setup | None,
     *,
     own_sources: bool,
 ) -> tuple[str, ...]:

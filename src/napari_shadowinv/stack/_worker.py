@@ -35,7 +35,7 @@ from napari_shadowinv.stack._references import checksum
 from napari_shadowinv.transport.sites import SitePlan
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["Beam", "Work", "arrays_of", "invert_shot", "shared_plan", "threads_here"]
 
@@ -195,7 +195,7 @@ class Work:
         Shape (H, W) that shots must have.
     options : InversionOptions
         Choices. If `threads` is None, shots that are inverted at once share the cores.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         For fields in SI units.
     variables : tuple of str
         Names of the arrays to make.
@@ -207,7 +207,7 @@ class Work:
 
     shape: tuple[int, int]
     options: InversionOptions
-    setup: ProtonSetup | OpticalSetup | None
+    setup: Setup | None
     variables: tuple[str, ...]
     mask: NDArray[np.bool_] | None
     preparation: Preparation
@@ -294,7 +294,7 @@ def _relative(image: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[An
 
 
 def arrays_of(
-    inversion: Inversion, names: Mapping[str, Any], setup: ProtonSetup | OpticalSetup | None
+    inversion: Inversion, names: Mapping[str, Any], setup: Setup | None
 ) -> dict[str, NDArray[Any]]:
     """Return variables of an inversion by name, fields in SI units among them.
 
@@ -304,7 +304,7 @@ def arrays_of(
         The result.
     names : collection of str
         Names as in `napari_shadowinv.io.dataset.variable_labels`.
-    setup : ProtonSetup or OpticalSetup or None
+    setup : Setup or None
         For fields in SI units.
 
     Returns
