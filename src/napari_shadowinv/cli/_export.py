@@ -75,13 +75,7 @@ def export_shots(
     variables: list[str],
     overwrite: bool,
 ) -> list[Path]:
-    """Write shots of a store in another format.
-
-    Returns
-    -------
-    list of Path
-        The files.
-    """
+    """Write shots of a store in another format."""
     if form not in FORMATS:
         raise InputError(f"format is {form!r}: expected one of {', '.join(FORMATS)}")
     protect_store(store, out)
@@ -197,13 +191,7 @@ def write_movie(
     limits: tuple[float, float] | None,
     overwrite: bool,
 ) -> int:
-    """Write a film of a store, a frame for each shot, all on one colour scale.
-
-    Returns
-    -------
-    int
-        Number of frames.
-    """
+    """Write a film of a store, a frame for each shot, all on one colour scale."""
     from napari_shadowinv.io import check_output
     from napari_shadowinv.plotting import stack_frames, write_film
 

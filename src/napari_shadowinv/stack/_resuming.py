@@ -36,19 +36,7 @@ _INSTEAD = "use the same, overwrite the store, or choose another name"
 
 
 def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
-    """Say what the store of a stack holds.
-
-    Parameters
-    ----------
-    stack : Stack
-        The shots and everything about them.
-    dtype : numpy.dtype
-        Type of stored images.
-
-    Returns
-    -------
-    Contents
-    """
+    """Say what the store of a stack holds."""
     identity = {name: value for name, value in _identity(stack, dtype).items() if value}
     return Contents(
         stack.sizes,
@@ -129,25 +117,7 @@ def _sum_of(mask: NDArray[np.bool_] | None) -> str:
 
 
 def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
-    """Refuse to mix what does not belong together in one store.
-
-    Parameters
-    ----------
-    store : StackStore
-        Of an earlier run.
-    stack, dtype
-        See `contents_of`.
-
-    Returns
-    -------
-    Stack
-        The same in the order of the store; shots that it does not hold yet are the last.
-
-    Raises
-    ------
-    InputError
-        If anything differs but that there are more shots.
-    """
+    """Refuse to mix what does not belong together in one store."""
     stack = stack.chosen(_order(store, stack.shots.names))
     found = _identity(stack, dtype, len(store.names))
     for name, value in {**found, "package_version": __version__}.items():
@@ -169,10 +139,7 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
 
 
 def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
-    """Places of the store's shots among those that are given, then of the new ones.
-
-    A shot keeps its number for good, so new ones go to the end wherever their names sort.
-    """
+    """Places of the store's shots among those that are given, then of the new ones."""
     count = len(store.names)
     if names[:count] == store.names:
         return list(range(len(names)))
@@ -206,27 +173,7 @@ def _difference(before: str, now: str) -> str:
 
 
 def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackStore:
-    """Append shots that arrived since the last run, pending, to its store.
-
-    Parameters
-    ----------
-    store : StackStore
-        The store.
-    stack : Stack
-        As `resume` returned it.
-    dtype : numpy.dtype
-        Type of stored images.
-
-    Returns
-    -------
-    StackStore
-        With all shots of the stack.
-
-    Raises
-    ------
-    StoreError
-        If it cannot be written.
-    """
+    """Append shots that arrived since the last run, pending, to its store."""
     coordinates = {
         name: np.asarray(coordinate.values)
         for name, coordinate in _coordinates(stack).items()

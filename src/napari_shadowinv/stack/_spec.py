@@ -143,22 +143,7 @@ def describe_stack(
     filters: Sequence[Filter],
     source_mask: ArrayLike | None,
 ) -> Stack:
-    """Check everything that can be checked before a shot is read.
-
-    Parameters
-    ----------
-    shots, source, mask, options, setup, variables, reader, warm_start, filters, source_mask
-        See `invert_stack`.
-
-    Returns
-    -------
-    Stack
-
-    Raises
-    ------
-    InputError
-        If something does not fit.
-    """
+    """Check everything that can be checked before a shot is read."""
     options = options or InversionOptions()
     if warm_start < 1:
         raise InputError(

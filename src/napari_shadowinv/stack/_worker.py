@@ -45,19 +45,7 @@ _PLANS_KEPT = 2  # a worker that changes between two sources makes each once
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """The undisturbed beam and the mask of one or more shots.
-
-    Attributes
-    ----------
-    shape : tuple of int
-        Shape (H, W).
-    source : ndarray, shape (H, W), or None
-        None for a uniform beam.
-    mask : ndarray of bool, shape (H, W), or None
-        The pixels that can be used.
-    key : str
-        Checksum of all of it.
-    """
+    """The undisturbed beam and the mask of one or more shots."""
 
     shape: tuple[int, int]
     source: NDArray[Any] | None = field(default=None, repr=False)
@@ -98,22 +86,7 @@ def shared_plan(
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> SitePlan:
-    """Return the sites for a beam; the first in this process who asks makes them.
-
-    Parameters
-    ----------
-    beam : Beam
-        Source and mask.
-    options : InversionOptions
-        Choices; `threads` does not matter.
-    on_progress, should_stop
-        See `napari_shadowinv.invert`.
-
-    Returns
-    -------
-    SitePlan
-        The same object for the same beam and options; the last few are kept.
-    """
+    """Return the sites for a beam; the first in this process who asks makes them."""
     key = beam.key + options.model_dump_json(exclude={"threads"})
     with _entries_lock:
         entry = _entries.setdefault(key, _Entry())
@@ -144,30 +117,7 @@ def invert_shot(
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Inversion:
-    """Invert one shot with the sites that its process shares.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-        The shot.
-    beam : Beam
-        Source and mask.
-    options : InversionOptions
-        Choices.
-    start : Inversion, optional
-        The solver starts from there.
-    on_progress, should_stop
-        See `napari_shadowinv.invert`.
-
-    Returns
-    -------
-    Inversion
-
-    Raises
-    ------
-    InputError
-        If the shot cannot be inverted.
-    """
+    """Invert one shot with the sites that its process shares."""
     began = time.perf_counter()
     plan = shared_plan(beam, options, on_progress=on_progress, should_stop=should_stop)
     on_sites = time.perf_counter() - began
@@ -187,23 +137,7 @@ def invert_shot(
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What is done with every shot of a stack, wherever it is.
-
-    Attributes
-    ----------
-    shape : tuple of int
-        Shape (H, W) that shots must have.
-    options : InversionOptions
-        Choices. If `threads` is None, shots that are inverted at once share the cores.
-    setup : Setup or None
-        For fields in SI units.
-    variables : tuple of str
-        Names of the arrays to make.
-    mask : ndarray of bool, shape (H, W), or None
-        The pixels that can be used.
-    preparation : Preparation
-        Filters, and how sources are guessed.
-    """
+    """What is done with every shot of a stack, wherever it is."""
 
     shape: tuple[int, int]
     options: InversionOptions
@@ -222,30 +156,7 @@ class Work:
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
-        """Filter and invert one shot.
-
-        Parameters
-        ----------
-        image : ndarray, shape (H, W)
-            The shot as it was recorded.
-        beam : Beam or None
-            What all shots share, filtered; None if this has a source of its own.
-        source : ndarray, shape (H, W), optional
-            That source as it was recorded. Default: it is guessed from the shot.
-        start, should_stop
-            See `invert_shot`.
-        workers : int, optional
-            See `threads_here`.
-
-        Returns
-        -------
-        Inversion
-
-        Raises
-        ------
-        InputError
-            If the shot cannot be inverted.
-        """
+        """Filter and invert one shot."""
         if np.shape(image) != self.shape:
             others = "the others" if beam is None or beam.source is None else "the source"
             raise InputError(
@@ -296,21 +207,7 @@ def _relative(image: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[An
 def arrays_of(
     inversion: Inversion, names: Mapping[str, Any], setup: Setup | None
 ) -> dict[str, NDArray[Any]]:
-    """Return variables of an inversion by name, fields in SI units among them.
-
-    Parameters
-    ----------
-    inversion : Inversion
-        The result.
-    names : collection of str
-        Names as in `napari_shadowinv.io.dataset.variable_labels`.
-    setup : Setup or None
-        For fields in SI units.
-
-    Returns
-    -------
-    dict of str to ndarray
-    """
+    """Return variables of an inversion by name, fields in SI units among them."""
     own = variable_labels()
     arrays = {name: getattr(inversion, name) for name in names if name in own}
     if len(arrays) < len(names):
@@ -320,20 +217,7 @@ def arrays_of(
 
 
 def threads_here(workers: int | None = None) -> int:
-    """Return how many threads one shot may use, so that all shots at once fill the machine.
-
-    Parameters
-    ----------
-    workers : int, optional
-        Shots that are inverted at once on this machine. Default: found out. On a worker of
-        `dask.distributed` it is the number of threads of all workers on this machine; in a
-        pool of dask it is `num_workers` of dask's configuration, or a thread for each core.
-
-    Returns
-    -------
-    int
-        Cores divided by workers, 1 at least.
-    """
+    """Return how many threads one shot may use, so that all shots at once fill the machine."""
     cores = available_threads(None)
     if workers is None:
         workers = _threads_of_cluster() or _threads_of_pool(cores)
