@@ -12,8 +12,6 @@ from napari_shadowinv.io.store import DONE
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["stack_statistics"]
-
 _AVERAGED = (
     "potential",
     "displacement",
@@ -78,13 +76,11 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
             spread = spread * np.nan
         found[f"{name}_std"] = _labelled(spread, field, "standard deviation of shots")
         found[f"{name}_peak"] = _labelled(_peak(field), field, "largest magnitude")
-    attributes = {**stack.attrs, "shots": stack.sizes["shot"]}
-    return xr.Dataset(found, attrs=attributes)
+    return xr.Dataset(found, attrs={**stack.attrs, "shots": stack.sizes["shot"]})
 
 
 def _peak(field: xarray.DataArray) -> xarray.DataArray:
-    planes = field.astype(np.float64)
-    squared = planes**2
+    squared = field.astype(np.float64) ** 2
     if "component" in field.dims:
         squared = squared.sum("component", skipna=False)
     largest: xarray.DataArray = squared.max(("y", "x"), skipna=False)
