@@ -38,13 +38,12 @@ QT_BINDINGS = ("PyQt6", "PySide6", "PySide6_Essentials", "PyQt5", "PySide2")
 
 def report_text() -> str:
     """Versions, platform, cores, memory and the folder of compiled code, one per line."""
-    bindings = [f"{name} {found}" for name in QT_BINDINGS if (found := _version(name))]
     memory = physical_memory()
     rows = [
         ("napari-shadowinv", __version__),
         ("python", f"{platform.python_version()} ({platform.python_implementation()})"),
         *[(name, _version(name) or "not installed") for name in PACKAGES],
-        ("Qt", ", ".join(bindings) or "not installed"),
+        ("Qt", ", ".join(_qt_bindings()) or "not installed"),
         ("platform", f"{platform.platform()}, {platform.machine()}"),
         ("cores", _cores()),
         ("memory", "not known" if memory is None else f"{memory / 2**30:.1f} GiB"),
@@ -59,6 +58,11 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def _qt_bindings() -> list[str]:
+    found = ((name, _version(name)) for name in QT_BINDINGS)
+    return [f"{name} {number}" for name, number in found if number]
 
 
 def _cores() -> str:
