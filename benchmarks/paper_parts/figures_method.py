@@ -135,7 +135,7 @@ def walk_through(n_sites: int = 100) -> Walkthrough:
         level,
         weights,
         moves,
-        *read_centroids(level, moves, shape),
+        *read_centroids(level, moves),
     )
 
 

@@ -10,20 +10,33 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import numpy as np
 import typer
+from rich import box, progress
+from rich.console import Console
+from rich.table import Table
 
 from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interrupted
 from napari_shadowinv.cli._inputs import picture_mask, setup_from
 from napari_shadowinv.cli._tables import Rows, options_text, two_columns
 from napari_shadowinv.cli._terminal import plain, say, say_on_stderr
 from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.io import Radiograph
+from napari_shadowinv.io.store import (
+    DONE,
+    FAILED,
+    PENDING,
+    STATUS_NAMES,
+    StackStore,
+    check_store_path,
+)
+from napari_shadowinv.physics.setup import binned_setup
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from napari_shadowinv.cli._choices import Choices
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.stack import RunProgress
@@ -40,21 +53,13 @@ class _Ledger:
     start: float = field(default_factory=time.monotonic)
     now: RunProgress | None = None
     ended: int = 0
-    failures: dict[str, str] = field(default_factory=dict)
-    not_converged: list[str] = field(default_factory=list)
 
-    def note(self, progress: RunProgress) -> None:
+    def note(self, news: RunProgress) -> None:
         if self.now is None:
             self.start = time.monotonic()  # the workers are there
-        self.now = progress
-        outcome = progress.outcome
-        if outcome is None:
-            return
-        self.ended += 1
-        if outcome.reason:
-            self.failures[progress.name] = outcome.reason
-        elif not outcome.converged:
-            self.not_converged.append(progress.name)
+        self.now = news
+        if news.outcome is not None:
+            self.ended += 1
 
     @property
     def rate_text(self) -> str:
@@ -97,7 +102,6 @@ def run_batch(
     quiet: bool,
 ) -> None:
     """Invert all shots into a store, tell of it, and end with what became of them."""
-    from napari_shadowinv.physics.setup import binned_setup
     from napari_shadowinv.stack import STORED, read_shot, run_stack
 
     _check(out, resume or redo_failed, overwrite)
@@ -131,31 +135,29 @@ def run_batch(
                 should_stop=interrupted,
             )
     except (KeyboardInterrupt, InversionCancelled):
-        _tell_how_to_resume(out, ledger)
+        state = _counts_text(StackStore(out)) if out.exists() else "nothing written"
+        say_on_stderr(f"Cancelled: {state}. Repeat the command with --resume to continue.")
         raise typer.Exit(EXIT_CANCELLED) from None
+    store = StackStore(out)
     if not quiet:
-        say(_summary(out, ledger))
-    _end(out)
+        say(_summary(store, ledger))
+    if (store.statuses() != DONE).any():
+        raise typer.Exit(EXIT_FAILED_SHOTS)
+    if not all(report.get("converged") for report in store.reports()):
+        raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
 def _check(out: Path, resume: bool, overwrite: bool) -> None:
-    from napari_shadowinv.io.store import check_store_path
-
     if resume and overwrite:
         raise InputError("got --resume and --overwrite, expected one of them")
     if check_store_path(out).exists() and not (resume or overwrite):
-        counts = _counts_text(*_counts(out))
         raise InputError(
-            f"{out} exists ({counts}): use --resume to continue, --overwrite to start again, or "
-            "another name"
+            f"{out} exists ({_counts_text(StackStore(out))}): use --resume to continue, "
+            "--overwrite to start again, or another name"
         )
 
 
-def _mask(path: Path, factor: int) -> Any:
-    import numpy as np
-
-    from napari_shadowinv.io import Radiograph
-
+def _mask(path: Path, factor: int) -> BoolArray | None:
     usable = picture_mask(path)
     return Radiograph(np.ones(usable.shape), mask=usable).binned(factor).mask
 
@@ -167,94 +169,65 @@ def _names(text: str) -> tuple[str, ...]:
 @contextmanager
 def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], None]]:
     """A bar with rate and time left, and above it each shot that failed."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        SpinnerColumn,
-        TextColumn,
-    )
-
     console = Console(stderr=True)
     columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TextColumn("{task.fields[left]}"),
-        TextColumn("{task.fields[failed]}", style="red"),
-        TextColumn("{task.fields[last]}", style="dim", markup=False),
+        progress.SpinnerColumn(),
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TextColumn("{task.fields[rate]}"),
+        progress.TextColumn("{task.fields[left]}"),
+        progress.TextColumn("{task.fields[failed]}", style="red"),
+        progress.TextColumn("{task.fields[last]}", style="dim", markup=False),
     )
     hidden = quiet or not console.is_terminal
-    with Progress(*columns, console=console, disable=hidden) as bars:
+    with progress.Progress(*columns, console=console, disable=hidden) as bars:
         task = bars.add_task("starting", total=None, rate="", left="", failed="", last="")
 
-        def show(progress: RunProgress) -> None:
-            if progress.compiling:
-                bars.update(task, description=f"compiling, {progress.compiling}")
+        def show(news: RunProgress) -> None:
+            if news.compiling:
+                bars.update(task, description=f"compiling, {news.compiling}")
                 return
-            ledger.note(progress)
-            outcome = progress.outcome
-            last = "" if outcome is None else f"{progress.name}, {outcome.seconds:.1f} s"
+            ledger.note(news)
+            outcome = news.outcome
+            last = "" if outcome is None else f"{news.name}, {outcome.seconds:.1f} s"
             bars.update(
                 task,
-                description=progress.engine,
-                total=progress.total,
-                completed=progress.done + progress.failed,
+                description=news.engine,
+                total=news.total,
+                completed=news.done + news.failed,
                 rate=ledger.rate_text,
                 left=ledger.left_text,
-                failed=f"{progress.failed} failed" if progress.failed else "",
+                failed=f"{news.failed} failed" if news.failed else "",
                 last=plain(last).plain,
             )
             if outcome is not None and outcome.reason and not quiet:
-                line = plain(f"failed: {progress.name}: {outcome.reason}", "red")
+                line = plain(f"failed: {news.name}: {outcome.reason}", "red")
                 console.print(line, soft_wrap=True)
 
         yield show
 
 
-def _counts(out: Path) -> tuple[int, int, int]:
-    """Shots that are done, failed, pending."""
-    import numpy as np
-
-    from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
-
-    statuses = StackStore(out).statuses()
-    done, failed, pending = (int(np.sum(statuses == s)) for s in (DONE, FAILED, PENDING))
-    return done, failed, pending
+def _counts_text(store: StackStore) -> str:
+    statuses = store.statuses()
+    counts = ((int(np.sum(statuses == status)), status) for status in (DONE, FAILED, PENDING))
+    return ", ".join(f"{count} {STATUS_NAMES[status]}" for count, status in counts)
 
 
-def _counts_text(done: int, failed: int, pending: int) -> str:
-    return f"{done} done, {failed} failed, {pending} pending"
-
-
-def _tell_how_to_resume(out: Path, ledger: _Ledger) -> None:
-    state = _counts_text(*_counts(out)) if out.exists() else "nothing written"
-    say_on_stderr(f"Cancelled: {state}. Repeat the command with --resume to continue.")
-
-
-def _summary(out: Path, ledger: _Ledger) -> Table:
-    done, failed, pending = _counts(out)
+def _summary(store: StackStore, ledger: _Ledger) -> Table:
     seconds = time.monotonic() - ledger.start
     this_run = f"{ledger.ended} shots in {seconds:.1f} s, {ledger.rate_text}"
     rows = [
-        ("shots", _counts_text(done, failed, pending)),
+        ("shots", _counts_text(store)),
         ("this run", this_run if ledger.ended else "nothing to do"),
-        *_trouble_rows(out),
-        ("written", str(out)),
+        *_trouble_rows(store),
+        ("written", str(store.path)),
     ]
     return two_columns("Batch", rows)
 
 
-def _trouble_rows(out: Path) -> Rows:
+def _trouble_rows(store: StackStore) -> Rows:
     """Shots that failed, and those that are not to be trusted."""
-    import numpy as np
-
-    from napari_shadowinv.io.store import DONE, FAILED, StackStore
-
-    store = StackStore(out)
     statuses = store.statuses()
     failed = [int(index) for index in np.flatnonzero(statuses == FAILED)]
     rows = [
@@ -262,7 +235,9 @@ def _trouble_rows(out: Path) -> Rows:
         for i in failed[:_NAMED]
     ]
     if len(failed) > _NAMED:
-        rows.append(("failed", f"and {len(failed) - _NAMED} more: shadowinv status {out} --all"))
+        rows.append(
+            ("failed", f"and {len(failed) - _NAMED} more: shadowinv status {store.path} --all")
+        )
     rough = [
         store.names[index]
         for index, report in enumerate(store.reports())
@@ -274,25 +249,9 @@ def _trouble_rows(out: Path) -> Rows:
     return rows
 
 
-def _end(out: Path) -> None:
-    from napari_shadowinv.io.store import DONE, StackStore
-
-    store = StackStore(out)
-    statuses = store.statuses()
-    if (statuses != DONE).any():
-        raise typer.Exit(EXIT_FAILED_SHOTS)
-    if not all(report.get("converged") for report in store.reports()):
-        raise typer.Exit(EXIT_NOT_CONVERGED)
-
-
 @refusing_damage
 def status_tables(path: Path, every: bool) -> list[Table]:
     """Tell what a store is, and what became of each shot."""
-    from rich import box
-    from rich.table import Table
-
-    from napari_shadowinv.io.store import STATUS_NAMES, StackStore
-
     tables = [two_columns(str(path), store_rows(path, trouble=not every))]
     if not every:
         return tables
@@ -318,16 +277,13 @@ def status_tables(path: Path, every: bool) -> list[Table]:
 @refusing_damage
 def store_rows(path: Path, *, trouble: bool = True) -> Rows:
     """Tell what a store is."""
-    from napari_shadowinv.io.store import StackStore
-
     store = StackStore(path)
-    done, failed, pending = _counts(path)
     attributes = store.attributes
     seconds = [report["seconds"] for report in store.reports() if "stages" in report]
     rows = [
         ("kind", f"stack of {len(store.names)} shots, shadowinv {attributes['package_version']}"),
         ("created", str(attributes["created"])),
-        ("shots", _counts_text(done, failed, pending)),
+        ("shots", _counts_text(store)),
         ("image", str(attributes["image_size"])),
         ("source", str(attributes.get("source_file", attributes["source_image"]))),
         *([("filters", str(attributes["filters"]))] if attributes.get("filters") else []),
@@ -337,4 +293,4 @@ def store_rows(path: Path, *, trouble: bool = True) -> Rows:
     if seconds:
         mean = sum(seconds) / len(seconds)
         rows.append(("time per shot", f"{mean:.2f} s on one worker, on average"))
-    return rows + (_trouble_rows(path) if trouble else [])
+    return rows + (_trouble_rows(store) if trouble else [])

@@ -9,23 +9,20 @@ from typing import TYPE_CHECKING
 from napari_shadowinv.cli._tables import closing_rows, inversion_rows, setup_text, two_columns
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
     from rich.table import Table
 
+    from napari_shadowinv._typing import FloatArray
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import ProtonSetup
 
-    Fields = Mapping[str, NDArray[np.float64]]
+    Fields = Mapping[str, FloatArray]
 
 _SHAPE = (200, 200)
 _SIGMA = 30e-6
 _SEED = 0
 
 
-def simulated_shot(
-    setup: ProtonSetup, dm: float, noise: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def simulated_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatArray, FloatArray]:
     """Image with noise, and the displacement that made it."""
     import numpy as np
 
@@ -38,9 +35,7 @@ def simulated_shot(
     return image + noise * image.mean() * grain, truth
 
 
-def compared_fields(
-    image: NDArray[np.float64], truth: NDArray[np.float64], inversion: Inversion
-) -> Fields:
+def compared_fields(image: FloatArray, truth: FloatArray, inversion: Inversion) -> Fields:
     """Displacements by name: the truth, ours, and what linear inversion makes of the image."""
     from napari_shadowinv.physics.poisson import poisson_invert
     from napari_shadowinv.physics.setup import displacement_from_potential

@@ -3,52 +3,51 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+import importlib.util
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from napari_shadowinv.cli._outputs import make_folder, protect_store
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
+from napari_shadowinv.io.pradformat import check_pradformat_setup
+from napari_shadowinv.io.store import DONE, STATUS_NAMES, StackStore, read_stack
 
 if TYPE_CHECKING:
     import xarray
 
 FORMATS = ("tiff", "pradformat", "csv")
 
-_TABLE = (
-    "shot",
-    "name",
-    "status",
-    "converged",
-    "flux_residual",
-    "image_residual",
-    "iterations",
-    "reason",
-)
+# Columns of the table, and what they are called in a shot's report.
+_REPORTED = {
+    "converged": "converged",
+    "flux_residual": "residual",
+    "image_residual": "image_residual",
+    "iterations": "iterations",
+    "reason": "reason",
+}
 
 
-def opened(path: Path, shots: str | None) -> xarray.Dataset:
+def _opened(path: Path, shots: str | None) -> xarray.Dataset:
     """Open a store and choose shots from it; only those that are done."""
-    import numpy as np
-
-    from napari_shadowinv.io.store import DONE, read_stack
-
-    dataset = read_stack(path).assign_coords(index=("shot", np.arange(_count(path))))
-    chosen = dataset if shots is None else dataset.isel(shot=parsed_shots(shots, _count(path)))
+    dataset = read_stack(path)
+    count = dataset.sizes["shot"]
+    chosen = dataset.assign_coords(index=("shot", np.arange(count)))
+    if shots is not None:
+        chosen = chosen.isel(shot=_parsed_shots(shots, count))
     done = chosen.isel(shot=np.flatnonzero(chosen["status"].values == DONE))
     if not done.sizes["shot"]:
         raise InputError(f"{path} has no finished shots in this selection: see shadowinv status")
     return done
 
 
-def _count(path: Path) -> int:
-    from napari_shadowinv.io.store import StackStore
-
-    return len(StackStore(path).names)
-
-
-def parsed_shots(text: str, count: int) -> list[int]:
+def _parsed_shots(text: str, count: int) -> list[int]:
     """Turn 3, 3:20, :10, ::5 or several of these with commas into numbers of shots."""
     chosen: list[int] = []
     for part in text.split(","):
@@ -69,33 +68,20 @@ def parsed_shots(text: str, count: int) -> list[int]:
 
 
 def export_shots(
-    store: Path,
-    out: Path,
-    form: str,
-    shots: str | None,
-    variables: list[str],
-    overwrite: bool,
+    store: Path, out: Path, form: str, shots: str | None, variables: list[str], overwrite: bool
 ) -> list[Path]:
-    """Write shots of a store in another format.
-
-    Returns
-    -------
-    list of Path
-        The files.
-    """
+    """Write shots of a store in another format; return the files."""
     if form not in FORMATS:
         raise InputError(f"format is {form!r}: expected one of {', '.join(FORMATS)}")
     protect_store(store, out)
     if form == "csv":
         return [_write_table(store, out, shots, overwrite)]
-    dataset = opened(store, shots)
+    dataset = _opened(store, shots)
     jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
-    from napari_shadowinv.io import check_output
-
     make_folder(out)
     for name, _ in jobs:
         check_output(out / name, overwrite)
-    return [_write(out / name, shot, overwrite) for name, shot in jobs]
+    return [write(out / name, load(), overwrite=overwrite) for name, load in jobs]
 
 
 def _stem(shot: xarray.Dataset) -> str:
@@ -105,7 +91,10 @@ def _stem(shot: xarray.Dataset) -> str:
     return f"{int(shot['index']):04d}_{safe}"
 
 
-def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[tuple[str, Any]]:
+_Job = tuple[str, Callable[[], Any]]  # the name of a file, and what reads its content
+
+
+def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
     for variable in variables:
         dims = dataset[variable].dims if variable in dataset else ()
         if dims[:1] != ("shot",) or dims[-2:] != ("y", "x"):
@@ -117,77 +106,47 @@ def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[tuple[
     for index in range(dataset.sizes["shot"]):
         shot = dataset.isel(shot=index)
         for variable in variables:
-            for component in ("y", "x") if "component" in shot[variable].dims else ("",):
-                plane = shot[variable]
-                if component:
-                    plane = plane.sel(component=component)
-                suffix = f"{variable}_{component}" if component else variable
-                yield f"{_stem(shot)}_{suffix}{TIFF.suffix}", plane
+            planes = {variable: shot[variable]}
+            if "component" in shot[variable].dims:
+                planes = {
+                    f"{variable}_{component}": shot[variable].sel(component=component)
+                    for component in ("y", "x")
+                }
+            for name, plane in planes.items():
+                yield f"{_stem(shot)}_{name}{TIFF.suffix}", partial(np.asarray, plane, dtype=float)
 
 
-def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
-    from napari_shadowinv.inversion.labels import setup_from_dataset
-    from napari_shadowinv.io.pradformat import check_pradformat_setup
-
+def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[_Job]:
     check_pradformat_setup(setup_from_dataset(dataset))
     for index in range(dataset.sizes["shot"]):
         shot = dataset.isel(shot=index)
-        yield (
-            f"{_stem(shot)}{PRADFORMAT.suffix}",
-            shot.assign_attrs(input_file=str(shot["name"].values)),
-        )
-
-
-def _write(path: Path, content: Any, overwrite: bool) -> Path:
-    import numpy as np
-
-    from napari_shadowinv.inversion.labels import setup_from_dataset
-    from napari_shadowinv.io import write
-
-    if path.suffix in PRADFORMAT.suffixes:
-        return write(path, content.load(), overwrite=overwrite)
-    setup = setup_from_dataset(content.to_dataset(name="plane").assign_attrs(content.attrs))
-    return write(path, np.asarray(content.values, dtype=float), setup=setup, overwrite=overwrite)
+        named = shot.assign_attrs(input_file=str(shot["name"].values))
+        yield f"{_stem(shot)}{PRADFORMAT.suffix}", named.compute
 
 
 def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:
     """One row for each shot, done or not, with the largest magnitude of each field."""
-    import numpy as np
-
-    from napari_shadowinv.io import replacing
-    from napari_shadowinv.io.store import STATUS_NAMES, StackStore, read_stack
     from napari_shadowinv.stack import stack_statistics
 
     content = StackStore(store)
-    dataset = read_stack(store)
-    peaks = stack_statistics(dataset)
+    peaks = stack_statistics(read_stack(store))
     names = [str(name) for name in peaks.data_vars if str(name).endswith("_peak")]
     columns = {name: np.asarray(peaks[name].values) for name in names}
     headings = [f"{name} ({peaks[name].attrs['units']})" for name in names]
     count = len(content.names)
-    chosen = range(count) if shots is None else parsed_shots(shots, count)
+    chosen = range(count) if shots is None else _parsed_shots(shots, count)
     statuses, reports = content.statuses(), content.reports()
     with (
         replacing(out, overwrite) as temporary,
         temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as f,
     ):
         rows = csv.writer(f)
-        rows.writerow([*_TABLE, *headings])
+        rows.writerow(["shot", "name", "status", *_REPORTED, *headings])
         for index in chosen:
-            report = reports[index]
-            rows.writerow(
-                [
-                    index,
-                    content.names[index],
-                    STATUS_NAMES[statuses[index]],
-                    report.get("converged", ""),
-                    report.get("residual", ""),
-                    report.get("image_residual", ""),
-                    report.get("iterations", ""),
-                    report.get("reason", ""),
-                    *(f"{columns[name][index]:.9g}" for name in names),
-                ]
-            )
+            report = (reports[index].get(name, "") for name in _REPORTED.values())
+            peak = (f"{columns[name][index]:.9g}" for name in names)
+            status = STATUS_NAMES[statuses[index]]
+            rows.writerow([index, content.names[index], status, *report, *peak])
     return out
 
 
@@ -201,32 +160,17 @@ def write_movie(
     limits: tuple[float, float] | None,
     overwrite: bool,
 ) -> int:
-    """Write a film of a store, a frame for each shot, all on one colour scale.
-
-    Returns
-    -------
-    int
-        Number of frames.
-    """
-    from napari_shadowinv.io import check_output
+    """Write a film of a store, all shots on one colour scale; return its number of frames."""
     from napari_shadowinv.plotting import stack_frames, write_film
 
     check_output(out, overwrite, suffixes=(".mp4", ".gif"))
     protect_store(store, out)
-    if out.suffix.lower() == ".mp4":
-        _require_ffmpeg(out)
-    if not 0 < rate <= 120:
-        raise InputError(f"rate is {rate:g}: expected more than 0 and at most 120 frames a second")
-    dataset = opened(store, shots)
-    frames = stack_frames(dataset, variable, limits=limits)
-    return write_film(out, frames, rate, overwrite=overwrite)
-
-
-def _require_ffmpeg(out: Path) -> None:
-    from importlib.util import find_spec
-
-    if find_spec("imageio_ffmpeg") is None:
+    if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise FileFormatError(
             f"{out} needs the package imageio-ffmpeg: install it with pip install "
             "'napari-shadowinv[movie]', or write a .gif"
         )
+    if not 0 < rate <= 120:
+        raise InputError(f"rate is {rate:g}: expected more than 0 and at most 120 frames a second")
+    frames = stack_frames(_opened(store, shots), variable, limits=limits)
+    return write_film(out, frames, rate, overwrite=overwrite)

@@ -10,20 +10,16 @@ from napari_shadowinv.cli._tables import setup_text
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from napari_shadowinv._typing import FloatArray
     from napari_shadowinv.physics.setup import Deflector, Setup
-
-    Plane = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Prediction:
     """A field with the experiment that it is from, and the one that it is to be seen in."""
 
-    displacement: Plane
-    source: Plane | None
+    displacement: FloatArray
+    source: FloatArray | None
     made_with: Setup | None
     seen: Setup | None
     deflector: Deflector | None
@@ -67,7 +63,7 @@ def seen_with(
     return replace(meant, source=None) if meant.is_elsewhere else meant
 
 
-def predicted(meant: Prediction, source: Plane | None) -> tuple[Plane, str]:
+def predicted(meant: Prediction, source: FloatArray | None) -> tuple[FloatArray, str]:
     """Return the image, and in words what was assumed."""
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.projection import default_deflector, project

@@ -28,7 +28,6 @@ _ONE_WISH = 2.0  # seconds in which impatient fingers mean one and the same Ctrl
 
 P = ParamSpec("P")
 
-
 _ctrl_c = threading.Event()
 
 
@@ -86,11 +85,9 @@ def interrupted() -> bool:
 
 @contextmanager
 def _noting_interrupts() -> Iterator[None]:
-    """Note Ctrl-C for `interrupted`.
+    """Note Ctrl-C for `interrupted`, and raise the interrupt as usual.
 
-    The interrupt is raised as usual, too; should a callback of compiled code swallow it,
-    the core still stops at its next step. What is pressed again at once is not raised: it
-    would interrupt the clearing up after the first.
+    Should a callback of compiled code swallow it, the core still stops at its next step.
     """
     _ctrl_c.clear()
     pressed = float("-inf")
@@ -102,7 +99,7 @@ def _noting_interrupts() -> Iterator[None]:
         nonlocal pressed
         _ctrl_c.set()
         if time.monotonic() < pressed + _ONE_WISH:
-            return
+            return  # it would interrupt the clearing up after the first
         pressed = time.monotonic()
         # What is half made now complains when Python clears up.
         sys.unraisablehook = lambda _: None

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli._tables import (
@@ -21,20 +20,20 @@ from napari_shadowinv.cli._tables import (
 
 if TYPE_CHECKING:
     import xarray
-    from numpy.typing import NDArray
     from rich.table import Table
 
+    from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.io import Radiograph
     from napari_shadowinv.io.formats import Format
     from napari_shadowinv.preprocessing import Provenance
 
 
+@refusing_damage
 def described(path: Path, variable: str | None = None) -> Table:
     """Tell what a file is and what is in it."""
     return two_columns(str(path), _rows(path, variable))
 
 
-@refusing_damage
 def _rows(path: Path, variable: str | None) -> Rows:
     from napari_shadowinv.cli._batch import store_rows
     from napari_shadowinv.io import Radiograph, is_stack, read
@@ -67,10 +66,7 @@ def _matlab_rows(path: Path, variable: str | None) -> Rows:
     from napari_shadowinv.io.matlab import mat_variables, read_mat
 
     held = mat_variables(path)
-    rows = [
-        ("kind", "MATLAB file"),
-        ("variables", ", ".join(map(str, held)) or "none"),
-    ]
+    rows = [("kind", "MATLAB file"), ("variables", ", ".join(map(str, held)) or "none")]
     images = [item for item in held if item.is_image]
     if variable is None and len(images) != 1:
         advice = "choose one with --variable" if images else "none that is an image"
@@ -86,12 +82,8 @@ def _picture_rows(path: Path, found: Format) -> Rows:
     warnings = film_warnings(array, None) if array.ndim == 2 else ()
     rows = [("kind", f"{found.name.upper()} picture, {metadata['bits']} bits per sample")]
     if array.ndim == 3:
-        rows.append(
-            (
-                "channels",
-                f"{array.shape[-1]}: convert a scan of film to dose, or choose with --channel",
-            )
-        )
+        advice = "convert a scan of film to dose, or choose with --channel"
+        rows.append(("channels", f"{array.shape[-1]}: {advice}"))
     return [*rows, *_array_rows(array), *[("warning", text) for text in warnings]]
 
 
@@ -99,7 +91,6 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> Rows:
     from napari_shadowinv.io import Radiograph
 
     assert isinstance(shot, Radiograph)
-    geometry = shot.metadata.get("geometry", {})
     names = {"text": "numbers as text", "pradformat": "pradformat radiograph"}
     rows = [
         ("kind", names.get(str(shot.metadata["kind"]), str(shot.metadata["kind"]))),
@@ -109,19 +100,14 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> Rows:
         rows.append(("source", "in the same file, below the image"))
     if shot.mask is not None:
         rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels excluded"))
-    return [*rows, *_geometry_rows(geometry), ("setup", setup_text(shot.setup, shot))]
+    for name, value in shot.metadata.get("geometry", {}).items():
+        if isinstance(value, int | float):
+            unit = "MeV" if name == "energy" else "m"
+            rows.append((f"{name.replace('_', ' ')} ({unit})", f"{value:g}"))
+    return [*rows, ("setup", setup_text(shot.setup, shot))]
 
 
-def _geometry_rows(geometry: Mapping[str, Any]) -> Rows:
-    units = {"energy": "MeV"}
-    return [
-        (f"{name.replace('_', ' ')} ({units.get(name, 'm')})", f"{value:g}")
-        for name, value in geometry.items()
-        if isinstance(value, int | float)
-    ]
-
-
-def _array_rows(array: NDArray[Any]) -> Rows:
+def _array_rows(array: AnyArray) -> Rows:
     import numpy as np
 
     values = array.astype(np.float64)

@@ -38,6 +38,7 @@ QT_BINDINGS = ("PyQt6", "PySide6", "PySide6_Essentials", "PyQt5", "PySide2")
 
 def report_text() -> str:
     """Versions, platform, cores, memory and the folder of compiled code, one per line."""
+    memory = physical_memory()
     rows = [
         ("napari-shadowinv", __version__),
         ("python", f"{platform.python_version()} ({platform.python_implementation()})"),
@@ -45,7 +46,7 @@ def report_text() -> str:
         ("Qt", ", ".join(_qt_bindings()) or "not installed"),
         ("platform", f"{platform.platform()}, {platform.machine()}"),
         ("cores", _cores()),
-        ("memory", _memory()),
+        ("memory", "not known" if memory is None else f"{memory / 2**30:.1f} GiB"),
         ("compiled code", _compiled_code()),
     ]
     width = max(len(name) for name, _ in rows)
@@ -71,11 +72,6 @@ def _cores() -> str:
     except AttributeError:  # not on macOS or Windows
         usable = count or 1
     return f"{count or 'not known'}, {usable} usable"
-
-
-def _memory() -> str:
-    size = physical_memory()
-    return "not known" if size is None else f"{size / 2**30:.1f} GiB"
 
 
 def _compiled_code() -> str:

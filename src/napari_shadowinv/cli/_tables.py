@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any
 from napari_shadowinv.cli._terminal import plain
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
     from rich.table import Table
 
+    from napari_shadowinv._typing import AnyArray, FloatArray
     from napari_shadowinv.inversion import Inversion, Report
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Provenance, Radiograph
@@ -85,24 +84,19 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
             f"{report.clipped_pixels} clipped",
         ),
         ("caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
-        *crossing_rows(report),
+        *[
+            (name, ", ".join(f"{side} {share:.2%}" for side, share in shares.items()))
+            for name, shares in [
+                ("flux left", report.flux_left),
+                ("flux entered", report.flux_entered),
+            ]
+            if shares  # where the boundary was free
+        ],
         *peak_rows(inversion.displacement, setup),
     ]
 
 
-def crossing_rows(report: Report) -> Rows:
-    """The flux that crossed the edge, side by side, where the boundary was free."""
-    return [
-        (name, ", ".join(f"{side} {share:.2%}" for side, share in shares.items()))
-        for name, shares in (
-            ("flux left", report.flux_left),
-            ("flux entered", report.flux_entered),
-        )
-        if shares
-    ]
-
-
-def peak_rows(displacement: NDArray[np.float64], setup: Setup | None) -> Rows:
+def peak_rows(displacement: FloatArray, setup: Setup | None) -> Rows:
     """The strongest point, in pixels and where there is a setup in SI units."""
     from napari_shadowinv.physics.units import shown_fields
 
@@ -117,8 +111,9 @@ def peak_rows(displacement: NDArray[np.float64], setup: Setup | None) -> Rows:
 
 def closing_rows(report: Report, written: Iterable[Path] = ()) -> Rows:
     """The time that it took, warnings, and the files that were written."""
+    stages = ", ".join(f"{stage} {value:.2f}" for stage, value in report.seconds.items())
     return [
-        ("time", _times_text(report.seconds)),
+        ("time", f"{sum(report.seconds.values()):.2f} s ({stages})"),
         *[("warning", warning) for warning in report.warnings],
         *[("written", str(path)) for path in written],
     ]
@@ -131,14 +126,9 @@ def setup_text(setup: Setup | None, shot: Radiograph | None = None) -> str:
             f"{setup.probe}, magnification {setup.magnification:.4g}, "
             f"pixel {setup.object_pixel_size * 1e6:.4g} µm at the object"
         )
-    if shot is not None and shot.metadata.get("geometry"):
-        missing = _missing(shot.metadata["geometry"])
-        return f"none: the file gives the geometry but not the {missing}; give it with --setup"
-    return "none: results in pixels; give --setup for SI units"
-
-
-def _missing(geometry: Mapping[str, Any]) -> str:
-    """What a file leaves out of a setup."""
+    geometry = {} if shot is None else shot.metadata.get("geometry", {})
+    if not geometry:
+        return "none: results in pixels; give --setup for SI units"
     needed = {
         "energy": "energy",
         "source_object_distance": "distance from source to object",
@@ -147,7 +137,10 @@ def _missing(geometry: Mapping[str, Any]) -> str:
     missing = [words for name, words in needed.items() if name not in geometry]
     if not {"pixel_size", "detector_pixel_size"} & geometry.keys():
         missing.append("pixel size")
-    return ", nor the ".join(missing)
+    return (
+        f"none: the file gives the geometry but not the {', nor the '.join(missing)}; give it "
+        "with --setup"
+    )
 
 
 def options_text(options: Mapping[str, Any]) -> str:
@@ -155,7 +148,7 @@ def options_text(options: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} = {value}" for name, value in options.items())
 
 
-def size_text(array: NDArray[Any]) -> str:
+def size_text(array: AnyArray) -> str:
     """Height and width are given as people do, width first."""
     return f"{array.shape[1]} × {array.shape[0]} px (width × height)"
 

@@ -1,8 +1,7 @@
 """The compiler's work, done once after an installation.
 
 - do it before an inversion that somebody waits for: `ensure_compiled`
-- whether it was done: `is_compiled`
-- where its result is kept: `code_folder`
+- whether it was done: `is_compiled`; where its result is kept: `code_folder`
 """
 
 from __future__ import annotations
@@ -56,24 +55,15 @@ def ensure_compiled(
 def is_compiled() -> bool:
     """Return whether an earlier run has left its machine code for this one.
 
-    Returns
-    -------
-    bool
-        False after an installation, where the cache (``NUMBA_CACHE_DIR``, or a folder
-        beside the package) is empty, and where nothing can be kept.
+    It has not after an installation, where the cache (``NUMBA_CACHE_DIR``, or a folder beside the
+    package) is empty, or where nothing can be kept.
     """
     kept = code_folder()
     return kept is not None and any(kept.glob("_flips.build-*.nbi"))
 
 
 def code_folder() -> Path | None:
-    """Return the folder in which the machine code of the triangulation is kept.
-
-    Returns
-    -------
-    Path or None
-        None where nothing can be kept.
-    """
+    """Return the folder of the triangulation's machine code; None where none can be kept."""
     from napari_shadowinv.geometry._flips import build
     from napari_shadowinv.geometry._kernel import is_kept
 

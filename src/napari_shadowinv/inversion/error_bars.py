@@ -24,11 +24,12 @@ from threading import Event
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.memory import physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.threads import available_threads
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.inversion._invert import invert
@@ -50,8 +51,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Uncertainty", "uncertainty"]
 
-Array = NDArray[np.float64]
-Draw = Callable[[np.random.Generator], Array]
+Draw = Callable[[np.random.Generator], FloatArray]
 
 _SAMPLE_SHARE = 0.2  # of the noise's flux errors that a sample may leave unsolved
 _LOOSEST_TOLERANCE = 0.1
@@ -91,10 +91,10 @@ class Uncertainty:
     """
 
     inversion: Inversion
-    potential_mean: Array
-    potential_std: Array
-    displacement_mean: Array
-    displacement_std: Array
+    potential_mean: FloatArray
+    potential_std: FloatArray
+    displacement_mean: FloatArray
+    displacement_std: FloatArray
     n: int
     noise: str
     tolerance: float
@@ -133,7 +133,7 @@ class Uncertainty:
         # each is its argument times a number, perhaps negative, perhaps with axes exchanged
         deviations = {str(name): np.abs(field.values) for name, field in scatter.items()}
 
-        def beside(name: str, what: str, values: Array) -> tuple[Any, ...]:
+        def beside(name: str, what: str, values: FloatArray) -> tuple[Any, ...]:
             field = dataset[name]
             long_name = f"{field.attrs['long_name']}, {what} of noisy samples"
             return field.dims, values, label(field.attrs["units"], long_name)
@@ -229,7 +229,10 @@ def uncertainty(
     )
     seeds = np.random.SeedSequence(options.seed).spawn(int(n))
     workers = _workers(options, len(inversion.sites), inversion.image.size)
-    sampling = _Sampling(plan, inversion.weights, draw, _options_of_samples(options, workers))
+    # The threads are shared out among the samples; what noise drives below zero is clipped.
+    threads = max(1, available_threads(options.threads) // workers)
+    clipping = options.model_copy(update={"threads": threads, "negative": "clip"})
+    sampling = _Sampling(plan, inversion.weights, draw, clipping)
     sampling = sampling.to_tolerance_of_noise(seeds[0])
     potential, displacement = _RunningMoments(), _RunningMoments()
     solutions: list[LevelSolution] = []
@@ -260,8 +263,8 @@ def uncertainty(
 class _Sample:
     """One noisy image, inverted."""
 
-    potential: Array
-    displacement: Array
+    potential: FloatArray
+    displacement: FloatArray
     solution: LevelSolution
 
 
@@ -270,7 +273,7 @@ class _Sampling:
     """Everything that the samples share."""
 
     plan: SitePlan
-    start: Array
+    start: FloatArray
     draw: Draw
     options: InversionOptions
 
@@ -287,12 +290,10 @@ class _Sampling:
         return _Sample(potential - border_mean(potential), displacement, solution)
 
     def to_tolerance_of_noise(self, seed: np.random.SeedSequence) -> _Sampling:
-        """Ask of the solver no more than what matters beside the flux errors that noise makes.
-
-        What it leaves unsolved is white, and moves the field far less than the flux that it
-        did move: where a fifth is left in the worst cell, a sample's field is within 3 % of
-        its change, and the deviation of many within 0.2 %.
-        """
+        """Ask of the solver no more than what matters beside the flux errors that noise makes."""
+        # What it leaves unsolved is white, and moves the field far less than the flux that it
+        # did move: where a fifth is left in the worst cell, a sample's field is within 3 % of
+        # its change, and the deviation of many within 0.2 %.
         level = self.plan.levels[-1]
         objective = TransportObjective(
             level.triangulation.copy(),
@@ -305,7 +306,7 @@ class _Sampling:
         tolerance = max(loosest, self.options.tolerance)
         return replace(self, options=self.options.model_copy(update={"tolerance": tolerance}))
 
-    def _image(self, seed: np.random.SeedSequence) -> Array:
+    def _image(self, seed: np.random.SeedSequence) -> FloatArray:
         noisy = self.draw(np.random.default_rng(seed))
         return prepare(noisy, self.plan.source, self.options, self.plan.mask).floored_image
 
@@ -315,19 +316,17 @@ class _RunningMoments:
 
     def __init__(self) -> None:
         self._count = 0
-        self.mean: Array = np.zeros(())
-        self._squares: Array = np.zeros(())
+        self.mean = self._squares = np.zeros(())
 
-    def add(self, values: Array) -> None:
+    def add(self, values: FloatArray) -> None:
         self._count += 1
         before = values - self.mean
         self.mean = self.mean + before / self._count
         self._squares = self._squares + before * (values - self.mean)
 
     @property
-    def std(self) -> Array:
-        deviation: Array = np.sqrt(self._squares / (self._count - 1))
-        return deviation
+    def std(self) -> FloatArray:
+        return np.asarray(np.sqrt(self._squares / (self._count - 1)))
 
 
 def _noise_of(
@@ -354,7 +353,7 @@ def _noise_of(
     return _gaussian(values, np.asarray(noise), usable)
 
 
-def _poisson(values: Array, gain: float | None) -> tuple[Draw, str]:
+def _poisson(values: FloatArray, gain: float | None) -> tuple[Draw, str]:
     if gain is None:
         if np.any(values != np.rint(values)):
             raise InputError(
@@ -373,7 +372,7 @@ def _poisson(values: Array, gain: float | None) -> tuple[Draw, str]:
     return lambda rng: gain * rng.poisson(quanta), f"Poisson, gain {gain:g}"
 
 
-def _gaussian(values: Array, sigma: NDArray[np.generic], usable: Array) -> tuple[Draw, str]:
+def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[Draw, str]:
     if sigma.dtype.kind not in "uif":
         raise InputError(
             f"noise has values of type {sigma.dtype}, expected 'poisson', a standard deviation "
@@ -394,12 +393,6 @@ def _gaussian(values: Array, sigma: NDArray[np.generic], usable: Array) -> tuple
     return lambda rng: values + deviation * rng.normal(size=values.shape), described
 
 
-def _options_of_samples(options: InversionOptions, workers: int) -> InversionOptions:
-    """Share the threads out among the samples; clip what noise drives below zero."""
-    threads = max(1, available_threads(options.threads) // workers)
-    return options.model_copy(update={"threads": threads, "negative": "clip"})
-
-
 def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
     """Samples to work on at once: one a thread, as far as they fit in half of the memory."""
     threads = available_threads(options.threads)
@@ -417,10 +410,8 @@ def _in_order(
     keep: Callable[[_Sample], None],
     report: Reporter,
 ) -> None:
-    """Work on a few seeds at once and hand over the samples in the order of the seeds.
-
-    Only this thread reports and asks whether to stop: what listens need not expect others.
-    """
+    """Work on a few seeds at once and hand over the samples in the order of the seeds."""
+    # Only this thread reports and asks whether to stop: what listens need not expect others.
     abandoned = Event()
     waiting: deque[Future[_Sample]] = deque()
     done = 0
@@ -446,12 +437,11 @@ def _in_order(
 
 
 def _warnings(inversion: Inversion, solutions: list[LevelSolution]) -> tuple[str, ...]:
-    warnings = inversion.report.warnings
     failed = sum(not solution.converged for solution in solutions)
-    if failed:
-        warnings = (
-            f"{failed} of {len(solutions)} samples did not converge: the deviations are "
-            "unreliable where the samples scatter most",
-            *warnings,
-        )
-    return warnings
+    if not failed:
+        return inversion.report.warnings
+    return (
+        f"{failed} of {len(solutions)} samples did not converge: the deviations are unreliable "
+        "where the samples scatter most",
+        *inversion.report.warnings,
+    )

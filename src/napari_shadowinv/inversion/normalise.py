@@ -1,22 +1,22 @@
 """An image and a source made ready for the transport.
 
-- check and normalise: `prepare`
+- check and normalise: `prepare`; a source or a mask alone: `checked_source`, `checked_mask`
+- the margin of a free boundary, and how many sites: `margin_around`, `number_of_sites`
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 
 __all__ = [
-    "Mask",
     "Prepared",
     "checked_mask",
     "checked_source",
@@ -26,9 +26,6 @@ __all__ = [
     "power_of_two",
     "prepare",
 ]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _SMALLEST_SIDE = 4
 _LEAST_MARGIN = 4
@@ -63,12 +60,12 @@ class Prepared:
         What the user should know.
     """
 
-    image: Array
-    source: Array
-    floored_image: Array
-    floored_source: Array
+    image: FloatArray
+    source: FloatArray
+    floored_image: FloatArray
+    floored_source: FloatArray
     unit: float
-    mask: Mask
+    mask: BoolArray
     clipped_pixels: int
     floored_pixels: int
     flux_scale: float
@@ -89,20 +86,15 @@ def prepare(
     ----------
     image : array_like, shape (H, W)
         The shot; counts or any linear measure of fluence.
-    source : array_like, shape (H, W), optional
+    source : array_like, shape (H, W), or None
         The undisturbed beam; uniform if None.
     options : InversionOptions
         Its `floor`, `negative` and `flux` are used.
     mask : array_like of bool, shape (H, W), optional
-        True where a pixel can be used; others carry no flux on either side, and what they
-        hold, even NaN, does not matter.
+        What other pixels hold, even NaN, does not matter; they carry no flux on either side.
     flux_scale : float, optional
         Divide the image by this. Default: what gives it the flux of the source, or 1 where
         `options.flux` says that it is known.
-
-    Returns
-    -------
-    Prepared
 
     Raises
     ------
@@ -161,20 +153,16 @@ def prepare(
         clipped_pixels=negative,
         floored_pixels=below,
         flux_scale=flux_scale,
-        warnings=(
-            *_warnings(ratio if conserved else 1.0, negative, below, int(usable.sum())),
-            *_large_mask(usable),
-            *_few_sites(values.size, options),
-        ),
+        warnings=_warnings(ratio if conserved else 1.0, negative, below, usable, options),
     )
 
 
-def power_of_two(source: Array) -> float:
+def power_of_two(source: FloatArray) -> float:
     """Return the power of two next below the brightest pixel: dividing by it rounds nothing."""
     return float(2.0 ** np.floor(np.log2(source.max())))
 
 
-def _refuse_the_image_itself(beam: Array, image: Array, mask: Mask) -> None:
+def _refuse_the_image_itself(beam: FloatArray, image: FloatArray, mask: BoolArray) -> None:
     """Refuse a source that is proportional to the image, unless both are uniform."""
     ones, others = (values[mask] / values[mask].mean() for values in (beam, image))
     if np.abs(ones - others).max() <= _ALIKE and np.ptp(ones) > 2 * _ALIKE:
@@ -184,23 +172,16 @@ def _refuse_the_image_itself(beam: Array, image: Array, mask: Mask) -> None:
         )
 
 
-def masked_source(source: Array, mask: Mask, options: InversionOptions) -> Array:
+def masked_source(source: FloatArray, mask: BoolArray, options: InversionOptions) -> FloatArray:
     """Return a source with its masked pixels at the floor, so that cells fill the image."""
     return np.where(mask, source, options.floor * source[mask].mean())
 
 
-def _large_mask(usable: Mask) -> tuple[str, ...]:
-    share = 1 - float(usable.mean())
-    if share < _NOTABLE_MASK:
-        return ()
-    return (
-        f"the mask excludes {share:.1%} of the pixels: the field there is only a smooth "
-        "continuation. To hide the object from a source estimate, use a source mask instead",
-    )
-
-
-def _warnings(ratio: float, clipped: int, floored: int, size: int) -> tuple[str, ...]:
+def _warnings(
+    ratio: float, clipped: int, floored: int, usable: BoolArray, options: InversionOptions
+) -> tuple[str, ...]:
     warnings = []
+    size, pixels = int(usable.sum()), usable.size
     if abs(ratio - 1) > _NOTABLE_FLUX_CHANGE:
         warnings.append(
             f"the image's flux is {ratio:.3g} times the source's; it was scaled to match"
@@ -213,36 +194,24 @@ def _warnings(ratio: float, clipped: int, floored: int, size: int) -> tuple[str,
             f"dark pixels raised to the floor: {dark} ({dark / size:.2%}); "
             "the field inside dark areas is not reliable"
         )
+    excluded = 1 - float(usable.mean())
+    if excluded >= _NOTABLE_MASK:
+        warnings.append(
+            f"the mask excludes {excluded:.1%} of the pixels: the field there is only a smooth "
+            "continuation. To hide the object from a source estimate, use a source mask instead"
+        )
+    if options.n_sites is None and pixels > MAX_DEFAULT_SITES:
+        warnings.append(
+            f"{MAX_DEFAULT_SITES:,} sites for {pixels:,} pixels, the default maximum: n_sites = "
+            f"{pixels:,} resolves single pixels but needs more time and memory"
+        )
     return tuple(warnings)
 
 
-def _few_sites(pixels: int, options: InversionOptions) -> tuple[str, ...]:
-    if options.n_sites is not None or pixels <= MAX_DEFAULT_SITES:
-        return ()
-    return (
-        f"{MAX_DEFAULT_SITES:,} sites for {pixels:,} pixels, the default maximum: n_sites = "
-        f"{pixels:,} resolves single pixels but needs more time and memory",
-    )
-
-
-def checked_source(source: ArrayLike, mask: Mask | None = None) -> Array:
+def checked_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:
     """Return a source as floats, 0 where masked, or raise an `InputError` that says what is wrong.
 
-    Parameters
-    ----------
-    source : array_like, shape (H, W)
-        The undisturbed beam.
-    mask : ndarray of bool, shape (H, W), optional
-        The pixels that are used, of the image's shape.
-
-    Returns
-    -------
-    ndarray, shape (H, W)
-
-    Raises
-    ------
-    InputError
-        If the source is of another shape, not a number, negative or zero everywhere.
+    That is another shape than the mask's, or pixels that are not numbers, negative, or all zero.
     """
     found = _plane(source, "source").shape
     if mask is not None and found != mask.shape:
@@ -259,7 +228,7 @@ def checked_source(source: ArrayLike, mask: Mask | None = None) -> Array:
     return beam
 
 
-def _check_range(values: Array, name: str) -> None:
+def _check_range(values: FloatArray, name: str) -> None:
     peak = float(values.max())
     if not _DIMMEST < peak < _BRIGHTEST:
         raise InputError(
@@ -268,7 +237,7 @@ def _check_range(values: Array, name: str) -> None:
         )
 
 
-def checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Mask:
+def checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> BoolArray:
     """Return a mask as booleans, or raise an `InputError` that says what is wrong with it."""
     usable = np.asarray(mask)
     if usable.shape != shape:
@@ -283,7 +252,7 @@ def checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Mask:
     return usable
 
 
-def _plane(values: ArrayLike, name: str) -> NDArray[Any]:
+def _plane(values: ArrayLike, name: str) -> AnyArray:
     array = np.asarray(values)
     if array.ndim != 2:
         raise InputError(
@@ -300,7 +269,7 @@ def _plane(values: ArrayLike, name: str) -> NDArray[Any]:
     return array
 
 
-def _finite_image(values: ArrayLike, name: str, mask: Mask) -> Array:
+def _finite_image(values: ArrayLike, name: str, mask: BoolArray) -> FloatArray:
     array = np.where(mask, _plane(values, name), 0.0).astype(np.float64)
     bad = int((~np.isfinite(array)).sum())
     if bad:
@@ -314,10 +283,7 @@ def _finite_image(values: ArrayLike, name: str, mask: Mask) -> Array:
 def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
     """Return the pixels beyond each edge that sites cover where the boundary is free.
 
-    Raises
-    ------
-    InputError
-        If it is wider than the image.
+    More than the image's longer side raise an `InputError`.
     """
     if options.margin is None:
         return max(_LEAST_MARGIN, round(_MARGIN_SHARE * min(shape)))
@@ -330,13 +296,7 @@ def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
 
 
 def number_of_sites(shape: tuple[int, int], options: InversionOptions) -> int:
-    """Return the sites to use for an image, or say why there cannot be so many.
-
-    Raises
-    ------
-    InputError
-        If they would not fit in memory.
-    """
+    """Return the sites to use for an image; an `InputError` if they would not fit in memory."""
     wanted = options.n_sites
     n_sites = min(shape[0] * shape[1], MAX_DEFAULT_SITES) if wanted is None else wanted
     memory = physical_memory()

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.interpolation import BLOCK
 from napari_shadowinv.geometry.natural_neighbor import natural_neighbor
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
@@ -24,7 +24,6 @@ from napari_shadowinv.transport.solvers import LevelSolution, potential_surface
 
 __all__ = ["read_centroids", "read_dual", "read_out"]
 
-Array = NDArray[np.float64]
 OnShare = Callable[[float], None]
 
 _PART = 64 * BLOCK  # pixels
@@ -35,7 +34,7 @@ def read_out(
     solution: LevelSolution,
     options: InversionOptions,
     on_share: OnShare | None = None,
-) -> tuple[Array, Array]:
+) -> tuple[FloatArray, FloatArray]:
     """Potential and displacement at the pixels, by the read-out that the options name.
 
     Parameters
@@ -56,24 +55,19 @@ def read_out(
     displacement : ndarray, shape (2, H, W)
         px.
     """
-    level = plan.levels[-1]
-    weights, displacement = solution.weights, solution.displacement
-    threads = options.threads
+    level, moves = plan.levels[-1], solution.displacement
     if options.readout == "centroid":
-        return read_centroids(
-            level, displacement, level.shape, threads, integration=options.integration
-        )
-    return read_dual(level, weights, displacement, level.shape, threads, on_share)
+        return read_centroids(level, moves, options.threads, integration=options.integration)
+    return read_dual(level, solution.weights, moves, options.threads, on_share)
 
 
 def read_dual(
     level: Level,
-    weights: Array,
-    site_displacement: Array,
-    shape: tuple[int, int],
+    weights: FloatArray,
+    site_displacement: FloatArray,
     threads: int | None = None,
     on_share: OnShare | None = None,
-) -> tuple[Array, Array]:
+) -> tuple[FloatArray, FloatArray]:
     """Read the potential off the weights: at a site it is half the weight.
 
     Parameters
@@ -84,8 +78,6 @@ def read_dual(
         Weights, px².
     site_displacement : ndarray, shape (n, 2)
         Displacement of each site, px; see `LevelSolution`.
-    shape : tuple of int
-        Shape (H, W) of the image.
     threads : int, optional
         Default: all cores.
     on_share : callable, optional
@@ -100,12 +92,12 @@ def read_dual(
         crosses, the potential is taken as its mirror image.
     """
     surface = potential_surface(level, weights, site_displacement, threads=threads)
-    potential = np.empty(shape)
+    potential = np.empty(level.shape)
     count = potential.size
     # Whole blocks of the surface's queries, so that the parts change nothing.
     for first in range(0, count, _PART):
         part = np.arange(first, min(first + _PART, count))
-        rows, columns = np.divmod(part.astype(np.float64), shape[1])
+        rows, columns = np.divmod(part.astype(np.float64), level.shape[1])
         potential.ravel()[part[0] : part[-1] + 1] = surface(np.column_stack([rows, columns]))[0]
         if on_share is not None:
             on_share((first + len(part)) / count)
@@ -116,12 +108,11 @@ def read_dual(
 
 def read_centroids(
     level: Level,
-    site_displacement: Array,
-    shape: tuple[int, int],
+    site_displacement: FloatArray,
     threads: int | None = None,
     *,
     integration: Literal["mean", "y", "x"] = "mean",
-) -> tuple[Array, Array]:
+) -> tuple[FloatArray, FloatArray]:
     """Interpolate the centroids' displacements and integrate them, as the paper does.
 
     The sites nearest to the corners are moved there, so that the sites' hull covers the
@@ -129,36 +120,31 @@ def read_centroids(
 
     Parameters
     ----------
-    level, site_displacement, shape, threads
+    level, site_displacement, threads
         See `read_dual`.
     integration : {"mean", "y", "x"}
         Integrate first along y and then along x, first along x, or take the mean of both.
 
     Returns
     -------
-    potential : ndarray, shape (H, W)
-        px², zero in the mean over the border.
-    displacement : ndarray, shape (2, H, W)
-        Natural-neighbour interpolation of the sites' displacements, px.
+    potential, displacement
+        As of `read_dual`, but the displacement is the natural-neighbour interpolation of that of
+        the sites.
 
     References
     ----------
     Paper, section III and lines 22–26 of its algorithm.
     """
-    sites = _moved_to_corners(level.sites, shape)
-    displacement = natural_neighbor(
-        RegularTriangulation(sites), site_displacement, _pixels(shape), threads=threads
-    )
+    shape = level.shape
+    pixels = np.indices(shape, dtype=np.float64).reshape(2, -1).T
+    triangulation = RegularTriangulation(_moved_to_corners(level.sites, shape))
+    displacement = natural_neighbor(triangulation, site_displacement, pixels, threads=threads)
     displacement = np.ascontiguousarray(displacement.T).reshape(2, *shape)
     potential = _integrated(displacement, integration)
     return potential - border_mean(potential), displacement
 
 
-def _pixels(shape: tuple[int, int]) -> Array:
-    return np.indices(shape, dtype=np.float64).reshape(2, -1).T
-
-
-def _moved_to_corners(sites: Array, shape: tuple[int, int]) -> Array:
+def _moved_to_corners(sites: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Move the site nearest to each corner of the image to it."""
     moved = sites.copy()
     for y in (-0.5, shape[0] - 0.5):
@@ -168,12 +154,12 @@ def _moved_to_corners(sites: Array, shape: tuple[int, int]) -> Array:
     return moved
 
 
-def _integrated(displacement: Array, first: Literal["mean", "y", "x"]) -> Array:
+def _integrated(displacement: FloatArray, first: Literal["mean", "y", "x"]) -> FloatArray:
     """Integrate minus the displacement along one axis and then the other."""
     along_y = cumulative_trapezoid(displacement[0], axis=0, initial=0)
     along_x = cumulative_trapezoid(displacement[1], axis=1, initial=0)
     y_first = along_y[:, :1] + along_x
     x_first = along_x[:1, :] + along_y
     share = {"y": 1.0, "x": 0.0, "mean": 0.5}[first]
-    potential: Array = -(share * y_first + (1 - share) * x_first)
+    potential: FloatArray = -(share * y_first + (1 - share) * x_first)
     return potential

@@ -42,20 +42,18 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
+
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion.normalise import Prepared
     from napari_shadowinv.options import InversionOptions
 
 __all__ = ["doubts", "image_residual"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _BRIGHT = 3.0  # times the source: there a bright line is, which pixels are too coarse for
 _LAGS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 4), (4, 0))
@@ -82,20 +80,10 @@ _CROSSING = 0.1  # of the displacement along the edge
 _MASKED_EDGE = 0.2  # of a side
 
 
-def image_residual(image: Array, reprojection: Array, mask: Mask) -> float:
+def image_residual(image: FloatArray, reprojection: FloatArray, mask: BoolArray) -> float:
     """How far a re-projection is from its image: r.m.s. difference over mean intensity.
 
-    Parameters
-    ----------
-    image, reprojection : ndarray, shape (H, W)
-        In the same units.
-    mask : ndarray of bool, shape (H, W)
-        The pixels that count.
-
-    Returns
-    -------
-    float
-        As a share of the image's mean.
+    Both in the same units; only the pixels of the mask count.
 
     Examples
     --------
@@ -108,13 +96,13 @@ def image_residual(image: Array, reprojection: Array, mask: Mask) -> float:
 
 def doubts(
     prepared: Prepared,
-    displacement: Array,
-    reprojection: Array,
-    jacobian: Array,
+    displacement: FloatArray,
+    reprojection: FloatArray,
+    jacobian: FloatArray,
     n_sites: int,
     options: InversionOptions,
 ) -> tuple[str, ...]:
-    """Say in plain sentences why a converged answer must not be trusted.
+    """Say in plain sentences why a converged answer must not be trusted; empty if nothing does.
 
     Parameters
     ----------
@@ -122,19 +110,12 @@ def doubts(
         Image, source and mask.
     displacement : ndarray, shape (2, H, W)
         The answer, px.
-    reprojection : ndarray, shape (H, W)
-        The source as displaced by it.
-    jacobian : ndarray, shape (H, W)
-        Its Jacobian determinant.
+    reprojection, jacobian : ndarray, shape (H, W)
+        The source as displaced by it, and its Jacobian determinant.
     n_sites : int
         Number of sites.
     options : InversionOptions
         Its `boundary` is used.
-
-    Returns
-    -------
-    tuple of str
-        Empty where nothing speaks against the answer.
     """
     noise = _Noise(prepared)
     square = np.einsum("cyx,cyx->yx", displacement, displacement)
@@ -152,7 +133,7 @@ def doubts(
     return tuple(sentence for sentence in found if sentence)
 
 
-def _misfit(prepared: Prepared, reprojection: Array, n_sites: int) -> str:
+def _misfit(prepared: Prepared, reprojection: FloatArray, n_sites: int) -> str:
     """The re-projection misses a pattern in the image."""
     mask, mean = prepared.mask, prepared.source[prepared.mask].mean()
     bright = ndimage.uniform_filter(prepared.image, 3) > _BRIGHT * np.maximum(prepared.source, mean)
@@ -165,21 +146,19 @@ def _misfit(prepared: Prepared, reprojection: Array, n_sites: int) -> str:
     np.clip(residual, -5 * share * mean, 5 * share * mean, out=residual)
     if max(abs(_correlation(residual, *lag)) for lag in _LAGS) < _PATTERN:
         return ""
-    advice = (
-        "use more sites"
-        if n_sites < mask.sum()
-        else (
+    advice = "use more sites"
+    if n_sites >= mask.sum():
+        advice = (
             "the image has structure on the scale of its pixels, so smooth it or record it "
             "with smaller pixels"
         )
-    )
     return (
         "the picture does not fit: the re-projection misses a pattern in the image, by "
         f"{share:.0%} of the mean (r.m.s.); do not trust the field: {advice}"
     )
 
 
-def _correlation(values: Array, down: int, right: int) -> float:
+def _correlation(values: FloatArray, down: int, right: int) -> float:
     """Correlation of pixels with those so many rows and columns further."""
     height, width = values.shape
     left = max(-right, 0)
@@ -199,8 +178,8 @@ class _Noise:
         finest = (excess[1:, 1:] - excess[1:, :-1] - excess[:-1, 1:] + excess[:-1, :-1]) / 2
         used = mask[1:, 1:] & mask[1:, :-1] & mask[:-1, 1:] & mask[:-1, :-1]
         differences = np.abs(finest[used]) if used.any() else np.zeros(1)
+        # With hot pixels and the finest structure.
         self.largest = float(np.sqrt(np.mean(differences**2)))
-        """With hot pixels and the finest structure."""
         limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(differences))
         self.typical = self.largest
         if limit > 0:
@@ -234,7 +213,7 @@ def _nothing_found(noise: _Noise, rms: float) -> str:
     )
 
 
-def _deep_folds(jacobian: Array, mask: Mask) -> str:
+def _deep_folds(jacobian: FloatArray, mask: BoolArray) -> str:
     """Caustics far beyond their beginning, told by the rim of the strip between them."""
     if not (jacobian < _CAUSTIC)[mask].any():
         return ""
@@ -255,7 +234,7 @@ def _deep_folds(jacobian: Array, mask: Mask) -> str:
     )
 
 
-def _strips(jacobian: Array, outer: float, least: float) -> tuple[NDArray[np.int32], NDArray[Any]]:
+def _strips(jacobian: FloatArray, outer: float, least: float) -> tuple[AnyArray, AnyArray]:
     """Label where the Jacobian is below `outer`; say which labels are strips with caustics."""
     labels, count = ndimage.label(jacobian < outer)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
@@ -263,14 +242,14 @@ def _strips(jacobian: Array, outer: float, least: float) -> tuple[NDArray[np.int
     return labels, np.flatnonzero((sizes >= least) & (caustics >= _LEAST_CAUSTIC * sizes))
 
 
-def _share_of_strips(jacobian: Array, inner: float, outer: float, least: float) -> float:
+def _share_of_strips(jacobian: FloatArray, inner: float, outer: float, least: float) -> float:
     """Of all strips: pixels below `inner` among those below `outer`."""
     labels, found = _strips(jacobian, outer, least)
     strips = jacobian[np.isin(labels, found)]
     return float((strips < inner).sum() / max(strips.size, 1))
 
 
-def _share_where_widest(jacobian: Array, inner: float, outer: float, least: float) -> float:
+def _share_where_widest(jacobian: FloatArray, inner: float, outer: float, least: float) -> float:
     """The same around the widest place of a strip: the tips of a crescent are shallow."""
     labels, found = _strips(jacobian, inner, least)
     boxes = ndimage.find_objects(labels)
@@ -286,7 +265,7 @@ def _share_where_widest(jacobian: Array, inner: float, outer: float, least: floa
     return largest
 
 
-def _cut_off(displacement: Array, mask: Mask, noise: _Noise, rms: float) -> str:
+def _cut_off(displacement: FloatArray, mask: BoolArray, noise: _Noise, rms: float) -> str:
     """The field does not end at the closed edge."""
     depth = max(2, round(_INSIDE * min(mask.shape)))
     y, x = np.where(mask, displacement, np.nan)
@@ -315,7 +294,7 @@ def _cut_off(displacement: Array, mask: Mask, noise: _Noise, rms: float) -> str:
     )
 
 
-def _is_strongest_at_edge(outwards: Array, along: Array, peak: float) -> bool:
+def _is_strongest_at_edge(outwards: FloatArray, along: FloatArray, peak: float) -> bool:
     """Whether it is, and not just the same all the way to the edge, as that of a jet."""
     crossing = np.nanmean(outwards**2) > _CROSSING**2 * np.nanmean(along**2)
     return bool(crossing and np.nanmax(np.abs(along)) > _AT_EDGE * peak)

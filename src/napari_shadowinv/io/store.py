@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._system.safety import refusing_damage, small_text
-from napari_shadowinv._typing import AnyArray
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.labels import setup_from_dataset, variable_labels
 from napari_shadowinv.io.files import check_folder_of

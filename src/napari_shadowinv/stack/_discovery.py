@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.files import in_counting_order, text_of
+from napari_shadowinv.io.files import in_counting_order, kind_of, text_of
+from napari_shadowinv.io.images import tiff_pages
 from napari_shadowinv.stack._references import (
     ArrayShot,
     BlockShot,
@@ -34,39 +35,19 @@ from napari_shadowinv.stack._references import (
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Shots", "find_shots", "find_source"]
-
 _MAGIC = re.compile(r"[*?\[]")
 _LOOKED_AT = 3  # files that are asked for the shape of all
 
 
-def _knows_pages(reader: Reader) -> bool:
-    return "page" in inspect.signature(reader).parameters
-
-
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """The shots of a stack, in order.
-
-    Attributes
-    ----------
-    items : sequence of Shot
-        One reference for each.
-    names : tuple of str
-        What each is called in messages and tables.
-    shape : tuple of int
-        Shape (H, W) that they should have.
-    coordinate : array or None
-        The values of the coordinate ``shot`` of an xarray object.
-    array : dask.array.Array or None
-        The same images as one array, chunks of one shot, where they came as an array.
-    """
+    """The shots of a stack, in order."""
 
     items: Sequence[Shot]
-    names: tuple[str, ...]
-    shape: tuple[int, int]
-    coordinate: Any = None
-    array: Any = None
+    names: tuple[str, ...]  # for messages and tables
+    shape: tuple[int, int]  # that they should have
+    coordinate: Any = None  # values of the coordinate ``shot`` of an xarray object
+    array: Any = None  # the same images as one dask array, chunks of one shot, if they came so
 
     def __len__(self) -> int:
         return len(self.items)
@@ -94,29 +75,7 @@ class Shots:
 def find_shots(
     shots: Any, *, reader: Reader = read_shot, shape: tuple[int, int] | None = None
 ) -> Shots:
-    """Turn whatever holds shots into references to them.
-
-    Parameters
-    ----------
-    shots : array, xarray object, path, glob or sequence of paths
-        See `napari_shadowinv.invert_stack`.
-    reader : callable, optional
-        Makes an image of a path.
-    shape : tuple of int, optional
-        Shape (H, W) that shots should have. Default: that of the array, or of most of the
-        first few files that can be read.
-
-    Returns
-    -------
-    Shots
-
-    Raises
-    ------
-    InputError
-        If there is no shot in it, or it is nothing that could hold shots.
-    FileFormatError
-        If none of the first files can be read.
-    """
+    """Turn whatever holds shots into references to them."""
     if isinstance(shots, (str, Path)):
         return _from_path(str(shots), reader, shape)
     if hasattr(shots, "dims") and hasattr(shots, "coords"):
@@ -150,21 +109,18 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
                 f"no file matches {text}: expected shots; check the folder and pattern"
             )
         return _from_files(found, reader, shape)
-    pages = _page_count(path) if _knows_pages(reader) else 1
+    pages = _page_count(path, reader)
     if pages == 1:
         return _from_files([path], reader, shape)
-    return _of_files(
-        [PageShot(path.absolute(), page, reader) for page in range(pages)],
-        tuple(f"{text_of(path.name)}[{page}]" for page in range(pages)),
-        shape,
-    )
+    items = [PageShot(path.absolute(), page, reader) for page in range(pages)]
+    names = tuple(f"{text_of(path.name)}[{page}]" for page in range(pages))
+    return Shots(items, names, shape or _usual_shape(items))
 
 
-def _page_count(path: Path) -> int:
-    from napari_shadowinv.io.formats import kind_of
-    from napari_shadowinv.io.images import tiff_pages
-
-    return tiff_pages(path) if kind_of(path) == "tiff" else 1
+def _page_count(path: Path, reader: Reader) -> int:
+    """Pages of a TIFF that the reader can tell apart."""
+    knows_pages = "page" in inspect.signature(reader).parameters
+    return tiff_pages(path) if knows_pages and kind_of(path) == "tiff" else 1
 
 
 def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | None) -> Shots:
@@ -176,12 +132,7 @@ def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | 
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise InputError(f"shots contain {twice} twice: expected each file once")
-    return _of_files([FileShot(path.absolute(), reader) for path in paths], names, shape)
-
-
-def _of_files(
-    items: Sequence[Shot], names: tuple[str, ...], shape: tuple[int, int] | None
-) -> Shots:
+    items = [FileShot(path.absolute(), reader) for path in paths]
     return Shots(items, names, shape or _usual_shape(items))
 
 
@@ -231,10 +182,13 @@ def _from_array(shots: Any, coordinate: Any = None) -> Shots:
         raise InputError(
             f"shots have the unknown shape {shots.shape}: call compute_chunk_sizes() first"
         )
-    lazy = isinstance(shots, da.Array)
-    array = shots if lazy else da.from_array(np.asarray(shots), chunks=(1, -1, -1))
-    array = array.rechunk((1, -1, -1))
-    items = _Blocks(array) if lazy else [ArrayShot(plane) for plane in np.asarray(shots)]
+    items: Sequence[Shot]
+    if isinstance(shots, da.Array):
+        array = shots.rechunk((1, -1, -1))
+        items = _Blocks(array)
+    else:
+        array = da.from_array(np.asarray(shots), chunks=(1, -1, -1))
+        items = [ArrayShot(plane) for plane in np.asarray(shots)]
     names = tuple(str(value) for value in (range(count) if coordinate is None else coordinate))
     return Shots(items, names, (shots.shape[1], shots.shape[2]), coordinate, array)
 
@@ -254,30 +208,12 @@ class _Blocks(Sequence[Shot]):
         return BlockShot(dask.optimize(self._array.blocks[index])[0])
 
 
-def find_source(source: Any, *, reader: Reader = read_shot) -> NDArray[Any] | Shots | None:
-    """Turn whatever holds the undisturbed beam into one image, or into many.
-
-    Parameters
-    ----------
-    source : array, path, sequence of paths, glob or None
-        See `napari_shadowinv.invert_stack`.
-    reader : callable, optional
-        Makes an image of a path.
-
-    Returns
-    -------
-    ndarray of shape (H, W), or Shots, or None
-        One image for all shots, references to one for each, or none: a uniform beam.
-
-    Raises
-    ------
-    InputError, FileFormatError
-        If it is nothing of this, or cannot be read.
-    """
+def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots | None:
+    """Turn whatever holds the undisturbed beam into one image, or into many."""
     if source is None:
         return None
     single = isinstance(source, (str, Path)) and not _MAGIC.search(str(source))
-    if single and not (_knows_pages(reader) and _page_count(Path(source)) > 1):
+    if single and _page_count(Path(source), reader) == 1:
         return FileShot(Path(source).absolute(), reader).load()[0]
     if getattr(source, "ndim", None) == 2:
         return np.asarray(source)

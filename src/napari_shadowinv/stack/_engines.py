@@ -12,15 +12,13 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.threads import available_threads
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.stack._local import local_client
 from napari_shadowinv.stack._references import BlockShot, Shot
-
-__all__ = ["Engine", "EngineError", "WorkerDied", "engine_for", "is_here"]
 
 _CONNECT_SECONDS = 10.0
 _POLL = 0.1  # seconds between two looks at `should_stop` while connecting
@@ -38,72 +36,47 @@ class WorkerDied(Exception):  # noqa: N818 - it is what happened to a shot
     """A shot was tried several times and each time the worker died."""
 
 
-class Engine(Protocol):
-    """Runs tasks somewhere, several at once."""
-
-    name: str
-    workers: int | None
-    stop: threading.Event | None
-
-    def window(self, *, files: bool) -> int:
-        """Return how many tasks to hand over at once."""
-        ...
-
-    def share(self, value: Any, name: str) -> Any:
-        """Bring a value to where the tasks are, and return what stands for it."""
-        ...
-
-    def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
-        """Start ``task(shots, *args)``; the future has `add_done_callback` and `cancel`."""
-        ...
-
-    def result(self, future: Any) -> Any:
-        """Return what a task returned.
-
-        Raises
-        ------
-        WorkerDied, EngineError
-            If the shot cannot be done here, or the engine is gone.
-        """
-        ...
-
-    def check(self) -> None:
-        """Raise `EngineError` if the engine is gone."""
-        ...
-
-
 class _Threads:
-    """Threads of this process, or the calling thread's own pool of one."""
+    """Threads of this process; what the methods promise, those of `_Cluster` do too."""
+
+    stop: threading.Event | None  # set to end tasks that run, if they share this process
+    workers: int | None  # on this machine, if it is known that all of them are
 
     def __init__(self, pool: ThreadPoolExecutor, workers: int) -> None:
         self.name = f"{workers} thread{'s' if workers > 1 else ''}"
-        self.workers: int | None = workers
-        self.stop: threading.Event | None = threading.Event()
+        self.workers = workers
+        self.stop = threading.Event()
         self._pool = pool
 
     def window(self, *, files: bool) -> int:
+        """Return how many tasks to hand over at once."""
         return _AHEAD * (self.workers or 1)
 
     def share(self, value: Any, name: str) -> Any:
+        """Bring a value to where the tasks are, and return what stands for it."""
         return value
 
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
+        """Start ``task(shots, *args)``; the future has `add_done_callback` and `cancel`."""
         return self._pool.submit(task, shots, *args)
 
     def result(self, future: Any) -> Any:
+        """Return what a task returned; raise `WorkerDied`, or `EngineError` if all is lost."""
         return future.result()
 
     def check(self) -> None:
-        return None
+        """Raise `EngineError` if the engine is gone."""
 
 
 class _Cluster:
     """Workers of `dask.distributed`."""
 
-    def __init__(self, client: Any, name: str, workers: int | None = None) -> None:
-        self.name = name
-        self.workers = workers  # of this machine, if it is known that all of them are
-        self.stop: threading.Event | None = None
+    stop = None
+
+    def __init__(self, client: Any, name: str = "", workers: int | None = None) -> None:
+        address = getattr(client.scheduler, "address", "?") if client.scheduler else "?"
+        self.name = name or f"the scheduler at {address}"
+        self.workers = workers
         self._client = client
         self._shared: list[Any] = []
         self._asked = -_ASKED_AGAIN_AFTER
@@ -129,16 +102,13 @@ class _Cluster:
             future = self._client.submit(_same, value, key=name)
         self._shared.append(future)
         if self._slots():
-            self._spread(future)
+            distributed: Any = import_module("distributed")
+            # To all workers at once, because dask gives tasks to those that have it first. Only
+            # to save time: a worker or scheduler that dies meanwhile shows where it matters.
+            with suppress(Exception), self._client.as_current():
+                distributed.wait([future], timeout=_CONNECT_SECONDS)
+                self._client.replicate([future])
         return future
-
-    def _spread(self, future: Any) -> None:
-        """Bring a value to all workers at once: dask gives tasks to those that have it first."""
-        distributed: Any = import_module("distributed")
-        # Only to save time: a worker or scheduler that dies meanwhile shows where it matters.
-        with suppress(Exception), self._client.as_current():
-            distributed.wait([future], timeout=_CONNECT_SECONDS)
-            self._client.replicate([future])
 
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
         # A dask array may live on the cluster already, so its blocks are the cluster's tasks.
@@ -187,6 +157,9 @@ class _Cluster:
             raise self._lost() from error
 
 
+Engine = _Threads | _Cluster
+
+
 def _same(value: Any) -> Any:
     return value
 
@@ -195,31 +168,7 @@ def _same(value: Any) -> Any:
 def engine_for(
     scheduler: Any = None, workers: int | None = None, should_stop: ShouldStop | None = None
 ) -> Iterator[Engine]:
-    """Make or find an engine; what was made here is taken down at the end.
-
-    Parameters
-    ----------
-    scheduler : str, distributed.Client, cluster or None
-        ``"threads"``, ``"synchronous"``, ``"processes"``, the address of a scheduler, a client
-        or a cluster. Default: the current client of dask, else threads.
-    workers : int, optional
-        Shots that are inverted at once on this machine. Default: as many as cores.
-    should_stop : callable, optional
-        Asked while a scheduler has not answered yet.
-
-    Yields
-    ------
-    Engine
-
-    Raises
-    ------
-    InputError
-        If there is no such engine.
-    EngineError
-        If the scheduler does not answer, or processes cannot be started.
-    InversionCancelled
-        If `should_stop` returned true.
-    """
+    """Make or find an engine; what was made here is taken down at the end."""
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}: expected 1 or more")
     scheduler = _chosen(scheduler)
@@ -244,17 +193,12 @@ def is_here(scheduler: Any) -> bool:
 
 
 def _chosen(scheduler: Any) -> Any:
-    return (_current_client() or "threads") if scheduler is None else scheduler
-
-
-def _current_client() -> Any:
-    if "distributed" not in sys.modules:
-        return None
-    distributed: Any = sys.modules["distributed"]
-    try:
-        return distributed.default_client()
-    except ValueError:
-        return None
+    """What is meant: by default dask's current client, else threads."""
+    if scheduler is None and "distributed" in sys.modules:
+        distributed: Any = sys.modules["distributed"]
+        with suppress(ValueError):
+            return distributed.default_client()
+    return "threads" if scheduler is None else scheduler
 
 
 def _threads(count: int) -> Iterator[Engine]:
@@ -263,7 +207,6 @@ def _threads(count: int) -> Iterator[Engine]:
     try:
         yield engine
     except BaseException:
-        # Shots that run stop at their next step.
         if engine.stop is not None:
             engine.stop.set()
         raise
@@ -294,17 +237,10 @@ def _last_cause(error: BaseException) -> str:
 def _given(scheduler: Any, should_stop: ShouldStop | None) -> Iterator[Engine]:
     distributed: Any = import_module("distributed")
     if isinstance(scheduler, distributed.Client):
-        yield _Cluster(scheduler, f"the scheduler at {_address(scheduler)}")
-        return
-    try:
-        client = _connected(scheduler, should_stop)
-    except (OSError, TypeError, ValueError) as error:
-        raise EngineError(
-            f"no scheduler responds at {scheduler} ({type(error).__name__}): start it with 'dask "
-            "scheduler', and check the address and, for tls://, the keys"
-        ) from None
-    with client:
-        yield _Cluster(client, f"the scheduler at {_address(client)}")
+        yield _Cluster(scheduler)
+    else:
+        with _connected(scheduler, should_stop) as client:
+            yield _Cluster(client)
 
 
 def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:
@@ -320,21 +256,22 @@ def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:
         except BaseException as error:
             answer.set_exception(error)
 
+    def hang_up(answer: Future[Any]) -> None:
+        if answer.exception() is None:
+            answer.result().close()
+
     threading.Thread(target=connect, name="connect", daemon=True).start()
     try:
         while not wait([answer], timeout=_POLL).done:
             if should_stop is not None and should_stop():
                 raise InversionCancelled("stopped on request; run again to resume")
     except BaseException:
-        answer.add_done_callback(_hang_up)
+        answer.add_done_callback(hang_up)
         raise
-    return answer.result()
-
-
-def _hang_up(answer: Future[Any]) -> None:
-    if answer.exception() is None:
-        answer.result().close()
-
-
-def _address(client: Any) -> str:
-    return str(getattr(client.scheduler, "address", "?")) if client.scheduler else "?"
+    try:
+        return answer.result()
+    except (OSError, TypeError, ValueError) as error:
+        raise EngineError(
+            f"no scheduler responds at {scheduler} ({type(error).__name__}): start it with 'dask "
+            "scheduler', and check the address and, for tls://, the keys"
+        ) from None

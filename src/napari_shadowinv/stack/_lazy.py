@@ -7,10 +7,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.labels import variable_labels
 from napari_shadowinv.io.store import SUMMARY
 from napari_shadowinv.options import InversionOptions
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Filter
-
-__all__ = ["invert_stack"]
 
 # One number for each shot, beside the arrays of an inversion.
 _NUMBERS = ("converged", "flux_residual", "image_residual", "iterations")
@@ -139,34 +137,28 @@ def _invert(
     previous: dict[str, Any] | None = None,
     keep: bool = False,
 ) -> dict[str, Any]:
-    """Task of one shot: its variables by name."""
-    start = None if previous is None else previous["inversion"]
+    """Task of one shot: its variables by name, and if the next shot starts there the inversion."""
     try:
         image = shot[0] if isinstance(shot, np.ndarray) else shot.load()[0]
+        start = None if previous is None else previous["inversion"]
         if beam is None or isinstance(beam, Beam):
             inversion = work.invert(image, beam, start=start)
         else:
             inversion = work.invert(image, None, beam.load()[0], start=start)
     except InputError as error:
         raise InputError(f"{label}: {error}") from error
-    return {
-        **work.arrays(inversion),
-        **_numbers_of(inversion),
-        **({"inversion": inversion} if keep else {}),
-    }
-
-
-def _numbers_of(inversion: Inversion) -> dict[str, Any]:
     report = inversion.report
     return {
+        **work.arrays(inversion),
         "converged": np.bool_(report.converged),
         "flux_residual": np.float64(report.residual),
         "image_residual": np.float64(report.image_residual),
         "iterations": np.int64(report.iterations),
+        **({"inversion": inversion} if keep else {}),
     }
 
 
-def _pick(record: dict[str, Any], name: str, with_shot: bool) -> NDArray[Any]:
+def _pick(record: dict[str, Any], name: str, with_shot: bool) -> AnyArray:
     value = np.asarray(record[name])
     return value[np.newaxis] if with_shot else value
 
@@ -181,7 +173,7 @@ class _Graph:
 
         self._stack = stack
         preparation = stack.preparation
-        token = tokenize(
+        self._token = token = tokenize(
             stack.shots.items if stack.shots.array is None else stack.shots.array.name,
             None if stack.sources is None else stack.sources.items,
             None if stack.beam is None else stack.beam.key,
@@ -194,7 +186,6 @@ class _Graph:
             stack.variables,
             stack.warm_start,
         )
-        self._token = token
         self._inverted = f"invert-shot-{token}"
         dependencies: list[Any] = [] if stack.shots.array is None else [stack.shots.array]
         self._beam: Any = None
@@ -222,7 +213,6 @@ class _Graph:
         return (_invert, stack.shots.label(index), shot, beam, work, previous, keep)
 
     def dataset(self) -> xarray.Dataset:
-        """Return the lazy dataset."""
         import xarray as xr
 
         stack = self._stack
@@ -253,8 +243,8 @@ class _Graph:
             {**self._shots.layers, layer: tasks},
             {**self._shots.dependencies, layer: {self._inverted}},
         )
-        chunks = ((1,) * sizes["shot"], *((sizes[dim],) for dim in dims))
         da: Any = import_module("dask.array")
+        chunks = ((1,) * sizes["shot"], *((sizes[dim],) for dim in dims))
         return da.Array(graph, layer, chunks, dtype=dtype or dtype_of(name))
 
     def _shared(self, name: str, dims: tuple[str, ...]) -> Any:
@@ -262,6 +252,6 @@ class _Graph:
 
         beam = delayed(values_of_beam, pure=True)(self._beam, self._stack.options)
         value = delayed(_pick, pure=True)(beam, name, False)
-        shape = tuple(self._stack.sizes[dim] for dim in dims)
         da: Any = import_module("dask.array")
+        shape = tuple(self._stack.sizes[dim] for dim in dims)
         return da.from_delayed(value, shape, dtype=dtype_of(name))

@@ -1,6 +1,6 @@
 """Worker processes on this machine, as runs of shots need them.
 
-- start some, connected: `local_client`
+- start some, connected: `local_client`; what each of them runs first: `dask_setup`
 
 Whoever may talk to a scheduler or a worker of dask can have it run any code. So these talk among
 themselves only: encrypted, with a key that is made for the run and exists nowhere but in them.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
@@ -20,30 +21,13 @@ from typing import Any
 
 from napari_shadowinv._system.interrupts import interrupts_put_off
 
-__all__ = ["local_client"]
-
 _ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
 _TRIMMING = "MALLOC_TRIM_THRESHOLD_"
 
 
 @contextmanager
 def local_client(count: int) -> Iterator[Any]:
-    """Start worker processes of one thread each, which end with the block.
-
-    Parameters
-    ----------
-    count : int
-        Processes.
-
-    Yields
-    ------
-    distributed.Client
-
-    Raises
-    ------
-    OSError, RuntimeError
-        If the processes cannot be started, or end while they start.
-    """
+    """Start worker processes of one thread each, which end with the block; yield a client."""
     distributed: Any = import_module("distributed")
     dask: Any = import_module("dask")
     with ExitStack() as opened:
@@ -65,7 +49,7 @@ def local_client(count: int) -> Iterator[Any]:
                 local_directory=own,
                 # Workers that die are told of by the shots that they were at.
                 silence_logs=logging.CRITICAL,
-                preload=["napari_shadowinv.stack._preload"],
+                preload=[__name__],
             )
             opened.enter_context(cluster)
             client = opened.enter_context(distributed.Client(cluster, set_as_default=False))
@@ -106,17 +90,20 @@ def _forgotten(name: str, value: Any) -> Iterator[None]:
 
 @contextmanager
 def _hidden_from_workers() -> Iterator[None]:
-    """Keep Ctrl-C, which a terminal sends to all processes, from those that the block starts.
-
-    They inherit the mask of signals from threads that the block starts; see also `_preload`.
-    """
+    """Keep Ctrl-C, which a terminal sends to all processes, from those that the block starts."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    # Whatever starts the first process of all lifts the mask: let it be now.
+    # They inherit the mask. Whatever starts the first process of all lifts it: let it be now.
     resource_tracker.ensure_running()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def dask_setup(worker: Any) -> None:
+    """Leave Ctrl-C to the process that started this worker; dask calls it by its name."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -14,42 +14,30 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    from napari_shadowinv.preprocessing import Radiograph
-
-__all__ = [
-    "ArrayShot",
-    "BlockShot",
-    "FileShot",
-    "PageShot",
-    "Reader",
-    "Shot",
-    "checksum",
-    "described_reader",
-    "read_shot",
-]
+from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.io.files import sha256
+from napari_shadowinv.io.images import read_tiff_page
+from napari_shadowinv.io.reading import read_radiograph
+from napari_shadowinv.preprocessing import Radiograph, remove_hot_pixels
 
 Reader = Callable[..., ArrayLike]
 
 
-class Shot(Protocol):
+class Shot:
     """One image that is read when it is asked for; it can be sent to a worker."""
 
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Return the image, and what tells it from others: a checksum at least.
-
-        ``warnings`` beside it are for the shot's report.
-        """
-        ...
+    def load(self) -> tuple[AnyArray, dict[str, Any]]:
+        """Return the image and its ``sha256``, with ``warnings`` for the shot's report if any."""
+        raise NotImplementedError
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Whether it is still the image of which `load` said this."""
-        ...
+        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
 
 
 def read_shot(
@@ -61,7 +49,7 @@ def read_shot(
     factor: int = 1,
     hot_pixels: float | None = None,
     warnings: list[str] | None = None,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Read the image of a shot; this is the reader where none is given.
 
     Parameters
@@ -91,36 +79,25 @@ def read_shot(
     FileFormatError, InputError
         See `napari_shadowinv.io.read_radiograph`.
     """
-    from napari_shadowinv.io.images import read_tiff_page
-    from napari_shadowinv.io.reading import read_radiograph
-    from napari_shadowinv.preprocessing import Radiograph
-
     if page is None:
         shot = read_radiograph(path, channel=channel, variable=variable)
     else:
         image, told = read_tiff_page(path, page, channel=channel)
         shot = Radiograph(image, warnings=told)
     if warnings is not None:
-        warnings += [*shot.warnings, *_left_out(shot)]
+        warnings.extend(shot.warnings)
+        ignored = [name for name in ("source", "mask") if getattr(shot, name) is not None]
+        if ignored:
+            warnings.append(
+                f"the file contains its own {' and '.join(ignored)}, which a stack ignores: pass "
+                "one for the whole stack"
+            )
     if hot_pixels is not None:
-        from napari_shadowinv.preprocessing import remove_hot_pixels
-
         shot = replace(shot, image=remove_hot_pixels(shot.image, threshold=hot_pixels)[0])
     return shot.binned(factor).image
 
 
-def _left_out(shot: Radiograph) -> list[str]:
-    """What a file holds beside its image, which all shots of a stack have in common."""
-    parts = [name for name in ("source", "mask") if getattr(shot, name) is not None]
-    if not parts:
-        return []
-    return [
-        f"the file contains its own {' and '.join(parts)}, which a stack ignores: pass one for "
-        "the whole stack"
-    ]
-
-
-def _read(reader: Reader, path: Path, **chosen: int) -> tuple[NDArray[Any], dict[str, Any]]:
+def _read(reader: Reader, path: Path, **chosen: int) -> tuple[AnyArray, dict[str, Any]]:
     """Image of a file, and warnings if the reader can tell some."""
     if "warnings" not in inspect.signature(reader).parameters:
         return np.asarray(reader(path, **chosen)), {}
@@ -130,18 +107,10 @@ def _read(reader: Reader, path: Path, **chosen: int) -> tuple[NDArray[Any], dict
 
 
 @dataclass(frozen=True)
-class FileShot:
-    """A file that holds one image.
+class FileShot(Shot):
+    """A file that holds one image."""
 
-    Attributes
-    ----------
-    path : Path
-        Absolute, so that a worker elsewhere finds it.
-    reader : callable, optional
-        Makes an image of the path.
-    """
-
-    path: Path
+    path: Path  # absolute, so that a worker elsewhere finds it
     reader: Reader = read_shot
 
     def __dask_tokenize__(self) -> tuple[Any, ...]:
@@ -149,24 +118,14 @@ class FileShot:
         from dask.base import normalize_token
 
         stamp = _stamp(self.path) if self.path.exists() else {}
-        return (
-            str(self.path),
-            normalize_token(self.reader),
-            stamp.get("size"),
-            stamp.get("mtime_ns"),
-        )
+        return (str(self.path), normalize_token(self.reader), *stamp.values())
 
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Read the file, with its checksum."""
-        from napari_shadowinv.io.files import sha256
-
+    def load(self) -> tuple[AnyArray, dict[str, Any]]:
         image, told = _read(self.reader, self.path)
         return image, {**_stamp(self.path), "sha256": sha256(self.path), **told}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare size and time, and only where these differ the checksum."""
-        from napari_shadowinv.io.files import sha256
-
         if not self.path.exists():
             return True  # put away after it was inverted
         if _stamp(self.path).items() <= origin.items():
@@ -180,60 +139,39 @@ def _stamp(path: Path) -> dict[str, int]:
 
 
 @dataclass(frozen=True)
-class PageShot:
+class PageShot(Shot):
     """A page of a TIFF that holds many; its reader takes the keyword ``page``."""
 
     path: Path
     page: int
     reader: Reader = read_shot
 
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Read the page, with its checksum."""
+    def load(self) -> tuple[AnyArray, dict[str, Any]]:
         image, told = _read(self.reader, self.path, page=self.page)
         return image, {"sha256": checksum(image), **told}
 
-    def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Read the page again and compare."""
-        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
-
 
 @dataclass(frozen=True, eq=False)
-class ArrayShot:
+class ArrayShot(Shot):
     """An image in memory."""
 
-    image: NDArray[Any] = field(repr=False)
+    image: AnyArray = field(repr=False)
 
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Return the array, with its checksum."""
+    def load(self) -> tuple[AnyArray, dict[str, Any]]:
         return self.image, {"sha256": checksum(self.image)}
-
-    def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Compare the checksum."""
-        return bool(checksum(self.image) == origin.get("sha256"))
 
 
 @dataclass(frozen=True, eq=False)
-class BlockShot:
-    """An image of a dask array, computed when it is needed.
-
-    Attributes
-    ----------
-    block : dask.array.Array
-        Shape (1, H, W), one chunk.
-    """
+class BlockShot(Shot):
+    """An image of a dask array of shape (1, H, W), computed by dask's current scheduler."""
 
     block: Any = field(repr=False)
 
-    def load(self) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Compute the image by dask's current scheduler."""
+    def load(self) -> tuple[AnyArray, dict[str, Any]]:
         return ArrayShot(np.asarray(self.block.compute())[0]).load()
 
-    def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Compute the image and compare."""
-        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
 
-
-def checksum(array: NDArray[Any]) -> str:
+def checksum(array: AnyArray) -> str:
     """Return the SHA-256 of an array's values, shape and type, in hexadecimal."""
     digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
     digest.update(np.ascontiguousarray(array).data)

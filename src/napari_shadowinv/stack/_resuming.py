@@ -13,9 +13,9 @@ from textwrap import shorten
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv import __version__
+from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import variable_labels
 from napari_shadowinv.io.store import DONE, StackStore
@@ -29,39 +29,19 @@ from napari_shadowinv.stack._spec import (
     values_of_beam,
 )
 
-__all__ = ["append_shots", "contents_of", "resume"]
-
 _APPENDED = "appended_at"  # attribute: where later runs began to append shots
 _INSTEAD = "use the same, overwrite the store, or choose another name"
 
 
 def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
-    """Say what the store of a stack holds.
-
-    Parameters
-    ----------
-    stack : Stack
-        The shots and everything about them.
-    dtype : numpy.dtype
-        Type of stored images.
-
-    Returns
-    -------
-    Contents
-    """
+    """Say what the store of a stack holds."""
     identity = {name: value for name, value in _identity(stack, dtype).items() if value}
-    return Contents(
-        stack.sizes,
-        _variables(stack, dtype),
-        _coordinates(stack),
-        {**attributes_of(stack), **identity},
-    )
+    attributes = {**attributes_of(stack), **identity}
+    return Contents(stack.sizes, _variables(stack, dtype), _coordinates(stack), attributes)
 
 
 def _coordinates(stack: Stack) -> dict[str, Variable]:
-    return {
-        name: _stored_coordinate(coordinate) for name, coordinate in coordinates_of(stack).items()
-    }
+    return {name: _stored_coordinate(values) for name, values in coordinates_of(stack).items()}
 
 
 def _stored_coordinate(coordinate: Any) -> Variable:
@@ -88,15 +68,12 @@ def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
             continue
         exact = dtype_of(name).kind != "f" or "site" in dims
         kept = dtype_of(name) if exact else dtype
-        shared = stack.is_shared(name)
-        values = _shared_values(stack, name) if shared else None
-        found[name] = Variable(dims if shared else ("shot", *dims), kept, labels, values)
+        if stack.beam is not None and stack.is_shared(name):
+            values = np.asarray(values_of_beam(stack.beam, stack.options)[name])
+            found[name] = Variable(dims, kept, labels, values)
+        else:
+            found[name] = Variable(("shot", *dims), kept, labels, None)
     return found
-
-
-def _shared_values(stack: Stack, name: str) -> NDArray[Any]:
-    assert stack.beam is not None
-    return np.asarray(values_of_beam(stack.beam, stack.options)[name])
 
 
 def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> dict[str, str]:
@@ -124,30 +101,12 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
     }
 
 
-def _sum_of(mask: NDArray[np.bool_] | None) -> str:
+def _sum_of(mask: BoolArray | None) -> str:
     return "" if mask is None else f"sha256 {checksum(mask)}"
 
 
 def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
-    """Refuse to mix what does not belong together in one store.
-
-    Parameters
-    ----------
-    store : StackStore
-        Of an earlier run.
-    stack, dtype
-        See `contents_of`.
-
-    Returns
-    -------
-    Stack
-        The same in the order of the store; shots that it does not hold yet are the last.
-
-    Raises
-    ------
-    InputError
-        If anything differs but that there are more shots.
-    """
+    """Return the stack in the order of its store, new shots last; refuse what does not belong."""
     stack = stack.chosen(_order(store, stack.shots.names))
     found = _identity(stack, dtype, len(store.names))
     for name, value in {**found, "package_version": __version__}.items():
@@ -169,10 +128,8 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
 
 
 def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
-    """Places of the store's shots among those that are given, then of the new ones.
-
-    A shot keeps its number for good, so new ones go to the end wherever their names sort.
-    """
+    """Places of the store's shots among those that are given, then of the new ones."""
+    # A shot keeps its number for good, so new ones go to the end wherever their names sort.
     count = len(store.names)
     if names[:count] == store.names:
         return list(range(len(names)))
@@ -206,27 +163,7 @@ def _difference(before: str, now: str) -> str:
 
 
 def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackStore:
-    """Append shots that arrived since the last run, pending, to its store.
-
-    Parameters
-    ----------
-    store : StackStore
-        The store.
-    stack : Stack
-        As `resume` returned it.
-    dtype : numpy.dtype
-        Type of stored images.
-
-    Returns
-    -------
-    StackStore
-        With all shots of the stack.
-
-    Raises
-    ------
-    StoreError
-        If it cannot be written.
-    """
+    """Append shots that arrived since the last run, pending, to the store that `resume` saw."""
     coordinates = {
         name: np.asarray(coordinate.values)
         for name, coordinate in _coordinates(stack).items()

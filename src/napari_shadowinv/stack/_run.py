@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Filter
 
-__all__ = ["STORED", "RunProgress", "ShotOutcome", "run_stack"]
-
 STORED = ("potential", "displacement", "caustic")
 
 _POLL = 0.25  # seconds between two looks at the engine and at `should_stop`
@@ -164,6 +162,7 @@ def run_stack(
     )
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
     if is_here(scheduler):
+        # Once for all workers, which would each be at it during their first shot.
         _compile(len(stack.shots), on_progress, should_stop)
     with locked(path):
         store = StackStore(path) if path.exists() and not overwrite else None
@@ -185,8 +184,6 @@ def run_stack(
 
 
 def _compile(shots: int, on_progress: OnRunProgress | None, should_stop: ShouldStop | None) -> None:
-    """Once for all workers, which would each be at it during their first shot."""
-
     def tell(news: Progress) -> None:
         if on_progress is not None:
             on_progress(RunProgress(shots, 0, 0, "", compiling=news.message))
@@ -301,11 +298,10 @@ class _Run:
         try:
             outcomes = engine.result(future)
         except WorkerDied as error:
-            outcomes = [self._fail(index, str(error)) for index in batch if index in self._todo]
+            lost = [index for index in batch if index in self._todo]
+            outcomes = [ShotOutcome(index, FAILED, 0.0, str(error)) for index in lost]
+            for index in lost:
+                self._store.writer.fail(index, {"reason": str(error)})
         for outcome in outcomes:
             self._todo.discard(outcome.index)
             self.tell(engine.name, outcome)
-
-    def _fail(self, index: int, reason: str) -> ShotOutcome:
-        self._store.writer.fail(index, {"reason": reason})
-        return ShotOutcome(index, FAILED, 0.0, reason)

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
@@ -31,59 +32,22 @@ from napari_shadowinv.stack._worker import Beam, Work, shared_plan, threads_here
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = [
-    "Stack",
-    "attributes_of",
-    "coordinates_of",
-    "describe_stack",
-    "dtype_of",
-    "values_of_beam",
-]
-
-_OF_PLAN = ("sites", "site_mass")
-
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Everything about a stack that is known before any shot is inverted.
-
-    Attributes
-    ----------
-    shots : Shots
-        The shots.
-    beam : Beam or None
-        Source, filtered, and mask of all shots; None if each has a source of its own.
-    sources : Shots or None
-        Source of each shot, if each has a measured one.
-    mask : ndarray of bool, shape (H, W), or None
-        The pixels that can be used.
-    options : InversionOptions
-        Choices.
-    setup : Setup or None
-        For fields in SI units.
-    variables : tuple of str
-        The variables that are wanted.
-    preparation : Preparation
-        Filters of the shots, and how their sources are guessed.
-    warm_start : int
-        So many shots in a row start from the answer to the one before; 1 for none.
-    source_file : str
-        Where the source comes from, if it was named by a path.
-    reader : str
-        Name of what reads the files.
-    """
+    """Everything about a stack that is known before any shot is inverted."""
 
     shots: Shots
-    beam: Beam | None
-    sources: Shots | None
-    mask: NDArray[np.bool_] | None
+    beam: Beam | None  # source, filtered, and mask of all shots; None if each has its own source
+    sources: Shots | None  # one for each shot, if these were measured
+    mask: BoolArray | None
     options: InversionOptions
     setup: Setup | None
     variables: tuple[str, ...]
-    preparation: Preparation
-    warm_start: int = 1
+    preparation: Preparation  # filters of the shots, and how their sources are guessed
+    warm_start: int = 1  # so many shots in a row start from the answer to the one before
     source_file: str = ""
-    reader: str = ""
+    reader: str = ""  # name of what reads the files
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -103,7 +67,7 @@ class Stack:
         """Whether all shots have one such variable together."""
         return (
             self.beam is not None
-            and name in (*_OF_PLAN, "source", "mask")
+            and name in ("sites", "site_mass", "source", "mask")
             and not (name == "source" and self.beam.source is None)
         )
 
@@ -121,7 +85,7 @@ class Stack:
         return Work(self.shape, self.options, self.setup, variables, self.mask, self.preparation)
 
     def changed(self, index: int, origin: dict[str, Any]) -> str:
-        """Say what of a shot is not what it was when this was said of it; empty if nothing."""
+        """Name what of a shot is not what its report says; empty if nothing."""
         if not self.shots.items[index].unchanged(origin):
             return self.shots.label(index)
         if self.sources is not None and not self.sources.items[index].unchanged(origin["source"]):
@@ -142,22 +106,7 @@ def describe_stack(
     filters: Sequence[Filter],
     source_mask: ArrayLike | None,
 ) -> Stack:
-    """Check everything that can be checked before a shot is read.
-
-    Parameters
-    ----------
-    shots, source, mask, options, setup, variables, reader, warm_start, filters, source_mask
-        See `invert_stack`.
-
-    Returns
-    -------
-    Stack
-
-    Raises
-    ------
-    InputError
-        If something does not fit.
-    """
+    """Check everything that can be checked before a shot is read."""
     options = options or InversionOptions()
     if warm_start < 1:
         raise InputError(

@@ -8,15 +8,20 @@ import numpy as np
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.store import DONE
-from napari_shadowinv.physics.setup import SETUPS
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["stack_statistics"]
-
-_IN_SI = dict.fromkeys(field.name for kind in SETUPS.values() for field in kind.si_fields)
-_AVERAGED = ("potential", "displacement", *_IN_SI)
+_AVERAGED = (
+    "potential",
+    "displacement",
+    "potential_si",
+    "deflection_angle",
+    "path_integrated_b",
+    "path_integrated_e",
+    "line_integrated_log_index",
+    "line_integrated_density",
+)
 
 
 def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
@@ -71,13 +76,11 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
             spread = spread * np.nan
         found[f"{name}_std"] = _labelled(spread, field, "standard deviation of shots")
         found[f"{name}_peak"] = _labelled(_peak(field), field, "largest magnitude")
-    attributes = {**stack.attrs, "shots": stack.sizes["shot"]}
-    return xr.Dataset(found, attrs=attributes)
+    return xr.Dataset(found, attrs={**stack.attrs, "shots": stack.sizes["shot"]})
 
 
 def _peak(field: xarray.DataArray) -> xarray.DataArray:
-    planes = field.astype(np.float64)
-    squared = planes**2
+    squared = field.astype(np.float64) ** 2
     if "component" in field.dims:
         squared = squared.sum("component", skipna=False)
     largest: xarray.DataArray = squared.max(("y", "x"), skipna=False)

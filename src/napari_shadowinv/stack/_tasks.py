@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
 from napari_shadowinv.stack._references import Shot, checksum
 from napari_shadowinv.stack._worker import Beam, Work
-
-__all__ = ["Settings", "ShotOutcome", "run_shots"]
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ def run_shots(
     stop: Any = None,
 ) -> list[ShotOutcome]:
     """Task: invert some shots one after the other and write each."""
-    stopping = None if stop is None else stop.is_set
+    should_stop = None if stop is None else stop.is_set
     previous: Inversion | None = None
     outcomes = []
     for shot, (index, wanted, source) in zip(shots, labels, strict=True):
@@ -77,12 +75,7 @@ def run_shots(
             if source is not None:
                 own, origin["source"] = source.load()
             previous = settings.work.invert(
-                image,
-                beam,
-                own,
-                start=previous,
-                workers=settings.workers,
-                should_stop=stopping,
+                image, beam, own, start=previous, workers=settings.workers, should_stop=should_stop
             )
         except InversionCancelled:
             raise
@@ -111,7 +104,7 @@ def _reason(error: Exception) -> str:
     return f"{kind}: {error}"
 
 
-def _loaded(shot: Any) -> tuple[NDArray[Any], dict[str, Any]]:
+def _loaded(shot: Any) -> tuple[AnyArray, dict[str, Any]]:
     """Image of a shot; a block of a dask array on a cluster has been computed already."""
     if isinstance(shot, np.ndarray):
         return shot[0], {"sha256": checksum(shot[0])}
@@ -120,11 +113,7 @@ def _loaded(shot: Any) -> tuple[NDArray[Any], dict[str, Any]]:
 
 
 def _write(
-    settings: Settings,
-    index: int,
-    inversion: Inversion,
-    origin: dict[str, Any],
-    seconds: float,
+    settings: Settings, index: int, inversion: Inversion, origin: dict[str, Any], seconds: float
 ) -> None:
     report = {
         **dataclasses.asdict(inversion.report),

@@ -1,10 +1,8 @@
 """What a worker does with one shot; sites are made once in each process.
 
-- an undisturbed beam that can be sent around: `Beam`
-- sites that threads share: `shared_plan`
-- a shot as it was recorded to an inversion: `Work`; with all filters and its beam: `invert_shot`
-- an inversion to arrays for a dataset: `arrays_of`
-- how many threads a shot may use: `threads_here`
+- an undisturbed beam that can be sent around: `Beam`; the sites that threads share: `shared_plan`
+- a shot as it was recorded to an inversion: `Work`; with filters and beam applied: `invert_shot`
+- an inversion to arrays for a dataset: `arrays_of`; threads for a shot: `threads_here`
 """
 
 from __future__ import annotations
@@ -21,10 +19,10 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from napari_shadowinv._system.progress import OnProgress, OnWarning, ShouldStop
+from napari_shadowinv._system.progress import OnWarning, ShouldStop
 from napari_shadowinv._system.threads import available_threads
+from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
@@ -36,54 +34,37 @@ from napari_shadowinv.transport.sites import SitePlan
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Beam", "Work", "arrays_of", "invert_shot", "shared_plan", "threads_here"]
-
 _ASKED_AGAIN_AFTER = 10.0  # seconds: workers come and go, but asking takes milliseconds
 _PLANS_KEPT = 2  # a worker that changes between two sources makes each once
 
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """The undisturbed beam and the mask of one or more shots.
-
-    Attributes
-    ----------
-    shape : tuple of int
-        Shape (H, W).
-    source : ndarray, shape (H, W), or None
-        None for a uniform beam.
-    mask : ndarray of bool, shape (H, W), or None
-        The pixels that can be used.
-    key : str
-        Checksum of all of it.
-    """
+    """The undisturbed beam and the mask of one or more shots."""
 
     shape: tuple[int, int]
-    source: NDArray[Any] | None = field(default=None, repr=False)
-    mask: NDArray[np.bool_] | None = field(default=None, repr=False)
-    key: str = ""
+    source: AnyArray | None = field(default=None, repr=False)
+    mask: BoolArray | None = field(default=None, repr=False)
+    key: str = ""  # checksum of the others
 
     @property
-    def image(self) -> NDArray[Any]:
+    def image(self) -> AnyArray:
         """The source; ones for a uniform beam."""
         return np.ones(self.shape) if self.source is None else self.source
 
     @classmethod
-    def of(
-        cls, shape: tuple[int, int], source: NDArray[Any] | None, mask: NDArray[np.bool_] | None
-    ) -> Beam:
-        """Make a beam with its checksum."""
+    def of(cls, shape: tuple[int, int], source: AnyArray | None, mask: BoolArray | None) -> Beam:
         parts = ["" if array is None else checksum(array) for array in (source, mask)]
         text = f"{shape}{parts[0]}|{parts[1]}"
         return cls(shape, source, mask, hashlib.sha256(text.encode()).hexdigest())
 
 
+@dataclass
 class _Entry:
     """A plan that is being made, or is there."""
 
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.plan: SitePlan | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    plan: SitePlan | None = None
 
 
 _entries: OrderedDict[str, _Entry] = OrderedDict()
@@ -91,28 +72,9 @@ _entries_lock = threading.Lock()
 
 
 def shared_plan(
-    beam: Beam,
-    options: InversionOptions,
-    *,
-    on_progress: OnProgress | None = None,
-    should_stop: ShouldStop | None = None,
+    beam: Beam, options: InversionOptions, *, should_stop: ShouldStop | None = None
 ) -> SitePlan:
-    """Return the sites for a beam; the first in this process who asks makes them.
-
-    Parameters
-    ----------
-    beam : Beam
-        Source and mask.
-    options : InversionOptions
-        Choices; `threads` does not matter.
-    on_progress, should_stop
-        See `napari_shadowinv.invert`.
-
-    Returns
-    -------
-    SitePlan
-        The same object for the same beam and options; the last few are kept.
-    """
+    """Return the sites for a beam; the first in this process who asks makes them."""
     key = beam.key + options.model_dump_json(exclude={"threads"})
     with _entries_lock:
         entry = _entries.setdefault(key, _Entry())
@@ -121,13 +83,7 @@ def shared_plan(
             _entries.popitem(last=False)
     with entry.lock:
         if entry.plan is None:
-            entry.plan = plan_sites(
-                beam.image,
-                options,
-                mask=beam.mask,
-                on_progress=on_progress,
-                should_stop=should_stop,
-            )
+            entry.plan = plan_sites(beam.image, options, mask=beam.mask, should_stop=should_stop)
             for level in entry.plan.levels:
                 # Made when first asked for, which two threads would do at once.
                 _ = level.mirrored
@@ -135,115 +91,49 @@ def shared_plan(
 
 
 def invert_shot(
-    image: NDArray[Any],
+    image: AnyArray,
     beam: Beam,
     options: InversionOptions,
     *,
     start: Inversion | None = None,
-    on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Inversion:
-    """Invert one shot with the sites that its process shares.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-        The shot.
-    beam : Beam
-        Source and mask.
-    options : InversionOptions
-        Choices.
-    start : Inversion, optional
-        The solver starts from there.
-    on_progress, should_stop
-        See `napari_shadowinv.invert`.
-
-    Returns
-    -------
-    Inversion
-
-    Raises
-    ------
-    InputError
-        If the shot cannot be inverted.
-    """
+    """Invert one shot with the sites that its process shares."""
     began = time.perf_counter()
-    plan = shared_plan(beam, options, on_progress=on_progress, should_stop=should_stop)
+    plan = shared_plan(beam, options, should_stop=should_stop)
     on_sites = time.perf_counter() - began
     if beam.source is None:
         image = _relative(image, beam.mask)
-    inversion = invert(
-        image,
-        options=options,
-        plan=plan,
-        start=start,
-        on_progress=on_progress,
-        should_stop=should_stop,
-    )
+    inversion = invert(image, options=options, plan=plan, start=start, should_stop=should_stop)
     seconds = {**inversion.report.seconds, "sites": on_sites}
     return replace(inversion, report=replace(inversion.report, seconds=seconds))
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What is done with every shot of a stack, wherever it is.
-
-    Attributes
-    ----------
-    shape : tuple of int
-        Shape (H, W) that shots must have.
-    options : InversionOptions
-        Choices. If `threads` is None, shots that are inverted at once share the cores.
-    setup : Setup or None
-        For fields in SI units.
-    variables : tuple of str
-        Names of the arrays to make.
-    mask : ndarray of bool, shape (H, W), or None
-        The pixels that can be used.
-    preparation : Preparation
-        Filters, and how sources are guessed.
-    """
+    """What is done with every shot of a stack, wherever it is."""
 
     shape: tuple[int, int]
-    options: InversionOptions
+    options: InversionOptions  # without `threads`, shots inverted at once share the cores
     setup: Setup | None
     variables: tuple[str, ...]
-    mask: NDArray[np.bool_] | None
+    mask: BoolArray | None
     preparation: Preparation
 
     def invert(
         self,
-        image: NDArray[Any],
+        image: AnyArray,
         beam: Beam | None,
-        source: NDArray[Any] | None = None,
+        source: AnyArray | None = None,
         *,
         start: Inversion | None = None,
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
-        """Filter and invert one shot.
+        """Filter and invert a shot as it was recorded.
 
-        Parameters
-        ----------
-        image : ndarray, shape (H, W)
-            The shot as it was recorded.
-        beam : Beam or None
-            What all shots share, filtered; None if this has a source of its own.
-        source : ndarray, shape (H, W), optional
-            That source as it was recorded. Default: it is guessed from the shot.
-        start, should_stop
-            See `invert_shot`.
-        workers : int, optional
-            See `threads_here`.
-
-        Returns
-        -------
-        Inversion
-
-        Raises
-        ------
-        InputError
-            If the shot cannot be inverted.
+        Without a beam that all shots share, it has the given source, also as it was recorded, or
+        one that is guessed from the image.
         """
         if np.shape(image) != self.shape:
             others = "the others" if beam is None or beam.source is None else "the source"
@@ -265,23 +155,23 @@ class Work:
 
     def _source(
         self,
-        image: NDArray[Any],
-        source: NDArray[Any] | None,
+        image: AnyArray,
+        source: AnyArray | None,
         should_stop: ShouldStop | None,
         on_warning: OnWarning,
-    ) -> NDArray[Any]:
+    ) -> AnyArray:
         if source is None:
             return self.preparation.estimated(image, self.mask, should_stop, on_warning)
         if np.shape(source) != self.shape:
             raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
         return self.preparation.filtered(source, self.mask, should_stop)
 
-    def arrays(self, inversion: Inversion) -> dict[str, NDArray[Any]]:
+    def arrays(self, inversion: Inversion) -> dict[str, AnyArray]:
         """Return the variables by name."""
         return arrays_of(inversion, dict.fromkeys(self.variables), self.setup)
 
 
-def _relative(image: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[Any]:
+def _relative(image: AnyArray, mask: BoolArray | None) -> AnyArray:
     """Divide by the mean, because a uniform beam that all shots share is 1 everywhere."""
     values = np.asarray(image, dtype=np.float64)
     used = values if mask is None else values[mask]
@@ -294,22 +184,8 @@ def _relative(image: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[An
 
 def arrays_of(
     inversion: Inversion, names: Mapping[str, Any], setup: Setup | None
-) -> dict[str, NDArray[Any]]:
-    """Return variables of an inversion by name, fields in SI units among them.
-
-    Parameters
-    ----------
-    inversion : Inversion
-        The result.
-    names : collection of str
-        Names as in `napari_shadowinv.io.dataset.variable_labels`.
-    setup : Setup or None
-        For fields in SI units.
-
-    Returns
-    -------
-    dict of str to ndarray
-    """
+) -> dict[str, AnyArray]:
+    """Return variables of an inversion by name, fields in SI units among them."""
     own = variable_labels()
     arrays = {name: getattr(inversion, name) for name in names if name in own}
     if len(arrays) < len(names):
@@ -319,20 +195,9 @@ def arrays_of(
 
 
 def threads_here(workers: int | None = None) -> int:
-    """Return how many threads one shot may use, so that all shots at once fill the machine.
-
-    Parameters
-    ----------
-    workers : int, optional
-        Shots that are inverted at once on this machine. Default: found out. On a worker of
-        `dask.distributed` it is the number of threads of all workers on this machine; in a
-        pool of dask it is `num_workers` of dask's configuration, or a thread for each core.
-
-    Returns
-    -------
-    int
-        Cores divided by workers, 1 at least.
-    """
+    """Return how many threads one shot may use, so that all shots at once fill the machine."""
+    # On a dask worker, workers default to the threads of all dask workers on this machine; in a
+    # pool of dask to its `num_workers`, or one for each core.
     cores = available_threads(None)
     if workers is None:
         workers = _threads_of_cluster() or _threads_of_pool(cores)
