@@ -13,26 +13,16 @@ from napari_shadowinv._napari.layer_metadata import (
     setup_of,
     setup_origin_of,
 )
-from napari_shadowinv._napari.widgets._base import Part
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._jobs import SourceJob
-from napari_shadowinv._napari.widgets._live import LivePanel
-from napari_shadowinv._napari.widgets._masks import MaskPicker
-from napari_shadowinv._napari.widgets._panels import RunPanel
-from napari_shadowinv._napari.widgets._picking import LayerPicker, LayerWatch
-from napari_shadowinv._napari.widgets._reading import image_of
-from napari_shadowinv._napari.widgets._results import (
-    LastResults,
-    ResultLayers,
-    keep_earlier_box,
-)
+from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, MaskPicker, image_of
+from napari_shadowinv._napari.widgets._panels import LivePanel, RunPanel
+from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.preprocessing.recipes import ESTIMATES
 
 if TYPE_CHECKING:
     import napari
-
-__all__ = ["EstimateSource"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +37,7 @@ class _Request:
 
 
 class EstimateSource(LivePanel):
-    """Choose a shot and a method; the estimate becomes an image layer.
-
-    Parameters
-    ----------
-    viewer : napari.viewer.Viewer
-        The viewer to work in.
-    """
+    """Choose a shot and a method; the estimate becomes an image layer."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__(
@@ -76,32 +60,22 @@ class EstimateSource(LivePanel):
         self.method = ModelPicker("Method", kinds_of(ESTIMATES))
         self.method.set_kind("total_variation")
         self.live.setToolTip("Update the estimate after every change.")
-        self.keep_earlier = keep_earlier_box()
         for row in (
             labelled("Image", self.image),
             self.masks,
             self.method,
             self.live,
-            self.keep_earlier,
+            self._last.keep_earlier,
             self.panel,
         ):
             self.column.addWidget(row)
-        self._connect()
+        edits = LayerWatch(self, (self.image, self.masks))
+        for signal in (self.image.picked, self.masks.changed, self.method.changed, edits.edited):
+            signal.connect(self.on_change)
         self.restore_last()
         self._ready = True
 
-    def _connect(self) -> None:
-        self._edits = LayerWatch((self.image, self.masks))
-        self._edits.setParent(self)
-        for signal in (
-            self.image.picked,
-            self.masks.changed,
-            self.method.changed,
-            self._edits.edited,
-        ):
-            signal.connect(self.on_change)
-
-    def parts(self) -> dict[str, Part]:
+    def parts(self) -> dict[str, Any]:
         return {"method": self.method, "painted_is_unusable": self.masks}
 
     def request(self, preview: bool = False) -> _Request:
@@ -139,5 +113,5 @@ class EstimateSource(LivePanel):
         shown = self.previewed
         if not preview:
             self.previewed.hide()
-            shown = self._last.next_of(layer, keep=self.keep_earlier.isChecked())
+            shown = self._last.next_of(layer)
         shown.show([described], select=not preview)
