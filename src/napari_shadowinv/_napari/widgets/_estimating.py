@@ -8,58 +8,32 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.progress import OnWarning, ShouldStop
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.preprocessing.recipes import Estimate
-
-__all__ = ["SourceCache", "quick_source", "same_array"]
-
-Image = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass
 class SourceCache:
     """The last estimate, for the next run with the same image."""
 
-    _kept: tuple[tuple[Estimate, bool], Image, Mask | None, Image, list[str]] | None = field(
-        default=None, repr=False
-    )
+    _kept: (
+        tuple[tuple[Estimate, bool], FloatArray, BoolArray | None, FloatArray, list[str]] | None
+    ) = field(default=None, repr=False)
 
     def source(
         self,
         estimate: Estimate,
-        image: Image,
-        mask: Mask | None,
+        image: FloatArray,
+        mask: BoolArray | None,
         most_pixels: int | None = None,
         should_stop: ShouldStop | None = None,
         on_warning: OnWarning | None = None,
-    ) -> Image:
-        """Return the source of an image.
-
-        Parameters
-        ----------
-        estimate : Estimate
-            How to guess it.
-        image : ndarray, shape (H, W)
-            The shot.
-        mask : ndarray of bool, shape (H, W), or None
-            True where a pixel is usable.
-        most_pixels : int, optional
-            Merge pixels until there are no more than these, to be quick.
-        should_stop : callable, optional
-            Asked at each step of an estimate that takes long.
-        on_warning : callable, optional
-            Receives a sentence where the estimate has to be doubted.
-
-        Returns
-        -------
-        ndarray, shape (H, W)
-        """
+    ) -> FloatArray:
+        """Return the source of an image; quickly with no more than `most_pixels`."""
         key = (estimate, most_pixels is not None)
         if self._kept is not None:
             last_key, last_image, last_mask, source, doubts = self._kept
@@ -75,7 +49,7 @@ class SourceCache:
         return _told(source, doubts, on_warning)
 
 
-def _told(source: Image, doubts: list[str], on_warning: OnWarning | None) -> Image:
+def _told(source: FloatArray, doubts: list[str], on_warning: OnWarning | None) -> FloatArray:
     if on_warning is not None:
         for doubt in doubts:
             on_warning(doubt)
@@ -84,23 +58,15 @@ def _told(source: Image, doubts: list[str], on_warning: OnWarning | None) -> Ima
 
 def quick_source(
     estimate: Estimate,
-    image: Image,
-    mask: Mask | None,
+    image: FloatArray,
+    mask: BoolArray | None,
     most_pixels: int,
     should_stop: ShouldStop | None = None,
     on_warning: OnWarning | None = None,
-) -> Image:
+) -> FloatArray:
     """Estimate the source from an image whose pixels are merged, and spread it again.
 
-    Parameters
-    ----------
-    estimate, image, mask, most_pixels, should_stop, on_warning
-        See `SourceCache.source`.
-
-    Returns
-    -------
-    ndarray, shape (H, W)
-        Linear between the middles of the merged pixels; the flux is that of the image.
+    It is linear between the middles of the merged pixels; the flux is that of the image.
     """
     factor = int(np.ceil(np.sqrt(image.size / most_pixels)))
     if factor == 1 or min(image.shape) < 8 * factor:
@@ -109,7 +75,7 @@ def quick_source(
     from skimage.transform import downscale_local_mean
 
     # It comes without types.
-    merged: Callable[..., Image] = downscale_local_mean
+    merged: Callable[..., FloatArray] = downscale_local_mean
     usable = np.ones(image.shape, bool) if mask is None else mask
     share = merged(usable.astype(float), (factor, factor))
     sums = merged(np.where(usable, image, 0.0), (factor, factor))
@@ -123,7 +89,7 @@ def quick_source(
     return np.asarray(fine * (image[usable].sum() / fine[usable].sum()))
 
 
-def same_array(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
+def same_array(one: AnyArray | None, other: AnyArray | None) -> bool:
     """Whether two arrays hold the same, or both are none."""
     if one is None or other is None:
         return one is other

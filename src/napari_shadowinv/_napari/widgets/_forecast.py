@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -37,13 +38,15 @@ class PhantomRecipe(BaseModel):
         """Make it in the middle of an image, or raise an `InputError` if it needs another setup."""
         if self.probe and getattr(setup, "kind", None) != self.probe:
             raise InputError(_NEEDS[self.probe])
-        return self._made(shape, setup)
+        from napari_shadowinv.physics import phantoms
+
+        return self._made(phantoms, shape, setup)
 
     def shadow(self, shape: tuple[int, int], setup: Any) -> BoolArray | None:
         """Pixels where the object stops the beam; None if it is transparent."""
         return None
 
-    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
+    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
         raise NotImplementedError
 
 
@@ -66,22 +69,16 @@ def _peak(default: float, where: str) -> Any:
 
 
 class ToroidRecipe(PhantomRecipe):
-    """The paper's toroidal field."""
-
     title = "toroidal magnetic field"
     probe = "proton"
     peak: float = _peak(97.0, "the radius")
     radius: float = _metres(30e-6, "Radius", "Radius σ of maximum field, in the object plane.")
 
-    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
-        from napari_shadowinv.physics.phantoms import toroid
-
-        return toroid(shape, setup, self.peak, self.radius)
+    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+        return phantoms.toroid(shape, setup, self.peak, self.radius)
 
 
 class FourToroidsRecipe(PhantomRecipe):
-    """The paper's four toroids."""
-
     title = "four toroids"
     probe = "proton"
     strength: float = Field(
@@ -93,10 +90,8 @@ class FourToroidsRecipe(PhantomRecipe):
         json_schema_extra={"slider": [0.05, 3.0]},
     )
 
-    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
-        from napari_shadowinv.physics.phantoms import four_toroids
-
-        return four_toroids(shape, setup, self.strength)
+    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+        return phantoms.four_toroids(shape, setup, self.strength)
 
 
 class CoaxialRecipe(PhantomRecipe):
@@ -110,15 +105,15 @@ class CoaxialRecipe(PhantomRecipe):
     rim: float = _metres(78e-6, "Outer conductor, outside", "Outer radius of the outer conductor.")
 
     def shadow(self, shape: tuple[int, int], setup: Any) -> BoolArray:
-        return self._line(shape, setup)[1]
+        from napari_shadowinv.physics import phantoms
 
-    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
-        return self._line(shape, setup)[0]
+        return phantoms.coaxial_line(shape, setup, self.peak, self._radii())[1]
 
-    def _line(self, shape: tuple[int, int], setup: Any) -> tuple[Phantom, BoolArray]:
-        from napari_shadowinv.physics.phantoms import coaxial_line
+    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+        return phantoms.coaxial_line(shape, setup, self.peak, self._radii())[0]
 
-        return coaxial_line(shape, setup, self.peak, (self.inner, self.outer, self.rim))
+    def _radii(self) -> tuple[float, float, float]:
+        return self.inner, self.outer, self.rim
 
 
 class WakefieldRecipe(PhantomRecipe):
@@ -149,15 +144,11 @@ class WakefieldRecipe(PhantomRecipe):
         ),
     )
 
-    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
-        from napari_shadowinv.physics.phantoms import wakefield
-
-        return wakefield(shape, setup, **self.model_dump())
+    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+        return phantoms.wakefield(shape, setup, **self.model_dump())
 
 
 class BlobRecipe(PhantomRecipe):
-    """A Gaussian potential, in pixels."""
-
     title = "Gaussian potential"
     amplitude: float = Field(
         default=50.0,
@@ -171,10 +162,8 @@ class BlobRecipe(PhantomRecipe):
         description="Standard deviation in px of the object plane.",
     )
 
-    def _made(self, shape: tuple[int, int], setup: Any) -> Phantom:
-        from napari_shadowinv.physics.phantoms import gaussian_blob
-
-        return gaussian_blob(shape, self.amplitude, self.sigma)
+    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+        return phantoms.gaussian_blob(shape, self.amplitude, self.sigma)
 
 
 PHANTOMS: dict[str, type[PhantomRecipe]] = {
@@ -188,8 +177,6 @@ PHANTOMS: dict[str, type[PhantomRecipe]] = {
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """The image that an object would make."""
-
     image: FloatArray  # in the unit of the source
     displacement: FloatArray  # px
     source: FloatArray | None  # the beam without what the object stops; None if it is uniform
@@ -227,7 +214,6 @@ class ForwardJob:
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Forecast:
-        """Predict it, or raise an `InputError` or `InversionCancelled`."""
         from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 
         report = Reporter(on_progress, should_stop)

@@ -89,8 +89,6 @@ def wrapping_label(text: str = "", style: str = "") -> QLabel:
 
 
 class PathEdit(QWidget):
-    """A file's path, typed or chosen."""
-
     changed = Signal()
 
     def __init__(self, title: str, example: str = "path of a file") -> None:
@@ -104,7 +102,6 @@ class PathEdit(QWidget):
 
     @property
     def path(self) -> str:
-        """The path; empty if there is none."""
         return str(self.edit.text()).strip()
 
     def ask(self) -> str:
@@ -241,7 +238,6 @@ class ModelPicker(QWidget):
 
     @property
     def kind(self) -> str:
-        """The key of the chosen kind."""
         return str(self.choice.currentData())
 
     def set_kind(self, kind: str) -> None:
@@ -252,7 +248,6 @@ class ModelPicker(QWidget):
 
     @property
     def form(self) -> ModelForm | None:
-        """The form of the chosen kind, if it has one."""
         return self._forms.get(self.kind)
 
     def model(self) -> BaseModel | None:
@@ -260,12 +255,10 @@ class ModelPicker(QWidget):
         return None if self.form is None else self.form.model()
 
     def state(self) -> dict[str, Any]:
-        """The choice and what all forms hold, to be kept."""
         values = {kind: form.values() for kind, form in self._forms.items()}
         return {"kind": self.kind, "values": values}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Show what `state` has returned."""
         values = state.get("values", {})
         for kind, held in values.items() if isinstance(values, Mapping) else ():
             if kind in self._kinds and isinstance(held, Mapping):

@@ -76,8 +76,6 @@ def _optical() -> type[BaseModel]:
 
 @dataclass(frozen=True)
 class _Given:
-    """What a form holds, and where that comes from."""
-
     values: dict[str, Any]
     origin: str
 
@@ -118,7 +116,6 @@ class SetupPicker(QWidget):
         self.picker.changed.connect(self._on_edit)
 
     def setup(self) -> ProtonSetup | OpticalSetup | None:
-        """The validated setup, or an `InputError`."""
         return self.picker.model()  # type: ignore[return-value]
 
     @property
@@ -131,7 +128,6 @@ class SetupPicker(QWidget):
 
     @property
     def described(self) -> str:
-        """The kind of setup, and where it comes from."""
         kind = self.picker.choice.currentText()
         return f"{kind}, {self.origin}" if self.origin else kind
 
@@ -188,7 +184,6 @@ class SetupPicker(QWidget):
         self._tell()
 
     def _on_edit(self) -> None:
-        """Take in what the user has chosen or typed."""
         kind, before = self.picker.kind, self._state
         values = self.picker.state()["values"].get(kind, {})
         # To look at another form, or to leave a field as it was, is no change of values.
@@ -249,8 +244,8 @@ class SourcePicker(RowPicker):
     def __init__(self, viewer: Any) -> None:
         self._image: Any = None
         self._before_own = "uniform"
-        self.layers = LayerPicker(viewer, ("image",), none="choose a layer", suits=self._offers)
-        self.layers.setToolTip("Image layer of the undisturbed beam.")
+        tip = "Image layer of the undisturbed beam."
+        self.layers = LayerPicker(viewer, ("image",), tip, "choose a layer", self._offers)
         self.file = PathEdit("Image of the undisturbed beam")
         kinds = kinds_of(ESTIMATES, "estimate: ")
         _, uniform = kinds.pop("uniform")
@@ -277,7 +272,6 @@ class SourcePicker(RowPicker):
 
     @property
     def described(self) -> str:
-        """Where the source comes from."""
         kind = self.picker.kind
         if kind == _LAYER and self.layers.layer is not None:
             return f"layer '{self.layers.layer.name}'"
@@ -328,7 +322,6 @@ class SourcePicker(RowPicker):
         return {**kept, "kind": "uniform" if kind in (_LAYER, _FILE) else kind}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Show what `state` has returned."""
         self.picker.restore(state)
 
     def follow(self, image_layer: Any) -> None:
@@ -381,7 +374,6 @@ class CleaningSection(QWidget):
         self._on_change()
 
     def model(self) -> Filter | None:
-        """The chosen filter, if any, or an `InputError`."""
         model = self.picker.model()
         assert model is None or isinstance(model, Filter)
         return model
@@ -395,8 +387,6 @@ class CleaningSection(QWidget):
 
 
 class OptionsForm(ModelForm):
-    """A form of the inversion's options, with buttons for TOML files."""
-
     def __init__(self) -> None:
         super().__init__(InversionOptions, first={"n_sites": PREVIEW_SITES})
         self.files = TomlButtons("options", self._to_save, self._take)
@@ -439,7 +429,6 @@ class InversionInputs:
         self.source_masks.setVisible(self.source.is_guessed)
 
     def parts(self) -> dict[str, Any]:
-        """The controls whose states are kept."""
         return {
             "source": self.source,
             "setup": self.setup,

@@ -17,7 +17,14 @@ from qtpy.QtCore import QObject, QSignalBlocker, Signal
 from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.layer_metadata import MASK, mark, mark_of, may_be_mask, role_of
+from napari_shadowinv._napari.layer_metadata import (
+    MASK,
+    mark,
+    mark_of,
+    may_be_mask,
+    may_be_shot,
+    role_of,
+)
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import labelled, with_button
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_alive
@@ -162,7 +169,7 @@ def _in_pixels(layer: Any, image: Any) -> list[FloatArray]:
     ]
 
 
-def new_mask(viewer: Any, image: Any, title: str = "mask") -> Any:
+def new_mask(viewer: Any, image: Any, title: str) -> Any:
     """Add labels of an image's or a stack's size, ready to paint; their name ends with `title`."""
     shape = (image_of(image) if image is None or image.ndim != 3 else stack_of(image)).shape[-2:]
     labels = _added(viewer, image, "labels", np.zeros(shape, np.uint8), title)
@@ -203,12 +210,14 @@ class LayerPicker(SteadyComboBox):
         self,
         viewer: Any,
         kinds: tuple[str, ...],
+        tip: str,
         none: str = "",
         suits: Callable[[Any], bool] = lambda _: True,
     ) -> None:
         super().__init__()
         self._viewer, self._kinds, self._none, self._suits = viewer, kinds, none, suits
         self._offered: list[Any] = []
+        self.setToolTip(tip)
         self.fill()
         self.currentIndexChanged.connect(lambda _: self.picked.emit())
         for emitter in (viewer.layers.events.inserted, viewer.layers.events.removed):
@@ -219,7 +228,6 @@ class LayerPicker(SteadyComboBox):
 
     @property
     def layer(self) -> Any | None:
-        """The chosen layer."""
         index = self.currentIndex() - bool(self._none)
         return self._offered[index] if 0 <= index < len(self._offered) else None
 
@@ -235,7 +243,6 @@ class LayerPicker(SteadyComboBox):
 
     @property
     def offered(self) -> list[Any]:
-        """The layers to choose from."""
         return list(self._offered)
 
     def fill(self, event: Any = None) -> None:
@@ -261,6 +268,11 @@ class LayerPicker(SteadyComboBox):
             self.picked.emit()
 
 
+def shot_picker(viewer: Any) -> LayerPicker:
+    """A picker of the layer that is a shot."""
+    return LayerPicker(viewer, ("image",), "The shot: a greyscale image layer.", suits=may_be_shot)
+
+
 class MaskPicker(QWidget):
     """A layer that is painted on, and what the paint means.
 
@@ -280,8 +292,7 @@ class MaskPicker(QWidget):
     ) -> None:
         super().__init__()
         self._viewer, self._image, self._title = viewer, image, title
-        self.layers = LayerPicker(viewer, kinds, none="none", suits=may_be_mask)
-        self.layers.setToolTip(f"<qt>{tip}</qt>")
+        self.layers = LayerPicker(viewer, kinds, f"<qt>{tip}</qt>", "none", may_be_mask)
         self.painted_is_unusable = QCheckBox("painted = unusable")
         self.painted_is_unusable.setChecked(True)
         self.painted_is_unusable.setToolTip(
@@ -300,7 +311,6 @@ class MaskPicker(QWidget):
 
     @property
     def layer(self) -> Any | None:
-        """The chosen layer."""
         return self.layers.layer
 
     @layer.setter
@@ -331,12 +341,10 @@ class MaskPicker(QWidget):
         return bool(self.painted_is_unusable.isChecked())
 
     def restore(self, state: Any) -> None:
-        """Show what `state` has returned."""
         self.painted_is_unusable.setChecked(bool(state))
 
     @notify_errors
     def paint(self) -> None:
-        """Add an empty mask and choose it."""
         self.layer = new_mask(self._viewer, self._image(), self._title.lower())
 
 

@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from napari.utils import progress as activity
@@ -39,10 +39,12 @@ from napari_shadowinv._napari.widgets._qt import (
     timer,
     when_destroyed,
 )
+from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv._system.progress import Progress
 
 if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.inversion import Inversion
 
 WIDTH = 330
@@ -125,7 +127,6 @@ class RunPanel(QWidget):
         self.runner.start(work, tag)
 
     def cancel(self) -> None:
-        """Ask the work to stop."""
         self.runner.cancel()
         if self.runner.running:
             self.button.setText("Cancelling…")
@@ -133,7 +134,6 @@ class RunPanel(QWidget):
             self.say("")
 
     def say(self, text: str, problem: bool = False) -> None:
-        """Show a line of text under the button."""
         # To draw a window with a canvas in it takes time: only if there is something new.
         if (text, problem) == self._said:
             return
@@ -162,7 +162,6 @@ class RunPanel(QWidget):
         self._news = news
 
     def _look(self) -> None:
-        """Show the latest news."""
         news = self._news
         if news is None or self.runner.cancelling:
             return
@@ -234,7 +233,6 @@ class ReportTable(QTableWidget):
         self.setVisible(False)
 
     def show_rows(self, rows: list[tuple[str, str]]) -> None:
-        """Replace what is shown."""
         self.setRowCount(len(rows))
         for row, texts in enumerate(rows):
             for place, text in enumerate(texts):
@@ -246,12 +244,10 @@ class ReportTable(QTableWidget):
         self._fit()
 
     def empty(self) -> None:
-        """Show nothing."""
         self.setRowCount(0)
         self.setVisible(False)
 
     def texts(self) -> dict[str, str]:
-        """What is shown, by name."""
         rows = range(self.rowCount())
         return {self.item(row, 0).text().strip(): self.item(row, 1).text() for row in rows}
 
@@ -304,17 +300,14 @@ class ToolPanel(Docked):
         return {}
 
     def state(self) -> dict[str, Any]:
-        """What is kept."""
         return {name: part.state() for name, part in self.parts().items()}
 
     def restore(self, kept: Mapping[str, Any]) -> None:
-        """Show what `state` has returned."""
         for name, part in self.parts().items():
             if name in kept:
                 part.restore(kept[name])
 
     def restore_last(self) -> None:
-        """Show what was kept when the widget was used last."""
         self.restore(self._keeper.load())
 
     def keep(self) -> None:
@@ -337,7 +330,6 @@ class ToolPanel(Docked):
         """Take away what was said of the last run."""
 
     def show_result(self, value: Any, request: Any) -> None:
-        """Show what a run returned."""
         raise NotImplementedError
 
     def _run_or_cancel(self) -> None:
@@ -369,11 +361,23 @@ class LivePanel(ToolPanel):
     def __init__(self, viewer: Any, name: str, panel: RunPanel) -> None:
         super().__init__(viewer, name, panel)
         self.live = QCheckBox("Live preview")
+        self.previewed = ResultLayers(viewer, self)
+        self._last = LastResults(viewer, self)
+        self.keep_earlier = self._last.keep_earlier
         self._settle = timer(self, _SETTLE, self._preview, once=True)
         self.live.toggled.connect(self.on_change)
 
     def request(self, preview: bool = False) -> Any:
         raise NotImplementedError
+
+    def show_layers(self, shot: Any, described: Sequence[FullLayerData], preview: bool) -> None:
+        """Show layers of a preview, or instead of them those of what the button has run."""
+        if preview:
+            self.previewed.show(described, select=False)
+            return
+        self.previewed.hide()
+        self.results = self._last.next_of(shot)
+        self.results.show(described)
 
     def on_change(self) -> None:
         """Something that the result depends on has changed."""

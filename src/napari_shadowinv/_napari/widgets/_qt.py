@@ -98,7 +98,6 @@ def error_text(error: BaseException | str) -> str:
 
 
 def tell_error(error: BaseException | str) -> None:
-    """Notify the user of what is wrong and what to do."""
     show_error(error_text(error))
 
 
@@ -176,11 +175,9 @@ class StateKeeper(QObject):
         return kept if isinstance(kept, dict) else {}
 
     def changed(self) -> None:
-        """Write soon."""
         self._timer.start()
 
     def write(self) -> None:
-        """Write now."""
         self._timer.stop()
         settings = _settings()
         settings.setValue(self._name, json.dumps(self._state()))

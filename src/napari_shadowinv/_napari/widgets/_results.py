@@ -81,7 +81,6 @@ class ResultLayers(QObject):
 
     @property
     def busy(self) -> bool:
-        """Whether layers wait to be added."""
         return bool(self._timer.isActive())
 
     def show(self, described: Sequence[FullLayerData], *, select: bool = True) -> None:
@@ -126,7 +125,6 @@ class ResultLayers(QObject):
                     self._viewer.layers.remove(layer)
 
     def hide(self) -> None:
-        """Switch them off."""
         for layer in self.layers:
             layer.visible = False
 

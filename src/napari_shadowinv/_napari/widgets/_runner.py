@@ -46,8 +46,6 @@ class Outcome:
 
 @dataclass
 class _LetterBox:
-    """What a thread and the window tell each other."""
-
     tag: Any = None
     give_up_at: float = math.inf
     stop: threading.Event = field(default_factory=threading.Event)
@@ -78,7 +76,6 @@ class Runner(QObject):
 
     @property
     def running(self) -> bool:
-        """Whether work is being done."""
         return self._box is not None
 
     @property

@@ -42,12 +42,10 @@ class RunBooks:
 
     @property
     def text(self) -> str:
-        """One line of it."""
         failed = f", {self.failed} failed" if self.failed else ""
         return f"{self.done} of {self.total} done{failed}"
 
     def take(self, news: RunProgress) -> None:
-        """Enter what became of a shot."""
         if news.outcome is not None:
             self.ended += 1
             if news.outcome.reason:

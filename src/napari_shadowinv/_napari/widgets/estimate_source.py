@@ -9,15 +9,13 @@ from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.layer_metadata import (
     SOURCE,
     mark,
-    may_be_shot,
     setup_of,
     setup_origin_of,
 )
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._jobs import SourceJob
-from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, MaskPicker, image_of
+from napari_shadowinv._napari.widgets._layers import LayerWatch, MaskPicker, image_of, shot_picker
 from napari_shadowinv._napari.widgets._panels import LivePanel, RunPanel
-from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.preprocessing.recipes import ESTIMATES
 
@@ -47,10 +45,7 @@ class EstimateSource(LivePanel):
                 "Estimate source", "Estimate", "Create an image layer with the estimated beam."
             ),
         )
-        self.previewed = ResultLayers(viewer, self)
-        self._last = LastResults(viewer, self)
-        self.image = LayerPicker(viewer, ("image",), suits=may_be_shot)
-        self.image.setToolTip("The shot: a greyscale image layer.")
+        self.image = shot_picker(viewer)
         self.masks = MaskPicker(
             viewer,
             lambda: self.image.layer,
@@ -65,7 +60,7 @@ class EstimateSource(LivePanel):
             self.masks,
             self.method,
             self.live,
-            self._last.keep_earlier,
+            self.keep_earlier,
             self.panel,
         ):
             self.column.addWidget(row)
@@ -110,8 +105,4 @@ class EstimateSource(LivePanel):
             },
             "image",
         )
-        shown = self.previewed
-        if not preview:
-            self.previewed.hide()
-            shown = self._last.next_of(layer)
-        shown.show([described], select=not preview)
+        self.show_layers(layer, [described], preview)

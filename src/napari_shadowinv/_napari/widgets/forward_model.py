@@ -138,10 +138,12 @@ class ForwardModel(ToolPanel):
             "Object", {**kinds_of(PHANTOMS), _LAYER: ("a result or potential", None)}
         )
         self.object.choice.setToolTip("Object that deflects the beam.")
-        self.potential = LayerPicker(viewer, ("image",), suits=may_be_a_field)
-        self.potential.setToolTip(
+        self.potential = LayerPicker(
+            viewer,
+            ("image",),
             "<qt>The field or potential of a result, or a potential in px² from a file; for a "
-            "stack, the shot in view.</qt>"
+            "stack, the shot in view.</qt>",
+            suits=may_be_a_field,
         )
         self.expected = wrapping_label()
         self.deflector = SteadyComboBox()
@@ -154,8 +156,8 @@ class ForwardModel(ToolPanel):
         )
         self.height_px, self.width_px = _side("Height"), _side("Width")
         self.setup = SetupPicker()
-        self.source = LayerPicker(viewer, ("image",), none="uniform", suits=may_be_source)
-        self.source.setToolTip("Image layer of the undisturbed beam.")
+        tip = "Image layer of the undisturbed beam."
+        self.source = LayerPicker(viewer, ("image",), tip, "uniform", may_be_source)
         self.warning = wrapping_label(style=PROBLEM_STYLE)
         self._potential_rows = (
             labelled("Layer", self.potential),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from napari.utils.notifications import show_warning
 
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, may_be_shot, role_of
+from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, role_of
 from napari_shadowinv._napari.widgets._estimating import SourceCache
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
@@ -26,17 +26,12 @@ from napari_shadowinv._napari.widgets._layers import (
     crop_of,
     image_of,
     new_shapes,
+    shot_picker,
     warnings_of,
 )
 from napari_shadowinv._napari.widgets._panels import LivePanel, ReportTable, RunPanel, report_rows
 from napari_shadowinv._napari.widgets._qt import notify_errors
-from napari_shadowinv._napari.widgets._results import (
-    LastResults,
-    Origins,
-    ResultLayers,
-    place_together,
-    result_frame,
-)
+from napari_shadowinv._napari.widgets._results import Origins, place_together, result_frame
 from napari_shadowinv._system.memory import physical_memory
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
@@ -68,7 +63,6 @@ class Cost:
 
     @property
     def is_too_much(self) -> bool:
-        """Whether it needs more memory than this machine has."""
         there_is = physical_memory()
         return there_is is not None and self.memory > there_is
 
@@ -117,8 +111,6 @@ class _Answer:
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """A run, and all that it takes to show its result."""
-
     job: ShotJob
     image: Any
     companions: tuple[Any, ...]
@@ -158,8 +150,6 @@ class InvertShot(InversionInputs, LivePanel):
             RunPanel("Invert shot", "Run", "Invert the image and show the result as layers."),
         )
         self._cache, self._estimates = PlanCache(), SourceCache()
-        self.previewed = ResultLayers(viewer, self)
-        self._last = LastResults(viewer, self)
         self._build()
         self._connect()
         self.restore_last()
@@ -168,8 +158,7 @@ class InvertShot(InversionInputs, LivePanel):
 
     def _build(self) -> None:
         viewer = self.viewer
-        self.image = LayerPicker(viewer, ("image",), suits=may_be_shot)
-        self.image.setToolTip("The shot: a greyscale image layer.")
+        self.image = shot_picker(viewer)
         self.make_inputs(
             viewer,
             lambda: self.image.layer,
@@ -181,14 +170,15 @@ class InvertShot(InversionInputs, LivePanel):
                 "inversion still uses it.",
             ),
         )
-        self.crop = LayerPicker(viewer, ("shapes",), none="none")
-        self.crop.setToolTip(
-            "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>"
+        self.crop = LayerPicker(
+            viewer,
+            ("shapes",),
+            "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>",
+            none="none",
         )
         self.live.setToolTip(
             f"<qt>Update the field after every change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
-        self.keep_earlier = self._last.keep_earlier
         self.cost, self._pace = wrapping_label(), 1.0
         self.report = ReportTable()
         for row in (
@@ -259,15 +249,13 @@ class InvertShot(InversionInputs, LivePanel):
         if request.setup is not None:
             place_together(self.viewer, image, request.setup, request.companions)
         if request.preview:
-            self.previewed.show(value.described, select=False)
+            self.show_layers(image, value.described, preview=True)
             if not value.inversion.report.converged:
                 self.panel.say(f"Preview {value.inversion.report.warnings[0]}", problem=True)
             return
         self.report.show_rows([*request.origins.rows(), *report_rows(value.inversion)])
         self._learn_pace(value.inversion)
-        self.previewed.hide()
-        self.results = self._last.next_of(image)
-        self.results.show(value.described)
+        self.show_layers(image, value.described, preview=False)
 
     def on_change(self) -> None:
         super().on_change()

@@ -38,8 +38,6 @@ _BETWEEN = "; "
 
 
 class _FilesEdit(PathEdit):
-    """Files by a pattern, or one by one."""
-
     def ask(self) -> str:
         paths, _ = QFileDialog.getOpenFileNames(self, self._title)
         return _BETWEEN.join(paths)
@@ -56,7 +54,6 @@ class StoreEdit(PathEdit):
 
     @property
     def store(self) -> Path:
-        """Its path, or an `InputError`."""
         if not self.path:
             raise InputError(
                 "no store is selected for the results: choose a folder whose name ends with "
@@ -84,13 +81,9 @@ class StoreEdit(PathEdit):
 
 
 class ShotsPicker(RowPicker):
-    """A stack layer, or files."""
-
     def __init__(self, viewer: Any) -> None:
-        self.layers = LayerPicker(viewer, ("image",), suits=may_be_shot)
-        self.layers.setToolTip(
-            "Image layer (shot, y, x); data on disk are read one shot at a time."
-        )
+        tip = "Image layer (shot, y, x); data on disk are read one shot at a time."
+        self.layers = LayerPicker(viewer, ("image",), tip, suits=may_be_shot)
         self.files = _FilesEdit("Files of the shots", "shots/*.tif")
         self.files.edit.setToolTip(
             "<qt>A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF.</qt>"
@@ -117,7 +110,6 @@ class ShotsPicker(RowPicker):
         return "" if self.layer is None else str(self.layer.name)
 
     def shots(self) -> Any:
-        """The chosen shots, as `run_stack` takes them, or an `InputError`."""
         if self.picker.kind == _LAYER:
             return stack_of(self.layers.layer)
         parts = [part.strip() for part in self.files.path.split(_BETWEEN.strip())]
@@ -165,7 +157,6 @@ class EnginePicker(RowPicker):
         return address, None
 
     def state(self) -> dict[str, Any]:
-        """What is kept between sessions."""
         return {
             "kind": self.picker.kind,
             "workers": self.workers.value(),
@@ -173,15 +164,12 @@ class EnginePicker(RowPicker):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Show what `state` has returned."""
         self.picker.set_kind(str(state.get("kind", _HERE)))
         self.workers.setValue(int(state.get("workers", 0)))
         self.address.setText(str(state.get("address", "")))
 
 
 class FailureTable(ReportTable):
-    """Names of shots that failed, and why."""
-
     def __init__(self) -> None:
         super().__init__()
         self.count = 0
@@ -319,7 +307,6 @@ class InvertStack(InversionInputs, ToolPanel):
             self._show(self.panel.runner.tag)
 
     def _show(self, request: StackRequest) -> None:
-        """Show what is new."""
         # Once it is done: to press Run again must not throw these shots away.
         self.overwrite.setChecked(False)
         self.redo_failed.setChecked(False)

@@ -64,8 +64,6 @@ _LONGEST_NAME = 34
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Values of one image along a line."""
-
     name: str
     unit: str
     values: FloatArray  # NaN where the line is outside the image
@@ -236,10 +234,8 @@ class LineProfile(Docked):
         self._distance = np.zeros(0)
         self._unit = "px"
         self.profiles: list[Profile] = []
-        self.lines = LayerPicker(viewer, ("shapes",), none="none yet")
-        self.lines.setToolTip(
-            "<qt>Shapes layer with the line; if it has several, the selected one is used.</qt>"
-        )
+        tip = "<qt>Shapes layer with the line; if it has several, the selected one is used.</qt>"
+        self.lines = LayerPicker(viewer, ("shapes",), tip, "none yet")
         self.layers = QListWidget()
         self.layers.setToolTip("Layers to plot.")
         self.layers.setMaximumHeight(110)
@@ -293,21 +289,18 @@ class LineProfile(Docked):
         self.export.clicked.connect(lambda: self._export())
 
     def checked(self) -> list[Any]:
-        """The layers to read."""
         items = [self.layers.item(row) for row in range(self.layers.count())]
         return [
             item.data(_LAYER_ROLE) for item in items if item.checkState() == Qt.CheckState.Checked
         ]
 
     def check(self, layer: Any, on: bool = True) -> None:
-        """Read a layer, or leave it out."""
         for row in range(self.layers.count()):
             item = self.layers.item(row)
             if item.data(_LAYER_ROLE) is layer:
                 item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
 
     def update_plot(self) -> None:
-        """Read the layers along the line, and draw."""
         vertices = self._vertices()
         layers = self.checked()
         self.profiles = []
@@ -379,7 +372,6 @@ class LineProfile(Docked):
             self._timer.start()
 
     def _watch(self) -> None:
-        """Follow the line, and the layers that are read."""
         for layer in [self.lines.layer, *self.checked()]:
             if layer is None or any(layer is known for known in self._watched):
                 continue
