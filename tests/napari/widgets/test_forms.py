@@ -10,11 +10,11 @@ import pytest
 from qtpy.QtWidgets import QFileDialog
 
 from napari_shadowinv import InputError, InversionOptions, OpticalSetup, ProtonSetup
-from napari_shadowinv._napari.widgets._forms import ModelForm, ModelPicker, kinds_of
-from napari_shadowinv._napari.widgets._setups import SetupPicker
-from napari_shadowinv._napari.widgets._state import StateKeeper
-from napari_shadowinv._napari.widgets._toml import dump_toml, load_toml
+from napari_shadowinv._napari.widgets._forms import ModelForm, ModelPicker, dump_toml, kinds_of
+from napari_shadowinv._napari.widgets._inputs import SetupPicker
+from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv.cli._inputs import options_from, setup_from
+from napari_shadowinv.io import read_toml
 from napari_shadowinv.preprocessing import ESTIMATES
 
 CHANGED = {
@@ -104,7 +104,7 @@ def test_the_command_line_reads_a_saved_setup(
     assert path.suffix == ".toml"
     assert setup_from(path) == setup
     picker.picker.set_kind("none")
-    picker._take(load_toml(path), str(path))
+    picker._take(read_toml(path), str(path))
     assert picker.setup() == setup
     if isinstance(setup, OpticalSetup):
         assert math.isinf(picker.setup().source_object_distance)
@@ -122,7 +122,7 @@ def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> 
     with pytest.raises(OSError, match="exists"):
         dump_toml({"seed": 2}, tmp_path / "options")
     dump_toml({"seed": 3}, tmp_path / "options.toml")
-    assert load_toml(tmp_path / "options.toml") == {"seed": 3}
+    assert read_toml(tmp_path / "options.toml") == {"seed": 3}
 
 
 def test_the_buttons_save_and_load(

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from napari.layers import Image, Labels, Shapes
-from napari_shadowinv._napari.widgets._estimating import quick_source
 from napari_shadowinv.cli._choices import Choices
 from napari_shadowinv.cli._preparing import filtered
 
@@ -21,23 +20,23 @@ from napari_shadowinv import (
     InversionCancelled,
     InversionOptions,
 )
-from napari_shadowinv._napari.widgets._cost import cost_of
-from napari_shadowinv._napari.widgets._forecast import ForwardJob
+from napari_shadowinv._napari.widgets._fields import parsed, shown
+from napari_shadowinv._napari.widgets._forecast import BlobRecipe, ForwardJob, ToroidRecipe
 from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob, SourceJob
-from napari_shadowinv._napari.widgets._phantoms import BlobRecipe, ToroidRecipe
-from napari_shadowinv._napari.widgets._quantities import parsed, shown
-from napari_shadowinv._napari.widgets._reading import crop_of, image_of, mask_of
-from napari_shadowinv._napari.widgets._sampling import (
+from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
+from napari_shadowinv._napari.widgets._stacking import StackJob
+from napari_shadowinv._napari.widgets.invert_shot import cost_of
+from napari_shadowinv._napari.widgets.line_profile import (
     Profile,
     abreast,
     along,
     sampled,
     table_text,
 )
-from napari_shadowinv._napari.widgets._stacking import StackJob
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.pipeline.cache import quick_source
 from napari_shadowinv.preprocessing import Radiograph, filters, isotropic_source, recipes
 
 FEW = InversionOptions(n_sites=500)

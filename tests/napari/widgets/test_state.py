@@ -23,10 +23,10 @@ from napari_shadowinv._napari.layer_metadata import (
     source_of,
 )
 from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.widgets._forms import dump_toml
+from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._jobs import ShotJob
-from napari_shadowinv._napari.widgets._setups import SetupPicker
 from napari_shadowinv._napari.widgets._stacking import StackJob
-from napari_shadowinv._napari.widgets._toml import dump_toml
 from napari_shadowinv._napari.widgets.estimate_source import EstimateSource
 from napari_shadowinv._napari.widgets.forward_model import ForwardModel
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot

@@ -1,11 +1,7 @@
-"""The plugin's dock widgets.
+"""The plugin's dock widgets, each a thin face of what `_jobs` and `_stacking` compute.
 
-- invert an image: `invert_shot`
-- invert a run of shots into a store: `invert_stack`
+- invert an image: `invert_shot`; a run of shots into a store: `invert_stack`
 - guess the undisturbed beam: `estimate_source`
 - plan a shot: `forward_model`
 - read values off a line: `line_profile`
-
-Each widget is a thin face: `_jobs`, `_stacking` and `_sampling` compute and know neither napari
-nor Qt, `_forms` makes forms from the pydantic models, `_runner` keeps the window responsive.
 """

@@ -1,26 +1,89 @@
-"""Editors for one field of a pydantic model each.
+"""Editors for one field of a pydantic model each, and numbers with units.
 
-- the right editor for a field: `editor_for`
-- what all of them have: `Editor`
+- the right editor for a field: `editor_for`; what all of them have: `Editor`
+- a number with its unit, as people write it: `parsed`, `shown`; which unit a title names:
+  `unit_of_title`
 """
 
 from __future__ import annotations
 
+import math
+import re
 import types
 from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 from qtpy.QtCore import QEvent, QObject, QSignalBlocker, Qt, Signal
-from qtpy.QtWidgets import QCheckBox, QComboBox, QHBoxLayout, QLineEdit, QSizePolicy, QWidget
+from qtpy.QtWidgets import QCheckBox, QComboBox, QLineEdit, QSizePolicy, QWidget
 from superqt import QLabeledDoubleSlider, QLabeledSlider, QLargeIntSpinBox
 
-from napari_shadowinv._napari.widgets._quantities import parsed, shown, unit_of_title
+from napari_shadowinv._napari.widgets._qt import beside
 from napari_shadowinv.errors import InputError
-
-__all__ = ["Editor", "SteadyComboBox", "editor_for"]
 
 _LARGEST_INTEGER = 2**63 - 1
 _NOT_GIVEN = "not given"
+_TITLE = re.compile(r"^(?P<name>.*\S)\s*\((?P<unit>[^()]+)\)$")
+_NUMBER = re.compile(
+    r"^\s*(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>\S*)\s*$"
+)
+# Units that come with prefixes; a kilopixel helps nobody.
+_PREFIXED = ("m", "eV", "MeV")
+
+
+def unit_of_title(title: str) -> tuple[str, str]:
+    """Split a title such as ``"Wavelength (m)"`` into its name and its unit."""
+    match = _TITLE.match(title)
+    return (match["name"], match["unit"]) if match else (title, "")
+
+
+def parsed(text: str, unit: str) -> float:
+    """Read a number such as ``1.3 mm`` or ``inf``, in the unit if it names none."""
+    if text.strip().lower() in ("inf", "infinite", "∞"):
+        return math.inf
+    match = _NUMBER.match(text)
+    if match is None:
+        raise InputError(f"{text!r} is not a number, expected {_example(unit)}")
+    number = float(match["number"])
+    if match["unit"] in ("", unit):
+        return number
+    return _converted(match["number"], match["unit"], unit)
+
+
+def shown(value: float, unit: str) -> str:
+    """Write a number with the prefix of its unit that makes it handy."""
+    if math.isinf(value) or not unit:
+        return f"{value:.12g}"
+    if unit not in _PREFIXED or value == 0:
+        return f"{value:.12g} {unit}"
+    import pint
+
+    compact = pint.application_registry.Quantity(value, unit).to_compact()
+    return f"{compact.magnitude:.12g} {compact.units:~P}"
+
+
+def _converted(number: str, from_unit: str, to_unit: str) -> float:
+    import pint
+
+    # By the text of the number, so that 1.3 mm is 0.0013 m to the last digit.
+    if not to_unit:
+        raise InputError(f"{number} {from_unit} has a unit, expected a plain number")
+    registry = pint.application_registry
+    try:
+        factor = registry.Quantity(1.0, from_unit).to(to_unit).magnitude
+    except (pint.errors.PintError, AttributeError, ValueError):
+        raise InputError(
+            f"{number} {from_unit} cannot be converted to {to_unit}, expected {_example(to_unit)}"
+        ) from None
+    power = round(math.log10(factor)) if factor > 0 else 0
+    if math.isclose(factor, 10.0**power, rel_tol=1e-9):
+        mantissa, _, exponent = number.lower().partition("e")
+        return float(f"{mantissa}e{int(exponent or 0) + power}")
+    return float(number) * float(factor)
+
+
+def _example(unit: str) -> str:
+    examples = {"m": "something like 1.3 mm", "MeV": "something like 14.7 MeV"}
+    return examples.get(unit, f"a number in {unit}" if unit else "a number")
 
 
 class _WheelGuard(QObject):
@@ -50,13 +113,7 @@ class SteadyComboBox(QComboBox):
 
 
 class Editor(QWidget):
-    """A widget that holds the value of one field; None if it holds none.
-
-    Signals
-    -------
-    changed
-        The user, or the program, changed the value.
-    """
+    """A widget that holds the value of one field; None if it holds none."""
 
     changed = Signal()
     # Whether the value is shown with its unit, so that the label need not tell it.
@@ -65,9 +122,7 @@ class Editor(QWidget):
     def __init__(self, inner: QWidget) -> None:
         super().__init__()
         self.inner = inner
-        row = QHBoxLayout(self)
-        row.setContentsMargins(0, 0, 0, 0)
-        row.addWidget(inner)
+        beside((inner, 0), holder=self)
 
     @property
     def checked(self) -> bool:
@@ -223,20 +278,10 @@ class _Optional(Editor):
 
 
 def editor_for(field: FieldInfo, first: Any = None) -> Editor:
-    """Make the editor that suits a field's type and bounds.
+    """Make the editor that suits a field's type and bounds, with its default as the value.
 
-    Parameters
-    ----------
-    field : pydantic.fields.FieldInfo
-        A number, a choice or a yes/no, each of them optional or not. A number whose
-        ``json_schema_extra`` holds ``"slider": [least, most]`` gets a slider.
-    first : object, optional
-        What an optional field starts with when it is first checked.
-
-    Returns
-    -------
-    Editor
-        With the field's default as its value.
+    A number whose ``json_schema_extra`` holds ``"slider": [least, most]`` gets a slider; an
+    optional field starts with `first` when it is first checked.
     """
     kind, optional = _without_none(field.annotation)
     editor = _plain_editor(kind, field)

@@ -1,53 +1,79 @@
-"""A form made from a pydantic model: there is no second list of fields and defaults.
+"""Forms made from pydantic models: there is no second list of fields and defaults.
 
-- edit a model: `ModelForm`
-- edit one of several kinds of models: `ModelPicker`
+- edit a model: `ModelForm`; one of several kinds of models: `ModelPicker`
 - choose one of several kinds of things, with other controls: `RowPicker`
+- their values as TOML files, as the command line reads them: `dump_toml`, `TomlButtons`
+- smaller parts: `labelled`, `with_button`, `section`, `wrapping_label`, `PathEdit`
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
-from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QLabel, QSizePolicy, QVBoxLayout, QWidget
+from qtpy.QtWidgets import (
+    QFileDialog,
+    QFormLayout,
+    QLabel,
+    QLineEdit,
+    QPushButton,
+    QSizePolicy,
+    QToolButton,
+    QWidget,
+)
+from superqt import QCollapsible
 
-from napari_shadowinv._napari.widgets._fields import Editor, SteadyComboBox, editor_for
-from napari_shadowinv._napari.widgets._quantities import unit_of_title
+from napari_shadowinv._napari.widgets._fields import (
+    Editor,
+    SteadyComboBox,
+    editor_for,
+    unit_of_title,
+)
+from napari_shadowinv._napari.widgets._qt import beside, column, notify_errors
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 
-__all__ = [
-    "Kinds",
-    "ModelForm",
-    "ModelPicker",
-    "RowPicker",
-    "kinds_of",
-    "labelled",
-    "wrapping_label",
-]
-
+# For each key the title to show, and what returns the model's class, if there is one: called
+# only when the kind is chosen, because some classes take a second to import.
 Kinds = dict[str, tuple[str, Callable[[], type[BaseModel]] | None]]
 
 PROBLEM_STYLE = "color: #d9822b;"
 _LABEL_WIDTH = 54
 _INDENT = 12
+_TOML = "TOML (*.toml)"
 # Of these optional fields only one may be given: checking one unchecks the other.
 _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
 
 
 def labelled(text: str, widget: QWidget) -> QWidget:
     """A widget with a label before it; all of them line up."""
-    holder = QWidget()
-    row = QHBoxLayout(holder)
-    row.setContentsMargins(0, 0, 0, 0)
     label = QLabel(text)
     label.setMinimumWidth(_LABEL_WIDTH)
-    row.addWidget(label)
-    row.addWidget(widget, 1)
-    return holder
+    return beside((label, 0), (widget, 1))
+
+
+def with_button(widget: QWidget, text: str, tip: str, action: Callable[[], Any]) -> QWidget:
+    """A widget with a small button on its right."""
+    button = QToolButton()
+    button.setText(text)
+    button.setToolTip(tip)
+    button.clicked.connect(lambda: action())
+    return beside((widget, 1), (button, 0))
+
+
+def section(title: str, *widgets: QWidget) -> QCollapsible:
+    """Widgets under a title that folds them away; folded to begin with."""
+    folded = QCollapsible(title, expandedIcon="▾", collapsedIcon="▸")
+    folded.setDuration(0)
+    folded.layout().setContentsMargins(0, 0, 0, 0)
+    folded.layout().setSpacing(2)
+    folded.content().layout().setContentsMargins(6, 2, 0, 4)
+    for widget in widgets:
+        folded.addWidget(widget)
+    return folded
 
 
 def wrapping_label(text: str = "", style: str = "") -> QLabel:
@@ -62,20 +88,39 @@ def wrapping_label(text: str = "", style: str = "") -> QLabel:
     return label
 
 
+class PathEdit(QWidget):
+    changed = Signal()
+
+    def __init__(self, title: str, example: str = "path of a file") -> None:
+        super().__init__()
+        self._title = title
+        self.edit = QLineEdit()
+        self.edit.setPlaceholderText(example)
+        self.edit.setMinimumWidth(60)
+        beside((with_button(self.edit, "…", title, self._choose), 0), holder=self)
+        self.edit.editingFinished.connect(self.changed)
+
+    @property
+    def path(self) -> str:
+        return str(self.edit.text()).strip()
+
+    def ask(self) -> str:
+        """Let the user choose in a dialog; empty if he does not."""
+        path, _ = QFileDialog.getOpenFileName(self, self._title)
+        return str(path)
+
+    def _choose(self) -> None:
+        path = self.ask()
+        if path:
+            self.edit.setText(path)
+            self.changed.emit()
+
+
 class ModelForm(QWidget):
     """Editors for all fields of a model, with titles, units and descriptions from it.
 
-    Parameters
-    ----------
-    model_class : type of pydantic.BaseModel
-        Fields that leave no choice (a Literal of one value) are not shown.
-    first : mapping of str to object, optional
-        Values that optional fields start with when they are first checked.
-
-    Signals
-    -------
-    changed
-        A value changed.
+    Fields that leave no choice (a Literal of one value) are not shown; optional ones start with
+    what `first` holds when they are first checked.
     """
 
     changed = Signal()
@@ -87,13 +132,12 @@ class ModelForm(QWidget):
         self._model_class = model_class
         self._fixed: dict[str, Any] = {}
         self.editors: dict[str, Editor] = {}
-        column = QVBoxLayout(self)
-        column.setContentsMargins(0, 0, 0, 0)
-        layout = QFormLayout()
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
-        layout.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
-        column.addLayout(layout)
+        rows = QFormLayout()
+        rows.setContentsMargins(0, 0, 0, 0)
+        rows.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
+        rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
+        whole = column(self)
+        whole.addLayout(rows)
         for name, field in model_class.model_fields.items():
             if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1:
                 self._fixed[name] = get_args(field.annotation)[0]
@@ -102,12 +146,13 @@ class ModelForm(QWidget):
             title = field.title or name
             label = QLabel(unit_of_title(title)[0] if editor.shows_unit else title)
             for widget in (label, editor):
-                widget.setToolTip(_tooltip(field.description))
-            layout.addRow(label, editor)
+                # As rich text, so that Qt breaks it into lines.
+                widget.setToolTip(f"<qt>{field.description}</qt>" if field.description else "")
+            rows.addRow(label, editor)
             editor.changed.connect(self._on_change)
             self.editors[name] = editor
         self._problem = wrapping_label(style=PROBLEM_STYLE)
-        column.addWidget(self._problem)
+        whole.addWidget(self._problem)
 
     @property
     def is_empty(self) -> bool:
@@ -128,30 +173,22 @@ class ModelForm(QWidget):
                 field = self._model_class.model_fields[name]
                 default = None if field.is_required() else field.get_default()
                 value = values.get(name, default)
-                if value is not None or default is None:
-                    _set_or_default(editor, value, default)
+                if value is None and default is not None:
+                    continue
+                try:
+                    editor.set_value(value)
+                except (TypeError, ValueError, OverflowError):
+                    # What an older version has kept may be of another kind by now.
+                    editor.set_value(default)
         self._on_change()
 
-    def state(self) -> dict[str, Any]:
-        """What is kept."""
-        return self.values()
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Show what `state` has returned."""
-        self.set_values(state)
+    # What is kept between sessions
+    state, restore = values, set_values
 
     def model(self) -> BaseModel:
-        """The validated model.
-
-        Raises
-        ------
-        InputError
-            If a value is missing or cannot be used.
-        """
-        return validated(self._model_class, self.values(), self._where())
-
-    def _where(self) -> str:
-        return self._model_class.__name__.removesuffix("Options").removesuffix("Setup").lower()
+        """The validated model, or an `InputError`."""
+        name = self._model_class.__name__.removesuffix("Options").removesuffix("Setup").lower()
+        return validated(self._model_class, self.values(), name)
 
     def _on_change(self) -> None:
         self._keep_one_alternative()
@@ -183,58 +220,24 @@ def kinds_of(models: Mapping[str, Any], prefix: str = "") -> Kinds:
     return {name: (f"{prefix}{model.title}", returning(model)) for name, model in models.items()}
 
 
-def _set_or_default(editor: Editor, value: Any, default: Any) -> None:
-    """What an older version has kept may be of another kind by now."""
-    try:
-        editor.set_value(value)
-    except (TypeError, ValueError, OverflowError):
-        editor.set_value(default)
-
-
-def _tooltip(description: str | None) -> str:
-    # As rich text, so that Qt breaks it into lines.
-    return f"<qt>{description}</qt>" if description else ""
-
-
 class ModelPicker(QWidget):
-    """A choice between kinds of things, each with a form of its own or with none.
-
-    Parameters
-    ----------
-    label : str
-        What is chosen; shown before the choice.
-    kinds : dict of str to (str, callable or None)
-        For each key the title to show, and what returns the model's class: called only when
-        the kind is chosen, because some classes take a second to import.
-
-    Signals
-    -------
-    changed
-        The kind or a value changed.
-    """
+    """A choice between kinds of things, each with a form of its own or with none."""
 
     changed = Signal()
 
-    def __init__(
-        self,
-        label: str,
-        kinds: Kinds,
-    ) -> None:
+    def __init__(self, label: str, kinds: Kinds) -> None:
         super().__init__()
         self._kinds = dict(kinds)
         self._forms: dict[str, ModelForm] = {}
         self.choice = SteadyComboBox()
         for key, (title, _) in self._kinds.items():
             self.choice.addItem(title, key)
-        column = QVBoxLayout(self)
-        column.setContentsMargins(0, 0, 0, 0)
-        column.addWidget(labelled(label, self.choice))
+        column(self, labelled(label, self.choice))
         self.choice.currentIndexChanged.connect(self._on_choice)
         self._on_choice()
 
     @property
     def kind(self) -> str:
-        """The key of the chosen kind."""
         return str(self.choice.currentData())
 
     def set_kind(self, kind: str) -> None:
@@ -245,26 +248,17 @@ class ModelPicker(QWidget):
 
     @property
     def form(self) -> ModelForm | None:
-        """The form of the chosen kind, if it has one."""
         return self._forms.get(self.kind)
 
     def model(self) -> BaseModel | None:
-        """The validated model of the chosen kind, None if it has none.
-
-        Raises
-        ------
-        InputError
-            If a value is missing or cannot be used.
-        """
+        """The validated model of the chosen kind, None if it has none, or an `InputError`."""
         return None if self.form is None else self.form.model()
 
     def state(self) -> dict[str, Any]:
-        """The choice and what all forms hold, to be kept."""
         values = {kind: form.values() for kind, form in self._forms.items()}
         return {"kind": self.kind, "values": values}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Show what `state` has returned."""
         values = state.get("values", {})
         for kind, held in values.items() if isinstance(values, Mapping) else ():
             if kind in self._kinds and isinstance(held, Mapping):
@@ -294,19 +288,7 @@ class ModelPicker(QWidget):
 class RowPicker(QWidget):
     """A choice between kinds of things, some with a control of their own in a row below.
 
-    Parameters
-    ----------
-    label, kinds
-        See `ModelPicker`.
-    tip : str
-        Tooltip of the choice.
-    rows : mapping of str to QWidget
-        For some kinds, what is shown below while they are chosen.
-
-    Signals
-    -------
-    changed
-        The kind or a value changed; for the rows, their owner connects it.
+    Their owner connects the signals of these controls.
     """
 
     changed = Signal()
@@ -316,10 +298,7 @@ class RowPicker(QWidget):
         self.picker = ModelPicker(label, kinds)
         self.picker.choice.setToolTip(f"<qt>{tip}</qt>")
         self._rows = dict(rows)
-        column = QVBoxLayout(self)
-        column.setContentsMargins(0, 0, 0, 0)
-        for widget in (self.picker, *self._rows.values()):
-            column.addWidget(widget)
+        column(self, self.picker, *self._rows.values())
         self.picker.changed.connect(self._on_kind)
         self._on_kind()
 
@@ -327,3 +306,65 @@ class RowPicker(QWidget):
         for kind, row in self._rows.items():
             row.setVisible(kind == self.picker.kind)
         self.changed.emit()
+
+
+def dump_toml(values: dict[str, object], path: str | Path) -> Path:
+    """Write values as a TOML file, whole or not at all, and return its path.
+
+    A file that exists is replaced, for the dialog has asked. A name without a suffix gets
+    ``.toml``, which the dialog has not asked about: then an existing file is refused.
+    """
+    import tomli_w
+
+    from napari_shadowinv.io import replacing
+
+    named = Path(path)
+    path = named if named.suffix else named.with_suffix(".toml")
+    with replacing(path, overwrite=path == named) as unfinished:
+        unfinished.write_text(tomli_w.dumps(values), encoding="utf-8")
+    return path
+
+
+class TomlButtons(QWidget):
+    """Load… and Save… beside each other.
+
+    `values` returns what is to be saved, `take` receives what was loaded and its path; both raise
+    an `InputError` for what cannot be used.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        values: Callable[[], dict[str, object]],
+        take: Callable[[dict[str, object], str], None],
+    ) -> None:
+        super().__init__()
+        self._what, self._values, self._take = what, values, take
+        self.load_button = QPushButton("Load…")
+        self.save_button = QPushButton("Save…")
+        self.load_button.setToolTip(f"Read {what} from a TOML file.")
+        self.save_button.setToolTip(
+            f"Write {what} to a TOML file, to reuse here or on the command line."
+        )
+        beside((self.load_button, 0), (self.save_button, 0), holder=self).layout().addStretch(1)
+        self.load_button.clicked.connect(lambda: self._load())
+        self.save_button.clicked.connect(lambda: self._save())
+
+    @notify_errors
+    def _load(self) -> None:
+        from napari_shadowinv.io import read_toml
+
+        path, _ = QFileDialog.getOpenFileName(self, f"Load {self._what}", "", _TOML)
+        if path:
+            self._take(read_toml(path), path)
+
+    @notify_errors
+    def _save(self) -> None:
+        values = self._values()
+        if not values:
+            raise InputError(f"there is no {self._what} to save: choose one first")
+        path, _ = QFileDialog.getSaveFileName(
+            self, f"Save {self._what}", f"{self._what}.toml", _TOML
+        )
+        if path:
+            dump_toml(values, path)

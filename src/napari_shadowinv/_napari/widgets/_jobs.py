@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from napari_shadowinv._napari.widgets._estimating import SourceCache, quick_source, same_array
 from napari_shadowinv._system.progress import OnProgress, OnWarning, Reporter, ShouldStop
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.pipeline.cache import SourceCache, quick_source, same_array
 from napari_shadowinv.preprocessing import Estimate, Filter, Preparation, UniformEstimate
 
 if TYPE_CHECKING:
@@ -30,10 +31,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.transport.sites import SitePlan
 
-__all__ = ["PREVIEW_SITES", "Crop", "PlanCache", "ShotJob", "SourceJob", "plane_of"]
-
-Image = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Crop = tuple[slice, slice]
 
 PREVIEW_SITES = 5_000
@@ -42,24 +39,18 @@ PREVIEW_PIXELS = 10_000
 
 @dataclass
 class PlanCache:
-    """The sites of the last run, for the next one with the same source.
+    """The sites of the last run, for the next one with the same source."""
 
-    Attributes
-    ----------
-    hits : int
-        How often the work was saved.
-    """
-
-    hits: int = 0
-    _kept: tuple[tuple[Any, ...], Image, Mask | None, SitePlan] | None = field(
+    hits: int = 0  # how often the work was saved
+    _kept: tuple[tuple[Any, ...], FloatArray, BoolArray | None, SitePlan] | None = field(
         default=None, repr=False
     )
     _solved: tuple[SitePlan, Inversion] | None = field(default=None, repr=False)
 
     def plan(
         self,
-        source: Image,
-        mask: Mask | None,
+        source: FloatArray,
+        mask: BoolArray | None,
         options: InversionOptions,
         on_progress: OnProgress | None,
         should_stop: ShouldStop | None,
@@ -98,55 +89,27 @@ class PlanCache:
         self._solved = plan, inversion
 
 
-def _alike(one: Image, other: Image) -> bool:
+def _alike(one: FloatArray, other: FloatArray) -> bool:
     # A filter keeps the mean of a uniform source to rounding only.
     return one.shape == other.shape and np.allclose(one, other, rtol=1e-9, atol=0)
 
 
 @dataclass(frozen=True, eq=False)
 class ShotJob:
-    """One shot to invert, with all that it takes.
+    """One shot to invert, with all that it takes."""
 
-    Attributes
-    ----------
-    image : array_like, shape (H, W)
-        The whole image; also one that is read only when it is needed.
-    source : array_like, shape (H, W), or Path or Estimate
-        The undisturbed beam, a file of it, or how to guess it.
-    mask : ndarray of bool, shape (H, W), optional
-        True where a pixel is usable.
-    crop : tuple of slice, optional
-        The part to invert.
-    cleaning : Filter, optional
-        What is done to the image first.
-    options : InversionOptions
-        Choices of the inversion.
-    cache : PlanCache
-        Sites of earlier runs.
-    estimates : SourceCache
-        The source that the last run has guessed.
-    preview : bool
-        Whether to be quick rather than exact.
-    source_mask : ndarray of bool, shape (H, W), optional
-        True where the object is not: an estimate of the source looks at no other pixels.
-    setup : Setup, optional
-        The experiment, for what depends on it before the inversion.
-    warnings : tuple of str
-        What is known against the image, for the report.
-    """
-
-    image: ArrayLike
+    image: ArrayLike  # also one that is read only when it is needed
     source: ArrayLike | Path | Estimate
-    mask: Mask | None = None
+    mask: BoolArray | None = None  # true where a pixel is usable
     crop: Crop | None = None
     cleaning: Filter | None = None
     options: InversionOptions = field(default_factory=InversionOptions)
     cache: PlanCache = field(default_factory=PlanCache)
     estimates: SourceCache = field(default_factory=SourceCache)
     preview: bool = False
-    source_mask: Mask | None = None
+    source_mask: BoolArray | None = None  # an estimate of the source looks only where it is true
     setup: Setup | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # what is known against the image
 
     def for_preview(self) -> ShotJob:
         """The same with few enough sites, and pixels of an estimate, to be quick."""
@@ -157,15 +120,6 @@ class ShotJob:
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Inversion:
-        """Invert the shot.
-
-        Raises
-        ------
-        InputError
-            If image, source, mask or crop cannot be used.
-        InversionCancelled
-            If `should_stop` returned true.
-        """
         from napari_shadowinv.inversion import invert
         from napari_shadowinv.inversion.compilation import ensure_compiled
         from napari_shadowinv.inversion.normalise import number_of_sites, prepare
@@ -229,7 +183,7 @@ class ShotJob:
             told["source_file"] = text_of(self.source.name)
         return told
 
-    def _image_and_masks(self) -> tuple[Image, Mask | None, Mask | None]:
+    def _image_and_masks(self) -> tuple[FloatArray, BoolArray | None, BoolArray | None]:
         image = plane_of(self.image, "the image")
         masks = {"mask": self.mask, "source mask": self.source_mask}
         for name, mask in masks.items():
@@ -266,12 +220,12 @@ class ShotJob:
 
     def _source(
         self,
-        image: Image,
-        mask: Mask | None,
+        image: FloatArray,
+        mask: BoolArray | None,
         preparation: Preparation,
         should_stop: ShouldStop | None,
         on_warning: OnWarning,
-    ) -> Image:
+    ) -> FloatArray:
         from napari_shadowinv.inversion.normalise import checked_source
 
         if preparation.estimate is not None:
@@ -296,37 +250,16 @@ class ShotJob:
 
 @dataclass(frozen=True, eq=False)
 class SourceJob:
-    """A source to estimate from a shot.
-
-    Attributes
-    ----------
-    image : array_like, shape (H, W)
-        The shot.
-    estimate : Estimate
-        How.
-    mask : ndarray of bool, shape (H, W), optional
-        True where a pixel is usable.
-    quick : bool
-        Whether to merge the pixels of a large image first.
-    """
+    """A source to estimate from a shot; quickly, if its pixels are to be merged first."""
 
     image: ArrayLike
     estimate: Estimate
-    mask: Mask | None = None
+    mask: BoolArray | None = None
     quick: bool = False
 
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
-    ) -> Image:
-        """Estimate it.
-
-        Raises
-        ------
-        InputError
-            If image and mask cannot be used.
-        InversionCancelled
-            If `should_stop` returned true.
-        """
+    ) -> FloatArray:
         report = Reporter(on_progress, should_stop)
         report("source", 0, None, type(self.estimate).title)
         image = plane_of(self.image, "the image")
@@ -338,14 +271,8 @@ class SourceJob:
         return source
 
 
-def plane_of(values: ArrayLike, name: str) -> Image:
-    """Return one image as floats, or say why it is none.
-
-    Raises
-    ------
-    InputError
-        If it is a stack, has channels, or does not hold real numbers.
-    """
+def plane_of(values: ArrayLike, name: str) -> FloatArray:
+    """Return one image as floats, or say why it is none."""
     array = np.asarray(values)
     if array.ndim != 2:
         raise InputError(
@@ -357,7 +284,7 @@ def plane_of(values: ArrayLike, name: str) -> Image:
     return array.astype(np.float64)
 
 
-def _cropped(image: Image, crop: Crop) -> Image:
+def _cropped(image: FloatArray, crop: Crop) -> FloatArray:
     part = image[crop]
     if min(part.shape) < 4:
         raise InputError(

@@ -1,40 +1,53 @@
-"""Parts that several widgets have: the run button, progress, the report.
+"""The frame of a widget: controls in a column, the run button, progress, the report.
 
+- a widget that runs on a button: `ToolPanel`; also on every change: `LivePanel`
 - start, cancel and watch: `RunPanel`
 - how an inversion went: `ReportTable`, `report_rows`
-- a part that can be folded away: `section`
 """
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from napari.utils import progress as activity
-from qtpy.QtCore import Qt, QTimer
+from qtpy.QtCore import QSize, Qt
 from qtpy.QtWidgets import (
     QAbstractItemView,
+    QCheckBox,
+    QFrame,
     QHeaderView,
     QProgressBar,
     QPushButton,
+    QScrollArea,
     QSizePolicy,
     QTableWidget,
     QTableWidgetItem,
-    QVBoxLayout,
     QWidget,
 )
-from superqt import QCollapsible
 
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, wrapping_label
-from napari_shadowinv._napari.widgets._lifetime import when_destroyed
-from napari_shadowinv._napari.widgets._notifications import error_text, tell_error
+from napari_shadowinv._napari.widgets._qt import (
+    MISTAKES,
+    Docked,
+    StateKeeper,
+    column,
+    error_text,
+    notify_errors,
+    tell_error,
+    timer,
+    when_destroyed,
+)
+from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv._system.progress import Progress
 
 if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.inversion import Inversion
 
-__all__ = ["ReportTable", "RunPanel", "report_rows", "section"]
+WIDTH = 330
 
 _STAGES = {
     "compile": "Compiling",
@@ -47,10 +60,9 @@ _STAGES = {
     "image": "Tracing the rays",
     "shots": "Inverting",
 }
-
-
 _LOOK_EVERY = 500  # ms
 _SHOW_SECONDS_FROM = 2.0
+_SETTLE = 10  # ms; a few changes at once are one
 
 
 class _Activity:
@@ -82,15 +94,6 @@ class RunPanel(QWidget):
     card, an animated bar thus takes the processor that the work needs: the bar stands still
     between two looks, and napari's activity dock, which is animated, is used only while the
     panel cannot be seen.
-
-    Parameters
-    ----------
-    what : str
-        The name of the work, for the activity dock.
-    run_text, run_tip : str
-        What the button says, and its tooltip.
-    **keywords
-        More of `Runner`.
     """
 
     def __init__(self, what: str, run_text: str, run_tip: str, **keywords: float) -> None:
@@ -106,38 +109,24 @@ class RunPanel(QWidget):
         # Nothing of napari's or of the system's style animates a bar that has a range.
         self.bar.setRange(0, 1)
         self.status = wrapping_label()
-        column = QVBoxLayout(self)
-        column.setContentsMargins(0, 0, 0, 0)
-        for widget in (self.button, self.bar, self.status):
-            column.addWidget(widget)
+        column(self, self.button, self.bar, self.status)
         self._activity = _Activity()
         self._quiet = False
         self._said = ("", False)
         self._news: Progress | None = None
         self._start = 0.0
-        self._looking = QTimer(self)
-        self._looking.setInterval(_LOOK_EVERY)
-        self._looking.timeout.connect(self._look)
+        self._looking = timer(self, _LOOK_EVERY, self._look)
         self.runner.started.connect(self._on_start)
         self.runner.progressed.connect(self._on_progress)
         self.runner.ended.connect(self._on_end)
         when_destroyed(self, self._activity.close)
 
     def run(self, work: Work, tag: object = None, *, quiet: bool = False) -> None:
-        """Begin some work.
-
-        Parameters
-        ----------
-        work, tag
-            See `Runner.start`.
-        quiet : bool
-            A preview: it neither shows its progress nor sends notifications.
-        """
+        """Begin some work; if quiet, it neither shows its progress nor sends notifications."""
         self._quiet = quiet
         self.runner.start(work, tag)
 
     def cancel(self) -> None:
-        """Ask the work to stop."""
         self.runner.cancel()
         if self.runner.running:
             self.button.setText("Cancelling…")
@@ -145,7 +134,6 @@ class RunPanel(QWidget):
             self.say("")
 
     def say(self, text: str, problem: bool = False) -> None:
-        """Show a line of text under the button."""
         # To draw a window with a canvas in it takes time: only if there is something new.
         if (text, problem) == self._said:
             return
@@ -174,7 +162,6 @@ class RunPanel(QWidget):
         self._news = news
 
     def _look(self) -> None:
-        """Show the latest news."""
         news = self._news
         if news is None or self.runner.cancelling:
             return
@@ -246,24 +233,21 @@ class ReportTable(QTableWidget):
         self.setVisible(False)
 
     def show_rows(self, rows: list[tuple[str, str]]) -> None:
-        """Replace what is shown."""
         self.setRowCount(len(rows))
-        for number, row in enumerate(rows):
-            for column, text in enumerate(row):
+        for row, texts in enumerate(rows):
+            for place, text in enumerate(texts):
                 item = QTableWidgetItem(text)
                 item.setTextAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignTop)
                 item.setToolTip(text)
-                self.setItem(number, column, item)
+                self.setItem(row, place, item)
         self.setVisible(True)
         self._fit()
 
     def empty(self) -> None:
-        """Show nothing."""
         self.setRowCount(0)
         self.setVisible(False)
 
     def texts(self) -> dict[str, str]:
-        """What is shown, by name."""
         rows = range(self.rowCount())
         return {self.item(row, 0).text().strip(): self.item(row, 1).text() for row in rows}
 
@@ -276,13 +260,145 @@ class ReportTable(QTableWidget):
         self.setFixedHeight(self.verticalHeader().length() + 2 * self.frameWidth())
 
 
-def section(title: str, *widgets: QWidget) -> QCollapsible:
-    """Widgets under a title that folds them away; folded to begin with."""
-    folded = QCollapsible(title, expandedIcon="▾", collapsedIcon="▸")
-    folded.setDuration(0)
-    folded.layout().setContentsMargins(0, 0, 0, 0)
-    folded.layout().setSpacing(2)
-    folded.content().layout().setContentsMargins(6, 2, 0, 4)
-    for widget in widgets:
-        folded.addWidget(widget)
-    return folded
+class ToolPanel(Docked):
+    """A column of controls that scrolls where the window is low, never sideways.
+
+    Its button runs what `request` describes; a subclass says what that is and shows the result.
+    """
+
+    def __init__(self, viewer: Any, name: str, panel: RunPanel) -> None:
+        super().__init__()
+        self.viewer, self.panel = viewer, panel
+        self._ready = False
+        self._running_preview = False
+        content = QWidget()
+        self.column = column(content, margin=6)
+        self.column.setAlignment(Qt.AlignmentFlag.AlignTop)
+        self.area = QScrollArea()
+        self.area.setWidgetResizable(True)
+        self.area.setFrameShape(QFrame.Shape.NoFrame)
+        self.area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.area.setWidget(content)
+        column(self, self.area)
+        self.setMinimumWidth(WIDTH)
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
+        self._keeper = StateKeeper(self, name, self.state)
+        panel.button.clicked.connect(lambda: self._run_or_cancel())
+        panel.runner.ended.connect(self._on_end)
+
+    def sizeHint(self) -> QSize:
+        return QSize(WIDTH + 30, 600)
+
+    def show_problem(self, text: str) -> None:
+        """Show what is wrong, where it can be read until the next run."""
+        self.panel.say(text, problem=True)
+
+    # What is kept between sessions, made of what JSON knows
+
+    def parts(self) -> dict[str, Any]:
+        """The controls whose states are kept, by name: with methods `state` and `restore`."""
+        return {}
+
+    def state(self) -> dict[str, Any]:
+        return {name: part.state() for name, part in self.parts().items()}
+
+    def restore(self, kept: Mapping[str, Any]) -> None:
+        for name, part in self.parts().items():
+            if name in kept:
+                part.restore(kept[name])
+
+    def restore_last(self) -> None:
+        self.restore(self._keeper.load())
+
+    def keep(self) -> None:
+        """The state has changed: write it soon."""
+        if self._ready:
+            self._keeper.changed()
+
+    def hideEvent(self, event: Any) -> None:
+        if self._ready:
+            self._keeper.write()
+        super().hideEvent(event)
+
+    # A run
+
+    def request(self) -> Any:
+        """What the controls ask for, with a method `run`; or an `InputError`."""
+        raise NotImplementedError
+
+    def forget(self) -> None:
+        """Take away what was said of the last run."""
+
+    def show_result(self, value: Any, request: Any) -> None:
+        raise NotImplementedError
+
+    def _run_or_cancel(self) -> None:
+        if self.panel.runner.running and not self._running_preview:
+            self.panel.cancel()
+            return
+        self.forget()
+        try:
+            request = self.request()
+        except MISTAKES as error:
+            self.panel.refuse(error)
+            return
+        self._running_preview = False
+        self.panel.run(request.run, request)
+
+    @notify_errors
+    def _on_end(self, outcome: Outcome) -> None:
+        if outcome.value is not None:
+            self.show_result(outcome.value, outcome.tag)
+
+
+class LivePanel(ToolPanel):
+    """Runs on its button, and with a preview on every change.
+
+    At most one run is under way and one, the latest, waits. A preview gives way to the
+    next and to the button; a run that the button began is not disturbed by previews.
+    """
+
+    def __init__(self, viewer: Any, name: str, panel: RunPanel) -> None:
+        super().__init__(viewer, name, panel)
+        self.live = QCheckBox("Live preview")
+        self.previewed = ResultLayers(viewer, self)
+        self._last = LastResults(viewer, self)
+        self.keep_earlier = self._last.keep_earlier
+        self._settle = timer(self, _SETTLE, self._preview, once=True)
+        self.live.toggled.connect(self.on_change)
+
+    def request(self, preview: bool = False) -> Any:
+        raise NotImplementedError
+
+    def show_layers(self, shot: Any, described: Sequence[FullLayerData], preview: bool) -> None:
+        """Show layers of a preview, or instead of them those of what the button has run."""
+        if preview:
+            self.previewed.show(described, select=False)
+            return
+        self.previewed.hide()
+        self.results = self._last.next_of(shot)
+        self.results.show(described)
+
+    def on_change(self) -> None:
+        """Something that the result depends on has changed."""
+        self.keep()
+        if self._ready and self.live.isChecked():
+            self._settle.start()
+
+    def showEvent(self, event: Any) -> None:
+        super().showEvent(event)
+        if self._ready and self.live.isChecked():
+            self._settle.start()
+
+    def _preview(self) -> None:
+        busy = self.panel.runner.running and not self._running_preview
+        if busy or not self.isVisible():
+            return
+        try:
+            request = self.request(preview=True)
+        except MISTAKES as error:
+            # Half a rectangle, half a number: no reason for a notification.
+            self.panel.say(str(error), problem=True)
+            return
+        self._running_preview = True
+        self.panel.run(request.run, request, quiet=True)

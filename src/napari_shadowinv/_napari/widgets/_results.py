@@ -1,55 +1,34 @@
 """Results as layers that stay where they are when the next result comes.
 
-- where a result lies: `result_frame`
-- place an image and what belongs to it by a setup: `place_together`
+- place an image and what belongs to it by a setup: `place_together`; a result: `result_frame`
 - show a result in layers of its own: `ResultLayers`; in those of the last result of the same
-  shot: `LastResults`, `keep_earlier_box`
+  shot: `LastResults`
+- where the parts of a result come from: `Origins`
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from qtpy.QtCore import QObject, QTimer, Signal
+from qtpy.QtCore import QObject, Signal
 from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, place
 from napari_shadowinv._napari.layer_metadata import role_of
-from napari_shadowinv._napari.widgets._picking import kind_of
+from napari_shadowinv._napari.widgets._layers import kind_of
+from napari_shadowinv._napari.widgets._qt import timer
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
-
-__all__ = [
-    "LastResults",
-    "ResultLayers",
-    "keep_earlier_box",
-    "place_together",
-    "result_frame",
-]
 
 _VISIBLE = 0.02  # of what limits span
 
 
 def result_frame(image: Any, setup: Any | None, crop: tuple[slice, slice] | None) -> Frame:
-    """Frame of a result, so that it lies on its image once that is placed by the setup.
-
-    Parameters
-    ----------
-    image : napari.layers.Image
-        The shot.
-    setup : Setup or None
-        The experiment.
-    crop : tuple of slice, optional
-        The part that is inverted.
-
-    Returns
-    -------
-    Frame
-    """
+    """Frame of a result, so that it lies on its image once that is placed by the setup."""
     frame = frame_of(image)
     if setup is not None:
         upright = frame_for(image.data.shape, setup)
@@ -58,22 +37,19 @@ def result_frame(image: Any, setup: Any | None, crop: tuple[slice, slice] | None
 
 
 def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> None:
-    """Give an image the pixel size of its setup, and what lies on it, too.
+    """Give an image the pixel size of its setup, and what lies on it, too; the camera follows.
 
-    Parameters
-    ----------
-    viewer : napari.Viewer
-        Its camera follows where the image goes.
-    image : napari.layers.Image
-        The shot.
-    setup : Setup
-        The experiment.
-    companions : sequence of napari.layers.Layer
-        Source, mask and crop: those that lie as the image does go with it, and so do other
-        images of its size. Pixels and lengths side by side would make napari warn at each layer.
+    Source, mask and crop that lie as the image does go with it, and so do other images of its
+    size: pixels and lengths side by side would make napari warn at each layer.
     """
     before = frame_of(image)
-    others = [layer for layer in viewer.layers if _is_alike(layer, image)]
+    others = [
+        layer
+        for layer in viewer.layers
+        if layer is not image
+        and kind_of(layer) in ("image", "labels")
+        and tuple(layer.data.shape[-2:]) == tuple(image.data.shape[-2:])
+    ]
     followers = [layer for layer in (*companions, *others) if frame_of(layer) == before]
     place(image, setup)
     if frame_of(image) == before:
@@ -84,30 +60,10 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
     viewer.reset_view()
 
 
-def _is_alike(layer: Any, image: Any) -> bool:
-    """Whether another layer holds images of the same size."""
-    if layer is image or kind_of(layer) not in ("image", "labels"):
-        return False
-    return tuple(layer.data.shape[-2:]) == tuple(image.data.shape[-2:])
-
-
 class ResultLayers(QObject):
-    """Layers of a result that may be computed again and again.
+    """Layers of a result that may be computed again and again."""
 
-    Parameters
-    ----------
-    viewer : napari.Viewer
-        Where they are shown.
-    parent : QObject
-        The widget that shows them.
-
-    Signals
-    -------
-    complete
-        All layers of the last result are there.
-    """
-
-    complete = Signal()
+    complete = Signal()  # all layers of the last result are there
 
     def __init__(self, viewer: Any, parent: QObject) -> None:
         super().__init__(parent)
@@ -116,9 +72,7 @@ class ResultLayers(QObject):
         self._order: list[str] = []
         self._waiting: list[FullLayerData] = []
         self._select, self._before = True, None
-        self._timer = QTimer(self)
-        self._timer.setInterval(0)
-        self._timer.timeout.connect(self._add_next)
+        self._timer = timer(self, 0, self._add_next)
 
     @property
     def layers(self) -> list[Any]:
@@ -127,22 +81,14 @@ class ResultLayers(QObject):
 
     @property
     def busy(self) -> bool:
-        """Whether layers wait to be added."""
         return bool(self._timer.isActive())
 
     def show(self, described: Sequence[FullLayerData], *, select: bool = True) -> None:
-        """Replace the data of the layers; add those that are not there.
+        """Replace the data of the layers, the lowest first; add those that are not there.
 
         Adding a layer takes napari some tenths of a second, so they are added one by one
         while the window stays alive: what is visible first, the hidden ones below and between
-        afterwards.
-
-        Parameters
-        ----------
-        described : sequence of (data, keywords, layer type)
-            The layers, the lowest first.
-        select : bool
-            Whether to select what is new; without it the user goes on painting where he was.
+        afterwards. They are selected unless the user goes on painting where he was.
         """
         self._select = select
         self._before = self._viewer.layers.selection.active
@@ -179,7 +125,6 @@ class ResultLayers(QObject):
                     self._viewer.layers.remove(layer)
 
     def hide(self) -> None:
-        """Switch them off."""
         for layer in self.layers:
             layer.visible = False
 
@@ -207,48 +152,60 @@ class ResultLayers(QObject):
         return next((layer for layer in layers if layer in self._viewer.layers), None)
 
 
-def keep_earlier_box() -> QCheckBox:
-    """A check box whether the next result leaves the last one of the same shot as it is."""
-    box = QCheckBox("Keep earlier results")
-    box.setToolTip(
-        "<qt>Keep the layers of earlier runs. Otherwise the next result replaces the previous "
-        "one of the same shot.</qt>"
-    )
-    return box
-
-
 class LastResults:
-    """The last result of each shot, which the next one of the same shot replaces.
-
-    Parameters
-    ----------
-    viewer : napari.Viewer
-        Where they are shown.
-    parent : QObject
-        The widget that shows them.
-    """
+    """The last result of each shot, which the next one of the same shot replaces or leaves."""
 
     def __init__(self, viewer: Any, parent: QObject) -> None:
         self._viewer, self._parent = viewer, parent
         self._last: list[tuple[Any, ResultLayers]] = []
+        self.keep_earlier = QCheckBox("Keep earlier results")
+        self.keep_earlier.setToolTip(
+            "<qt>Keep the layers of earlier runs. Otherwise the next result replaces the previous "
+            "one of the same shot.</qt>"
+        )
 
-    def next_of(self, shot: Any, *, keep: bool) -> ResultLayers:
-        """Return what shows the next result of a shot.
-
-        Parameters
-        ----------
-        shot : object
-            What was inverted or estimated from, such as an image layer.
-        keep : bool
-            Whether the layers of its last result stay as they are.
-        """
+    def next_of(self, shot: Any) -> ResultLayers:
+        """Return what shows the next result of a shot: an image layer, or a name."""
         results = ResultLayers(self._viewer, self._parent)
         for known, last in self._last:
-            if known == shot and not keep:
+            if known == shot and not self.keep_earlier.isChecked():
                 results.take_over(last)
         self._last = [(known, last) for known, last in self._last if known != shot]
         self._last.append((shot, results))
         return results
+
+
+@dataclass(frozen=True)
+class Origins:
+    """What an inversion was given, in words; empty where there is no mask or setup."""
+
+    image: str
+    source: str
+    mask: str
+    source_mask: str
+    setup: str
+    setup_origin: str
+
+    def attributes(self) -> dict[str, str]:
+        """What a result keeps of it, beside the names of files."""
+        told = {
+            "source_origin": self.source,
+            "mask_origin": self.mask,
+            "source_mask_origin": self.source_mask,
+            "setup_origin": self.setup_origin,
+        }
+        return {name: text for name, text in told.items() if text}
+
+    def rows(self) -> list[tuple[str, str]]:
+        """What a report tells of it, in two columns of text."""
+        told = [
+            ("Image", self.image),
+            ("Source", self.source),
+            ("Source mask", self.source_mask),
+            ("Mask", self.mask),
+            ("Setup", self.setup),
+        ]
+        return [(name, text) for name, text in told if text]
 
 
 def _role(keywords: dict[str, Any]) -> str:

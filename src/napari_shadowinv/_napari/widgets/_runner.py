@@ -1,6 +1,4 @@
-"""Long work beside a responsive window.
-
-- run something, cancel it, hear how it ended: `Runner`, `Outcome`
+"""Long work beside a responsive window: `Runner`, `Outcome`.
 
 The thread talks to nobody: it leaves progress and outcome in a letter box that a timer of
 the window looks into. So no signal crosses threads, a closed window can be reached by
@@ -15,16 +13,14 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
-from qtpy.QtCore import QObject, QTimer, Signal
+from qtpy.QtCore import QObject, Signal
 
-from napari_shadowinv._napari.widgets._lifetime import when_destroyed
-from napari_shadowinv._napari.widgets._notifications import MISTAKES
+from napari_shadowinv._napari.widgets._qt import MISTAKES, timer, when_destroyed
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InversionCancelled
-
-__all__ = ["Outcome", "Runner", "Work"]
 
 Work = Callable[[OnProgress, ShouldStop], Any]
 
@@ -35,19 +31,7 @@ _PATIENCE = 0.5  # s
 
 @dataclass(frozen=True)
 class Outcome:
-    """How some work ended.
-
-    Attributes
-    ----------
-    value : object
-        What it returned.
-    error : Exception or None
-        What it raised.
-    cancelled : bool
-        Whether it was stopped on request.
-    tag : object
-        What `Runner.start` was given to remember.
-    """
+    """How some work ended; `tag` is what `Runner.start` was given to remember."""
 
     value: Any = None
     error: Exception | None = None
@@ -62,8 +46,6 @@ class Outcome:
 
 @dataclass
 class _LetterBox:
-    """What a thread and the window tell each other."""
-
     tag: Any = None
     give_up_at: float = math.inf
     stop: threading.Event = field(default_factory=threading.Event)
@@ -71,36 +53,11 @@ class _LetterBox:
     outcome: Outcome | None = None
 
 
-@dataclass
-class _Stopper:
-    """Stops what runs, when its runner is gone and can no longer do so."""
-
-    box: _LetterBox | None = None
-
-    def stop(self) -> None:
-        if self.box is not None:
-            self.box.stop.set()
-
-
 class Runner(QObject):
     """Runs one piece of work at a time in a thread of its own.
 
-    Parameters
-    ----------
-    parent : QObject
-        What it lives as long as.
-    patience : float
-        Seconds that cancelled work has to stop. After that it counts as cancelled, nobody
-        listens to it any more, and its thread ends where it next asks whether to stop.
-
-    Signals
-    -------
-    started
-        Work began.
-    progressed : Progress
-        The latest news of it.
-    ended : Outcome
-        It ended, one way or another.
+    Work that was cancelled has `patience` seconds to stop. After that it counts as cancelled,
+    nobody listens to it any more, and its thread ends where it next asks whether to stop.
     """
 
     started = Signal()
@@ -112,17 +69,19 @@ class Runner(QObject):
         self._patience = patience
         self._box: _LetterBox | None = None
         self._pending: tuple[Work, Any] | None = None
-        self._stopper = _Stopper()
-        # A window that is closed takes its work with it.
-        when_destroyed(self, self._stopper.stop)
-        self._timer = QTimer(self)
-        self._timer.setInterval(_LOOK_EVERY)
-        self._timer.timeout.connect(self._look)
+        self._to_stop: list[_LetterBox] = []
+        # A window that is closed takes its work with it; the runner is gone by then.
+        when_destroyed(self, partial(_stop, self._to_stop))
+        self._timer = timer(self, _LOOK_EVERY, self._look)
 
     @property
     def running(self) -> bool:
-        """Whether work is being done."""
         return self._box is not None
+
+    @property
+    def tag(self) -> Any:
+        """What came with the work that is being done; None without any."""
+        return None if self._box is None else self._box.tag
 
     @property
     def cancelling(self) -> bool:
@@ -130,23 +89,13 @@ class Runner(QObject):
         return self._box is not None and self._box.stop.is_set() and self._pending is None
 
     def start(self, work: Work, tag: Any = None) -> None:
-        """Begin some work; what is running is asked to stop first.
-
-        Only the latest request waits: those between it and the running one are dropped.
-
-        Parameters
-        ----------
-        work : callable
-            Takes `on_progress` and `should_stop`, and runs in another thread.
-        tag : object
-            Comes back in the outcome.
-        """
+        """Begin some work; what is running is asked to stop first, and only the latest waits."""
         if self._box is not None:
             self._pending = (work, tag)
             self._box.stop.set()
             return
         box = self._box = _LetterBox(tag)
-        self._stopper.box = box
+        self._to_stop.append(box)
         threading.Thread(target=_run, args=(work, box), name="shadowinv", daemon=False).start()
         self._timer.start()
         self.started.emit()
@@ -173,7 +122,8 @@ class Runner(QObject):
                 return
             outcome = Outcome(cancelled=True, tag=box.tag)
         self._timer.stop()
-        self._box = self._stopper.box = None
+        self._box = None
+        self._to_stop.clear()
         pending, self._pending = self._pending, None
         self.ended.emit(outcome)
         if pending is not None and self._box is None:
@@ -207,6 +157,11 @@ class _Courtesy:
 
 
 _courtesy = _Courtesy()
+
+
+def _stop(boxes: list[_LetterBox]) -> None:
+    for box in boxes:
+        box.stop.set()
 
 
 def _run(work: Work, box: _LetterBox) -> None:

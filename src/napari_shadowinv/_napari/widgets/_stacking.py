@@ -1,61 +1,51 @@
-"""A run over many shots, without napari and Qt.
+"""A run over many shots.
 
-- what to do: `StackJob`
-- what has come of it so far, for the window to look at: `RunBooks`
+- what to do: `StackJob`; what has come of it so far, for the window to look at: `RunBooks`
+- a run and the layers over its store: `StackRequest`; where they lie: `place_on`
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from napari_shadowinv._napari.layer_metadata import KEY, role_of
+from napari_shadowinv._napari.widgets._layers import kind_of
+from napari_shadowinv._napari.widgets._results import Origins, result_frame
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
+from napari_shadowinv._typing import AnyArray, BoolArray
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Estimate, Filter, UniformEstimate
 
 if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.stack import RunProgress
-
-__all__ = ["RunBooks", "StackJob"]
-
-Image = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass
 class RunBooks:
-    """What is known of a run. Its thread writes, the window reads.
+    """What is known of a run. Its thread writes, the window reads."""
 
-    Attributes
-    ----------
-    total, done, failed : int
-        Shots of the stack, with those of earlier runs.
-    ended : int
-        Shots that ended in this run.
-    failures : list of (str, str)
-        Names of failed shots, and why.
-    """
-
+    # Shots of the stack, with those of earlier runs
     total: int = 0
     done: int = 0
     failed: int = 0
-    ended: int = 0
-    failures: list[tuple[str, str]] = field(default_factory=list)
+    ended: int = 0  # in this run
+    failures: list[tuple[str, str]] = field(default_factory=list)  # names, and why
 
     @property
     def text(self) -> str:
-        """One line of it."""
         failed = f", {self.failed} failed" if self.failed else ""
         return f"{self.done} of {self.total} done{failed}"
 
     def take(self, news: RunProgress) -> None:
-        """Enter what became of a shot."""
         if news.outcome is not None:
             self.ended += 1
             if news.outcome.reason:
@@ -65,30 +55,12 @@ class RunBooks:
 
 @dataclass(frozen=True, eq=False)
 class StackJob:
-    """Many shots to invert into a store.
+    """Many shots to invert into a store; what is not told here, see `stack.run_stack`."""
 
-    Attributes
-    ----------
-    shots : array of shape (shots, H, W), str or list of Path
-        The images, also lazy ones, or their files.
-    out : Path
-        The store.
-    source : array_like, Path or Estimate
-        The undisturbed beam, of all shots or of each, or how to guess it for each.
-    cleaning : Filter, optional
-        What is done to the images first.
-    mask, source_mask : ndarray of bool, shape (H, W), optional
-        True where a pixel is usable, and where an estimate of the source may look.
-    options, setup, scheduler, workers, overwrite, redo_failed
-        See `napari_shadowinv.stack.run_stack`.
-    books : RunBooks
-        What becomes of it.
-    """
-
-    shots: Any
+    shots: Any  # an array (shot, y, x), also a lazy one, or files
     out: Path
     source: ArrayLike | Path | Estimate = field(default_factory=UniformEstimate)
-    mask: Mask | None = None
+    mask: BoolArray | None = None
     cleaning: Filter | None = None
     options: InversionOptions = field(default_factory=InversionOptions)
     setup: Setup | None = None
@@ -97,7 +69,7 @@ class StackJob:
     overwrite: bool = False
     redo_failed: bool = False
     books: RunBooks = field(default_factory=RunBooks)
-    source_mask: Mask | None = None
+    source_mask: BoolArray | None = None
 
     def run(
         self,
@@ -107,20 +79,8 @@ class StackJob:
     ) -> RunBooks:
         """Invert all shots that are not done yet.
 
-        Parameters
-        ----------
-        on_progress, should_stop
-            See `napari_shadowinv._system.progress`.
-        on_done : callable, optional
-            Called before it is told that there are finished shots, with the one that has just
-            ended well, if any.
-
-        Raises
-        ------
-        InputError, OSError
-            See `napari_shadowinv.stack.run_stack`.
-        InversionCancelled
-            If `should_stop` returned true.
+        `on_done` is called before it is told that there are finished shots, with the one that has
+        just ended well, if any.
         """
         from napari_shadowinv.stack import run_stack
 
@@ -167,3 +127,109 @@ class StackJob:
         for index in np.flatnonzero(store.statuses() == FAILED):
             reason = str(store.report(int(index)).get("reason", "unknown"))
             self.books.failures.append((store.names[index], reason))
+
+
+@dataclass(frozen=True, eq=False)
+class StackRequest:
+    """A run, and all that it takes to show its results in layers over its store."""
+
+    job: StackJob
+    image: Any
+    companions: tuple[Any, ...]
+    place: dict[str, Any]
+    origins: Origins
+    # Empty until a shot is finished.
+    described: list[FullLayerData] = field(default_factory=list)
+    # Written by the run's thread, so that the window only reads them.
+    _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _earlier: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _given: set[tuple[float, float]] = field(default_factory=set)
+
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
+        """Invert the shots, and describe the layers once one is done, beside the window."""
+        return self.job.run(on_progress, should_stop, self._look)
+
+    def follow(self, layers: Sequence[Any]) -> None:
+        """Let the colours of layers reach to the strongest shot so far.
+
+        Where the user has chosen other contrast limits, they stay.
+        """
+        for layer in filter(_is_image, layers):
+            role = str(role_of(layer))
+            if role not in self._limits:
+                continue
+            wanted = self._wanted(role)
+            if wanted == tuple(layer.contrast_limits):
+                continue
+            if tuple(layer.contrast_limits) in self._given:
+                self._given.add(wanted)
+                layer.contrast_limits = wanted
+
+    def go_on_from(self, earlier: StackRequest, layers: Sequence[Any]) -> None:
+        """Take over the colours of an earlier run into the same store."""
+        self._given.update(earlier._given)
+        now = {role_of(one): tuple(one.contrast_limits) for one in layers if _is_image(one)}
+        for _, keywords, kind in self.described:
+            role = str(role_of(keywords))
+            if kind == "image" and role in earlier._limits:
+                self._earlier[role] = earlier._wanted(role)
+                limits = self._wanted(role)
+                self._given.add(limits)
+                keywords["contrast_limits"] = now.get(role, limits)
+
+    def _wanted(self, role: str) -> tuple[float, float]:
+        """Limits that hold all shots of this run, and of earlier ones into the same store."""
+        limits = self._limits[role]
+        earlier = self._earlier.get(role)
+        return limits if earlier is None else _widened(limits, np.array(earlier))
+
+    def _look(self, index: int | None) -> None:
+        """Describe the layers once a shot is done, and look how strong each one is."""
+        if not self.described:
+            self._describe()
+        if index is None:
+            return
+        for data, keywords, kind in self.described:
+            if kind == "image":
+                role = str(role_of(keywords))
+                self._limits[role] = _widened(self._limits[role], np.asarray(data[index]))
+
+    def _describe(self) -> None:
+        from napari_shadowinv._napari.stores import store_layers
+
+        try:
+            layers = store_layers(self.job.out)
+        except (InputError, OSError):
+            return  # the next shot may do, and the run goes on without
+        # What napari remembers of a pending shot would hide that it is done.
+        more = {"cache": False, **self.place}
+        for _, keywords, kind in layers:
+            keywords["metadata"][KEY]["made_from"] = self.origins.attributes()
+            if kind == "image":
+                limits = keywords["contrast_limits"]
+                self._limits[str(role_of(keywords))] = limits
+                self._given.add(limits)
+        self.described.extend((data, keywords | more, kind) for data, keywords, kind in layers)
+
+
+def _is_image(layer: Any) -> bool:
+    return kind_of(layer) == "image"
+
+
+def _widened(limits: tuple[float, float], plane: AnyArray) -> tuple[float, float]:
+    """Limits that hold a plane, too; around zero if they were."""
+    finite = plane[np.isfinite(plane)]
+    low = min(limits[0], float(finite.min(initial=np.inf)))
+    high = max(limits[1], float(finite.max(initial=-np.inf)))
+    if limits[0] == -limits[1]:
+        return -max(-low, high), max(-low, high)
+    return low, high
+
+
+def place_on(layer: Any, setup: Any) -> dict[str, Any]:
+    """Keywords that lay results on their stack, once that is placed by the setup."""
+    keywords = result_frame(layer, setup, None).keywords(stacked=True)
+    first = {"scale": layer.scale, "translate": layer.translate, "units": layer.units}
+    for name, values in first.items():
+        keywords[name] = (values[0], *keywords[name][1:])
+    return keywords

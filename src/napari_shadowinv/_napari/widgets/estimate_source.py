@@ -9,30 +9,18 @@ from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.layer_metadata import (
     SOURCE,
     mark,
-    may_be_shot,
     setup_of,
     setup_origin_of,
 )
-from napari_shadowinv._napari.widgets._base import Part
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._jobs import SourceJob
-from napari_shadowinv._napari.widgets._live import LivePanel
-from napari_shadowinv._napari.widgets._masks import MaskPicker
-from napari_shadowinv._napari.widgets._panels import RunPanel
-from napari_shadowinv._napari.widgets._picking import LayerPicker, LayerWatch
-from napari_shadowinv._napari.widgets._reading import image_of
-from napari_shadowinv._napari.widgets._results import (
-    LastResults,
-    ResultLayers,
-    keep_earlier_box,
-)
+from napari_shadowinv._napari.widgets._layers import LayerWatch, MaskPicker, image_of, shot_picker
+from napari_shadowinv._napari.widgets._panels import LivePanel, RunPanel
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.preprocessing import ESTIMATES
 
 if TYPE_CHECKING:
     import napari
-
-__all__ = ["EstimateSource"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +35,7 @@ class _Request:
 
 
 class EstimateSource(LivePanel):
-    """Choose a shot and a method; the estimate becomes an image layer.
-
-    Parameters
-    ----------
-    viewer : napari.viewer.Viewer
-        The viewer to work in.
-    """
+    """Choose a shot and a method; the estimate becomes an image layer."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__(
@@ -63,10 +45,7 @@ class EstimateSource(LivePanel):
                 "Estimate source", "Estimate", "Create an image layer with the estimated beam."
             ),
         )
-        self.previewed = ResultLayers(viewer, self)
-        self._last = LastResults(viewer, self)
-        self.image = LayerPicker(viewer, ("image",), suits=may_be_shot)
-        self.image.setToolTip("The shot: a greyscale image layer.")
+        self.image = shot_picker(viewer)
         self.masks = MaskPicker(
             viewer,
             lambda: self.image.layer,
@@ -76,7 +55,6 @@ class EstimateSource(LivePanel):
         self.method = ModelPicker("Method", kinds_of(ESTIMATES))
         self.method.set_kind("total_variation")
         self.live.setToolTip("Update the estimate after every change.")
-        self.keep_earlier = keep_earlier_box()
         for row in (
             labelled("Image", self.image),
             self.masks,
@@ -86,22 +64,13 @@ class EstimateSource(LivePanel):
             self.panel,
         ):
             self.column.addWidget(row)
-        self._connect()
+        edits = LayerWatch(self, (self.image, self.masks))
+        for signal in (self.image.picked, self.masks.changed, self.method.changed, edits.edited):
+            signal.connect(self.on_change)
         self.restore_last()
         self._ready = True
 
-    def _connect(self) -> None:
-        self._edits = LayerWatch((self.image, self.masks))
-        self._edits.setParent(self)
-        for signal in (
-            self.image.picked,
-            self.masks.changed,
-            self.method.changed,
-            self._edits.edited,
-        ):
-            signal.connect(self.on_change)
-
-    def parts(self) -> dict[str, Part]:
+    def parts(self) -> dict[str, Any]:
         return {"method": self.method, "painted_is_unusable": self.masks}
 
     def request(self, preview: bool = False) -> _Request:
@@ -136,8 +105,4 @@ class EstimateSource(LivePanel):
             },
             "image",
         )
-        shown = self.previewed
-        if not preview:
-            self.previewed.hide()
-            shown = self._last.next_of(layer, keep=self.keep_earlier.isChecked())
-        shown.show([described], select=not preview)
+        self.show_layers(layer, [described], preview)

@@ -5,14 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
-from qtpy.QtWidgets import QHBoxLayout, QLabel, QSpinBox, QWidget
+import numpy as np
+from numpy.typing import ArrayLike
+from qtpy.QtWidgets import QLabel, QSpinBox
 
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of
-from napari_shadowinv._napari.layer_metadata import CAME_WITH, SHOT, mark, may_be_source, unit_of
+from napari_shadowinv._napari.layer_metadata import (
+    CAME_WITH,
+    SHOT,
+    mark,
+    may_be_shot,
+    may_be_source,
+    result_of,
+    role_of,
+    setup_of,
+    unit_of,
+)
 from napari_shadowinv._napari.layers import intensity_limits
-from napari_shadowinv._napari.widgets._base import ToolPanel
-from napari_shadowinv._napari.widgets._fields import SteadyComboBox
-from napari_shadowinv._napari.widgets._forecast import ForwardJob
+from napari_shadowinv._napari.widgets._fields import SteadyComboBox, parsed
+from napari_shadowinv._napari.widgets._forecast import PHANTOMS, Forecast, ForwardJob
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
     ModelPicker,
@@ -20,30 +31,85 @@ from napari_shadowinv._napari.widgets._forms import (
     labelled,
     wrapping_label,
 )
-from napari_shadowinv._napari.widgets._known_fields import (
-    is_surely_a_field,
-    known_field,
-    may_be_a_field,
-)
-from napari_shadowinv._napari.widgets._notifications import MISTAKES, error_text
-from napari_shadowinv._napari.widgets._panels import RunPanel
-from napari_shadowinv._napari.widgets._phantoms import PHANTOMS
-from napari_shadowinv._napari.widgets._picking import LayerPicker
-from napari_shadowinv._napari.widgets._reading import image_of
-from napari_shadowinv._napari.widgets._results import LastResults, keep_earlier_box
-from napari_shadowinv._napari.widgets._runner import Outcome
-from napari_shadowinv._napari.widgets._setups import SetupPicker
+from napari_shadowinv._napari.widgets._inputs import SetupPicker
+from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
+from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._qt import beside, error_text
+from napari_shadowinv._napari.widgets._results import LastResults
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup import SETUPS, Deflector
+from napari_shadowinv.physics.setup import Deflector
 
 if TYPE_CHECKING:
     import napari
+    from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["ForwardModel"]
 
-
+_FIELDS = ("field", "field y", "field x")
 _LAYER = "layer"
 _LARGEST_SIDE = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class KnownField:
+    """A potential or a displacement that an image can be predicted from."""
+
+    values: ArrayLike  # (H, W), or (2, H, W) in px
+    to_px2: float  # brings the potential to px²
+    made_with: Setup | None  # its experiment, where the layer knows it
+    text: str  # what it is taken for, in a sentence
+
+
+def is_surely_a_field(layer: Any) -> bool:
+    """Whether a layer says of itself that it is a potential, or the field of one result."""
+    if role_of(layer) == "potential":
+        return True
+    return role_of(layer) in _FIELDS and result_of(layer) is not None
+
+
+def may_be_a_field(layer: Any) -> bool:
+    """Whether a layer is a field, or an image that does not tell what it is."""
+    unknown = may_be_shot(layer) and result_of(layer) is None
+    return is_surely_a_field(layer) or (unknown and not getattr(layer, "rgb", False))
+
+
+def known_field(layer: Any | None, point: Any, setup: Any) -> KnownField:
+    """Take what a layer holds; of a stack, the shot at a viewer's ``dims.point``.
+
+    The setup is for a potential in m that does not know its own; without it, or without a
+    layer, there is an `InputError`.
+    """
+    if layer is None:
+        raise InputError(
+            "there is no potential or result to start from: invert a shot (Plugins → Invert "
+            "shot), open a .shadowinv file or an image of a potential in px² (File → Open), or "
+            "choose one of the simulated objects"
+        )
+    result = result_of(layer)
+    if result is not None and role_of(layer) in _FIELDS:
+        content: Any = result.content
+        displacement = np.asarray(
+            content["displacement"] if hasattr(content, "data_vars") else content.displacement
+        )
+        return KnownField(displacement, 1.0, result.setup, "The displacement of this result.")
+    potential = shown_plane(layer, point) if layer.ndim == 3 else image_of(layer, "potential")
+    unit, own = unit_of(layer), setup_of(layer)
+    if role_of(layer) != "potential":
+        text = (
+            "This image is not labelled as a potential: its values are treated as a potential "
+            "in px² of the object plane."
+        )
+        return KnownField(potential, 1.0, own, text)
+    if unit in ("", "px²"):
+        return KnownField(potential, 1.0, own, "A potential in px².")
+    made_with = own or setup
+    if made_with is None:
+        raise InputError(
+            f"'{layer.name}' is in {unit}: choose the setup of its experiment, which is needed "
+            "to convert it to pixels"
+        )
+    to_px2 = float(made_with.normalized_potential(parsed(f"1 {unit}", "m")))
+    return KnownField(potential, to_px2, made_with, f"A potential in {unit}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,26 +120,29 @@ class _Request:
     setup_origin: str
     of: Any
 
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Forecast:
+        return self.job.run(on_progress, should_stop)
+
 
 class ForwardModel(ToolPanel):
-    """Choose an object or a potential; see the image that it would make.
-
-    Parameters
-    ----------
-    viewer : napari.viewer.Viewer
-        The viewer to work in.
-    """
+    """Choose an object or a potential; see the image that it would make."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(viewer, "forward-model")
+        super().__init__(
+            viewer,
+            "forward-model",
+            RunPanel("Forward model", "Simulate", "Trace the beam through the object."),
+        )
         self.object = ModelPicker(
             "Object", {**kinds_of(PHANTOMS), _LAYER: ("a result or potential", None)}
         )
         self.object.choice.setToolTip("Object that deflects the beam.")
-        self.potential = LayerPicker(viewer, ("image",), suits=may_be_a_field)
-        self.potential.setToolTip(
+        self.potential = LayerPicker(
+            viewer,
+            ("image",),
             "<qt>The field or potential of a result, or a potential in px² from a file; for a "
-            "stack, the shot in view.</qt>"
+            "stack, the shot in view.</qt>",
+            suits=may_be_a_field,
         )
         self.expected = wrapping_label()
         self.deflector = SteadyComboBox()
@@ -86,25 +155,24 @@ class ForwardModel(ToolPanel):
         )
         self.height_px, self.width_px = _side("Height"), _side("Width")
         self.setup = SetupPicker()
-        self.source = LayerPicker(viewer, ("image",), none="uniform", suits=may_be_source)
-        self.source.setToolTip("Image layer of the undisturbed beam.")
-        self.panel = RunPanel("Forward model", "Simulate", "Trace the beam through the object.")
+        tip = "Image layer of the undisturbed beam."
+        self.source = LayerPicker(viewer, ("image",), tip, "uniform", may_be_source)
         self.warning = wrapping_label(style=PROBLEM_STYLE)
         self._potential_rows = (
             labelled("Layer", self.potential),
             self.expected,
             labelled("Bent by", self.deflector),
         )
-        self.keep_earlier = keep_earlier_box()
         self._last = LastResults(viewer, self)
-        self._size_row = labelled("Size", _size(self.width_px, self.height_px))
+        size = beside((self.width_px, 1), (QLabel("×"), 0), (self.height_px, 1))
+        self._size_row = labelled("Size", size)
         for row in (
             self.object,
             *self._potential_rows,
             self._size_row,
             self.setup,
             labelled("Source", self.source),
-            self.keep_earlier,
+            self._last.keep_earlier,
             self.panel,
             self.warning,
         ):
@@ -115,9 +183,7 @@ class ForwardModel(ToolPanel):
         self.setup.changed.connect(self._on_change)
         for side in (self.height_px, self.width_px):
             side.valueChanged.connect(lambda _: self.keep())
-        self.panel.button.clicked.connect(lambda: self._run_or_cancel())
-        self.panel.runner.ended.connect(self._on_end)
-        self.restore(self._keeper.load())
+        self.restore_last()
         self._ready = True
         self._on_change()
 
@@ -129,7 +195,6 @@ class ForwardModel(ToolPanel):
         }
 
     def restore(self, kept: Any) -> None:
-        """Show what `state` has returned."""
         self.setup.restore(kept.get("setup", {}))
         self.object.restore(kept.get("object", {}))
         if self.object.kind != _LAYER:
@@ -139,13 +204,6 @@ class ForwardModel(ToolPanel):
         self.width_px.setValue(int(size[1]))
 
     def request(self) -> _Request:
-        """What the controls ask for.
-
-        Raises
-        ------
-        InputError
-            If there is no potential, or anything else that cannot be used.
-        """
         setup = self.setup.setup()
         source = None if self.source.layer is None else image_of(self.source.layer)
         if self.object.kind == _LAYER:
@@ -171,17 +229,8 @@ class ForwardModel(ToolPanel):
         frame = frame_for(shape, setup)
         return _Request(job, f"{name} image", frame, self.setup.origin, name)
 
-    def _run_or_cancel(self) -> None:
-        if self.panel.runner.running:
-            self.panel.cancel()
-            return
+    def forget(self) -> None:
         self.warning.setVisible(False)
-        try:
-            request = self.request()
-        except MISTAKES as error:
-            self.panel.refuse(error)
-            return
-        self.panel.run(request.job.run, request)
 
     def _on_object(self) -> None:
         """Choose the beam that an object needs; one that is filled in already stays."""
@@ -198,7 +247,10 @@ class ForwardModel(ToolPanel):
         self.setup.picker.set_kind(kind)
         form = self.setup.picker.form
         if form is not None and form.is_empty:
-            self.setup.suggest(SETUPS[kind].example(), "the paper's beam")
+            from napari_shadowinv.physics.phantoms import paper_setup, wakefield_setup
+
+            usual = paper_setup() if kind == "proton" else wakefield_setup()
+            self.setup.suggest(usual, "the paper's beam")
 
     def _follow_potential(self) -> None:
         """A potential has the setup of its result; a phantom that of the user."""
@@ -236,30 +288,26 @@ class ForwardModel(ToolPanel):
         unsure = not is_surely_a_field(layer)
         self.expected.setStyleSheet(PROBLEM_STYLE if unsure else "")
 
-    def _on_end(self, outcome: Outcome) -> None:
-        if outcome.value is None:
-            return
-        forecast, request = outcome.value, outcome.tag
+    def show_result(self, value: Forecast, request: _Request) -> None:
         unit = "" if request.job.source is None else unit_of(self.source.layer or {})
         # Whoever inverts the image finds its source.
-        came_with = {} if forecast.source is None else {"source": forecast.source}
+        came_with: dict[str, Any] = {} if value.source is None else {"source": value.source}
         # In another experiment the same object may be seen with other pixels.
         frame, made_with = request.frame, request.job.made_with
         if made_with is not None and made_with != request.job.setup:
-            frame = frame_for(forecast.image.shape, request.job.setup)
+            frame = frame_for(value.image.shape, request.job.setup)
         if request.setup_origin:
             came_with["setup_origin"] = f"{CAME_WITH} the forward model, {request.setup_origin}"
         keywords = {
             "name": request.name,
             "metadata": mark(SHOT, unit, request.job.setup, **came_with),
-            "contrast_limits": intensity_limits(forecast.image),
+            "contrast_limits": intensity_limits(value.image),
             **frame.keywords(),
         }
-        shown = self._last.next_of(request.of, keep=self.keep_earlier.isChecked())
-        shown.show([(forecast.image, keywords, "image")])
+        self._last.next_of(request.of).show([(value.image, keywords, "image")])
         self.viewer.reset_view()
-        self.warning.setText(forecast.warning)
-        self.warning.setVisible(bool(forecast.warning))
+        self.warning.setText(value.warning)
+        self.warning.setVisible(bool(value.warning))
 
 
 def _side(what: str) -> QSpinBox:
@@ -268,13 +316,3 @@ def _side(what: str) -> QSpinBox:
     side.setSuffix(" px")
     side.setToolTip(f"{what} of the image in px.")
     return side
-
-
-def _size(width: QSpinBox, height: QSpinBox) -> QWidget:
-    holder = QWidget()
-    row = QHBoxLayout(holder)
-    row.setContentsMargins(0, 0, 0, 0)
-    row.addWidget(width, 1)
-    row.addWidget(QLabel("×"))
-    row.addWidget(height, 1)
-    return holder

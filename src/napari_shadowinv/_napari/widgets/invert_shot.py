@@ -6,44 +6,101 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from napari.utils.notifications import show_warning
+
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, may_be_shot, role_of
-from napari_shadowinv._napari.widgets._base import Part, with_button
-from napari_shadowinv._napari.widgets._cleaning import CleaningSection
-from napari_shadowinv._napari.widgets._cost import cost_of
-from napari_shadowinv._napari.widgets._drawing import new_shapes
-from napari_shadowinv._napari.widgets._estimating import SourceCache
-from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled, wrapping_label
-from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
-from napari_shadowinv._napari.widgets._live import LivePanel
-from napari_shadowinv._napari.widgets._masks import MaskPicker
-from napari_shadowinv._napari.widgets._notifications import notify_errors, tell_warning
-from napari_shadowinv._napari.widgets._options import OptionsForm
-from napari_shadowinv._napari.widgets._origins import Origins
-from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, report_rows, section
-from napari_shadowinv._napari.widgets._picking import LayerPicker, LayerWatch
-from napari_shadowinv._napari.widgets._reading import crop_of, image_of, warnings_of
-from napari_shadowinv._napari.widgets._results import (
-    LastResults,
-    ResultLayers,
-    keep_earlier_box,
-    place_together,
-    result_frame,
+from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, role_of
+from napari_shadowinv._napari.widgets._forms import (
+    PROBLEM_STYLE,
+    labelled,
+    section,
+    with_button,
+    wrapping_label,
 )
-from napari_shadowinv._napari.widgets._setups import SetupPicker
-from napari_shadowinv._napari.widgets._sources import SourcePicker
+from napari_shadowinv._napari.widgets._inputs import InversionInputs
+from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
+from napari_shadowinv._napari.widgets._layers import (
+    LayerPicker,
+    LayerWatch,
+    crop_of,
+    image_of,
+    new_shapes,
+    shot_picker,
+    warnings_of,
+)
+from napari_shadowinv._napari.widgets._panels import LivePanel, ReportTable, RunPanel, report_rows
+from napari_shadowinv._napari.widgets._qt import notify_errors
+from napari_shadowinv._napari.widgets._results import Origins, place_together, result_frame
+from napari_shadowinv._system.memory import physical_memory
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
+from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
+from napari_shadowinv.pipeline.cache import SourceCache
 
 if TYPE_CHECKING:
     import napari
     from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.inversion import Inversion
 
-__all__ = ["InvertShot"]
-
 _PREVIEW_ROLES = ("potential", "field", "caustic")
+# Measured on two cores, images of 0.25 to 4 Mpx with 5,000 to 1,000,000 sites; a window's layers
+# of the result are counted with the pixels.
+_SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
+_BYTES, _BYTES_PER_PIXEL, _BYTES_PER_SITE = 200e6, 280.0, 1700.0
+_WORTH_TELLING = 1_000_000  # pixels
+_MINUTE, _HOUR = 60, 3600
+
+
+@dataclass(frozen=True)
+class Cost:
+    """About how long an inversion takes (s), and its memory at most (bytes)."""
+
+    pixels: int
+    sites: int
+    seconds: float
+    memory: float
+
+    @property
+    def is_too_much(self) -> bool:
+        there_is = physical_memory()
+        return there_is is not None and self.memory > there_is
+
+    @property
+    def text(self) -> str:
+        """In a sentence; empty for an image that takes no time to speak of."""
+        if self.pixels < _WORTH_TELLING and not self.is_too_much:
+            return ""
+        text = (
+            f"{self.pixels / 1e6:.3g} Mpx with {self.sites:,} sites: about "
+            f"{_duration(self.seconds)} and up to {self.memory / 1e9:.1f} GB"
+        )
+        if not self.is_too_much:
+            return f"{text}."
+        return (
+            f"{text}, more than this machine's {(physical_memory() or 0) / 1e9:.1f} GB: crop or "
+            "bin the image, or choose fewer sites."
+        )
+
+
+def cost_of(shape: tuple[int, ...], options: InversionOptions, pace: float = 1.0) -> Cost:
+    """Forecast an inversion, with `pace` times the usual time on this machine."""
+    pixels = shape[0] * shape[1]
+    sites = options.n_sites or min(pixels, MAX_DEFAULT_SITES)
+    return Cost(
+        pixels,
+        sites,
+        pace * (_SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites),
+        _BYTES + _BYTES_PER_PIXEL * pixels + _BYTES_PER_SITE * sites,
+    )
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 2 * _MINUTE:
+        return f"{float(f'{seconds:.1g}'):g} s" if seconds < 10 else f"{round(seconds, -1):g} s"
+    if seconds < 2 * _HOUR:
+        return f"{seconds / _MINUTE:.0f} min"
+    return f"{seconds / _HOUR:.1f} h"
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +111,6 @@ class _Answer:
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """A run, and all that it takes to show its result."""
-
     job: ShotJob
     image: Any
     companions: tuple[Any, ...]
@@ -85,14 +140,8 @@ class _Request:
         return _Answer(inversion, described)
 
 
-class InvertShot(LivePanel):
-    """Choose an image, press Run; all else has a default.
-
-    Parameters
-    ----------
-    viewer : napari.viewer.Viewer
-        The viewer to work in.
-    """
+class InvertShot(InversionInputs, LivePanel):
+    """Choose an image, press Run; all else has a default."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__(
@@ -101,8 +150,6 @@ class InvertShot(LivePanel):
             RunPanel("Invert shot", "Run", "Invert the image and show the result as layers."),
         )
         self._cache, self._estimates = PlanCache(), SourceCache()
-        self.previewed = ResultLayers(viewer, self)
-        self._last = LastResults(viewer, self)
         self._build()
         self._connect()
         self.restore_last()
@@ -111,38 +158,29 @@ class InvertShot(LivePanel):
 
     def _build(self) -> None:
         viewer = self.viewer
-        self.image = LayerPicker(viewer, ("image",), suits=may_be_shot)
-        self.image.setToolTip("The shot: a greyscale image layer.")
-        self.source = SourcePicker(viewer)
-        self.masks = MaskPicker(
+        self.image = shot_picker(viewer)
+        self.make_inputs(
             viewer,
             lambda: self.image.layer,
             ("labels", "shapes"),
-            "Labels or shapes marking detector pixels. The inversion ignores masked pixels, so "
-            "do not mask the object.",
+            (
+                "Labels or shapes marking detector pixels. The inversion ignores masked pixels, so "
+                "do not mask the object.",
+                "Labels or shapes that hide the object from the source estimate only; the "
+                "inversion still uses it.",
+            ),
         )
-        self.source_masks = MaskPicker(
+        self.crop = LayerPicker(
             viewer,
-            lambda: self.image.layer,
-            ("labels", "shapes"),
-            "Labels or shapes that hide the object from the source estimate only; the inversion "
-            "still uses it.",
-            "Source mask",
+            ("shapes",),
+            "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>",
+            none="none",
         )
-        self.crop = LayerPicker(viewer, ("shapes",), none="none")
-        self.crop.setToolTip(
-            "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>"
-        )
-        self.setup = SetupPicker()
-        self.cleaning = CleaningSection()
-        self.options = OptionsForm()
         self.live.setToolTip(
             f"<qt>Update the field after every change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
-        self.keep_earlier = keep_earlier_box()
         self.cost, self._pace = wrapping_label(), 1.0
         self.report = ReportTable()
-
         for row in (
             labelled("Image", self.image),
             self.source,
@@ -151,49 +189,27 @@ class InvertShot(LivePanel):
             labelled("Crop", with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)),
             self.setup,
             self.cleaning,
+            section("Options", self.options),
+            self.live,
+            self.keep_earlier,
+            self.cost,
+            self.panel,
+            self.report,
         ):
             self.column.addWidget(row)
-        self.column.addWidget(section("Options", self.options))
-        for widget in (self.live, self.keep_earlier, self.cost, self.panel, self.report):
-            self.column.addWidget(widget)
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
-        self._edits = LayerWatch(
-            (self.image, self.masks, self.source_masks, self.crop, self.source.layers)
+        edits = LayerWatch(
+            self, (self.image, self.masks, self.source_masks, self.crop, self.source.layers)
         )
-        self._new_image = LayerWatch((self.image,))
-        for watch in (self._edits, self._new_image):
-            watch.setParent(self)
-        self._new_image.edited.connect(self._forget_report)
+        LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
         # Also for a run that is cancelled, or refused before it starts.
         for signal in (self.panel.button.clicked, self.panel.runner.started):
             signal.connect(lambda: self.report.empty())
-        self.source.changed.connect(self._show_source_mask)
-        self._show_source_mask()
-        for signal in (
-            self.source.changed,
-            self.masks.changed,
-            self.source_masks.changed,
-            self.crop.picked,
-            self._edits.edited,
-            self.setup.changed,
-            self.cleaning.changed,
-            self.options.changed,
-        ):
+        changes = [one.changed for one in self.inputs]
+        for signal in (*changes, self.crop.picked, edits.edited):
             signal.connect(self.on_change)
-
-    # What is kept, and what is asked for
-
-    def parts(self) -> dict[str, Part]:
-        return {
-            "source": self.source,
-            "setup": self.setup,
-            "cleaning": self.cleaning,
-            "options": self.options,
-            "painted_is_unusable": self.masks,
-            "painted_is_object": self.source_masks,
-        }
 
     def request(self, preview: bool = False) -> _Request:
         layer: Any = self.image.layer
@@ -214,40 +230,32 @@ class InvertShot(LivePanel):
             setup=setup,
             warnings=warnings_of(layer),
         )
-        companions = (
-            self.masks.layer,
-            self.source_masks.layer,
-            self.crop.layer,
-            self.source.layers.layer,
-        )
         return _Request(
             job.for_preview() if preview else job,
             layer,
-            tuple(one for one in companions if one is not None and one is not layer),
+            self.companions(layer, self.crop.layer),
             setup,
             result_frame(layer, setup, job.crop),
-            Origins.of(self, layer, layer.name),
+            self.origins(layer, layer.name),
             preview,
         )
 
     def show_result(self, value: _Answer, request: _Request) -> None:
         image = request.image
         if image not in self.viewer.layers and not request.preview:
-            tell_warning(
+            show_warning(
                 f"'{image.name}' was deleted during its inversion; the result is shown anyway"
             )
         if request.setup is not None:
             place_together(self.viewer, image, request.setup, request.companions)
         if request.preview:
-            self.previewed.show(value.described, select=False)
+            self.show_layers(image, value.described, preview=True)
             if not value.inversion.report.converged:
                 self.panel.say(f"Preview {value.inversion.report.warnings[0]}", problem=True)
             return
         self.report.show_rows([*request.origins.rows(), *report_rows(value.inversion)])
         self._learn_pace(value.inversion)
-        self.previewed.hide()
-        self.results = self._last.next_of(image, keep=self.keep_earlier.isChecked())
-        self.results.show(value.described)
+        self.show_layers(image, value.described, preview=False)
 
     def on_change(self) -> None:
         super().on_change()
@@ -292,9 +300,6 @@ class InvertShot(LivePanel):
         self.report.empty()
         if not self.panel.runner.running:
             self.panel.say("")
-
-    def _show_source_mask(self) -> None:
-        self.source_masks.setVisible(self.source.is_guessed)
 
     @notify_errors
     def _draw_crop(self) -> None:

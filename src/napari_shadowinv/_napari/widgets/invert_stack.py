@@ -3,69 +3,211 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
-from qtpy.QtCore import QTimer
-from qtpy.QtWidgets import QCheckBox, QLabel
+from qtpy.QtCore import Qt
+from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdit, QSpinBox
 
-from napari_shadowinv._napari.layer_metadata import role_of
+from napari_shadowinv._napari.layer_metadata import may_be_shot, role_of
 from napari_shadowinv._napari.stores import follow_shots
-from napari_shadowinv._napari.widgets._base import Part, ToolPanel
-from napari_shadowinv._napari.widgets._cleaning import CleaningSection
-from napari_shadowinv._napari.widgets._forms import labelled
-from napari_shadowinv._napari.widgets._masks import MaskPicker
-from napari_shadowinv._napari.widgets._notifications import MISTAKES, notify_errors
-from napari_shadowinv._napari.widgets._options import OptionsForm
-from napari_shadowinv._napari.widgets._origins import Origins
-from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, section
-from napari_shadowinv._napari.widgets._reading import stack_of
+from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled, section
+from napari_shadowinv._napari.widgets._inputs import InversionInputs
+from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
+from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._qt import notify_errors, timer
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._runner import Outcome
-from napari_shadowinv._napari.widgets._setups import SetupPicker
-from napari_shadowinv._napari.widgets._sources import SourcePicker
-from napari_shadowinv._napari.widgets._stack_inputs import EnginePicker, ShotsPicker, StoreEdit
-from napari_shadowinv._napari.widgets._stack_results import FailureTable, StackRequest, place_on
-from napari_shadowinv._napari.widgets._stacking import StackJob
+from napari_shadowinv._napari.widgets._stacking import StackJob, StackRequest, place_on
 from napari_shadowinv._system.progress import Progress
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.store import STORE_SUFFIX
 
 if TYPE_CHECKING:
     import napari
 
-__all__ = ["InvertStack"]
-
 _REFRESH_AFTER = 200  # ms; many small shots may end in a second
+_MOST_FAILURES = 100
+_NAME_WIDTH = 110
+_LAYER, _FILES = "layer", "files"
+_HERE, _SCHEDULER = "threads", "scheduler"
+_BETWEEN = "; "
 
 
-class InvertStack(ToolPanel):
-    """Choose shots and a store, press Run; press it again to go on after an interruption.
+class _FilesEdit(PathEdit):
+    def ask(self) -> str:
+        paths, _ = QFileDialog.getOpenFileNames(self, self._title)
+        return _BETWEEN.join(paths)
 
-    Parameters
-    ----------
-    viewer : napari.viewer.Viewer
-        The viewer to work in.
-    """
+
+class StoreEdit(PathEdit):
+    """The folder that shots are written to, new or begun."""
+
+    def __init__(self) -> None:
+        super().__init__("Store of the results", f"results{STORE_SUFFIX}")
+        self.edit.setToolTip(
+            f"<qt>A folder named …{STORE_SUFFIX}. If it exists, the run is resumed.</qt>"
+        )
+
+    @property
+    def store(self) -> Path:
+        if not self.path:
+            raise InputError(
+                "no store is selected for the results: choose a folder whose name ends with "
+                f"{STORE_SUFFIX}"
+            )
+        return Path(self.path).expanduser()
+
+    def ask(self) -> str:
+        # To go on with what is there is no danger: nothing is replaced without its box.
+        path, _ = QFileDialog.getSaveFileName(
+            self,
+            self._title,
+            self.path or f"results{STORE_SUFFIX}",
+            f"stores (*{STORE_SUFFIX})",
+            options=QFileDialog.Option.DontConfirmOverwrite,
+        )
+        if not path:
+            return ""
+        chosen = Path(path)
+        # A store is a folder, which a dialog steps into.
+        for folder in (chosen, *chosen.parents):
+            if folder.name.endswith(STORE_SUFFIX):
+                return str(folder)
+        return path + STORE_SUFFIX
+
+
+class ShotsPicker(RowPicker):
+    def __init__(self, viewer: Any) -> None:
+        tip = "Image layer (shot, y, x); data on disk are read one shot at a time."
+        self.layers = LayerPicker(viewer, ("image",), tip, suits=may_be_shot)
+        self.files = _FilesEdit("Files of the shots", "shots/*.tif")
+        self.files.edit.setToolTip(
+            "<qt>A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF.</qt>"
+        )
+        super().__init__(
+            "Shots",
+            {_LAYER: ("a stack layer", None), _FILES: ("files", None)},
+            "Location of the shots.",
+            {_LAYER: labelled("", self.layers), _FILES: labelled("", self.files)},
+        )
+        self.layers.picked.connect(self.changed)
+        self.files.changed.connect(self.changed)
+
+    @property
+    def layer(self) -> Any | None:
+        """The chosen layer; None where files are chosen."""
+        return self.layers.layer if self.picker.kind == _LAYER else None
+
+    @property
+    def name(self) -> str:
+        """What to call the shots."""
+        if self.picker.kind == _FILES:
+            return self.files.path
+        return "" if self.layer is None else str(self.layer.name)
+
+    def shots(self) -> Any:
+        if self.picker.kind == _LAYER:
+            return stack_of(self.layers.layer)
+        parts = [part.strip() for part in self.files.path.split(_BETWEEN.strip())]
+        paths = [os.path.expanduser(part) for part in parts if part]
+        if not paths:
+            raise InputError(
+                "no files are selected: enter a pattern such as shots/*.tif, or choose"
+            )
+        return paths[0] if len(paths) == 1 else paths
+
+
+class EnginePicker(RowPicker):
+    """The computer in front of the user, or a scheduler of dask."""
+
+    def __init__(self) -> None:
+        self.workers = QSpinBox()
+        self.workers.setRange(0, 1024)
+        self.workers.setSuffix(" at once")
+        self.workers.setSpecialValueText("one per core")
+        self.workers.setToolTip("Number of shots inverted at the same time.")
+        self.address = QLineEdit()
+        self.address.setPlaceholderText("tcp://host:8786")
+        self.address.setToolTip("Address printed by 'dask scheduler' when it starts.")
+        self.address.setMinimumWidth(60)
+        super().__init__(
+            "Run on",
+            {_HERE: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
+            "This does not affect the results. Cluster workers must be able to access the shots "
+            "and the store at the same paths.",
+            {_HERE: labelled("Jobs", self.workers), _SCHEDULER: labelled("Address", self.address)},
+        )
+        self.workers.valueChanged.connect(lambda _: self.changed.emit())
+        self.address.editingFinished.connect(self.changed)
+
+    def engine(self) -> tuple[str, int | None]:
+        """Scheduler and number of workers, as `run_stack` takes them, or an `InputError`."""
+        if self.picker.kind == _HERE:
+            return "threads", self.workers.value() or None
+        address = self.address.text().strip()
+        if "://" not in address:
+            raise InputError(
+                f"the scheduler's address is '{address}': expected one such as tcp://host:8786, "
+                "as printed by 'dask scheduler'"
+            )
+        return address, None
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "kind": self.picker.kind,
+            "workers": self.workers.value(),
+            "address": self.address.text(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.picker.set_kind(str(state.get("kind", _HERE)))
+        self.workers.setValue(int(state.get("workers", 0)))
+        self.address.setText(str(state.get("address", "")))
+
+
+class FailureTable(ReportTable):
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+        # Names of files have no spaces to wrap at: their ends tell them apart.
+        self.setTextElideMode(Qt.TextElideMode.ElideMiddle)
+        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Fixed)
+        self.horizontalHeader().resizeSection(0, _NAME_WIDTH)
+
+    def show_failures(self, failures: list[tuple[str, str]]) -> None:
+        """Replace what is shown, by no more than can be looked through."""
+        self.count = len(failures)
+        more = self.count - _MOST_FAILURES
+        rows = failures[:_MOST_FAILURES] + ([("…", f"and {more} more")] if more > 0 else [])
+        self.show_rows(rows)
+        self.setVisible(bool(rows))
+
+
+class InvertStack(InversionInputs, ToolPanel):
+    """Choose shots and a store, press Run; again to go on after an interruption."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(viewer, "invert-stack")
-        self.panel = RunPanel(
-            "Invert stack",
-            "Run",
-            "Invert all shots not yet in the store.",
-            patience=math.inf,  # until it has left the store
+        super().__init__(
+            viewer,
+            "invert-stack",
+            RunPanel(
+                "Invert stack",
+                "Run",
+                "Invert all shots not yet in the store.",
+                patience=math.inf,  # until it has left the store
+            ),
         )
         self.results = ResultLayers(viewer, self)
         self._shown: StackRequest | None = None
-        self._running: StackRequest | None = None
         self._heard = 0
         self._look_at = False
         self._arrows: Any = None
         self._read_arrows: Callable[[], None] | None = None
-        self._soon = QTimer(self)
-        self._soon.setSingleShot(True)
-        self._soon.setInterval(_REFRESH_AFTER)
-        self._soon.timeout.connect(self._refresh)
+        self._soon = timer(self, _REFRESH_AFTER, self._refresh, once=True)
         self._build()
         self._connect()
         self.restore_last()
@@ -74,25 +216,17 @@ class InvertStack(ToolPanel):
 
     def _build(self) -> None:
         self.shots = ShotsPicker(self.viewer)
-        self.source = SourcePicker(self.viewer)
-        self.masks = MaskPicker(
+        self.make_inputs(
             self.viewer,
             lambda: self.shots.layer,
             ("labels",),
-            "Labels marking detector pixels in all shots. The inversion ignores masked pixels, "
-            "so do not mask the object.",
+            (
+                "Labels marking detector pixels in all shots. The inversion ignores masked pixels, "
+                "so do not mask the object.",
+                "Labels that hide the object from the source estimates only; the inversion still "
+                "uses it.",
+            ),
         )
-        self.source_masks = MaskPicker(
-            self.viewer,
-            lambda: self.shots.layer,
-            ("labels",),
-            "Labels that hide the object from the source estimates only; the inversion still "
-            "uses it.",
-            "Source mask",
-        )
-        self.setup = SetupPicker()
-        self.cleaning = CleaningSection()
-        self.options = OptionsForm()
         self.store = StoreEdit()
         self.overwrite = QCheckBox("overwrite the store")
         self.overwrite.setToolTip("<qt>Start from scratch. Otherwise the run is resumed.</qt>")
@@ -124,43 +258,14 @@ class InvertStack(ToolPanel):
 
     def _connect(self) -> None:
         self.shots.changed.connect(self._on_layer)
-        for signal in (
-            self.source.changed,
-            self.setup.changed,
-            self.cleaning.changed,
-            self.options.changed,
-            self.engine.changed,
-            self.masks.changed,
-            self.source_masks.changed,
-        ):
-            signal.connect(self.keep)
-        self.source.changed.connect(self._show_source_mask)
-        self._show_source_mask()
-        self.panel.button.clicked.connect(lambda: self._run_or_cancel())
+        for part in (*self.inputs, self.engine):
+            part.changed.connect(self.keep)
         self.panel.runner.progressed.connect(self._on_progress)
-        self.panel.runner.ended.connect(self._on_end)
 
-    # What is kept, and what is asked for
-
-    def parts(self) -> dict[str, Part]:
-        return {
-            "source": self.source,
-            "setup": self.setup,
-            "cleaning": self.cleaning,
-            "options": self.options,
-            "engine": self.engine,
-            "painted_is_unusable": self.masks,
-            "painted_is_object": self.source_masks,
-        }
+    def parts(self) -> dict[str, Any]:
+        return {**super().parts(), "engine": self.engine}
 
     def request(self) -> StackRequest:
-        """What the controls ask for.
-
-        Raises
-        ------
-        InputError
-            If something is missing or cannot be used.
-        """
         layer = self.shots.layer
         setup = self.setup.setup()
         scheduler, workers = self.engine.engine()
@@ -180,13 +285,12 @@ class InvertStack(ToolPanel):
             overwrite=self.overwrite.isChecked(),
             redo_failed=self.redo_failed.isChecked(),
         )
-        companions = (self.masks.layer, self.source_masks.layer, self.source.layers.layer)
         return StackRequest(
             job,
             layer,
-            tuple(one for one in companions if one is not None and one is not layer),
+            self.companions(layer),
             {} if layer is None else place_on(layer, setup),
-            Origins.of(self, layer, self.shots.name),
+            self.origins(layer, self.shots.name),
         )
 
     def _source(self, layer: Any) -> ArrayLike:
@@ -198,24 +302,11 @@ class InvertStack(ToolPanel):
 
     # A run
 
-    def _run_or_cancel(self) -> None:
-        if self.panel.runner.running:
-            self.panel.cancel()
-            return
-        self._forget()
-        try:
-            self._running, self._heard = self.request(), 0
-        except MISTAKES as error:
-            self.panel.refuse(error)
-            return
-        self.panel.run(self._running.run, self._running)
-
     def _on_progress(self, news: Progress) -> None:
-        if self._running is not None and news.stage == "shots":
-            self._show(self._running)
+        if news.stage == "shots":
+            self._show(self.panel.runner.tag)
 
     def _show(self, request: StackRequest) -> None:
-        """Show what is new."""
         # Once it is done: to press Run again must not throw these shots away.
         self.overwrite.setChecked(False)
         self.redo_failed.setChecked(False)
@@ -260,8 +351,8 @@ class InvertStack(ToolPanel):
         if self._read_arrows is not None:
             self._read_arrows()
 
-    def _forget(self) -> None:
-        """What was said of one run does not hold for another."""
+    def forget(self) -> None:
+        self._heard = 0
         self.report.empty()
         self._show_failures([])
         self.panel.say("")
@@ -274,7 +365,6 @@ class InvertStack(ToolPanel):
     def _on_end(self, outcome: Outcome) -> None:
         request: StackRequest = outcome.tag
         books = request.job.books
-        self._running = None
         if not books.total:
             return
         self._show(request)
@@ -292,8 +382,5 @@ class InvertStack(ToolPanel):
         self.source.follow(layer)
         self.setup.follow(layer, "" if layer is not None else self.shots.name)
         if not self.panel.runner.running:
-            self._forget()
+            self.forget()
         self.keep()
-
-    def _show_source_mask(self) -> None:
-        self.source_masks.setVisible(self.source.is_guessed)

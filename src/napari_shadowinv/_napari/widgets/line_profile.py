@@ -1,65 +1,232 @@
-"""The widget that reads values off a line across layers: `LineProfile`."""
+"""The widget that reads values off a line across layers: `LineProfile`.
+
+- points along a line: `along`; beside it, to average over: `abreast`
+- sample an image: `sampled`; several of them on one axis: `Profile`; as a table: `table_text`
+- draw them: `ProfilePlot`
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from qtpy.QtCore import QSignalBlocker, QSize, Qt, QTimer
+from napari.utils.notifications import show_info
+from numpy.typing import ArrayLike
+from qtpy.QtCore import QSignalBlocker, QSize, Qt
 from qtpy.QtWidgets import (
     QDoubleSpinBox,
     QFileDialog,
-    QHBoxLayout,
     QListWidget,
     QListWidgetItem,
     QPushButton,
     QSizePolicy,
-    QVBoxLayout,
     QWidget,
 )
 
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
-from napari_shadowinv._napari.widgets._base import with_button
-from napari_shadowinv._napari.widgets._docking import Docked
-from napari_shadowinv._napari.widgets._drawing import new_shapes
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
-from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled, wrapping_label
-from napari_shadowinv._napari.widgets._lifetime import while_alive
-from napari_shadowinv._napari.widgets._notifications import notify_errors, tell_info
-from napari_shadowinv._napari.widgets._picking import LayerPicker, kind_of
-from napari_shadowinv._napari.widgets._plotting import ProfilePlot
-from napari_shadowinv._napari.widgets._reading import shown_plane
-from napari_shadowinv._napari.widgets._sampling import (
-    Profile,
-    abreast,
-    along,
-    sampled,
-    table_text,
+from napari_shadowinv._napari.widgets._forms import (
+    PROBLEM_STYLE,
+    labelled,
+    with_button,
+    wrapping_label,
 )
+from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
+from napari_shadowinv._napari.widgets._panels import WIDTH
+from napari_shadowinv._napari.widgets._qt import (
+    Docked,
+    beside,
+    column,
+    notify_errors,
+    timer,
+    while_alive,
+)
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
     import napari
-
-__all__ = ["LineProfile"]
 
 _FOLLOW = 40  # ms between two drawings while the line moves
 _LAYER_ROLE = Qt.ItemDataRole.UserRole
 _STRAIGHT = ("line", "path")
 _PIXELS = "px"
 _WIDEST = 1e6
+_MOST_SAMPLES = 5000
+_COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
+_LONGEST_NAME = 34
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    name: str
+    unit: str
+    values: FloatArray  # NaN where the line is outside the image
+    averaged: str = ""  # what the values are averaged over; empty for those on the line alone
+
+
+def along(vertices: ArrayLike, step: float) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 2) along a path of corners (k, 2), no further apart than the step.
+
+    They lie evenly from the first corner to the last; returned with their distance along the path.
+    """
+    corners, reached = _corners(vertices)
+    count = min(int(np.ceil(reached[-1] / step - 1e-9)) + 1, _MOST_SAMPLES)
+    distance = np.linspace(0, reached[-1], max(count, 2))
+    return _on_path(corners, reached, distance), distance
+
+
+def _corners(vertices: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Corners of a path, no two of them in one place, and its length up to each."""
+    corners = np.asarray(vertices, dtype=np.float64)
+    lengths = np.hypot(*np.diff(corners, axis=0).T)
+    moves = np.concatenate([[True], lengths > 0])
+    if moves.sum() > 1:
+        corners, lengths = corners[moves], lengths[moves[1:]]
+    return corners, np.concatenate([[0.0], np.cumsum(lengths)])
+
+
+def _on_path(corners: FloatArray, reached: FloatArray, distance: FloatArray) -> FloatArray:
+    return np.stack([np.interp(distance, reached, corners[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def abreast(vertices: ArrayLike, distance: FloatArray, width: float, step: float) -> FloatArray:
+    """Points (m, n, 2) of a strip around a path, in n rows at right angles to it.
+
+    The rows are at these distances, their m points in the middles of equal parts of the width, no
+    further apart than the step; with no width, each row is the point on the path alone.
+    """
+    corners, reached = _corners(vertices)
+    points = _on_path(corners, reached, distance)
+    edges = np.diff(corners, axis=0)
+    edge = np.clip(np.searchsorted(reached, distance, side="right") - 1, 0, len(edges) - 1)
+    lengths = np.maximum(np.hypot(*edges.T), np.finfo(float).tiny)
+    along_y, along_x = (edges / lengths[:, None])[edge].T
+    across = np.stack([along_x, -along_y], axis=1)
+    count = min(max(int(np.ceil(width / step - 1e-9)), 1), _MOST_SAMPLES)
+    offsets = width * ((np.arange(count) + 0.5) / count - 0.5)
+    rows: FloatArray = points + offsets[:, None, None] * across
+    return rows
+
+
+def sampled(
+    image: ArrayLike, points: FloatArray, to_pixels: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Values of an image at points (n, 2) of the world, linear between the pixels' centres.
+
+    Of points (m, n, 2) those inside are averaged over the m. NaN outside the image, whose pixels
+    reach half a pixel beyond their centres.
+    """
+    from scipy.ndimage import map_coordinates
+
+    plane = np.asarray(image, dtype=np.float64)
+    pixels = to_pixels(points.reshape(-1, 2))
+    values = np.asarray(map_coordinates(plane, pixels.T, order=1, mode="nearest"))
+    size = np.array(plane.shape)
+    inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1)
+    rows = np.where(inside, values, 0.0).reshape(-1, points.shape[-2])
+    count = inside.reshape(rows.shape).sum(axis=0)
+    return np.where(count > 0, rows.sum(axis=0) / np.maximum(count, 1), np.nan)
+
+
+def table_text(distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> str:
+    """Return profiles as comma-separated values, a column each, with units in the first row."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([f"distance ({unit})", *(_heading(profile) for profile in profiles)])
+    for row in zip(distance, *(profile.values for profile in profiles), strict=True):
+        writer.writerow([f"{value:.9g}" for value in row])
+    return text.getvalue()
+
+
+def _heading(profile: Profile) -> str:
+    """Its name, with the unit if the name does not tell it, and what it is averaged over."""
+    name = profile.name
+    if profile.unit and f"({profile.unit})" not in name:
+        name = f"{name} ({profile.unit})"
+    return f"{name}, {profile.averaged}" if profile.averaged else name
+
+
+class ProfilePlot(QWidget):
+    """One plot for each unit, one above the other, with the distance in common."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setMinimumHeight(220)
+        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
+        column(self)
+        self.figure: Any = None
+        self._canvas: Any = None
+
+    def show_profiles(self, distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> None:
+        """Draw profiles; none empties the plot."""
+        if self._canvas is None:
+            if not profiles:
+                return
+            self._make_canvas()
+        ink, paper = self._colours()
+        self.figure.clear()
+        self.figure.set_facecolor(paper)
+        units = list(dict.fromkeys(profile.unit for profile in profiles))
+        axes = self.figure.subplots(max(len(units), 1), 1, sharex=True, squeeze=False)[:, 0]
+        for axis, of_unit in zip(axes, units or [""], strict=True):
+            _dress(axis, ink, paper)
+            axis.set_ylabel(of_unit or "value", color=ink)
+            for number, profile in enumerate(profiles):
+                if profile.unit == of_unit:
+                    colour = _COLOURS[number % len(_COLOURS)]
+                    axis.plot(distance, profile.values, color=colour, label=_short(profile.name))
+            if profiles:
+                axis.legend(fontsize=8, labelcolor=ink, facecolor=paper, edgecolor=ink)
+        averaged = f", {profiles[0].averaged}" if profiles and profiles[0].averaged else ""
+        axes[-1].set_xlabel(f"distance ({unit}){averaged}", color=ink)
+        self._canvas.draw_idle()
+
+    def _make_canvas(self) -> None:
+        # Half a second to import: not before there is something to draw.
+        from matplotlib.backends.backend_qtagg import FigureCanvasQTAgg
+        from matplotlib.figure import Figure
+
+        self.figure = Figure(layout="constrained")
+        # It comes without types.
+        canvas: Any = FigureCanvasQTAgg
+        self._canvas = canvas(self.figure)
+        self._canvas.setMinimumSize(100, 100)
+        self.layout().addWidget(self._canvas)
+
+    def _colours(self) -> tuple[str, str]:
+        from napari.settings import get_settings
+        from napari.utils.theme import get_theme
+
+        try:
+            theme = get_theme(get_settings().appearance.theme)
+            return theme.text.as_hex(), theme.background.as_hex()
+        except (KeyError, AttributeError, ValueError):
+            palette = self.palette()
+            return palette.windowText().color().name(), palette.window().color().name()
+
+
+def _dress(axis: Any, ink: str, paper: str) -> None:
+    axis.set_facecolor(paper)
+    axis.tick_params(colors=ink, labelsize=8)
+    for spine in axis.spines.values():
+        spine.set_color(ink)
+    axis.grid(color=ink, alpha=0.15)
+
+
+def _short(name: str) -> str:
+    if len(name) <= _LONGEST_NAME:
+        return name
+    return f"…{name[-_LONGEST_NAME + 1 :]}"
 
 
 class LineProfile(Docked):
-    """Draw a line; see the values of the checked layers along it, in their units.
-
-    Parameters
-    ----------
-    viewer : napari.viewer.Viewer
-        The viewer to work in.
-    """
+    """Draw a line; see the values of the checked layers along it, in their units."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__()
@@ -67,10 +234,8 @@ class LineProfile(Docked):
         self._distance = np.zeros(0)
         self._unit = "px"
         self.profiles: list[Profile] = []
-        self.lines = LayerPicker(viewer, ("shapes",), none="none yet")
-        self.lines.setToolTip(
-            "<qt>Shapes layer with the line; if it has several, the selected one is used.</qt>"
-        )
+        tip = "<qt>Shapes layer with the line; if it has several, the selected one is used.</qt>"
+        self.lines = LayerPicker(viewer, ("shapes",), tip, "none yet")
         self.layers = QListWidget()
         self.layers.setToolTip("Layers to plot.")
         self.layers.setMaximumHeight(110)
@@ -92,61 +257,50 @@ class LineProfile(Docked):
         self.problem = wrapping_label(style=PROBLEM_STYLE)
         self.export = QPushButton("Export CSV…")
         self.export.setToolTip("Save the profile as a table.")
-        column = QVBoxLayout(self)
-        column.setContentsMargins(6, 6, 6, 6)
-        column.addWidget(
-            labelled("Line", with_button(self.lines, "✎", "Draw a new line.", self._draw))
-        )
-        width = QWidget()
-        row = QHBoxLayout(width)
-        row.setContentsMargins(0, 0, 0, 0)
-        row.addWidget(self.width_edit, 2)
-        row.addWidget(self.width_unit, 1)
-        for widget in (self.layers, labelled("Width", width), self.hint):
-            column.addWidget(widget)
-        column.addWidget(self.plot, 1)
+        lines = with_button(self.lines, "✎", "Draw a new line.", self._draw)
+        width = beside((self.width_edit, 2), (self.width_unit, 1))
+        rows = (labelled("Line", lines), self.layers, labelled("Width", width), self.hint)
+        whole = column(self, *rows, margin=6)
+        whole.addWidget(self.plot, 1)
         for widget in (self.export, self.problem):
-            column.addWidget(widget)
-        self.setMinimumWidth(330)
+            whole.addWidget(widget)
+        self.setMinimumWidth(WIDTH)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
         self._connect()
         self._fill()
 
     def sizeHint(self) -> QSize:
-        return QSize(380, 600)
+        return QSize(WIDTH + 50, 600)
 
     def _connect(self) -> None:
-        self._timer = QTimer(self)
-        self._timer.setSingleShot(True)
-        self._timer.setInterval(_FOLLOW)
-        self._timer.timeout.connect(self.update_plot)
+        self._timer = timer(self, _FOLLOW, self.update_plot, once=True)
         self._watched: list[Any] = []
         events = self.viewer.layers.events
         for emitter in (events.inserted, events.removed, events.reordered):
             while_alive(self, emitter, self._fill)
         while_alive(self, self.viewer.dims.events.current_step, self._soon)
         self.lines.picked.connect(self._soon)
-        self.layers.itemChanged.connect(lambda _: self._soon())
-        self.width_edit.valueChanged.connect(lambda _: self._soon())
-        self.width_unit.currentIndexChanged.connect(lambda _: self._soon())
+        for signal in (
+            self.layers.itemChanged,
+            self.width_edit.valueChanged,
+            self.width_unit.currentIndexChanged,
+        ):
+            signal.connect(lambda _: self._soon())
         self.export.clicked.connect(lambda: self._export())
 
     def checked(self) -> list[Any]:
-        """The layers to read."""
         items = [self.layers.item(row) for row in range(self.layers.count())]
         return [
             item.data(_LAYER_ROLE) for item in items if item.checkState() == Qt.CheckState.Checked
         ]
 
     def check(self, layer: Any, on: bool = True) -> None:
-        """Read a layer, or leave it out."""
         for row in range(self.layers.count()):
             item = self.layers.item(row)
             if item.data(_LAYER_ROLE) is layer:
                 item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
 
     def update_plot(self) -> None:
-        """Read the layers along the line, and draw."""
         vertices = self._vertices()
         layers = self.checked()
         self.profiles = []
@@ -196,13 +350,7 @@ class LineProfile(Docked):
         return width, f"mean over {number:g} {unit}"
 
     def table(self) -> str:
-        """What is shown, as comma-separated values.
-
-        Raises
-        ------
-        InputError
-            If nothing is shown.
-        """
+        """What is shown, as comma-separated values; an `InputError` if that is nothing."""
         if not self.profiles:
             raise InputError("there is no profile to export: draw a line and check a layer first")
         return table_text(self._distance, self._unit, self.profiles)
@@ -224,7 +372,6 @@ class LineProfile(Docked):
             self._timer.start()
 
     def _watch(self) -> None:
-        """Follow the line, and the layers that are read."""
         for layer in [self.lines.layer, *self.checked()]:
             if layer is None or any(layer is known for known in self._watched):
                 continue
@@ -280,7 +427,7 @@ class LineProfile(Docked):
         path = Path(name) if Path(name).suffix else Path(name).with_suffix(SITES.suffix)
         with replacing(path, overwrite=str(path) == name) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
-        tell_info(f"Wrote {path}")
+        show_info(f"Wrote {path}")
 
 
 def _mapper(layer: Any) -> Callable[[Any], Any]:

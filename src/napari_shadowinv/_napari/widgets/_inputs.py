@@ -1,0 +1,456 @@
+"""What an inversion is given, beside the shots.
+
+- the experiment's geometry: `SetupPicker`; the undisturbed beam: `SourcePicker`
+- what is done to images first: `CleaningSection`; how to invert: `OptionsForm`
+- all of these and the masks, as the widgets for shots and for stacks have them: `InversionInputs`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import ArrayLike
+from pydantic import BaseModel
+from qtpy.QtCore import QSignalBlocker, Signal
+from qtpy.QtWidgets import QWidget
+
+from napari_shadowinv._napari.layer_metadata import (
+    CAME_WITH,
+    SOURCE,
+    keep_setup,
+    mark_of,
+    may_be_source,
+    result_of,
+    role_of,
+    setup_of,
+    setup_origin_of,
+    source_of,
+)
+from napari_shadowinv._napari.widgets._forms import (
+    ModelForm,
+    ModelPicker,
+    PathEdit,
+    RowPicker,
+    TomlButtons,
+    kinds_of,
+    labelled,
+    section,
+    wrapping_label,
+)
+from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES
+from napari_shadowinv._napari.widgets._layers import LayerPicker, MaskPicker, image_of
+from napari_shadowinv._napari.widgets._qt import column
+from napari_shadowinv._napari.widgets._results import Origins
+from napari_shadowinv._system.validation import validated
+from napari_shadowinv._typing import BoolArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocessing import ESTIMATES, FILTERS, Estimate, Filter, check_masks
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import Setup
+
+    pass
+
+_NONE = "none"
+_CHANGED = ", changed by hand"
+_EARLIER = ", in an earlier session"
+_OWN, _LAYER, _FILE = "own", "layer", "file"
+# Estimates that do not look at the shot, so that no mask can mislead them.
+_BLIND = ("uniform", "isotropic")
+
+
+def _proton() -> type[BaseModel]:
+    from napari_shadowinv.physics.setup import ProtonSetup
+
+    return ProtonSetup
+
+
+def _optical() -> type[BaseModel]:
+    from napari_shadowinv.physics.setup import OpticalSetup
+
+    return OpticalSetup
+
+
+@dataclass(frozen=True)
+class _Given:
+    values: dict[str, Any]
+    origin: str
+
+
+class SetupPicker(QWidget):
+    """No setup, particles or light, with buttons for TOML files.
+
+    A setup belongs to an image: it is kept with the image's layer, and another image without
+    one starts with none. What the user has typed or loaded for one image is in the form when
+    he chooses particles or light for the next, in the next session too; a line tells where
+    it comes from. What came with a file is never handed on.
+    """
+
+    changed = Signal()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._layer: Any = None
+        self._name, self._keeps = "", True
+        self._own: dict[str, _Given] = {}
+        self._shown: dict[str, _Given] = {}
+        self.picker = ModelPicker(
+            "Setup",
+            {
+                _NONE: ("none: results in pixels", None),
+                "proton": ("particles (protons, …)", _proton),
+                "optical": ("light", _optical),
+            },
+        )
+        self.picker.choice.setToolTip(
+            "<qt>With a setup the results are in SI units; lengths can be entered as 1.3 mm or "
+            "0.0013.</qt>"
+        )
+        self.note = wrapping_label()
+        self.files = TomlButtons("setup", self._to_save, self._take)
+        column(self, self.picker, self.note, self.files)
+        self._state = self.picker.state()
+        self.picker.changed.connect(self._on_edit)
+
+    def setup(self) -> Setup | None:
+        return self.picker.model()  # type: ignore[return-value]
+
+    @property
+    def origin(self) -> str:
+        """Where the setup comes from, such as ``"typed for 'shot'"``; empty for none."""
+        if self.picker.kind == _NONE:
+            return ""
+        given = self._shown.get(self.picker.kind)
+        return self._typed() if given is None else given.origin
+
+    @property
+    def described(self) -> str:
+        kind = self.picker.choice.currentText()
+        return f"{kind}, {self.origin}" if self.origin else kind
+
+    def state(self) -> dict[str, Any]:
+        """What is kept: what the user gave. Whether it is chosen is a matter of the image."""
+        return {"own": {kind: asdict(given) for kind, given in self._own.items()}}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Have ready what `state` has returned; none is chosen."""
+        own = state.get("own")
+        for kind, given in own.items() if isinstance(own, Mapping) else ():
+            origin = str(given["origin"]).removesuffix(_EARLIER) + _EARLIER
+            self._own[kind] = _Given(dict(given["values"]), origin)
+        self._show(_NONE)
+
+    def follow(self, layer: Any, name: str = "", *, keep: bool = True) -> None:
+        """Show the setup of another image, or of images called so that are no layer.
+
+        With `keep`, what the user chooses from now on is kept with the layer.
+        """
+        if layer == self._layer and name == self._name:
+            return
+        # Files may be named after their setup is typed.
+        stays = layer is None and self._layer is None and not self._name
+        self._layer, self._name, self._keeps = layer, name, keep
+        setup = None if layer is None else setup_of(layer)
+        if setup is not None:
+            self.suggest(setup, setup_origin_of(layer) or f"{CAME_WITH} '{layer.name}'")
+        elif not stays:
+            self._show(_NONE)
+            self.changed.emit()
+
+    def suggest(self, setup: Setup, origin: str) -> None:
+        """Show a setup that is not the user's own, until he changes it."""
+        self._show(setup.kind, _Given(setup.model_dump(), origin))
+        self.changed.emit()
+
+    def show_setup(self, values: Mapping[str, Any], origin: str = "") -> None:
+        """Fill in a setup that the user gives; without an origin he has typed it."""
+        kind = str(values["kind"])
+        given = _Given(dict(values), origin or self._typed())
+        self._show(kind, given)
+        self._remember(kind, given)
+        self._keep_with_image()
+        self.changed.emit()
+
+    def _show(self, kind: str, given: _Given | None = None) -> None:
+        """Fill in one setup, or none, and for the other kinds what the user gave last."""
+        self._shown = {**self._own} | ({} if given is None else {kind: given})
+        blank: dict[str, Any] = {known: {} for known in self.picker.state()["values"]}
+        values = blank | {known: held.values for known, held in self._shown.items()}
+        with QSignalBlocker(self.picker):
+            self.picker.restore({"kind": kind, "values": values})
+        self._tell()
+
+    def _on_edit(self) -> None:
+        kind, before = self.picker.kind, self._state
+        values = self.picker.state()["values"].get(kind, {})
+        # To look at another form, or to leave a field as it was, is no change of values.
+        if kind == before["kind"] and values != before["values"].get(kind):
+            shown = self._shown.get(kind)
+            if shown is None or shown.origin.startswith("typed"):
+                origin = self._typed()
+            else:
+                origin = shown.origin.removesuffix(_CHANGED) + _CHANGED
+            self._remember(kind, _Given(values, origin))
+        self._tell()
+        self._keep_with_image()
+        self.changed.emit()
+
+    def _remember(self, kind: str, given: _Given) -> None:
+        """Keep what is shown for other images, if it is the user's own."""
+        self._shown[kind] = given
+        if not given.origin.startswith(CAME_WITH):
+            self._own[kind] = given
+
+    def _keep_with_image(self) -> None:
+        if self._layer is None or not self._keeps:
+            return
+        try:
+            setup = self.setup()
+        except InputError:
+            return  # half a setup: the image keeps the one it has
+        if setup != setup_of(self._layer) or self.origin != setup_origin_of(self._layer):
+            keep_setup(self._layer, setup, self.origin)
+
+    def _typed(self) -> str:
+        name = self._name if self._layer is None else self._layer.name
+        return f"typed for '{name}'" if name else "typed"
+
+    def _tell(self) -> None:
+        """Say beside the fields where they come from, unless there is nothing in them."""
+        self._state = self.picker.state()
+        form = self.picker.form
+        filled = form is not None and not form.is_empty
+        self.note.setText(f"{self.origin[:1].upper()}{self.origin[1:]}." if filled else "")
+        self.note.setVisible(filled)
+
+    def _to_save(self) -> dict[str, object]:
+        setup = self.setup()
+        return {} if setup is None else setup.model_dump()
+
+    def _take(self, loaded: dict[str, object], path: str) -> None:
+        from napari_shadowinv.physics.setup import setup_from_dict
+
+        values = setup_from_dict(loaded, path).model_dump()
+        whom = self._typed().removeprefix("typed")
+        self.show_setup(values, f"loaded from {Path(path).name}{whom}")
+
+
+class SourcePicker(RowPicker):
+    """Uniform, a layer, a file, what came with the shot, or an estimate from it."""
+
+    def __init__(self, viewer: Any) -> None:
+        self._image: Any = None
+        self._before_own = "uniform"
+        tip = "Image layer of the undisturbed beam."
+        self.layers = LayerPicker(viewer, ("image",), tip, "choose a layer", self._offers)
+        self.file = PathEdit("Image of the undisturbed beam")
+        kinds = kinds_of(ESTIMATES, "estimate: ")
+        _, uniform = kinds.pop("uniform")
+        super().__init__(
+            "Source",
+            {
+                "uniform": ("uniform", uniform),
+                _LAYER: ("a layer", None),
+                _FILE: ("a file", None),
+                _OWN: ("the one supplied with the shot", None),
+                **kinds,
+            },
+            "The beam without the object: ideally a measured reference image, otherwise uniform "
+            "or estimated from the shot itself.",
+            {_LAYER: labelled("", self.layers), _FILE: labelled("", self.file)},
+        )
+        self.layers.picked.connect(self.changed)
+        self.file.changed.connect(self.changed)
+
+    @property
+    def is_guessed(self) -> bool:
+        """Whether it is an estimate from the shot, which a mask can keep from the object."""
+        return self.picker.kind in ESTIMATES and self.picker.kind not in _BLIND
+
+    @property
+    def described(self) -> str:
+        kind = self.picker.kind
+        if kind == _LAYER and self.layers.layer is not None:
+            return f"layer '{self.layers.layer.name}'"
+        if kind == _FILE:
+            return f"file {Path(self.file.path).name}"
+        if kind == _OWN:
+            return "came with the shot"
+        model = self.picker.model()
+        assert isinstance(model, Estimate)
+        return f"estimate: {model.described}" if self.is_guessed else model.described
+
+    def source(self, image_layer: Any) -> ArrayLike | Path | Estimate:
+        """The chosen source of an image layer, as a job takes it, or an `InputError`."""
+        kind = self.picker.kind
+        if kind == _LAYER:
+            if self.layers.layer is None:
+                raise InputError(
+                    "no source layer is selected: choose one below 'a layer', or choose another "
+                    "source"
+                )
+            return image_of(self.layers.layer, "source image")
+        if kind == _FILE:
+            if not self.file.path:
+                raise InputError("no source file is selected: choose one, or choose another source")
+            return Path(self.file.path)
+        if kind == _OWN:
+            own = source_of(image_layer)
+            if own is None:
+                raise InputError(
+                    f"'{image_layer.name}' has no source of its own: choose another kind of source"
+                )
+            return own
+        model = self.picker.model()
+        assert isinstance(model, Estimate)
+        return model
+
+    def check(self, mask: BoolArray | None) -> None:
+        """Refuse a mask over what the chosen layer was estimated without: the object."""
+        layer = self.layers.layer if self.picker.kind == _LAYER else None
+        bare = None if layer is None else mark_of(layer).get("source_mask")
+        if bare is not None and mask is not None and bare.shape == mask.shape:
+            check_masks(mask, bare)
+
+    def state(self) -> dict[str, Any]:
+        """What is kept: layers and files belong to a session."""
+        kept = self.picker.state()
+        kind = self._before_own if kept["kind"] == _OWN else kept["kind"]
+        return {**kept, "kind": "uniform" if kind in (_LAYER, _FILE) else kind}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.picker.restore(state)
+
+    def follow(self, image_layer: Any) -> None:
+        """Take the source that came with an image, or leave that of another image."""
+        self._image = image_layer
+        self.layers.fill()
+        if image_layer is not None and source_of(image_layer) is not None:
+            if self.picker.kind != _OWN:
+                self._before_own = self.picker.kind
+            self.picker.set_kind(_OWN)
+        elif self.picker.kind == _OWN:
+            self.picker.set_kind(self._before_own)
+
+    def _offers(self, layer: Any) -> bool:
+        # An image is not its own source: it would differ from it nowhere.
+        return layer != self._image and may_be_source(layer)
+
+    def _on_kind(self) -> None:
+        if self.picker.kind == _LAYER and self.layers.layer is None:
+            self.layers.layer = self._only_source()
+        super()._on_kind()
+
+    def _only_source(self) -> Any | None:
+        """The layer that is known to be a source and fits the image, if there is just one.
+
+        The source of a result does not count: it is what some other run made of one.
+        """
+        shape = None if self._image is None else tuple(self._image.data.shape[-2:])
+        known = [
+            layer
+            for layer in self.layers.offered
+            if role_of(layer) == SOURCE
+            and result_of(layer) is None
+            and tuple(layer.data.shape[-2:]) == shape
+        ]
+        return known[0] if len(known) == 1 else None
+
+
+class CleaningSection(QWidget):
+    """A choice of filters, folded away under a title that tells which."""
+
+    changed = Signal()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.picker = ModelPicker("Filter", {"none": ("nothing", None), **kinds_of(FILTERS)})
+        self.folded = section("", self.picker)
+        column(self, self.folded)
+        self.picker.changed.connect(self._on_change)
+        self._on_change()
+
+    def model(self) -> Filter | None:
+        model = self.picker.model()
+        assert model is None or isinstance(model, Filter)
+        return model
+
+    def _on_change(self) -> None:
+        # A filter must not work unseen in a folded section.
+        title = f"Filter first: {self.picker.choice.currentText()}"
+        if self.folded.text() != title:
+            self.folded.setText(title)
+        self.changed.emit()
+
+
+class OptionsForm(ModelForm):
+    def __init__(self) -> None:
+        super().__init__(InversionOptions, first={"n_sites": PREVIEW_SITES})
+        self.files = TomlButtons("options", self._to_save, self._take)
+        self.layout().addWidget(self.files)
+
+    def _to_save(self) -> dict[str, object]:
+        self.model()
+        return self.values()
+
+    def _take(self, loaded: dict[str, object], path: str) -> None:
+        validated(InversionOptions, loaded, path)
+        self.set_values(loaded)
+
+
+class InversionInputs:
+    """The controls that panels for a shot and for a stack have in common."""
+
+    def make_inputs(
+        self, viewer: Any, image: Callable[[], Any], kinds: tuple[str, ...], tips: tuple[str, str]
+    ) -> None:
+        """Make them; masks are layers of these kinds for the image, with a tooltip each."""
+        self.source = SourcePicker(viewer)
+        self.masks = MaskPicker(viewer, image, kinds, tips[0])
+        self.source_masks = MaskPicker(viewer, image, kinds, tips[1], "Source mask")
+        self.setup = SetupPicker()
+        self.cleaning = CleaningSection()
+        self.options = OptionsForm()
+        self.inputs = (
+            self.source,
+            self.source_masks,
+            self.masks,
+            self.setup,
+            self.cleaning,
+            self.options,
+        )
+        self.source.changed.connect(self._show_source_mask)
+        self._show_source_mask()
+
+    def _show_source_mask(self) -> None:
+        self.source_masks.setVisible(self.source.is_guessed)
+
+    def parts(self) -> dict[str, Any]:
+        return {
+            "source": self.source,
+            "setup": self.setup,
+            "cleaning": self.cleaning.picker,
+            "options": self.options,
+            "painted_is_unusable": self.masks,
+            "painted_is_object": self.source_masks,
+        }
+
+    def companions(self, image: Any, *others: Any) -> tuple[Any, ...]:
+        """Layers that lie on an image: masks and source, and others if there are any."""
+        layers = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
+        return tuple(one for one in layers if one is not None and one is not image)
+
+    def origins(self, layer: Any, name: str) -> Origins:
+        """Where all of it comes from, for an image or the images of that name."""
+        return Origins(
+            name,
+            self.source.described,
+            self.masks.described(layer),
+            self.source_masks.described(layer) if self.source.is_guessed else "",
+            self.setup.described,
+            self.setup.origin,
+        )
