@@ -62,23 +62,10 @@ def dataset_from_field(
     *,
     attributes: Mapping[str, Any] | None = None,
 ) -> xarray.Dataset:
-    """Label a displacement and its potential, in pixels and, with a setup, in SI units.
+    """Label a displacement (px) and, where known, its potential (px²).
 
-    Parameters
-    ----------
-    displacement : ndarray, shape (2, H, W)
-        Displacement in px, axis order (y, x).
-    potential : ndarray, shape (H, W), or None
-        Normalised potential in px², where it is known.
-    setup : Setup or None
-        Adds the fields in SI units, and coordinates in metres.
-    attributes : mapping of str to str, optional
-        More attributes.
-
-    Returns
-    -------
-    xarray.Dataset
-        Dimensions y, x and component ("y", "x").
+    A setup adds the fields in SI units, and coordinates in metres. The dimensions are y, x and
+    component ("y", "x").
     """
     import xarray as xr
 
@@ -106,17 +93,9 @@ def dataset_from_field(
 def variable_labels(
     setup: Setup | None = None,
 ) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-    """Name every variable of a result, with its dimensions and labels.
+    """Dimensions, ``units`` and ``long_name`` of every variable of a result by its name.
 
-    Parameters
-    ----------
-    setup : Setup, optional
-        Adds the fields in SI units.
-
-    Returns
-    -------
-    dict of str to (tuple of str, dict of str to str)
-        Dimensions, and ``units`` and ``long_name``.
+    A setup adds the fields in SI units.
 
     Examples
     --------
@@ -131,18 +110,7 @@ def variable_labels(
 
 
 def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:
-    """Return the setup that a dataset was made with.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        As `Inversion.to_dataset` returns it.
-
-    Returns
-    -------
-    Setup or None
-        None if it was made without.
-    """
+    """Return the setup that a dataset of `Inversion.to_dataset` was made with, if there was one."""
     from napari_shadowinv.physics.setup import setup_from_dict
 
     if "setup" not in dataset.attrs:

@@ -212,16 +212,8 @@ def transferred_displacement(
 def default_deflector(made_with: Setup, setup: Setup) -> Deflector:
     """What is taken to bend the beam if nobody says so.
 
-    Parameters
-    ----------
-    made_with, setup : Setup
-        Two experiments.
-
-    Returns
-    -------
-    str
-        A magnetic field for particles; for light a refractive index, if the wavelength is the
-        same: then a plasma comes to the same.
+    A magnetic field for particles; for light a refractive index, if the wavelength is the same:
+    then a plasma comes to the same.
 
     Raises
     ------

@@ -82,20 +82,10 @@ class ShownField:
 
 
 def shown_fields(displacements: Collection[FloatArray], setup: Setup | None) -> list[ShownField]:
-    """Turn displacements into what an experimenter asks for, in one unit for all.
+    """Turn displacements in px into what an experimenter asks for, in one unit for all.
 
-    Parameters
-    ----------
-    displacements : collection of ndarray, shape (2, H, W)
-        Displacements in px.
-    setup : Setup or None
-        With it, the main field of its kind: the path-integrated magnetic field of particles,
-        or the deflection angle of light; without, the displacement in px.
-
-    Returns
-    -------
-    list of ShownField
-        One for each displacement.
+    That is the main field of the setup's kind: the path-integrated magnetic field of particles,
+    or the deflection angle of light; without a setup, the displacement in px.
     """
     if setup is None:
         return [ShownField(d, "Displacement", "|d|", "px", ("dy", "dx")) for d in displacements]
