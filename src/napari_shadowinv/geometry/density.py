@@ -110,14 +110,14 @@ def _moments(f: Triple, g: float, k: Triple, y0: float, y1: float) -> Triple:
 def _moments_in_pixel(
     sums: FloatArray,
     value: float,
-    pixel: tuple[int, int],
+    row: int,
+    column: int,
     y0: float,
     x0: float,
     y1: float,
     x1: float,
 ) -> Triple:
     """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
-    row, column = pixel
     left = float(column)
     left2 = left * left
     left3 = left2 * left
@@ -179,9 +179,7 @@ def _walk_inside(
         flux += value * (t_next - t)
         mass += (sums[0, row, column] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
         if with_moments:
-            of_y, of_x, of_both = _moments_in_pixel(
-                sums, value, (row, column), y, x, y_next, x_next
-            )
+            of_y, of_x, of_both = _moments_in_pixel(sums, value, row, column, y, x, y_next, x_next)
             moment_y += of_y
             moment_x += of_x
             inertia += of_both
