@@ -19,6 +19,7 @@ from napari_shadowinv import FileFormatError, ProtonSetup, write
 from napari_shadowinv._napari.layer_metadata import mark_of, result_of, role_of, setup_of, source_of
 from napari_shadowinv._napari.layers import thinned_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
+from napari_shadowinv._napari.stores import follow_shots
 from napari_shadowinv._napari.widgets._layers import warnings_of
 from napari_shadowinv.inversion import Inversion
 

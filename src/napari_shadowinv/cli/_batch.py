@@ -5,12 +5,12 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import typer
@@ -19,13 +19,10 @@ from rich.console import Console
 from rich.table import Table
 
 from napari_shadowinv._system.safety import refusing_damage
-from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interrupted
-from napari_shadowinv.cli._inputs import picture_mask, setup_from
 from napari_shadowinv.cli._tables import Rows, options_text, two_columns
 from napari_shadowinv.cli._terminal import plain, say, say_on_stderr
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.io import Radiograph
 from napari_shadowinv.io.store import (
     DONE,
     FAILED,
@@ -34,11 +31,9 @@ from napari_shadowinv.io.store import (
     StackStore,
     check_store_path,
 )
-from napari_shadowinv.physics.setup import binned_setup
 
 if TYPE_CHECKING:
-    from napari_shadowinv.cli._choices import Choices
-    from napari_shadowinv.options import InversionOptions
+    from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunProgress
 
 EXIT_FAILED_SHOTS = 1
@@ -83,13 +78,7 @@ def run_batch(
     shots: list[str],
     out: Path,
     *,
-    source: str | None,
-    mask: Path | None,
-    setup: Path | None,
-    options: InversionOptions,
-    choices: Choices,
-    source_mask: Path | None,
-    factor: int,
+    recipe: Recipe,
     channel: str | None,
     variable: str | None,
     variables: str | None,
@@ -102,28 +91,24 @@ def run_batch(
     quiet: bool,
 ) -> None:
     """Invert all shots into a store, tell of it, and end with what became of them."""
+    from napari_shadowinv.pipeline.run import picture_mask
     from napari_shadowinv.stack import STORED, read_shot, run_stack
 
     _check(out, resume or redo_failed, overwrite)
     ledger = _Ledger()
-    geometry = None if setup is None else binned_setup(setup_from(setup), factor)
-    reader = functools.partial(read_shot, channel=channel, factor=factor)
+    reader = functools.partial(read_shot, channel=channel)
     if variable is not None:
         reader = functools.partial(reader, variable=variable)
-    if choices.hot_pixels is not None:
-        reader = functools.partial(reader, hot_pixels=choices.hot_pixels)
-    estimate = choices.estimate()
     try:
         with _display(ledger, quiet) as show:
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
-                source=source if estimate is None else estimate,
-                mask=None if mask is None else _mask(mask, factor),
-                filters=choices.filters(),
-                source_mask=None if source_mask is None else _mask(source_mask, factor),
-                options=options,
-                setup=geometry,
+                recipe=recipe,
+                mask=None if recipe.mask is None else picture_mask(recipe.mask),
+                source_mask=None
+                if recipe.source_mask is None
+                else picture_mask(recipe.source_mask),
                 variables=STORED if variables is None else _names(variables),
                 reader=reader,
                 warm_start=warm_start,
@@ -155,11 +140,6 @@ def _check(out: Path, resume: bool, overwrite: bool) -> None:
             f"{out} exists ({_counts_text(StackStore(out))}): use --resume to continue, "
             "--overwrite to start again, or another name"
         )
-
-
-def _mask(path: Path, factor: int) -> BoolArray | None:
-    usable = picture_mask(path)
-    return Radiograph(np.ones(usable.shape), mask=usable).binned(factor).mask
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -226,6 +206,16 @@ def _summary(store: StackStore, ledger: _Ledger) -> Table:
     return two_columns("Batch", rows)
 
 
+def _recipe_rows(attributes: Mapping[str, Any]) -> Rows:
+    """Where the source came from, and what was done to each shot."""
+    from napari_shadowinv.preprocessing import Provenance
+
+    provenance = Provenance.model_validate_json(attributes["provenance"])
+    source = provenance.source.file if provenance.source is not None else ""
+    rows = [("source", source or str(attributes["source_image"]))]
+    return rows + [("step", step.described) for step in provenance.recipe.steps]
+
+
 def _trouble_rows(store: StackStore) -> Rows:
     """Shots that failed, and those that are not to be trusted."""
     statuses = store.statuses()
@@ -285,8 +275,7 @@ def store_rows(path: Path, *, trouble: bool = True) -> Rows:
         ("created", str(attributes["created"])),
         ("shots", _counts_text(store)),
         ("image", str(attributes["image_size"])),
-        ("source", str(attributes.get("source_file", attributes["source_image"]))),
-        *([("filters", str(attributes["filters"]))] if attributes.get("filters") else []),
+        *_recipe_rows(attributes),
         ("stored", str(attributes["stored"])),
         ("options", options_text(json.loads(attributes["options"]))),
     ]

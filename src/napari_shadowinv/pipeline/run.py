@@ -180,11 +180,12 @@ def run_prepared(
     seconds: dict[str, float] = {}
     clock = time.perf_counter() if began is None else began
     report("prepare", 0, None)
-    # Before the sites are spread: a mistake is told at once.
-    prepare(shot.image, None, options, shot.mask)
     doubts: list[str] = []
+    if shot.source is None:
+        prepare(shot.image, None, options, shot.mask)  # likewise, and before the estimate
     source = _source(inputs, shot, report, should_stop, cache, doubts, preview=preview)
     report("prepare", 0, None)
+    # Before the sites are spread: a mistake is told at once.
     prepare(shot.image, source, options, shot.mask)
     seconds["source"] = time.perf_counter() - clock
     ensure_compiled(on_progress, should_stop)
@@ -223,16 +224,16 @@ def _source(
     preview: bool,
 ) -> FloatArray:
     """The undisturbed beam of a shot after its steps."""
-    if shot.source is not None:
-        usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask
-        return checked_source(shot.source, usable)
     recorded = inputs.shot.shape
     matrix = inputs.recipe.matrix(recorded)
     estimate = inputs.recipe.estimate
-    assert estimate is not None
     if isinstance(estimate, UniformEstimate):
         centre = centre_within(recorded, matrix)
         doubts.extend(uniform_warnings(shot.shape, shot.setup, centre=centre))
+    if shot.source is not None:
+        usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask
+        return checked_source(shot.source, usable)
+    assert estimate is not None
     estimate = estimate.placed(shot.setup, recorded, matrix)
     report("source", 0, None, estimate.title)
     kept = partial(cache.source, estimate, most_pixels=_PREVIEW_PIXELS if preview else None)

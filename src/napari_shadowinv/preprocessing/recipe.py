@@ -11,7 +11,6 @@ import base64
 import warnings
 import zlib
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
@@ -173,14 +172,16 @@ class Recipe(BaseModel):
             shape = step.shape_after(shape)
         return matrix
 
-    def setup_after(self) -> Setup | None:
+    def setup_after(self, shape: tuple[int, int]) -> Setup | None:
         """Return the setup of what is inverted, whose pixels may be larger."""
-        shot = Radiograph(np.ones((2, 2)), setup=self.setup)
+        return self.moved(Radiograph(np.ones(shape), setup=self.setup)).setup
+
+    def moved(self, shot: Radiograph) -> Radiograph:
+        """Return a shot after those steps alone that move pixels, such as for its masks."""
         for step in self.steps:
-            if isinstance(step, Bin):
-                shot = replace(shot, image=np.ones((2 * step.factor, 2 * step.factor)))
+            if not isinstance(step, Filter):
                 shot = step.applied(shot)
-        return shot.setup
+        return shot
 
     def check(self, shot: Radiograph) -> None:
         """Reject choices that contradict each other, or the shot, before any work is done.

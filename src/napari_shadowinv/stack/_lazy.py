@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Filter
+    from napari_shadowinv.preprocessing import Recipe, Step
 
 # One number for each shot, beside the arrays of an inversion.
 _NUMBERS = ("converged", "flux_residual", "image_residual", "iterations")
@@ -42,7 +42,8 @@ def invert_stack(
     mask: ArrayLike | None = None,
     options: InversionOptions | None = None,
     setup: Setup | None = None,
-    filters: Sequence[Filter] = (),
+    recipe: Recipe | None = None,
+    filters: Sequence[Step] = (),
     source_mask: ArrayLike | None = None,
     variables: Collection[str] | None = None,
     reader: Reader = read_shot,
@@ -66,17 +67,18 @@ def invert_stack(
         Choices. If `threads` is None, all shots that are inverted at once share the cores.
     setup : Setup, optional
         Adds fields in SI units.
-    filters : sequence of Filter, optional
-        Filters of `napari_shadowinv.preprocessing` for each shot, in their order. A measured
-        source is cleaned and blurred alike; what flattens the image needs a source that is
-        not measured.
+    recipe : Recipe, optional
+        Everything that is done to each shot, in place of `options`, `setup` and `filters`.
+    filters : sequence of Step, optional
+        Steps of `napari_shadowinv.preprocessing` for each shot, in their order. They are applied
+        to a measured source, too; what flattens the image needs a source that is not measured.
     source_mask : array_like of bool, shape (H, W), optional
         Pixels where the object never is; an estimate of the source looks at no others.
     variables : collection of str, optional
         Make only these of a result's variables. Default: all.
     reader : callable, optional
         Makes an image of a path; one with a keyword ``page`` reads TIFFs with many pages, too.
-        `functools.partial(read_shot, factor=2)` sums blocks of 2 × 2 pixels.
+        `functools.partial(read_shot, channel="red")` reads one channel of colour images.
     warm_start : int, optional
         The solver starts from the answer to the shot before, in runs of so many shots: for
         series in which shots are alike and share their source. The answers are the same within
@@ -123,6 +125,7 @@ def invert_stack(
         variables=variables,
         reader=reader,
         warm_start=warm_start,
+        recipe=recipe,
         filters=filters,
         source_mask=source_mask,
     )
@@ -172,17 +175,13 @@ class _Graph:
         from dask.highlevelgraph import HighLevelGraph
 
         self._stack = stack
-        preparation = stack.preparation
         self._token = token = tokenize(
             stack.shots.items if stack.shots.array is None else stack.shots.array.name,
             None if stack.sources is None else stack.sources.items,
             None if stack.beam is None else stack.beam.key,
-            stack.mask,
-            preparation.described,
-            None if preparation.estimate is None else preparation.estimate.described,
-            preparation.bare,
-            stack.options.model_dump_json(),
-            None if stack.setup is None else stack.setup.model_dump_json(),
+            stack.inputs.shot.mask,
+            stack.inputs.shot.source_mask,
+            stack.recipe.model_dump_json(),
             stack.variables,
             stack.warm_start,
         )
@@ -250,7 +249,7 @@ class _Graph:
     def _shared(self, name: str, dims: tuple[str, ...]) -> Any:
         from dask.delayed import delayed
 
-        beam = delayed(values_of_beam, pure=True)(self._beam, self._stack.options)
+        beam = delayed(values_of_beam, pure=True)(self._beam, self._stack.recipe.options)
         value = delayed(_pick, pure=True)(beam, name, False)
         da: Any = import_module("dask.array")
         shape = tuple(self._stack.sizes[dim] for dim in dims)

@@ -12,7 +12,7 @@ import functools
 import hashlib
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.images import read_tiff_page
 from napari_shadowinv.io.reading import read_radiograph
-from napari_shadowinv.preprocessing import Radiograph, remove_hot_pixels
+from napari_shadowinv.preprocessing import Radiograph
 
 Reader = Callable[..., ArrayLike]
 
@@ -46,8 +46,6 @@ def read_shot(
     page: int | None = None,
     channel: str | int | None = None,
     variable: str | None = None,
-    factor: int = 1,
-    hot_pixels: float | None = None,
     warnings: list[str] | None = None,
 ) -> FloatArray:
     """Read the image of a shot; this is the reader where none is given.
@@ -62,11 +60,6 @@ def read_shot(
         What to take of a colour image.
     variable : str, optional
         Name of the array in a MATLAB or HDF5 file.
-    factor : int, optional
-        Sum blocks of so many pixels squared.
-    hot_pixels : float, optional
-        Before that, replace pixels that differ from the median of their neighbours by more
-        standard deviations of the noise.
     warnings : list of str, optional
         What the user should know before trusting the image is put in here.
 
@@ -92,9 +85,7 @@ def read_shot(
                 f"the file contains its own {' and '.join(ignored)}, which a stack ignores: pass "
                 "one for the whole stack"
             )
-    if hot_pixels is not None:
-        shot = replace(shot, image=remove_hot_pixels(shot.image, threshold=hot_pixels)[0])
-    return shot.binned(factor).image
+    return shot.image
 
 
 def _read(reader: Reader, path: Path, **chosen: int) -> tuple[AnyArray, dict[str, Any]]:

@@ -69,7 +69,7 @@ def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
         exact = dtype_of(name).kind != "f" or "site" in dims
         kept = dtype_of(name) if exact else dtype
         if stack.beam is not None and stack.is_shared(name):
-            values = np.asarray(values_of_beam(stack.beam, stack.options)[name])
+            values = np.asarray(values_of_beam(stack.beam, stack.recipe.options)[name])
             found[name] = Variable(dims, kept, labels, values)
         else:
             found[name] = Variable(("shot", *dims), kept, labels, None)
@@ -79,21 +79,21 @@ def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
 def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> dict[str, str]:
     """What must be the same for a store to be continued; of so many of its shots."""
     height, width = stack.shape
+    recipe, shot = stack.recipe, stack.inputs.shot
     source = "uniform"
-    preparation = stack.preparation
     if stack.sources is not None:
         source = f"one for each shot: {', '.join(stack.sources.names[:shots])}"
-    elif preparation.estimate is not None:
-        source = f"guessed from each shot: {preparation.estimate.described}"
     elif stack.beam is not None and stack.beam.source is not None:
         source = f"sha256 {checksum(stack.beam.source)}"
+    elif stack.beam is None and recipe.estimate is not None:
+        source = f"estimated from each shot: {recipe.estimate.model_dump_json()}"
     return {
-        "options": stack.options.model_dump_json(exclude={"threads"}),
-        "setup": "" if stack.setup is None else stack.setup.model_dump_json(),
+        "options": recipe.options.model_dump_json(exclude={"threads"}),
+        "setup": "" if recipe.setup is None else recipe.setup.model_dump_json(),
         "source_image": source,
-        "mask_image": _sum_of(stack.mask) or "none",
-        "filters": preparation.described,
-        "source_mask_image": _sum_of(preparation.bare),
+        "mask_image": _sum_of(shot.mask) or "none",
+        "steps": json.dumps([step.model_dump() for step in recipe.steps]) if recipe.steps else "",
+        "source_mask_image": _sum_of(shot.source_mask),
         "image_size": f"{width} × {height} px",
         "stored": f"{', '.join(stack.variables)} as {dtype}",
         "reader": stack.reader,

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Filter
+    from napari_shadowinv.preprocessing import Recipe, Step
 
 STORED = ("potential", "displacement", "caustic")
 
@@ -82,7 +82,8 @@ def run_stack(
     mask: ArrayLike | None = None,
     options: InversionOptions | None = None,
     setup: Setup | None = None,
-    filters: Sequence[Filter] = (),
+    recipe: Recipe | None = None,
+    filters: Sequence[Step] = (),
     source_mask: ArrayLike | None = None,
     variables: Collection[str] = STORED,
     dtype: str = "float32",
@@ -157,6 +158,7 @@ def run_stack(
         variables=variables,
         reader=reader,
         warm_start=warm_start,
+        recipe=recipe,
         filters=filters,
         source_mask=source_mask,
     )

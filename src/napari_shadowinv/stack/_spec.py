@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
@@ -24,7 +23,16 @@ from napari_shadowinv.inversion.normalise import checked_mask, checked_source
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing import Estimate, Filter, Preparation, UniformEstimate
+from napari_shadowinv.pipeline import Inputs, gathered
+from napari_shadowinv.preprocessing import (
+    Estimate,
+    MeasuredSource,
+    Origin,
+    Radiograph,
+    Recipe,
+    Step,
+    UniformEstimate,
+)
 from napari_shadowinv.stack._discovery import Shots, find_shots, find_source
 from napari_shadowinv.stack._references import Reader, Shot, described_reader
 from napari_shadowinv.stack._worker import Beam, Work, shared_plan, threads_here
@@ -38,29 +46,40 @@ class Stack:
     """Everything about a stack that is known before any shot is inverted."""
 
     shots: Shots
-    beam: Beam | None  # source, filtered, and mask of all shots; None if each has its own source
+    inputs: Inputs  # recipe, masks, and where they came from
+    beam: Beam | None  # source, after all steps, and mask of all shots; None if each has its own
     sources: Shots | None  # one for each shot, if these were measured
-    mask: BoolArray | None
-    options: InversionOptions
-    setup: Setup | None
     variables: tuple[str, ...]
-    preparation: Preparation  # filters of the shots, and how their sources are guessed
     warm_start: int = 1  # so many shots in a row start from the answer to the one before
-    source_file: str = ""
     reader: str = ""  # name of what reads the files
 
     @property
+    def recipe(self) -> Recipe:
+        """What is done to each shot."""
+        return self.inputs.recipe
+
+    @cached_property
+    def moved(self) -> Radiograph:
+        """Masks and setup after the steps that move pixels; its image means nothing."""
+        return self.recipe.moved(self.inputs.shot)
+
+    @property
     def shape(self) -> tuple[int, int]:
-        """Shape (H, W) of each shot."""
-        return self.shots.shape
+        """Shape (H, W) of each result."""
+        return self.moved.shape
+
+    @property
+    def setup(self) -> Setup | None:
+        """Setup of the results."""
+        return self.moved.setup
 
     @cached_property
     def sizes(self) -> dict[str, int]:
         """Length of each dimension."""
         height, width = self.shape
         # Where each shot has its own, there are sites only if they do not depend on it.
-        beam = self.beam or Beam.of(self.shape, None, self.mask)
-        sites = count_sites(beam.image, self.options, mask=beam.mask)
+        beam = self.beam or Beam.of(self.shape, None, self.moved.mask)
+        sites = count_sites(beam.image, self.recipe.options, mask=beam.mask)
         return {"shot": len(self.shots), "y": height, "x": width, "component": 2, "site": sites}
 
     def is_shared(self, name: str) -> bool:
@@ -82,7 +101,7 @@ class Stack:
 
     def work(self, variables: tuple[str, ...]) -> Work:
         """Return what the task of each shot needs to know to make some variables."""
-        return Work(self.shape, self.options, self.setup, variables, self.mask, self.preparation)
+        return Work(self.shots.shape, self.inputs, variables)
 
     def changed(self, index: int, origin: dict[str, Any]) -> str:
         """Name what of a shot is not what its report says; empty if nothing."""
@@ -98,24 +117,30 @@ def describe_stack(
     *,
     source: Any,
     mask: ArrayLike | None,
+    recipe: Recipe | None,
     options: InversionOptions | None,
     setup: Setup | None,
     variables: Collection[str] | None,
     reader: Reader,
     warm_start: int,
-    filters: Sequence[Filter],
+    filters: Sequence[Step],
     source_mask: ArrayLike | None,
 ) -> Stack:
     """Check everything that can be checked before a shot is read."""
-    options = options or InversionOptions()
     if warm_start < 1:
         raise InputError(
             f"warm_start is {warm_start}: expected a number of shots, or 1 to disable it"
         )
-    estimate = source if isinstance(source, Estimate) else None
-    if isinstance(estimate, UniformEstimate):
-        estimate = None
-    sources = None if isinstance(source, Estimate) else find_source(source, reader=reader)
+    wanted = _recipe(recipe, options, setup, filters)
+    if isinstance(source, Estimate):
+        wanted = wanted.model_copy(update={"source": source})
+        source = None
+    measured = wanted.source if isinstance(wanted.source, MeasuredSource) else MeasuredSource()
+    source = measured.file if source is None else source
+    source_reader = reader
+    if measured.variable is not None:
+        source_reader = partial(reader, variable=measured.variable)
+    sources = find_source(source, reader=source_reader)
     # Where the source tells it, no shot needs to be read for its shape.
     shape: tuple[int, ...] = () if mask is None else np.shape(mask)
     if sources is not None:
@@ -127,58 +152,77 @@ def describe_stack(
         raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
     usable = None if mask is None else checked_mask(mask, found.shape)
     bare = None if source_mask is None else checked_mask(source_mask, found.shape)
-    if estimate is not None:
-        estimate = estimate.placed(setup, found.shape)
-    preparation = Preparation(tuple(filters), estimate, bare)
-    preparation.check(has_source=sources is not None, mask=usable)
-    beam = None
-    if not isinstance(sources, Shots):
-        if sources is not None:
-            sources = preparation.filtered(sources, usable)
-            checked_source(sources, usable)
-        if estimate is None:
-            beam = Beam.of(found.shape, sources, usable)
-        sources = None
-    elif len(sources) != len(found):
+    nothing = np.ones(found.shape)
+    inputs = gathered(
+        wanted.model_copy(update={"source": wanted.estimate}),
+        Radiograph(nothing),
+        source=None if sources is None else nothing,
+        mask=usable,
+        source_mask=bare,
+    )
+    inputs.recipe.check(inputs.shot)
+    if inputs.recipe.estimate is not None:
+        inputs.recipe.estimate.placed(inputs.recipe.setup, found.shape)  # refuses a wrong setup
+    if isinstance(source, (str, Path)):
+        origin = Origin(file=text_of(Path(source).name))
+        provenance = inputs.provenance.model_copy(update={"source": origin})
+        inputs = replace(inputs, provenance=provenance)
+    inputs = replace(inputs, shot=replace(inputs.shot, source=None))
+    beam = _shared_beam(inputs, sources)
+    own = sources if isinstance(sources, Shots) else None
+    if own is not None and len(own) != len(found):
         raise InputError(
-            f"got {len(sources)} sources for {len(found)} shots: expected one, or one for each shot"
+            f"got {len(own)} sources for {len(found)} shots: expected one, or one for each shot"
         )
     if beam is None and warm_start > 1:
         raise InputError(
             f"warm_start is {warm_start} and each shot has its own source: the previous solution "
             "belongs to different sites; leave warm_start out, or give one source for all shots"
         )
-    return Stack(
-        found,
-        beam,
-        sources,
-        usable,
-        options,
-        setup,
-        _checked_variables(variables, options, setup, own_sources=beam is None),
-        preparation,
-        warm_start,
-        source_file=text_of(Path(source).name) if isinstance(source, (str, Path)) else "",
-        reader=described_reader(reader),
-    )
+    chosen = _checked_variables(variables, inputs.recipe, own_sources=beam is None)
+    return Stack(found, inputs, beam, own, chosen, warm_start, described_reader(reader))
+
+
+def _recipe(
+    recipe: Recipe | None,
+    options: InversionOptions | None,
+    setup: Setup | None,
+    filters: Sequence[Step],
+) -> Recipe:
+    """The recipe that was given, or that the other keywords make up."""
+    if recipe is None:
+        return Recipe(steps=tuple(filters), setup=setup, options=options or InversionOptions())
+    given = {"options": options, "setup": setup, "filters": tuple(filters) or None}
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"got a recipe and {name}: say so in the recipe")
+    return recipe
+
+
+def _shared_beam(inputs: Inputs, sources: Any) -> Beam | None:
+    """Source, after all steps, and mask that the shots share; None if each has its own source."""
+    moved = inputs.recipe.moved(inputs.shot)
+    if isinstance(inputs.recipe.source, UniformEstimate):
+        return Beam.of(moved.shape, None, moved.mask)
+    if sources is None or isinstance(sources, Shots):
+        return None
+    ready = inputs.recipe.prepared(replace(inputs.shot, image=np.asarray(sources, np.float64)))
+    checked_source(ready.image, ready.mask)
+    return Beam.of(ready.shape, ready.image, ready.mask)
 
 
 def _checked_variables(
-    wanted: Collection[str] | None,
-    options: InversionOptions,
-    setup: Setup | None,
-    *,
-    own_sources: bool,
+    wanted: Collection[str] | None, recipe: Recipe, *, own_sources: bool
 ) -> tuple[str, ...]:
     """Names of the variables that a stack shall have."""
-    labels = variable_labels(setup)
+    labels = variable_labels(recipe.setup)
     # As many sites then as the source shines into the margin: shots would differ.
-    ragged = own_sources and options.boundary == "free"
+    ragged = own_sources and recipe.options.boundary == "free"
     known = tuple(name for name, (dims, _) in labels.items() if not (ragged and "site" in dims))
     for name in wanted or ():
         if name in known:
             continue
-        hint = " (it needs a setup)" if setup is None else ""
+        hint = " (it needs a setup)" if recipe.setup is None else ""
         if name in labels:
             hint = " (sites differ between shots with a free boundary and one source per shot)"
         raise InputError(
@@ -201,11 +245,13 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
 def attributes_of(stack: Stack) -> dict[str, str]:
     """Return the attributes of a stack's dataset."""
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.setup).attrs
-    if stack.source_file:
-        attributes["source_file"] = stack.source_file
-    if stack.preparation.filters:
-        attributes["filters"] = stack.preparation.described
-    return {"format": FORMAT, **attributes, "options": stack.options.model_dump_json()}
+    provenance = stack.inputs.provenance.model_copy(update={"setup": stack.setup})
+    return {
+        "format": FORMAT,
+        **attributes,
+        "options": stack.recipe.options.model_dump_json(),
+        "provenance": provenance.model_dump_json(exclude_none=True),
+    }
 
 
 def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:

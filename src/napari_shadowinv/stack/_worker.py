@@ -1,7 +1,7 @@
 """What a worker does with one shot; sites are made once in each process.
 
 - an undisturbed beam that can be sent around: `Beam`; the sites that threads share: `shared_plan`
-- a shot as it was recorded to an inversion: `Work`; with filters and beam applied: `invert_shot`
+- a shot as it was recorded to an inversion: `Work`
 - an inversion to arrays for a dataset: `arrays_of`; threads for a shot: `threads_here`
 """
 
@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.progress import OnWarning, ShouldStop
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.threads import available_threads
-from napari_shadowinv._typing import AnyArray, BoolArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import Inversion, invert, plan_sites
+from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing import Preparation, uniform_warnings
+from napari_shadowinv.pipeline import Cache, Inputs, run_prepared
 from napari_shadowinv.stack._references import checksum
 from napari_shadowinv.transport.sites import SitePlan
 
@@ -75,7 +75,7 @@ def shared_plan(
     beam: Beam, options: InversionOptions, *, should_stop: ShouldStop | None = None
 ) -> SitePlan:
     """Return the sites for a beam; the first in this process who asks makes them."""
-    key = beam.key + options.model_dump_json(exclude={"threads"})
+    key = beam.key + options.site_key()
     with _entries_lock:
         entry = _entries.setdefault(key, _Entry())
         _entries.move_to_end(key)
@@ -90,35 +90,31 @@ def shared_plan(
         return entry.plan
 
 
-def invert_shot(
-    image: AnyArray,
-    beam: Beam,
-    options: InversionOptions,
-    *,
-    start: Inversion | None = None,
-    should_stop: ShouldStop | None = None,
-) -> Inversion:
-    """Invert one shot with the sites that its process shares."""
-    began = time.perf_counter()
-    plan = shared_plan(beam, options, should_stop=should_stop)
-    on_sites = time.perf_counter() - began
-    if beam.source is None:
-        image = _relative(image, beam.mask)
-    inversion = invert(image, options=options, plan=plan, start=start, should_stop=should_stop)
-    seconds = {**inversion.report.seconds, "sites": on_sites}
-    return replace(inversion, report=replace(inversion.report, seconds=seconds))
+@dataclass
+class _SharedSites(Cache):
+    """Sites that all shots of a process share, where they share their beam."""
+
+    beam: Beam | None = None
+
+    def plan(
+        self,
+        source: FloatArray,
+        mask: BoolArray | None,
+        options: InversionOptions,
+        on_progress: OnProgress | None = None,
+        should_stop: ShouldStop | None = None,
+    ) -> SitePlan:
+        beam = self.beam or Beam.of(source.shape, source, mask)
+        return shared_plan(beam, options, should_stop=should_stop)
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
     """What is done with every shot of a stack, wherever it is."""
 
-    shape: tuple[int, int]
-    options: InversionOptions  # without `threads`, shots inverted at once share the cores
-    setup: Setup | None
+    shape: tuple[int, int]  # of the shots as recorded
+    inputs: Inputs  # without an image; shots inverted at once share the cores
     variables: tuple[str, ...]
-    mask: BoolArray | None
-    preparation: Preparation
 
     def invert(
         self,
@@ -130,45 +126,37 @@ class Work:
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
-        """Filter and invert a shot as it was recorded.
+        """Apply the recipe to a shot as it was recorded.
 
         Without a beam that all shots share, it has the given source, also as it was recorded, or
-        one that is guessed from the image.
+        one that is estimated from the image.
         """
         if np.shape(image) != self.shape:
             others = "the others" if beam is None or beam.source is None else "the source"
             raise InputError(
                 f"image has shape {np.shape(image)}, expected {self.shape} as {others}"
             )
-        image = self.preparation.filtered(image, self.mask, should_stop)
-        doubts: list[str] = []
-        if beam is None:
-            own = self._source(image, source, should_stop, doubts.append)
-            beam = Beam.of(self.shape, own, self.mask)
-        elif beam.source is None:
-            doubts.extend(uniform_warnings(self.shape, self.setup))
-        options = self.options
+        if source is not None and np.shape(source) != self.shape:
+            raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
+        recipe = self.inputs.recipe
+        values = np.asarray(image, dtype=np.float64)
+        shot = replace(self.inputs.shot, image=values, source=source)
+        ready = recipe.prepared(shot, should_stop)
+        if beam is not None:
+            ready = replace(ready, source=beam.image)
+            if beam.source is None:
+                ready = replace(ready, image=_relative(ready.image, ready.mask))
+        options = recipe.options
         if options.threads is None:
             options = options.model_copy(update={"threads": threads_here(workers)})
-        inversion = invert_shot(image, beam, options, start=start, should_stop=should_stop)
-        return inversion.with_warnings(doubts)
-
-    def _source(
-        self,
-        image: AnyArray,
-        source: AnyArray | None,
-        should_stop: ShouldStop | None,
-        on_warning: OnWarning,
-    ) -> AnyArray:
-        if source is None:
-            return self.preparation.estimated(image, self.mask, should_stop, on_warning)
-        if np.shape(source) != self.shape:
-            raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
-        return self.preparation.filtered(source, self.mask, should_stop)
+        recipe = recipe.model_copy(update={"options": options})
+        inputs = replace(self.inputs, recipe=recipe, shot=shot)
+        sites = _SharedSites(beam=beam)
+        return run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
 
     def arrays(self, inversion: Inversion) -> dict[str, AnyArray]:
         """Return the variables by name."""
-        return arrays_of(inversion, dict.fromkeys(self.variables), self.setup)
+        return arrays_of(inversion, dict.fromkeys(self.variables), inversion.setup)
 
 
 def _relative(image: AnyArray, mask: BoolArray | None) -> AnyArray:
