@@ -181,7 +181,11 @@ def _geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, A
     ):
         if value is not None:
             geometry[name] = value
-    _check_square(path, attributes, width)
+    first, second = attributes.get(width), attributes.get(f"{width}_ax2")
+    if first is not None and second is not None and not np.isclose(first, second, rtol=1e-6):
+        raise FileFormatError(
+            f"{path} has pixels of {first:g} m by {second:g} m: expected square pixels; resample it"
+        )
     return geometry
 
 
@@ -194,14 +198,6 @@ def _distances(attributes: dict[str, Any]) -> tuple[float | None, float | None]:
     if source_image is None or object_image is None:
         return None, object_image
     return source_image - object_image, object_image
-
-
-def _check_square(path: Path, attributes: dict[str, Any], width: str) -> None:
-    first, second = attributes.get(width), attributes.get(f"{width}_ax2")
-    if first is not None and second is not None and not np.isclose(first, second, rtol=1e-6):
-        raise FileFormatError(
-            f"{path} has pixels of {first:g} m by {second:g} m: expected square pixels; resample it"
-        )
 
 
 def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
@@ -232,26 +228,6 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
     angle = setup.deflection_angle(dataset["displacement"].values)
     potential = -setup.potential(dataset["potential"].values)
     datasets = {"phi": potential, "defl_ax1": angle[0], "defl_ax2": angle[1]}
-    with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
-        for name, values in datasets.items():
-            file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
-        file.attrs.update(_inversion_attributes(setup, dataset.attrs.get("input_file", "")))
-
-
-def check_pradformat_setup(setup: ProtonSetup | OpticalSetup | None) -> ProtonSetup:
-    """Refuse a setup that a pradformat inversion cannot be written with; the format needs all."""
-    from napari_shadowinv.physics.setup import ProtonSetup
-
-    if not isinstance(setup, ProtonSetup):
-        found = "none" if setup is None else f"kind '{setup.kind}'"
-        raise InputError(
-            f"a pradformat inversion needs a setup of kind 'proton', received {found}: give one, "
-            "or write .shadowinv"
-        )
-    return setup
-
-
-def _inversion_attributes(setup: ProtonSetup, radiograph_filename: str) -> dict[str, Any]:
     attributes: dict[str, Any] = {
         "object_type": "inversion",
         "inversion_type": "simple",
@@ -266,6 +242,22 @@ def _inversion_attributes(setup: ProtonSetup, radiograph_filename: str) -> dict[
         "file_date": datetime.now(UTC).date().isoformat(),
         "description": "Power-diagram inversion by napari-shadowinv",
     }
-    if radiograph_filename:
-        attributes["radiograph_filename"] = radiograph_filename
-    return attributes
+    if name := dataset.attrs.get("input_file"):
+        attributes["radiograph_filename"] = name
+    with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
+        for key, values in datasets.items():
+            file.create_dataset(key, data=values, compression="gzip", compression_opts=4)
+        file.attrs.update(attributes)
+
+
+def check_pradformat_setup(setup: ProtonSetup | OpticalSetup | None) -> ProtonSetup:
+    """Refuse a setup that a pradformat inversion cannot be written with; the format needs all."""
+    from napari_shadowinv.physics.setup import ProtonSetup
+
+    if not isinstance(setup, ProtonSetup):
+        found = "none" if setup is None else f"kind '{setup.kind}'"
+        raise InputError(
+            f"a pradformat inversion needs a setup of kind 'proton', received {found}: give one, "
+            "or write .shadowinv"
+        )
+    return setup
