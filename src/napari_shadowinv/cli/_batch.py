@@ -91,7 +91,6 @@ def run_batch(
     quiet: bool,
 ) -> None:
     """Invert all shots into a store, tell of it, and end with what became of them."""
-    from napari_shadowinv.pipeline.run import picture_mask
     from napari_shadowinv.stack import STORED, read_shot, run_stack
 
     _check(out, resume or redo_failed, overwrite)
@@ -105,8 +104,6 @@ def run_batch(
                 shots[0] if len(shots) == 1 else shots,
                 out,
                 recipe=recipe,
-                mask=None if recipe.mask is None else picture_mask(recipe.mask),
-                source_mask=None
                 if recipe.source_mask is None
                 else picture_mask(recipe.source_mask),
                 variables=STORED if variables is None else _names(variables),

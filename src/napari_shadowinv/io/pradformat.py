@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup, Species
-    from napari_shadowinv.preprocessing import Provenance
 
 __all__ = [
     "check_pradformat_setup",
@@ -183,7 +182,11 @@ def _geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, A
     ):
         if value is not None:
             geometry[name] = value
-    _check_square(path, attributes, width)
+    first, second = attributes.get(width), attributes.get(f"{width}_ax2")
+    if first is not None and second is not None and not np.isclose(first, second, rtol=1e-6):
+        raise FileFormatError(
+            f"{path} has pixels of {first:g} m by {second:g} m: expected square pixels; resample it"
+        )
     return geometry
 
 
@@ -196,14 +199,6 @@ def _distances(attributes: dict[str, Any]) -> tuple[float | None, float | None]:
     if source_image is None or object_image is None:
         return None, object_image
     return source_image - object_image, object_image
-
-
-def _check_square(path: Path, attributes: dict[str, Any], width: str) -> None:
-    first, second = attributes.get(width), attributes.get(f"{width}_ax2")
-    if first is not None and second is not None and not np.isclose(first, second, rtol=1e-6):
-        raise FileFormatError(
-            f"{path} has pixels of {first:g} m by {second:g} m: expected square pixels; resample it"
-        )
 
 
 def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
@@ -233,25 +228,6 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
     angle = setup.deflection_angle(dataset["displacement"].values)
     potential = -setup.potential(dataset["potential"].values)
     datasets = {"phi": potential, "defl_ax1": angle[0], "defl_ax2": angle[1]}
-    with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
-        for name, values in datasets.items():
-            file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
-        attributes = _inversion_attributes(setup, provenance_of(dataset))
-        file.attrs.update(attributes)
-
-
-def check_pradformat_setup(setup: Setup | None) -> Setup:
-    """Refuse a setup that a pradformat inversion cannot be written with; the format needs all."""
-    if setup is None or not setup.in_pradformat:
-        found = "none" if setup is None else f"kind '{setup.kind}'"
-        raise InputError(
-            f"a pradformat inversion needs a setup of kind 'proton', received {found}: give one, "
-            "or write .shadowinv"
-        )
-    return setup
-
-
-def _inversion_attributes(setup: Any, provenance: Provenance | None) -> dict[str, Any]:
     attributes: dict[str, Any] = {
         "object_type": "inversion",
         "inversion_type": "simple",
@@ -266,8 +242,23 @@ def _inversion_attributes(setup: Any, provenance: Provenance | None) -> dict[str
         "file_date": datetime.now(UTC).date().isoformat(),
         "description": "Power-diagram inversion by napari-shadowinv",
     }
+    provenance = provenance_of(dataset)
     if provenance is not None:
         attributes["provenance"] = provenance.model_dump_json(exclude_none=True)
         if provenance.image.file:
             attributes["radiograph_filename"] = provenance.image.file
-    return attributes
+    with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
+        for name, values in datasets.items():
+            file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
+        file.attrs.update(attributes)
+
+
+def check_pradformat_setup(setup: Setup | None) -> Setup:
+    """Refuse a setup that a pradformat inversion cannot be written with; the format needs all."""
+    if setup is None or not setup.in_pradformat:
+        found = "none" if setup is None else f"kind '{setup.kind}'"
+        raise InputError(
+            f"a pradformat inversion needs a setup of kind 'proton', received {found}: give one, "
+            "or write .shadowinv"
+        )
+    return setup

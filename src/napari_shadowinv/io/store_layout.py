@@ -104,8 +104,8 @@ def grow_store(
 ) -> StackStore:
     """Make room for more shots at the end of a store, all of them pending.
 
-    The coordinates, `values`, are those of all `length` shots. A process killed while extending
-    the store leaves it unchanged: it can be read, and be extended again; so does a `StoreError`.
+    The coordinates, `values`, are those of all `length` shots. A `StoreError`, or a process killed
+    while extending the store, leaves it unchanged: it can be read, and be extended again.
     """
     import zarr
 
@@ -119,21 +119,17 @@ def grow_store(
             array.resize((length, *array.shape[1:]))
             if name in values:
                 array[before:] = values[name][before:]
-        _tell_length(path, longer, length, attributes)
+        file = path / "zarr.json"
+        metadata = json.loads(file.read_text(encoding="utf-8"))
+        metadata["attributes"].update(attributes)
+        for name in longer:
+            metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
+        # From here on the store is longer.
+        with replacing(file, overwrite=True) as draft:
+            draft.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
     except OSError as error:
         raise store_error(path, error) from error
     return StackStore(path)
-
-
-def _tell_length(path: Path, names: list[str], length: int, attributes: Mapping[str, Any]) -> None:
-    """Replace the folder's own metadata: from here on the store is longer."""
-    file = path / "zarr.json"
-    metadata = json.loads(file.read_text(encoding="utf-8"))
-    metadata["attributes"].update(attributes)
-    for name in names:
-        metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
-    with replacing(file, overwrite=True) as draft:
-        draft.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
 
 
 def _write_template(path: Path, contents: Contents) -> None:

@@ -20,7 +20,8 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.files import in_counting_order, kind_of, text_of
+from napari_shadowinv.io.files import in_counting_order, text_of
+from napari_shadowinv.io.formats import kind_of
 from napari_shadowinv.io.images import tiff_pages
 from napari_shadowinv.stack._references import (
     ArrayShot,
