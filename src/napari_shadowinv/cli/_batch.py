@@ -104,8 +104,6 @@ def run_batch(
                 shots[0] if len(shots) == 1 else shots,
                 out,
                 recipe=recipe,
-                if recipe.source_mask is None
-                else picture_mask(recipe.source_mask),
                 variables=STORED if variables is None else _names(variables),
                 reader=reader,
                 warm_start=warm_start,

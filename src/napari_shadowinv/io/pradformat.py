@@ -253,7 +253,7 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         file.attrs.update(attributes)
 
 
-def check_pradformat_setup(setup: Setup | None) -> Setup:
+def check_pradformat_setup(setup: Setup | None) -> Any:
     """Refuse a setup that a pradformat inversion cannot be written with; the format needs all."""
     if setup is None or not setup.in_pradformat:
         found = "none" if setup is None else f"kind '{setup.kind}'"
