@@ -27,12 +27,13 @@ import numpy as np
 import psutil  # dask needs it, too
 from distributed import Client
 
-from napari_shadowinv import InversionOptions, run_stack, synthetic_image
+from napari_shadowinv import InversionOptions, Recipe, run, run_stack, synthetic_image
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.pipeline import Cache
+from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import ShotOutcome, read_shot
 from napari_shadowinv.stack._local import local_client
-from napari_shadowinv.stack._worker import Beam, invert_shot
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 
@@ -65,7 +66,7 @@ class Night:
     shots: list[Path]
     source: Path
     reader: Callable[[Path], np.ndarray]
-    options: InversionOptions
+    recipe: Recipe
     name: str
 
 
@@ -74,13 +75,15 @@ def night(folder: Path, count: int, shape: tuple[int, int], sites: int | None) -
     options = InversionOptions(n_sites=sites, threads=1)
     reference, shots = BURNER / "Image_00000.bmp", sorted(BURNER.glob("Image_2*.bmp"))[:count]
     if len(shots) == count and shape == (464, 576):
-        binned = partial(read_shot, channel="mean", factor=2)
-        return Night(shots, reference, binned, options, "burner, binned by 2")
+        grey = partial(read_shot, channel="mean")
+        recipe = Recipe(steps=(Bin(factor=2),), options=options)
+        return Night(shots, reference, grey, recipe, "burner, binned by 2")
     shots = [folder / f"shot_{number}.npy" for number in range(count)]
     for number, path in enumerate(shots):
         np.save(path, plume(shape, number))
     np.save(folder / "reference.npy", np.full(shape, 1000.0))
-    return Night(shots, folder / "reference.npy", read_shot, options, "simulated plumes")
+    recipe = Recipe(options=options)
+    return Night(shots, folder / "reference.npy", read_shot, recipe, "simulated plumes")
 
 
 def warm_up(shots: int, folder: Path, scheduler: Any) -> None:
@@ -91,11 +94,11 @@ def warm_up(shots: int, folder: Path, scheduler: Any) -> None:
     run_stack(few, out, options=options, scheduler=scheduler, overwrite=True)
 
 
-def on_workers(count: int, run: Callable[[Client], float], folder: Path) -> float:
+def on_workers(count: int, timed: Callable[[Client], float], folder: Path) -> float:
     """Time a run on workers with one thread each that have done a few shots before."""
     with local_client(count) as client:
         warm_up(6 * count, folder, client)
-        return run(client)
+        return timed(client)
 
 
 def plainly(night: Night, shots: list[Path], folder: Path, start: Any, ended: Any) -> None:
@@ -104,10 +107,9 @@ def plainly(night: Night, shots: list[Path], folder: Path, start: Any, ended: An
     warm_up(3, folder, "synchronous")
     start.wait()
     began = time.perf_counter()
-    source = night.reader(night.source)
-    beam = Beam.of((source.shape[0], source.shape[1]), source, None)
+    source, cache = night.reader(night.source), Cache()
     for path in shots:
-        invert_shot(night.reader(path), beam, night.options)
+        run(night.recipe, night.reader(path), source=source, cache=cache)
     ended.put(time.perf_counter() - began)
 
 
@@ -128,18 +130,19 @@ def in_processes(count: int, night: Night, folder: Path) -> float:
 
 def speedup(arguments: argparse.Namespace, folder: Path) -> None:
     shots = night(folder, arguments.shots, tuple(arguments.side), arguments.sites)
-    beam = shots.reader(shots.source)
-    size = f"{beam.shape[1]} × {beam.shape[0]} px, {shots.options.n_sites or beam.size:,} sites"
+    height, width = shots.recipe.shape_after(shots.reader(shots.source).shape)
+    sites = shots.recipe.options.n_sites or height * width
+    size = f"{width} × {height} px, {sites:,} sites"
     print(f"\n{arguments.shots} shots ({shots.name}), {size}\n")
 
-    def run(client: Client) -> float:
+    def timed(client: Client) -> float:
         start = time.perf_counter()
         run_stack(
             shots.shots,
             folder / "night.shadowinv.zarr",
             source=shots.source,
             reader=shots.reader,
-            options=shots.options,
+            recipe=shots.recipe,
             scheduler=client,
             overwrite=True,
             on_progress=lambda told: told.outcome and ended.append(told.outcome),
@@ -149,7 +152,7 @@ def speedup(arguments: argparse.Namespace, folder: Path) -> None:
     times: dict[int, float] = {}
     for workers in (2, 1):
         ended: list[ShotOutcome] = []
-        times[workers] = on_workers(workers, run, folder)
+        times[workers] = on_workers(workers, timed, folder)
         assert all(outcome.status == DONE for outcome in ended)
     plain = {count: in_processes(count, shots, folder) for count in (1, 2)}
     # Of the run on one worker.
@@ -193,7 +196,7 @@ def stream(arguments: argparse.Namespace, folder: Path) -> None:
     curve: list[tuple[int, float, float]] = []
     busy = [0.0]
 
-    def run(client: Client) -> float:
+    def timed(client: Client) -> float:
         def note(progress):
             if progress.outcome is not None:
                 busy[0] += progress.outcome.seconds
@@ -214,7 +217,7 @@ def stream(arguments: argparse.Namespace, folder: Path) -> None:
         )
         return time.perf_counter() - start
 
-    seconds = on_workers(2, run, folder)
+    seconds = on_workers(2, timed, folder)
     statuses = StackStore(out).statuses()
     print(f"\n{count} shots of 100 × 100 px on two workers\n")
     print("| shots done | memory of the largest worker, MB | of the client, MB |\n|---|---|---|")

@@ -23,7 +23,21 @@ from numpy.typing import NDArray
 
 from napari_shadowinv import invert, read, synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
-from napari_shadowinv.preprocessing import filters, sources
+from napari_shadowinv.preprocessing import (
+    butterworth,
+    gaussian_source,
+    high_pass,
+    interpolated_source,
+    isotropic_source,
+    low_pass,
+    low_pass_source,
+    polynomial_source,
+    remove_background,
+    remove_hot_pixels,
+    total_variation_source,
+    uniform_source,
+)
+from napari_shadowinv.preprocessing.isotropic import point_distance
 
 SHOT = "Image_20241017221829851.bmp"
 SHAPE = (160, 200)
@@ -83,7 +97,7 @@ def tilted_beam() -> FloatArray:
 
 
 def patchy_beam(width: float, seed: int = 2) -> FloatArray:
-    patches = filters.low_pass(np.random.default_rng(seed).normal(size=SHAPE), width)
+    patches = low_pass(np.random.default_rng(seed).normal(size=SHAPE), width)
     return np.exp(0.28 * (patches - patches.mean()) / patches.std())
 
 
@@ -140,7 +154,7 @@ def source_picture(
     tidy(axes[3], f"Cut at y = {shot.row} px", "x (px)", "Intensity / mean")
     beams = {"this source": source, "the true beam": shot.beam}
     if name != "uniform":
-        beams["a uniform source"] = sources.uniform_source(shot.shot)
+        beams["a uniform source"] = uniform_source(shot.shot)
     footer = "Error of the retrieved displacement:  " + "  ·  ".join(
         f"{displacement_error(shot, beam):.0%} with {text}" for text, beam in beams.items()
     )
@@ -150,31 +164,37 @@ def source_picture(
 def source_pictures() -> None:
     y, x = grid()
     flat = scene(np.ones(SHAPE), big_object())
-    source_picture("uniform", "uniform_source", flat, sources.uniform_source(flat.shot))
+    source_picture("uniform", "uniform_source", flat, uniform_source(flat.shot))
     setup = paper_setup().model_copy(update={"pixel_size": 4e-6})
-    point = scene(sources.isotropic_source(np.ones(SHAPE), setup), 0.5 * big_object())
+    point = scene(isotropic_source(np.ones(SHAPE), setup), 0.5 * big_object())
     source_picture(
         "isotropic",
-        f"isotropic_source, {sources.point_distance(setup):.0f} px from the detector",
+        f"isotropic_source, {point_distance(setup):.0f} px from the detector",
         point,
-        sources.isotropic_source(point.shot, setup),
+        isotropic_source(point.shot, setup),
     )
     spot = scene(gaussian_beam(), big_object())
-    source_picture("gaussian", "gaussian_source", spot, sources.gaussian_source(spot.shot))
+    source_picture("gaussian", "gaussian_source", spot, gaussian_source(spot.shot))
     tilted = scene(tilted_beam(), big_object())
     source_picture(
-        "polynomial", "polynomial_source, degree 2", tilted, sources.polynomial_source(tilted.shot)
+        "polynomial",
+        "polynomial_source, degree 2",
+        tilted,
+        polynomial_source(tilted.shot),
     )
     patchy = scene(patchy_beam(24), small_objects(), row=67)
     source_picture(
-        "low-pass", "low_pass_source, width 10 px", patchy, sources.low_pass_source(patchy.shot, 10)
+        "low-pass",
+        "low_pass_source, width 10 px",
+        patchy,
+        low_pass_source(patchy.shot, 10),
     )
     clipped = scene(clipped_beam(), small_objects(), row=67)
     source_picture(
         "total-variation",
         "total_variation_source, weight 1 px",
         clipped,
-        sources.total_variation_source(clipped.shot, weight=1.0),
+        total_variation_source(clipped.shot, weight=1.0),
     )
     covered = scene(patchy_beam(45, seed=6), big_object())
     mask = np.hypot((y - 78) / 38, (x - 102) / 50) > 1
@@ -182,7 +202,7 @@ def source_pictures() -> None:
         "interpolated",
         "interpolated_source",
         covered,
-        sources.interpolated_source(covered.shot, mask, width=8.0),
+        interpolated_source(covered.shot, mask, width=8.0),
         mask,
     )
 
@@ -195,10 +215,10 @@ def burner_sources_picture(folder: Path) -> None:
     y, x = np.mgrid[: shot.shape[0], : shot.shape[1]]
     mask = ~((x > 115) & (x < 530) & (y < 200)) & ~((x > 190) & (x < 440))
     estimates = {
-        "Uniform": sources.uniform_source(shot),
-        "Gaussian": sources.gaussian_source(shot, mask=mask),
-        "Polynomial, degree 4": sources.polynomial_source(shot, degree=4, mask=mask),
-        "Low pass, 60 px": sources.low_pass_source(shot, 60),
+        "Uniform": uniform_source(shot),
+        "Gaussian": gaussian_source(shot, mask=mask),
+        "Polynomial, degree 4": polynomial_source(shot, degree=4, mask=mask),
+        "Low pass, 60 px": low_pass_source(shot, 60),
     }
     figure, axes = page("A real beam: plume of an alcohol burner", [1, 1, 1], rows=2)
     show(axes[0], shot, "Shot", "Intensity / mean", (0.75, 1.4))
@@ -207,7 +227,7 @@ def burner_sources_picture(folder: Path) -> None:
     for panel, (name, beam) in zip(axes[2:], estimates.items(), strict=True):
         miss = beam / beam.mean() / reference - 1
         title = f"{name}: {100 * miss.std():.1f} % rms"
-        miss = filters.low_pass(100 * miss, 2.0)
+        miss = low_pass(100 * miss, 2.0)
         show(panel, miss, title, "Estimate - beam (% of beam)", (-15, 15), "RdBu_r")
     footer = (
         "Orange: the Gaussian and the polynomial were fitted outside of it. The low pass saw all."
@@ -239,14 +259,14 @@ def gain_panel(axes: Axes, curves: dict[str, Callable[[FloatArray], FloatArray]]
 def pass_pictures() -> None:
     shot = scene(gaussian_beam(), big_object()).shot
     noisy = np.random.default_rng(3).poisson(shot / 60).astype(float)
-    noisy, smooth = noisy / noisy.mean(), filters.low_pass(noisy, 1.5) / noisy.mean()
+    noisy, smooth = noisy / noisy.mean(), low_pass(noisy, 1.5) / noisy.mean()
     figure, axes = page("low_pass, width 1.5 px", [1, 1, 1.15])
     show(axes[0], noisy, "Shot of 33 counts per pixel", "Intensity / mean", range_of(smooth, 0.1))
     show(axes[1], smooth, "Filtered", "Intensity / mean", range_of(smooth, 0.1))
     gain_panel(
         axes[2],
         {
-            f"width {width:g} px": lambda image, width=width: filters.low_pass(image, width)
+            f"width {width:g} px": lambda image, width=width: low_pass(image, width)
             for width in (1.5, 5.0, 15.0)
         },
     )
@@ -258,18 +278,18 @@ def pass_pictures() -> None:
         (
             "high-pass",
             "high_pass, width 10 px",
-            filters.high_pass(patchy, 10.0),
+            high_pass(patchy, 10.0),
             {
-                f"width {width:g} px": lambda image, width=width: filters.high_pass(image, width)
+                f"width {width:g} px": lambda image, width=width: high_pass(image, width)
                 for width in (5.0, 10.0, 30.0)
             },
         ),
         (
             "butterworth",
             "butterworth, cutoff 40 px, order 2",
-            filters.butterworth(patchy, 40.0, 2),
+            butterworth(patchy, 40.0, 2),
             {
-                f"order {order}": lambda image, order=order: filters.butterworth(image, 40.0, order)
+                f"order {order}": lambda image, order=order: butterworth(image, 40.0, order)
                 for order in (1, 2, 4, 8)
             },
         ),
@@ -284,7 +304,7 @@ def pass_pictures() -> None:
 def background_picture() -> None:
     tilted = scene(tilted_beam(), big_object())
     shot = tilted.shot / tilted.shot.mean()
-    flat = filters.remove_background(shot, 2)
+    flat = remove_background(shot, 2)
     figure, axes = page("remove_background, degree 2", [1, 1, 1.15])
     show(axes[0], shot, "Shot", "Intensity / mean", range_of(shot))
     show(axes[1], flat, "Flattened", "Intensity / mean", range_of(shot))
@@ -304,7 +324,7 @@ def hot_pixels_picture() -> None:
     places = [tuple(rng.integers(0, SHAPE, 2)) for _ in range(60)]
     for number, place in enumerate(places):
         shot[place] = 0 if number % 3 == 0 else rng.uniform(7000, 16000)
-    clean, hot, dead = filters.remove_hot_pixels(shot)
+    clean, hot, dead = remove_hot_pixels(shot)
     broken = np.zeros(SHAPE, dtype=bool)
     broken[tuple(np.transpose(places))] = True
     mean = np.median(shot)
@@ -329,14 +349,14 @@ def burner_filters_picture(folder: Path) -> None:
     """The paper's filtering of a shadowgram, of its potential, and of both."""
     shot = read(folder / SHOT).binned(4).image
     reference = read(folder / "Image_00000.bmp").binned(4).image
-    flat = filters.remove_background(shot, 4)
+    flat = remove_background(shot, 4)
     raw = invert(shot).potential
     potentials = {
         "Recorded beam, unfiltered": invert(shot, source=reference).potential,
         "Uniform source, unfiltered": raw,
-        "Potential high-passed": filters.high_pass(raw, 25.0),
+        "Potential high-passed": high_pass(raw, 25.0),
         "Image flattened": invert(flat).potential,
-        "Both": filters.high_pass(invert(flat).potential, 25.0),
+        "Both": high_pass(invert(flat).potential, 25.0),
     }
     figure, axes = page("Filtering a real shot without its beam", [1, 1, 1], rows=2)
     show(axes[0], shot / shot.mean(), "Shot", "Intensity / mean", (0.75, 1.4))

@@ -24,7 +24,7 @@ from qtpy.QtWidgets import QApplication
 import napari
 from napari_shadowinv import InversionOptions, add_inversion, invert
 from napari_shadowinv._napari.layer_metadata import setup_of
-from napari_shadowinv.stack import read_shot
+from napari_shadowinv.io import read_radiograph
 
 HERE = Path(__file__).parent / "pictures"
 PLUGIN = "napari-shadowinv"
@@ -106,7 +106,7 @@ def toroid_window() -> None:
 def stack_window(folder: Path) -> None:
     """A run over real shadowgrams without a reference: the widget, and a shot's field."""
     viewer = new_window("alcohol burner")
-    shots = [read_shot(path, channel="mean", factor=4) for path in frames(folder)]
+    shots = [read_radiograph(path, channel="mean").binned(4).image for path in frames(folder)]
     viewer.add_image(np.stack(shots), name="burner")
     _, widget = viewer.window.add_plugin_dock_widget(PLUGIN, "Invert stack")
     widget.source.picker.set_kind("polynomial")

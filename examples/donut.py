@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from napari_shadowinv import ProtonSetup, Radiograph, invert, poisson_invert, write
+from napari_shadowinv import ProtonSetup, Recipe, poisson_invert, run, write
+from napari_shadowinv.preprocessing import Bin
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("folder", type=Path, help="folder with intensity.npy and displacement.npy")
@@ -31,16 +32,15 @@ setup = ProtonSetup(
     object_image_distance=20e-2,
     pixel_size=10e-6,
 )
-shot = Radiograph(np.load(options.folder / "intensity.npy").astype(float), setup=setup)
 truth = np.load(options.folder / "displacement.npy")
 if options.small:
-    shot = shot.binned(2)
-    setup = shot.setup
     truth = truth.reshape(2, 100, 2, 100, 2).mean(axis=(2, 4)) / 2
 
 # %% The inversion, and the linear one for comparison
-inversion = invert(shot.image)
-linear = -np.array(np.gradient(poisson_invert(shot.image)))
+recipe = Recipe(steps=(Bin(factor=2),) if options.small else (), setup=setup)
+inversion = run(recipe, options.folder / "intensity.npy")
+setup = inversion.setup  # with the pixels of the result
+linear = -np.array(np.gradient(poisson_invert(inversion.image)))
 
 # %% The field in MG µm, and how far it is from the truth
 fields = {
@@ -57,7 +57,7 @@ for name, field in strength.items():
     print(f"{name}: peak {field.max():.1f} MG µm, error {errors[name]:.1%}")
 
 # %% The picture
-side = shot.image.shape[0] * setup.object_pixel_size * 1e3
+side = inversion.image.shape[0] * setup.object_pixel_size * 1e3
 extent = (0, side, side, 0)
 figure = Figure(figsize=(11.5, 6.6), layout="constrained")
 panels = figure.subplots(2, 3)
@@ -89,6 +89,6 @@ cut.set_ylim(0, 1.55 * strength["True"].max())
 cut.set_box_aspect(1)
 cut.legend(frameon=False, fontsize=8, loc="upper right")
 
-# %% Results: the picture, and everything in one file
+# %% Results: the picture, and everything in one file, with the recipe
 figure.savefig(options.out / "donut.png", dpi=130)
-write(options.out / "donut.shadowinv", inversion, setup=setup, shot=shot, overwrite=True)
+write(options.out / "donut.shadowinv", inversion, overwrite=True)

@@ -1,6 +1,6 @@
 """Pages of the reference that are written when the site is built, so that they are never stale.
 
-- every parameter of filters, source estimates, setups and options, from the pydantic models
+- every parameter of a recipe's steps and sources, of setups and options, from the pydantic models
 - every command with its options, from the command-line program
 - the public names, from each module's ``__all__``
 """
@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from enum import Enum
 from importlib import import_module
 from inspect import cleandoc, isclass, unwrap
@@ -20,14 +21,16 @@ from rich.text import Text
 from sphinx.application import Sphinx
 from sphinx.config import Config
 
+from napari_shadowinv.preprocessing import Choice
+
 FOLDER = Path(__file__).parents[1] / "reference"
 
 _SHAPES: dict[Any, str] = {Path: "PATH", int: "INTEGER", float: "NUMBER", str: "TEXT"}
 
 MODULES = {
-    "preprocessing.recipes": "Filters and source estimates with their parameters",
-    "preprocessing.filters": "Filters as functions",
-    "preprocessing.sources": "Source estimates as functions",
+    "preprocessing": "Recipes, steps, filters and source estimates",
+    "preprocessing.film": "Scans of film to dose",
+    "pipeline": "From a recipe and a shot to a result",
     "physics.phantoms": "Test objects",
     "io": "Files",
 }
@@ -63,49 +66,54 @@ def write_pages(app: Sphinx, config: Config) -> None:
 def parameters_page() -> str:
     from napari_shadowinv import InversionOptions
     from napari_shadowinv.physics.setup import SETUPS
-    from napari_shadowinv.preprocessing import ESTIMATES, FILTERS
+    from napari_shadowinv.preprocessing import ESTIMATES, STEPS, MeasuredSource
 
+    sources = [MeasuredSource, *ESTIMATES.values()]
     parts = [
         "# Parameters",
         "The same parameters appear in napari's forms, in TOML files and in Python. "
-        "Lengths in px are pixels of the image that is inverted, after any binning.",
-        "## Filters",
-        "Chosen under *Filter first* in napari; see [](../filters.md).",
-        *(model_section(model, name) for name, model in FILTERS.items()),
-        "## Source estimates",
-        "Chosen under *Source* in napari; see [](../sources.md).",
-        *(model_section(model, name) for name, model in ESTIMATES.items()),
+        "Lengths in px are pixels of the image as it is when they are used, after any earlier binning.",
+        "## Steps",
+        "What is done to the image first. In a recipe `[[steps]]`, in any order; the command applies "
+        "the steps its flags ask for in the order below. See [](../recipes.md) and [](../filters.md).",
+        *(choice_section(model) for model in STEPS.values()),
+        "## Sources",
+        "The undisturbed beam. In a recipe `[source]`; see [](../sources.md).",
+        *(choice_section(model) for model in sources),
         "## Setups",
         "The geometry of the experiment. In napari under *Setup*; on the command line "
         "`--setup setup.toml`.",
-        *(model_section(model, kind, title=model.beam) for kind, model in SETUPS.items()),
+        *(
+            section(model, model.beam, f'`kind = "{kind}"`', "napari_shadowinv")
+            for kind, model in SETUPS.items()
+        ),
         "## Inversion options",
         "In napari under *Options*; in Python the arguments of "
         "{py:class}`~napari_shadowinv.InversionOptions`.",
-        model_table(InversionOptions),
+        table_of(InversionOptions.model_fields),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def model_section(model: type[BaseModel], name: str, title: str = "") -> str:
-    heading = title or str(model.title)  # type: ignore[attr-defined]
+def choice_section(model: type[Choice]) -> str:
+    named = f'`{model.key} = "{model.name()}"`'
+    return section(model, model.title, named, "napari_shadowinv.preprocessing")
+
+
+def section(model: type[BaseModel], title: str, named: str, module: str) -> str:
     summary = cleandoc(model.__doc__ or "").split("\n\n")[0]
-    place = (
-        "napari_shadowinv.preprocessing.recipes"
-        if hasattr(model, "function")
-        else "napari_shadowinv"
-    )
-    says = f"Named `{name}`; in Python {{py:class}}`~{place}.{model.__name__}`."
-    table = model_table(model) if model.model_fields else "No parameters."
-    return f"### {heading[:1].upper()}{heading[1:]}\n\n{summary} {says}\n\n{table}"
+    says = f"In files {named}; in Python {{py:class}}`~{module}.{model.__name__}`."
+    fields = model.parameters() if issubclass(model, Choice) else model.model_fields
+    table = table_of(fields) if fields else "No parameters."
+    return f"### {title[:1].upper()}{title[1:]}\n\n{summary} {says}\n\n{table}"
 
 
-def model_table(model: type[BaseModel]) -> str:
+def table_of(fields: Mapping[str, FieldInfo]) -> str:
     rows = [
         "| field | in files and Python | unit | default | range | meaning |",
         "|---|---|---|---|---|---|",
     ]
-    for name, field in model.model_fields.items():
+    for name, field in fields.items():
         title, unit = title_and_unit(field.title or name)
         cells = (
             title,
