@@ -72,10 +72,10 @@ def parameters_page() -> str:
     parts = [
         "# Parameters",
         "The same parameters appear in napari's forms, in TOML files and in Python. "
-        "Lengths in px are pixels of the image as it is when they are used, after any earlier binning.",
+        "Lengths in px are pixels of the image that a step receives, after any binning before it.",
         "## Steps",
-        "What is done to the image first. In a recipe `[[steps]]`, in any order; the command applies "
-        "the steps its flags ask for in the order below. See [](../recipes.md) and [](../filters.md).",
+        "What is done to the image first. In a recipe `[[steps]]`, in any order; flags of the "
+        "command apply steps in the order below. See [](../recipes.md) and [](../filters.md).",
         *(choice_section(model) for model in STEPS.values()),
         "## Sources",
         "The undisturbed beam. In a recipe `[source]`; see [](../sources.md).",
@@ -136,6 +136,8 @@ def default_of(field: FieldInfo) -> str:
     if field.is_required():
         return "*required*"
     default = field.get_default(call_default_factory=True)
+    if isinstance(default, tuple):
+        default = ":".join("" if end is None else str(end) for end in default)
     return "–" if default is None else f"`{default}`"
 
 
