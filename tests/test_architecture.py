@@ -1,0 +1,185 @@
+"""How the source is laid out: who imports whom, what is said only once, how long a module is.
+
+The facts are read from the source with `ast`, so that imports inside functions, for type checkers
+only, and in the stubs of lazily loaded packages count like any other.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocessing import ESTIMATES, STEPS
+
+SOURCE = Path(__file__).parents[1] / "src"
+PACKAGE = "napari_shadowinv"
+# From the ground up: a room imports only rooms of the lines above its own.
+ROOMS = (
+    ("errors", "options", "_typing"),
+    ("_system",),
+    ("geometry",),
+    ("physics",),
+    ("preprocessing",),
+    ("transport",),
+    ("inversion",),
+    ("io",),
+    ("pipeline",),
+    ("stack", "plotting"),
+    ("cli", "_napari"),
+    ("",),  # the package itself, with the public names
+)
+HEIGHT = {room: height for height, rooms in enumerate(ROOMS) for room in rooms}
+CORE = {room for room in HEIGHT if HEIGHT[room] < HEIGHT["io"]}
+NEVER_IN_CORE = {"dask", "distributed", "matplotlib", "napari", "qtpy", "superqt", "typer"}
+NOT_AT_ONCE_IN_CORE = {"xarray"}
+MOST_LINES = 500
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(SOURCE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+# A stub names what its package loads lazily.
+FILES = [*sorted((SOURCE / PACKAGE).rglob("*.py")), *sorted((SOURCE / PACKAGE).rglob("*.pyi"))]
+MODULES = {module_of(path) for path in FILES}
+TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
+
+
+def imported(path: Path, nodes: Iterator[ast.AST]) -> Iterator[str]:
+    """The modules that imports among some nodes of a file need."""
+    package = module_of(path) if path.stem == "__init__" else module_of(path).rpartition(".")[0]
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")
+            above = above[: len(above) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            for alias in node.names:
+                # Set before anything is imported, so that it may be asked for from anywhere.
+                if (base, alias.name) == (PACKAGE, "__version__"):
+                    continue
+                name = f"{base}.{alias.name}"
+                yield name if name in MODULES else base
+
+
+def outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
+    """Nodes that run when a module is imported, not those for type checkers."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        yield node
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield from outside_functions(node)
+
+
+def needs() -> dict[str, set[str]]:
+    """Every module of the package, and those of the package that it imports."""
+    found: dict[str, set[str]] = {module: set() for module in MODULES}
+    for path, tree in TREES.items():
+        names = imported(path, ast.walk(tree))
+        found[module_of(path)] |= {name for name in names if name.split(".")[0] == PACKAGE}
+    return found
+
+
+def room_of(module: str) -> str:
+    return module.split(".")[1] if "." in module else ""
+
+
+def test_every_room_has_its_place():
+    assert {room_of(module) for module in MODULES} == set(HEIGHT)
+
+
+def test_a_room_imports_only_rooms_below_it():
+    above = [
+        f"{module} imports {other}"
+        for module, others in needs().items()
+        for other in others
+        if room_of(module) != room_of(other) and HEIGHT[room_of(other)] >= HEIGHT[room_of(module)]
+    ]
+    assert not above
+
+
+def test_modules_do_not_import_each_other_in_circles():
+    try:
+        TopologicalSorter(needs()).prepare()
+    except CycleError as error:
+        pytest.fail(f"circle: {' <- '.join(error.args[1])}")
+
+
+@pytest.mark.parametrize("room", sorted(CORE))
+def test_the_core_imports_no_window_no_cluster_no_figure(room):
+    for path, tree in TREES.items():
+        if room_of(module_of(path)) != room:
+            continue
+        anywhere = {name.split(".")[0] for name in imported(path, ast.walk(tree))}
+        assert not anywhere & NEVER_IN_CORE, path
+        at_once = {name.split(".")[0] for name in imported(path, outside_functions(tree))}
+        assert not at_once & NOT_AT_ONCE_IN_CORE, path
+
+
+def test_no_module_is_too_long_to_be_read_at_once():
+    lengths = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
+    assert not {path.name: lines for path, lines in lengths.items() if lines > MOST_LINES}
+
+
+def fields_of(wanted: str) -> dict[str, list[str]]:
+    """Classes that declare a field of a name, by file."""
+    found: dict[str, list[str]] = {}
+    for path, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                names = [
+                    part.target.id
+                    for part in node.body
+                    if isinstance(part, ast.AnnAssign)
+                    and isinstance(part.target, ast.Name)
+                    and isinstance(part.value, ast.Call)
+                    and ast.unparse(part.value.func) == "Field"
+                ]
+                if wanted in names:
+                    found.setdefault(path.name, []).append(node.name)
+    return found
+
+
+@pytest.mark.parametrize("option", InversionOptions.model_fields)
+def test_an_option_is_declared_once(option):
+    own = {name for model in (*STEPS.values(), *ESTIMATES.values()) for name in model.parameters()}
+    assert option not in own  # its flag would be that of a step
+    assert fields_of(option) == {"options.py": ["InversionOptions"]}
+
+
+def names_declared() -> Counter[tuple[str, str]]:
+    """Names of steps and sources, as a class declares them: ``step: Literal["bin"] = "bin"``."""
+    return Counter(
+        (part.target.id, ast.literal_eval(part.value))
+        for tree in TREES.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+        for part in node.body
+        if isinstance(part, ast.AnnAssign)
+        and isinstance(part.target, ast.Name)
+        and part.target.id in ("step", "method")
+        and isinstance(part.value, ast.Constant)
+        and ast.unparse(part.annotation).startswith("Literal")
+    )
+
+
+def test_a_step_and_a_source_are_declared_once():
+    steps = {("step", name): 1 for name in STEPS}
+    sources = {("method", name): 1 for name in ("measured", *ESTIMATES)}
+    assert names_declared() == steps | sources
+    classes = Counter(
+        node.name
+        for tree in TREES.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    )
+    assert {classes[model.__name__] for model in (*STEPS.values(), *ESTIMATES.values())} == {1}
