@@ -1,0 +1,73 @@
+"""The examples of CONTRIBUTING.md must work as they stand there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocessing import Radiograph
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def names() -> dict[str, Any]:
+    names: dict[str, Any] = {"__name__": "contributing"}
+    for block in re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL):
+        exec(compile(block, "CONTRIBUTING.md", "exec", dont_inherit=True), names)
+    return names
+
+
+def test_the_filter_is_a_step(names):
+    step = names["MedianFilter"](size=5)
+    assert step.name() == "median"
+    image = np.ones((20, 20))
+    image[9, 9] = 50.0
+    np.testing.assert_array_equal(step.applied(Radiograph(image)).image, 1.0)
+
+
+def test_the_option_is_one_field(names):
+    (field,) = names["InversionOptions"].model_fields
+    assert field not in InversionOptions.model_fields
+    assert names["InversionOptions"](ceiling=10.0).ceiling == 10.0
+
+
+@pytest.mark.parametrize("kind", ["u1", ">u2"])
+def test_the_format_is_recognised_and_read(names, tmp_path, kind):
+    pixels = np.arange(32, 44).reshape(3, 4).astype(kind)
+    white = np.iinfo(kind).max
+    path = tmp_path / "shot.pgm"
+    path.write_bytes(b"P5\n4 3\n%d\n" % white + pixels.tobytes())
+    assert names["PGM"].fits(path, path.read_bytes())
+    image, told = names["read_pgm"](path)
+    np.testing.assert_array_equal(image, pixels)
+    assert told == {"bits": 8 * pixels.itemsize}
+
+
+def test_the_setup_converts_and_projects(names):
+    setup = names["XRaySetup"].example()
+    assert setup.deflection_angle(1.0) == pytest.approx(1e-6 * 11.0 / 1.0)
+    harder = setup.model_copy(update={"photon_energy": 16.0})
+    assert harder.angle_ratio(setup, "electron density") == 0.25
+    assert harder.probe == "X-rays of 16 keV"
+
+
+def test_the_rooms_are_those_of_the_source():
+    package = ROOT / "src" / "napari_shadowinv"
+    rooms = {path.parent.name for path in package.glob("*/__init__.py")}
+    told = re.findall(r"^        ([_a-z]+)/ ", TEXT, re.MULTILINE)
+    assert set(told) == rooms
+
+
+def test_every_benchmark_is_listed_and_every_link_leads_somewhere():
+    told = re.findall(r"benchmarks/(\w+\.py)", TEXT)
+    own = {path.name for path in (ROOT / "benchmarks").glob("*.py")} - {"reference.py"}
+    assert set(told) == own
+    for target in re.findall(r"\]\(([^)#]+)\)", TEXT):
+        assert (ROOT / target).exists(), target
