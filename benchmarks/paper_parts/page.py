@@ -20,24 +20,24 @@ from paper_parts.measurements import (
 )
 from paper_parts.shots import PIXEL, SETUP, SHAPE, SIGMA, seconds_of, toroid_truth
 
-PAGE = """# The paper's figures, repeated
+PAGE = """# The paper's figures, reproduced
 
 Kasim et al., "Quantitative shadowgraphy and proton radiography for large intensity modulations",
 [arXiv:1607.04179](https://arxiv.org/abs/1607.04179). This page, its pictures and its numbers are
-written by
+produced by
 
     python benchmarks/paper.py
 
 in {minutes:.1f} minutes on {cores} cores. The images are synthetic: exact fields, the package's
-own forward model, and normal noise whose standard deviation is 10 % of the mean. (The paper says
+own forward model, and Gaussian noise with a standard deviation of 10 % of the mean. (The paper says
 "variance 10 % of the average intensity".) Negative pixels are set to zero, and the source is
-uniform, except where a row says otherwise.
+uniform unless a row says otherwise.
 
 {merit}
 
-Peak error: largest retrieved field against the largest true one. L2 error: norm of the difference
-of the displacements against the norm of the truth. The solver's tolerance and all other options
-are the defaults, with a site per pixel. Seconds are those of a whole inversion.
+The peak error compares the largest retrieved field with the largest true field. The L2 error is the
+norm of the displacement error divided by the norm of the true displacement. All options have their
+default values, with one site per pixel. Seconds are for a whole inversion.
 
 ## Fig. 1: Voronoi diagram, power diagram, Lloyd's algorithm
 
@@ -48,13 +48,13 @@ are the defaults, with a site per pixel. Seconds are those of a whole inversion.
 ![Twelve steps from the source to the deflection potential](paper-algorithm.png)
 
 As in the paper: L-BFGS from zero weights ({iterations} iterations), centroids, natural-neighbour
-interpolation and integration, which the options `solver="lbfgs"`, `stages="single"` and
-`readout="centroid"` ask for. Everything below uses the defaults instead: Newton's method on
-several levels, and the potential read off the weights.
+interpolation and integration, selected by the options `solver="lbfgs"`, `stages="single"` and
+`readout="centroid"`. Everything below uses the defaults instead: Newton's method on several levels,
+and the potential taken from the weights.
 
 ## Fig. 3: the set-up
 
-The drawing (a) of the paper is the table below.
+The table below replaces panel (a) of the paper.
 
 ![Field and image of the toroid with 97 MG µm](paper-setup.png)
 
@@ -70,10 +70,10 @@ The drawing (a) of the paper is the table below.
 
 {sweep}
 
-Errors with noise are the mean over {n_noises} images, and the range of their peak's. An inversion
-amplifies the slow variations of noise: where the object is weak they add to its field, and the
-largest value lies above the true peak. Beyond the caustics' onset rays cross, which no transport
-of least cost does: the field comes out too smooth there.
+Errors with noise are the mean over {n_noises} images; the next column is the range of
+their peak errors. An inversion amplifies noise at long wavelengths: if the object is weak, this
+noise adds to its field, and the largest value exceeds the true peak. Beyond the onset of caustics
+rays cross, but the rays of an optimal transport never do: the retrieved field is too smooth there.
 
 ## Fig. 6: other structures
 
@@ -81,19 +81,19 @@ of least cost does: the field comes out too smooth there.
 
 {structures}
 
-The paper gives no numbers for its structures: positions, sizes and strengths are ours, such that
-caustics have just formed. Of the re-projection's difference from the image, 10 % are the noise.
-In (e) two conductors stop the beam (grey in the cut). Row (e) is the paper's method as it is
-written, with a uniform source and no mask: shadows count as deflection, so the field is wrong far
-around them. Row (e′) tells the inversion where the beam was stopped, by zeros in the source; most
-of what is left comes from noise inside the shadows, which counts as light there. Row (e″) leaves
-the same pixels out with `mask=~obstructed`. That is better than (e) and far worse than (e′), with
-noise and without, above all along the outer conductor: a mask takes the same pixels out of source
-and image, while rays that pass are deflected by up to {deflected:.1f} px. Some land where the mask
-throws their light away ({lost:.1f} % of all light, noise-free), and beside the conductors the image
-stays dark, which counts as deflection. So what stops the beam at the object belongs in the source,
-as zeros. Errors and correlations of the coaxial line are over the pixels that the beam passes;
-inside the shadows there is nothing to see.
+The paper gives no numbers for its structures: we chose positions, sizes and strengths such that
+caustics have just formed. The difference between re-projection and image includes the 10 % noise.
+In (e) two conductors stop the beam (grey in the cut). Row (e) is the paper's method as published,
+with a uniform source and no mask: the shadows are taken for deflection, so the field is wrong far
+around them. In row (e′) the source is zero where the beam was stopped; most of the remaining error
+comes from noise inside the shadows, which is taken for flux. In row (e″) the same pixels are
+excluded with `mask=~obstructed`. That is better than (e) but far worse than (e′), with and without
+noise, above all along the outer conductor: a mask removes the same pixels from source and image,
+while rays beside the conductors are deflected by up to {deflected:.1f} px. Some land on
+masked pixels, where their flux is lost ({lost:.1f} % of the total, noise-free), and the image
+stays dark beside the conductors, which is taken for deflection. An obstacle in the object plane
+should therefore be entered as zeros in the source. Errors and correlations of the coaxial line are
+evaluated over the pixels that the beam passes; the shadows contain no information.
 
 ## Section V: a plasma wave seen by light
 
@@ -102,12 +102,12 @@ inside the shadows there is nothing to see.
 {wave}
 
 A density wave of {wavelength:.2f} µm (n₀ = 1.65e19 cm⁻³) with curved wavefronts, probed at 810
-nm, on {wave_shape} px in {wave_seconds:.1f} s. The paper's shadowgrams are measured, with no
-truth to compare with; amplitude and distance are ours. The image is one of rays, without
-diffraction. n₀ / n_c is {first_order:.2f} %: of that order is the error of the thin plasma, ln η ≈
-−n/2n_c. (The paper's Eq. 12 leaves out the ½; see `OpticalSetup.line_integrated_density`.) As in
-the paper, a high-pass filter (the potential minus its average over a plasma wavelength, Gaussian)
-takes out the slow variations into which an inversion turns noise.
+nm, on {wave_shape} px in {wave_seconds:.1f} s. The paper's shadowgrams are measured, so the
+true field is not known; we chose amplitude and distance. The image is computed from rays, without
+diffraction. n₀ / n_c is {first_order:.2f} %, which is also the order of the error of the
+thin-plasma approximation ln η ≈ −n/2n_c. (The paper's Eq. 12 leaves out the ½; see
+`OpticalSetup.line_integrated_density`.) As in the paper, a high-pass filter (the potential minus its average over a plasma wavelength, Gaussian)
+removes the slow variations that an inversion produces from noise.
 """
 
 
@@ -126,7 +126,7 @@ def worst_single(rows: list[SweepRow], low: float, high: float) -> float:
 
 def sweep_table(rows: list[SweepRow]) -> str:
     lines = [
-        "| D_m, MG µm | 10 % noise: peak / L2 error, % | range of the peak's | noise-free, % "
+        "| D_m, MG µm | 10 % noise: peak / L2 error, % | range of the peak error | noise-free, % "
         "| Poisson, noise-free, % | seconds |",
         "|---|---|---|---|---|---|",
     ]
