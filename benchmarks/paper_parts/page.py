@@ -106,8 +106,9 @@ nm, on {wave_shape} px in {wave_seconds:.1f} s. The paper's shadowgrams are meas
 true field is not known; we chose amplitude and distance. The image is computed from rays, without
 diffraction. n₀ / n_c is {first_order:.2f} %, which is also the order of the error of the
 thin-plasma approximation ln η ≈ −n/2n_c. (The paper's Eq. 12 leaves out the ½; see
-`OpticalSetup.line_integrated_density`.) As in the paper, a high-pass filter (the potential minus its average over a plasma wavelength, Gaussian)
-removes the slow variations that an inversion produces from noise.
+`OpticalSetup.line_integrated_density`.) As in the paper, a high-pass filter (the potential minus
+its average over a plasma wavelength, Gaussian) removes the slow variations that an inversion
+produces from noise.
 """
 
 
