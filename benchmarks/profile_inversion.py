@@ -125,9 +125,9 @@ def main() -> None:
     inversion, count = counted(case.image, options)
     borders, pieces = pixels_crossed(inversion)
     print(
-        f"\n{count.trials} diagrams tried on the finest level, {count.rejected} of them left at an "
-        f"empty cell; {count.flips:,} flips in repairs on all levels; {borders:,} borders in "
-        f"{pieces:,} pieces, {pieces / borders:.2f} pixels each."
+        f"\n{count.trials} trial diagrams on the finest level, {count.rejected} of them rejected "
+        f"because of an empty cell; {count.flips:,} repair flips on all levels; {borders:,} "
+        f"borders in {pieces:,} pieces, {pieces / borders:.2f} pixels per border."
     )
 
 
