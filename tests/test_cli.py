@@ -44,8 +44,11 @@ from napari_shadowinv.preprocessing import (
     ButterworthFilter,
     HotPixelFilter,
     LowPassFilter,
+    Origin,
+    Provenance,
     Radiograph,
     Recipe,
+    UniformEstimate,
 )
 
 BLOB = gaussian_blob((24, 32), 6.0, 4.0, (10, 18))
@@ -138,8 +141,10 @@ def test_invert_writes_what_the_core_returns(folder: Path, shot: Path) -> None:
     expected = invert(np.load(shot), options=options)
     np.testing.assert_array_equal(saved["displacement"], expected.displacement)
     assert Inversion.from_dataset(saved).options == options
-    assert saved.attrs["input_file"] == "shot.npy"
-    assert saved.attrs["input_sha256"] == sha256(shot)
+    kept = Provenance.of(saved.attrs)
+    assert kept is not None
+    assert kept.image == Origin(file="shot.npy", sha256=sha256(shot), shape=(24, 32))
+    assert kept.recipe == Recipe(source=UniformEstimate(), options=options)
     assert iio.imread("shot.png").ndim == 3
     for word in ("300", "converged", "peak |d|", "shot.shadowinv", "shot.png"):
         assert word in result.stdout
@@ -160,7 +165,10 @@ def test_source_setup_and_options_are_used(folder: Path, shot: Path) -> None:
     assert result.exit_code == 0, result.output
     saved = dataset("result.shadowinv")
     np.testing.assert_array_equal(saved["source"], source.astype(np.float32))
-    assert saved.attrs["source_file"] == "beam.tif"
+    kept = Provenance.of(saved.attrs)
+    assert kept is not None
+    assert kept.source is not None
+    assert kept.source.file == "beam.tif"
     # A flag wins over the file.
     assert Inversion.from_dataset(saved).options == InversionOptions(n_sites=200, tolerance=0.01)
     assert setup_from_dataset(saved) == ProtonSetup(
@@ -388,10 +396,10 @@ def test_impossible_images_and_sources_are_refused(
     refused("invert", "zero.npy", names=("zero.npy", "no positive pixel"))
     refused("invert", shot, "--source", "zero.npy", names="source is zero")
     refused("invert", shot, "--source", "small.npy", names=("(20, 20)", "(24, 32)"))
-    refused("invert", shot, "--bin", 0, names="by 0")
+    refused("invert", shot, "--bin", 0, names=("--bin", "is 0", "at least 1"))
     refused("invert", shot, "--bin", 20, names="by 20")
     np.save("pixel.npy", np.ones((1, 1)))
-    refused("invert", "pixel.npy", names=("pixel.npy has 1×1 pixels", "two rows"))
+    refused("invert", "pixel.npy", names=("pixel.npy", "(1, 1)", "at least 4 × 4"))
 
 
 def test_impossible_numbers_of_sites_are_refused(shot: Path, refused: Callable[..., None]) -> None:
@@ -811,7 +819,7 @@ def test_mistakes_in_a_recipe_are_named(
         ("[[steps]]\nwidth = 2\n", ("steps", "'step'")),
         ("[source]\nmethod = 'polynomial'\ndegree = 11\n", ("'source.degree' is 11", "at most 10")),
         ("[setup]\nkind = 'proton'\nenergy = -1\n", ("'setup.energy' is -1",)),
-        ("[options]\nn_site = 1\n", ("'n_site'", "'n_sites'")),
+        ("[options]\nn_site = 1\n", ("'options.n_site'", "'n_sites'")),
         ("steps = 6\n", ("'steps' is 6",)),
         ("mask = 'nowhere.png'\n", ("nowhere.png",)),
     ):
@@ -953,14 +961,16 @@ def test_a_name_that_is_no_text_is_kept_as_its_bytes(folder: Path, shot: Path) -
     os.rename(shot, b"sh\xf6t.npy")
     result = shadowinv("invert", os.fsdecode(b"sh\xf6t.npy"), "--out", "a.shadowinv")
     assert result.exit_code == 0, result.output
-    assert dataset("a.shadowinv").attrs["input_file"] == r"sh\xf6t.npy"
+    kept = Provenance.of(dataset("a.shadowinv").attrs)
+    assert kept is not None
+    assert kept.image.file == r"sh\xf6t.npy"
 
 
 def test_our_own_bug_is_not_blamed_on_the_user(shot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*arguments: object, **options: object) -> None:
         raise ValueError("shapes do not broadcast")
 
-    monkeypatch.setattr("napari_shadowinv.inversion.invert", broken)
+    monkeypatch.setattr("napari_shadowinv.pipeline._run.invert", broken)
     result = shadowinv("invert", shot)
     assert isinstance(result.exception, ValueError)
 

@@ -57,6 +57,15 @@ def _with_files(recipe: Recipe, moved: Any) -> Recipe:
 
 def _without_defaults(recipe: Recipe) -> dict[str, Any]:
     """Options that were chosen, and all that the rest says."""
-    content = recipe.model_dump(mode="json", exclude_none=True)
-    content["options"] = recipe.options.model_dump(mode="json", exclude_defaults=True)
-    return {name: value for name, value in content.items() if value not in ([], {})}
+    content = recipe.model_dump(exclude_none=True)
+    content["options"] = recipe.options.model_dump(exclude_defaults=True)
+    return {name: _plain(value) for name, value in content.items() if value not in ((), {})}
+
+
+def _plain(value: Any) -> Any:
+    """What TOML knows, which is no tuples, paths or None."""
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value if one is not None]
+    return str(value) if isinstance(value, Path) else value

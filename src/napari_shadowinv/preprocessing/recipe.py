@@ -10,12 +10,12 @@ from __future__ import annotations
 import base64
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -56,6 +56,7 @@ __all__ = [
     "check_masks",
 ]
 
+_CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 _LEAST_VISIBLE = 0.1  # of what the source mask hides in one place, for the inversion to see it
 _LEAST_OBJECT = 10  # pixels
 _MOST_FALL = 10.0  # times below the dimmest pixel seen
@@ -124,7 +125,7 @@ class Recipe(BaseModel):
     True
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = _CONFIG
 
     steps: tuple[Annotated[AnyStep, Field(discriminator="step")], ...] = Field(
         default=(), title="Steps", description="What is done to the image first, in this order."
@@ -358,7 +359,7 @@ class Origin(BaseModel):
         Its shape.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = _CONFIG
     file: str = ""
     sha256: str = ""
     variable: str | None = None
@@ -400,7 +401,7 @@ class Provenance(BaseModel):
         What the steps found and did, for people.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = _CONFIG
     version: str
     recipe: Recipe
     image: Origin = Origin()
@@ -409,3 +410,11 @@ class Provenance(BaseModel):
     source_mask: Origin | None = None
     setup: Setup | None = None
     notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, attributes: Mapping[str, Any]) -> Provenance | None:
+        """Read it from a dataset's attributes; None if they do not tell, or as no version does."""
+        try:
+            return cls.model_validate_json(attributes.get("provenance", ""))
+        except ValidationError:
+            return None
