@@ -37,11 +37,12 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.pipeline import gathered
+from napari_shadowinv.pipeline import gathered, read_recipe
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
     Bin,
     ButterworthFilter,
+    Crop,
     HotPixelFilter,
     LowPassFilter,
     Origin,
@@ -827,6 +828,83 @@ def test_mistakes_in_a_recipe_are_named(
         refused("invert", shot, "--recipe", "recipe.toml", names=names)
     (folder / "options.toml").write_text("[prepare]\nhot_pixels = 6\n")
     refused("invert", shot, "--options", "options.toml", names=("[prepare]", "--recipe"))
+
+
+def test_a_recipe_that_was_saved_does_the_same(folder: Path, shot: Path) -> None:
+    usable = np.ones((24, 32), np.uint8)
+    usable[3, 4:6] = 0
+    iio.imwrite("usable.png", usable)
+    (folder / "setup.toml").write_text(PROTON_TOML)
+    (folder / "kept").mkdir()
+    flags = [
+        "--mask", "usable.png", "--setup", "setup.toml", "--bin", 2, "--crop-x", "2:",
+        "--source-from", "polynomial", "--source-degree", 1, "--n-sites", 150, "--seed", 3,
+    ]  # fmt: skip
+    kept = ["--save-recipe", "kept/recipe.toml", "--out", "first.shadowinv"]
+    result = shadowinv("invert", shot, *flags, *kept)
+    assert result.exit_code == 0, result.output
+    recipe = read_recipe(folder / "kept" / "recipe.toml")
+    assert recipe.steps == (Crop(x=(2, None)), Bin(factor=2))
+    assert recipe.mask is not None
+    assert recipe.mask.resolve() == folder / "usable.png"
+    again = ["--recipe", "kept/recipe.toml", "--out", "second.shadowinv"]
+    assert shadowinv("invert", shot, *again).exit_code == 0
+    first, second = dataset("first.shadowinv"), dataset("second.shadowinv")
+    for name in first.data_vars:
+        np.testing.assert_array_equal(first[name], second[name])
+    assert first.attrs["provenance"] == second.attrs["provenance"]
+    # A flag wins over the recipe, where it stands.
+    assert shadowinv("invert", shot, *again, "--bin", 3, "--overwrite").exit_code == 0
+    made = Provenance.of(dataset("second.shadowinv").attrs)
+    assert made is not None
+    assert made.recipe.steps == (Crop(x=(2, None)), Bin(factor=3))
+    assert made.setup is not None
+    assert made.setup.object_pixel_size == pytest.approx(3e-5)
+
+
+def test_a_result_is_made_again_bit_for_bit(
+    folder: Path, shot: Path, refused: Callable[..., None]
+) -> None:
+    np.save("beam.npy", 100 * np.tile(np.linspace(0.9, 1.1, 32), (24, 1)))
+    usable = np.ones((24, 32), np.uint8)
+    usable[3, 4:6] = 0
+    iio.imwrite("usable.png", usable)
+    flags = [
+        "--source",
+        "beam.npy",
+        "--mask",
+        "usable.png",
+        "--low-pass",
+        0.6,
+        "--boundary",
+        "free",
+    ]
+    assert shadowinv("invert", shot, *flags, "--out", "first.shadowinv").exit_code == 0
+    (folder / "usable.png").unlink()  # it is kept with the result
+    result = shadowinv("rerun", "first.shadowinv")
+    assert result.exit_code == 0, result.output
+    text = flat(result.stdout)
+    assert "changed nothing" in text
+    assert "the same result, bit for bit" in text
+    first, second = dataset("first.shadowinv"), dataset("first_again.shadowinv")
+    for name in first.data_vars:
+        np.testing.assert_array_equal(first[name], second[name])
+    # Another file of the same name is told of.
+    np.save(shot, 1.5 * np.load(shot) + 3)
+    text = flat(shadowinv("rerun", "first.shadowinv", "--overwrite").stdout)
+    assert "changed the image shot.npy differs" in text
+    assert "displacement differs by up to" in text
+    # A version, too.
+    old = first.attrs["provenance"].replace(f'"version":"{__version__}"', '"version":"0.0.1"')
+    write("old.shadowinv", first.assign_attrs(provenance=old))
+    assert f"made by version 0.0.1, now {__version__}" in flat(
+        shadowinv("rerun", "old.shadowinv").stdout
+    )
+    for path in (shot, folder / "old_again.shadowinv", folder / "old_again.png"):
+        path.unlink()
+    refused("rerun", "first.shadowinv", "--overwrite", names=("shot.npy", "not there"))
+    write("bare.shadowinv", invert(np.ones((8, 8))))
+    refused("rerun", "bare.shadowinv", names=("bare.shadowinv", "does not say how it was made"))
 
 
 def test_info_tells_what_is_inside(folder: Path) -> None:

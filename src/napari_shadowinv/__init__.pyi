@@ -9,6 +9,8 @@ from .physics.forward import synthetic_image
 from .physics.poisson import poisson_invert
 from .physics.projection import project, project_potential
 from .physics.setup import OpticalSetup, ProtonSetup
+from .pipeline import run
+from .preprocessing import Recipe
 from .stack import invert_stack, run_stack, stack_statistics
 
 __version__: str
@@ -23,6 +25,7 @@ __all__ = [
     "Progress",
     "ProtonSetup",
     "Radiograph",
+    "Recipe",
     "Report",
     "Uncertainty",
     "__version__",
@@ -34,6 +37,7 @@ __all__ = [
     "project",
     "project_potential",
     "read",
+    "run",
     "run_stack",
     "stack_statistics",
     "synthetic_image",
