@@ -63,9 +63,11 @@ def _without_defaults(recipe: Recipe) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """What TOML knows, which is no tuples, paths or None."""
+    """What TOML knows, which is neither paths nor None; ranges as they are typed."""
     if isinstance(value, dict):
         return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], int):
+        return f"{value[0]}:{'' if value[1] is None else value[1]}"
     if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value if one is not None]
+        return [_plain(one) for one in value]
     return str(value) if isinstance(value, Path) else value

@@ -199,8 +199,6 @@ class Rotate(Step):
 
 def _as_range(value: Any) -> Any:
     """Read ``"10:200"``, as typed on a command line."""
-    if isinstance(value, (list, tuple)) and len(value) == 1:
-        return (value[0], None)  # TOML knows no None
     if not isinstance(value, str):
         return value
     first, colon, last = value.partition(":")
