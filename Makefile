@@ -50,6 +50,7 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/npe2 validate --imports napari.yaml
+	@sh .ci/lint-workflows
 
 dist: $(VENV)/installed-dev
 	rm -rf dist
