@@ -13,11 +13,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.io import savemat
 
-from napari_shadowinv import InputError, InversionOptions, OpticalSetup, invert, plan_sites
+from napari_shadowinv import (
+    InputError,
+    InversionOptions,
+    OpticalSetup,
+    invert,
+    invert_stack,
+    plan_sites,
+)
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cli._flags import recipe_of, takes_recipe
 from napari_shadowinv.inversion.normalise import number_of_sites
+from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.pipeline import Cache, read_recipe, run, write_recipe
@@ -289,6 +298,18 @@ def test_what_does_not_fit_together_is_refused(
     }
     with pytest.raises(InputError, match=named):
         run(recipe, image, **arguments)
+
+
+def test_a_source_beside_the_shot_in_its_file_is_found(tmp_path: Path, image: FloatArray) -> None:
+    beam = np.full_like(image, 90)
+    savemat(tmp_path / "shots.mat", {"shot": image, "beam": beam})
+    shot = read_radiograph(tmp_path / "shots.mat", variable="shot")
+    recipe = Recipe(source=MeasuredSource(variable="beam"), options=OPTIONS)
+    assert_same(run(recipe, shot), invert(image, source=beam, options=OPTIONS))
+    with pytest.raises(InputError, match="but names no file"):
+        invert_stack(np.stack([image, image]), recipe=recipe)
+    stack = invert_stack(np.stack([image, image]), recipe=recipe, source=beam)
+    np.testing.assert_array_equal(stack.displacement[1], run(recipe, shot).displacement)
 
 
 def test_provenance_says_all_that_is_needed(image: FloatArray) -> None:
