@@ -1,6 +1,7 @@
 # make demo   simulate and invert the paper's toroidal shot, write figures to demo/
 # make test   check style and types, build the site, then run the whole test suite
 # make docs   build the documentation site into build/docs; GALLERY=1 runs the examples for it, too
+# make coverage  run the tests once more and report which lines they reach
 # make test-oldest  test the core with the lowest versions that pyproject.toml allows
 # make gallery make the pictures of docs/gallery.md again
 # make dist   build the source distribution and the wheel in dist/
@@ -19,7 +20,7 @@ CORE_TESTS := tests/geometry tests/transport tests/physics tests/io tests/invers
 	tests/test_cli.py tests/test_plotting.py tests/stack/test_lazy.py tests/stack/test_run.py \
 	tests/stack/test_statistics.py
 
-.PHONY: demo test test-oldest docs gallery lint dist check-wheel format clean
+.PHONY: demo test coverage test-oldest docs gallery lint dist check-wheel format clean
 
 demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
@@ -37,6 +38,11 @@ test: lint docs
 	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES) -q \
 		tests/napari/widgets/test_tools.py tests/napari/widgets/test_forms.py
 
+coverage: $(VENV)/installed-dev
+	@sh .ci/need-display
+	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES) -q --cov=napari_shadowinv \
+		--cov-report=term:skip-covered
+
 # Without pytest-qt its setting is unknown, so the configuration is not strict here.
 test-oldest: $(VENV)/installed-dev
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(OLDEST)
@@ -50,6 +56,7 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/npe2 validate --imports napari.yaml
+	@sh .ci/lint-workflows
 
 dist: $(VENV)/installed-dev
 	rm -rf dist

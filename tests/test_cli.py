@@ -37,15 +37,19 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.pipeline import gathered
+from napari_shadowinv.pipeline import gathered, read_recipe
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
     Bin,
     ButterworthFilter,
+    Crop,
     HotPixelFilter,
     LowPassFilter,
+    Origin,
+    Provenance,
     Radiograph,
     Recipe,
+    UniformEstimate,
 )
 
 BLOB = gaussian_blob((24, 32), 6.0, 4.0, (10, 18))
@@ -138,8 +142,10 @@ def test_invert_writes_what_the_core_returns(folder: Path, shot: Path) -> None:
     expected = invert(np.load(shot), options=options)
     np.testing.assert_array_equal(saved["displacement"], expected.displacement)
     assert Inversion.from_dataset(saved).options == options
-    assert saved.attrs["input_file"] == "shot.npy"
-    assert saved.attrs["input_sha256"] == sha256(shot)
+    kept = Provenance.of(saved.attrs)
+    assert kept is not None
+    assert kept.image == Origin(file="shot.npy", sha256=sha256(shot), shape=(24, 32))
+    assert kept.recipe == Recipe(source=UniformEstimate(), options=options)
     assert iio.imread("shot.png").ndim == 3
     for word in ("300", "converged", "peak |d|", "shot.shadowinv", "shot.png"):
         assert word in result.stdout
@@ -160,7 +166,10 @@ def test_source_setup_and_options_are_used(folder: Path, shot: Path) -> None:
     assert result.exit_code == 0, result.output
     saved = dataset("result.shadowinv")
     np.testing.assert_array_equal(saved["source"], source.astype(np.float32))
-    assert saved.attrs["source_file"] == "beam.tif"
+    kept = Provenance.of(saved.attrs)
+    assert kept is not None
+    assert kept.source is not None
+    assert kept.source.file == "beam.tif"
     # A flag wins over the file.
     assert Inversion.from_dataset(saved).options == InversionOptions(n_sites=200, tolerance=0.01)
     assert setup_from_dataset(saved) == ProtonSetup(
@@ -388,10 +397,10 @@ def test_impossible_images_and_sources_are_refused(
     refused("invert", "zero.npy", names=("zero.npy", "no positive pixel"))
     refused("invert", shot, "--source", "zero.npy", names="source is zero")
     refused("invert", shot, "--source", "small.npy", names=("(20, 20)", "(24, 32)"))
-    refused("invert", shot, "--bin", 0, names="by 0")
+    refused("invert", shot, "--bin", 0, names=("--bin", "is 0", "at least 1"))
     refused("invert", shot, "--bin", 20, names="by 20")
     np.save("pixel.npy", np.ones((1, 1)))
-    refused("invert", "pixel.npy", names=("pixel.npy has 1×1 pixels", "two rows"))
+    refused("invert", "pixel.npy", names=("pixel.npy", "(1, 1)", "at least 4 × 4"))
 
 
 def test_impossible_numbers_of_sites_are_refused(shot: Path, refused: Callable[..., None]) -> None:
@@ -811,7 +820,7 @@ def test_mistakes_in_a_recipe_are_named(
         ("[[steps]]\nwidth = 2\n", ("steps", "'step'")),
         ("[source]\nmethod = 'polynomial'\ndegree = 11\n", ("'source.degree' is 11", "at most 10")),
         ("[setup]\nkind = 'proton'\nenergy = -1\n", ("'setup.energy' is -1",)),
-        ("[options]\nn_site = 1\n", ("'n_site'", "'n_sites'")),
+        ("[options]\nn_site = 1\n", ("'options.n_site'", "'n_sites'")),
         ("steps = 6\n", ("'steps' is 6",)),
         ("mask = 'nowhere.png'\n", ("nowhere.png",)),
     ):
@@ -819,6 +828,83 @@ def test_mistakes_in_a_recipe_are_named(
         refused("invert", shot, "--recipe", "recipe.toml", names=names)
     (folder / "options.toml").write_text("[prepare]\nhot_pixels = 6\n")
     refused("invert", shot, "--options", "options.toml", names=("[prepare]", "--recipe"))
+
+
+def test_a_recipe_that_was_saved_does_the_same(folder: Path, shot: Path) -> None:
+    usable = np.ones((24, 32), np.uint8)
+    usable[3, 4:6] = 0
+    iio.imwrite("usable.png", usable)
+    (folder / "setup.toml").write_text(PROTON_TOML)
+    (folder / "kept").mkdir()
+    flags = [
+        "--mask", "usable.png", "--setup", "setup.toml", "--bin", 2, "--crop-x", "2:",
+        "--source-from", "polynomial", "--source-degree", 1, "--n-sites", 150, "--seed", 3,
+    ]  # fmt: skip
+    kept = ["--save-recipe", "kept/recipe.toml", "--out", "first.shadowinv"]
+    result = shadowinv("invert", shot, *flags, *kept)
+    assert result.exit_code == 0, result.output
+    recipe = read_recipe(folder / "kept" / "recipe.toml")
+    assert recipe.steps == (Crop(x=(2, None)), Bin(factor=2))
+    assert recipe.mask is not None
+    assert recipe.mask.resolve() == folder / "usable.png"
+    again = ["--recipe", "kept/recipe.toml", "--out", "second.shadowinv"]
+    assert shadowinv("invert", shot, *again).exit_code == 0
+    first, second = dataset("first.shadowinv"), dataset("second.shadowinv")
+    for name in first.data_vars:
+        np.testing.assert_array_equal(first[name], second[name])
+    assert first.attrs["provenance"] == second.attrs["provenance"]
+    # A flag wins over the recipe, where it stands.
+    assert shadowinv("invert", shot, *again, "--bin", 3, "--overwrite").exit_code == 0
+    made = Provenance.of(dataset("second.shadowinv").attrs)
+    assert made is not None
+    assert made.recipe.steps == (Crop(x=(2, None)), Bin(factor=3))
+    assert made.setup is not None
+    assert made.setup.object_pixel_size == pytest.approx(3e-5)
+
+
+def test_a_result_is_made_again_bit_for_bit(
+    folder: Path, shot: Path, refused: Callable[..., None]
+) -> None:
+    np.save("beam.npy", 100 * np.tile(np.linspace(0.9, 1.1, 32), (24, 1)))
+    usable = np.ones((24, 32), np.uint8)
+    usable[3, 4:6] = 0
+    iio.imwrite("usable.png", usable)
+    flags = [
+        "--source",
+        "beam.npy",
+        "--mask",
+        "usable.png",
+        "--low-pass",
+        0.6,
+        "--boundary",
+        "free",
+    ]
+    assert shadowinv("invert", shot, *flags, "--out", "first.shadowinv").exit_code == 0
+    (folder / "usable.png").unlink()  # it is kept with the result
+    result = shadowinv("rerun", "first.shadowinv")
+    assert result.exit_code == 0, result.output
+    text = flat(result.stdout)
+    assert "changed nothing" in text
+    assert "the same result, bit for bit" in text
+    first, second = dataset("first.shadowinv"), dataset("first_again.shadowinv")
+    for name in first.data_vars:
+        np.testing.assert_array_equal(first[name], second[name])
+    # Another file of the same name is told of.
+    np.save(shot, 1.5 * np.load(shot) + 3)
+    text = flat(shadowinv("rerun", "first.shadowinv", "--overwrite").stdout)
+    assert "changed the image shot.npy differs" in text
+    assert "displacement differs by up to" in text
+    # A version, too.
+    old = first.attrs["provenance"].replace(f'"version":"{__version__}"', '"version":"0.0.1"')
+    write("old.shadowinv", first.assign_attrs(provenance=old))
+    assert f"made by version 0.0.1, now {__version__}" in flat(
+        shadowinv("rerun", "old.shadowinv").stdout
+    )
+    for path in (shot, folder / "old_again.shadowinv", folder / "old_again.png"):
+        path.unlink()
+    refused("rerun", "first.shadowinv", "--overwrite", names=("shot.npy", "not there"))
+    write("bare.shadowinv", invert(np.ones((8, 8))))
+    refused("rerun", "bare.shadowinv", names=("bare.shadowinv", "does not say how it was made"))
 
 
 def test_info_tells_what_is_inside(folder: Path) -> None:
@@ -953,14 +1039,16 @@ def test_a_name_that_is_no_text_is_kept_as_its_bytes(folder: Path, shot: Path) -
     os.rename(shot, b"sh\xf6t.npy")
     result = shadowinv("invert", os.fsdecode(b"sh\xf6t.npy"), "--out", "a.shadowinv")
     assert result.exit_code == 0, result.output
-    assert dataset("a.shadowinv").attrs["input_file"] == r"sh\xf6t.npy"
+    kept = Provenance.of(dataset("a.shadowinv").attrs)
+    assert kept is not None
+    assert kept.image.file == r"sh\xf6t.npy"
 
 
 def test_our_own_bug_is_not_blamed_on_the_user(shot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*arguments: object, **options: object) -> None:
         raise ValueError("shapes do not broadcast")
 
-    monkeypatch.setattr("napari_shadowinv.inversion.invert", broken)
+    monkeypatch.setattr("napari_shadowinv.pipeline._run.invert", broken)
     result = shadowinv("invert", shot)
     assert isinstance(result.exception, ValueError)
 

@@ -5,7 +5,8 @@
 - how far the image's noise moves its field: `uncertainty`
 - what a deflection means in SI units: `ProtonSetup`, `OpticalSetup`
 - many shots, with dask: `invert_stack`, `run_stack`, `stack_statistics`
-- clean images, guess undisturbed beams: `preprocessing`
+- everything that is done to a shot, as one model: `Recipe`; apply it: `run`; its parts, and
+  what else cleans images and estimates beams: `napari_shadowinv.preprocessing`
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
 - predict the image of the same object in another experiment: `project`, `project_potential`
 - read and write files: `read`, `write`

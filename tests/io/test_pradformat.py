@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 
 import h5py
@@ -8,8 +9,9 @@ import xarray as xr
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.labels import setup_from_dataset
-from napari_shadowinv.io import Radiograph, read, read_radiograph, write
+from napari_shadowinv.io import read, read_radiograph, write
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.preprocessing import Origin, Provenance, Recipe
 
 IMAGE = np.arange(20.0).reshape(4, 5)
 ATTRIBUTES = {
@@ -109,8 +111,8 @@ def test_published_examples(
 
 
 def written(path: Path, inversion: Inversion, setup: ProtonSetup) -> Path:
-    shot = Radiograph(inversion.image, path=Path("somewhere/shot.tif"))
-    return write(path, inversion, setup=setup, shot=shot)
+    made = Provenance(version="1", recipe=Recipe(), image=Origin(file="shot.tif"))
+    return write(path, dataclasses.replace(inversion, provenance=made), setup=setup)
 
 
 def test_inversion_follows_the_format(

@@ -268,7 +268,7 @@ def test_bins_sum_counts_and_widen_pixels(proton_setup: Any) -> None:
     assert (binned.source == 4).all()
     assert binned.setup is not None
     assert binned.setup.object_pixel_size == 2 * proton_setup.object_pixel_size
-    assert binned.metadata["cropped"] == (0, 1)
+    assert binned.notes == ("binned 2 × 2, 0 rows and 1 columns cut off",)
     with pytest.raises(InputError, match="from 1 to 3"):
         shot.binned(4)
 

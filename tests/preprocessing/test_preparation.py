@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.preprocessing import InterpolatedEstimate, PolynomialEstimate, Preparation
+from napari_shadowinv.preprocessing import (
+    Estimate,
+    InterpolatedEstimate,
+    PolynomialEstimate,
+    Radiograph,
+    Recipe,
+    estimated_source,
+)
 
 SHAPE = (120, 160)
 
@@ -15,6 +22,12 @@ def outside(radius: float, centre: tuple[float, float] = (60, 80)) -> np.ndarray
     """A mask that hides a disc."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     return np.hypot(y - centre[0], x - centre[1]) > radius
+
+
+def check(estimate: Estimate, mask: np.ndarray | None, source_mask: np.ndarray | None) -> None:
+    """Check a recipe with an estimate against a shot with masks."""
+    shot = Radiograph(np.ones(SHAPE), mask=mask, source_mask=source_mask)
+    Recipe(source=estimate).check(shot)
 
 
 OBJECT = outside(25)
@@ -41,7 +54,7 @@ def test_a_mask_that_hides_the_object_too_is_refused(
 ) -> None:
     for estimate in (PolynomialEstimate(), InterpolatedEstimate()):
         with pytest.raises(InputError, match="the object would be excluded from the inversion"):
-            Preparation((), estimate, source_mask).check(has_source=False, mask=mask)
+            check(estimate, mask, source_mask)
 
 
 @pytest.mark.parametrize(
@@ -59,12 +72,12 @@ def test_a_mask_that_hides_the_object_too_is_refused(
 def test_masks_that_share_dead_pixels_are_fine(
     mask: np.ndarray | None, source_mask: np.ndarray | None
 ) -> None:
-    Preparation((), PolynomialEstimate(), source_mask).check(has_source=False, mask=mask)
+    check(PolynomialEstimate(), mask, source_mask)
 
 
 def test_what_is_filled_in_must_be_inverted() -> None:
     with pytest.raises(InputError, match="without a source mask"):
-        Preparation((), InterpolatedEstimate()).check(has_source=False, mask=OBJECT)
+        check(InterpolatedEstimate(), OBJECT, None)
 
 
 def test_a_source_that_is_dark_behind_the_source_mask_is_told_of() -> None:
@@ -72,8 +85,9 @@ def test_a_source_that_is_dark_behind_the_source_mask_is_told_of() -> None:
     x = np.mgrid[: SHAPE[0], : SHAPE[1]][1]
     for image, count in ((np.maximum(120.0 - x, 15), 1), (np.full(SHAPE, 100.0), 0)):
         told: list[str] = []
-        preparation = Preparation((), PolynomialEstimate(degree=1), x < 100)
-        preparation.estimated(image, DEAD, on_warning=told.append)
+        estimate = PolynomialEstimate(degree=1)
+        shot = Radiograph(image, mask=DEAD, source_mask=x < 100)
+        estimated_source(estimate, shot, on_warning=told.append)
         assert len(told) == count
         # Nor where nothing of it is inverted.
-        Preparation((), PolynomialEstimate(degree=1)).estimated(image, x < 100)
+        estimated_source(estimate, Radiograph(image, mask=x < 100))

@@ -18,7 +18,6 @@ from napari_shadowinv.preprocessing import (
     interpolated_source,
     isotropic_source,
     low_pass_source,
-    point_distance,
     polynomial_source,
     remove_background,
     remove_hot_pixels,
@@ -27,6 +26,7 @@ from napari_shadowinv.preprocessing import (
     uniform_warnings,
 )
 from napari_shadowinv.preprocessing._total_variation import least_variation
+from napari_shadowinv.preprocessing.isotropic import point_distance
 
 SHAPE = (48, 60)
 # 200 px from the source to the detector.

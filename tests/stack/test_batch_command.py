@@ -22,6 +22,7 @@ from typer.testing import CliRunner, Result
 from napari_shadowinv import InversionOptions, invert, read
 from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
+from napari_shadowinv.preprocessing import Provenance
 
 HERE = Path(__file__).parent
 SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
@@ -92,7 +93,10 @@ def test_a_batch_is_written_and_told_of(night, folder):
     dataset = read("n.shadowinv.zarr")
     alone = invert(night.images[2], source=night.source, options=InversionOptions(n_sites=100))
     np.testing.assert_allclose(dataset.potential[2], alone.potential, rtol=1e-6, atol=1e-6)
-    assert dataset.attrs["source_file"] == "reference.npy"
+    provenance = Provenance.of(dataset.attrs)
+    assert provenance is not None
+    assert provenance.source is not None
+    assert provenance.source.file == "reference.npy"
     assert "line_integrated_density" in dataset
 
 

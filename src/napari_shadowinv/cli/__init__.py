@@ -50,6 +50,7 @@ def main(
 
 
 app.command(epilog=_shot_commands.INVERT_EPILOG)(_shot_commands.invert)
+app.command()(_shot_commands.rerun)
 app.command(epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
 app.command()(_shot_commands.info)
 app.command()(_shot_commands.demo)

@@ -205,10 +205,12 @@ def _recipe_rows(attributes: Mapping[str, Any]) -> Rows:
     """Where the source came from, and what was done to each shot."""
     from napari_shadowinv.preprocessing import Provenance
 
-    provenance = Provenance.model_validate_json(attributes["provenance"])
-    source = provenance.source.file if provenance.source is not None else ""
+    provenance = Provenance.of(attributes)
+    measured = None if provenance is None else provenance.source
+    source = measured.file if measured is not None else ""
     rows = [("source", source or str(attributes["source_image"]))]
-    return rows + [("step", step.described) for step in provenance.recipe.steps]
+    steps = () if provenance is None else provenance.recipe.steps
+    return rows + [("step", step.described) for step in steps]
 
 
 def _trouble_rows(store: StackStore) -> Rows:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv.cli._guard import interrupted
 from napari_shadowinv.errors import InputError
@@ -18,14 +18,20 @@ if TYPE_CHECKING:
 
 
 def inverted(
-    recipe: Recipe, shot: Radiograph, source: Radiograph | None = None, quiet: bool = False
+    recipe: Recipe,
+    shot: Radiograph,
+    source: Radiograph | None = None,
+    quiet: bool = False,
+    **masks: Any,
 ) -> Inversion:
     """Apply a recipe to a shot; a mistake is told with the file's name."""
     from napari_shadowinv.pipeline import run
 
     with nullcontext() if quiet else progress_bars() as show:
         try:
-            return run(recipe, shot, source=source, on_progress=show, should_stop=interrupted)
+            return run(
+                recipe, shot, source=source, **masks, on_progress=show, should_stop=interrupted
+            )
         except InputError as error:
             raise InputError(f"{shot.path}: {error}" if shot.path else str(error)) from error
 

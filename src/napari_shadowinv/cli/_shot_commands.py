@@ -51,7 +51,7 @@ from napari_shadowinv.cli._outputs import (
 )
 from napari_shadowinv.cli._progress import inverted
 from napari_shadowinv.cli._report import report_text
-from napari_shadowinv.cli._tables import size_text, summary
+from napari_shadowinv.cli._tables import rerun_table, size_text, summary
 from napari_shadowinv.cli._terminal import say
 from napari_shadowinv.errors import InputError
 
@@ -150,6 +150,49 @@ def invert(
         written = [path for path in outputs if path.exists()]
         say(summary(inversion, shot, written))
     alarm_unless_converged(inversion.report, result)
+
+
+@notify_errors
+def rerun(
+    result: Annotated[
+        Path, typer.Argument(help="A .shadowinv result of this program.", show_default=False)
+    ],
+    image: Annotated[
+        Path | None,
+        typer.Argument(
+            help=(
+                "Its image, or another one. Default: the file of that name beside the result or in "
+                "the current folder."
+            ),
+            show_default=False,
+        ),
+    ] = None,
+    source: Annotated[
+        Path | None, typer.Option("--source", help="Its measured source, if it has moved.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Result file. Default: the result's name with _again.")
+    ] = None,
+    report: Figure = None,
+    overwrite: Overwrite = False,
+    quiet: QuietInversion = False,
+) -> None:
+    """Make a result again from the recipe it contains, and say what has changed.
+
+    With the same files and version the result is the same, bit for bit.
+    """
+    from napari_shadowinv.cli._rerun import made_again
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
+
+    target = out or Path(f"{result.stem}_again{result.suffix}")
+    again_out, figure = result_and_figure(result, target, report)
+    check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
+    protect([again_out, figure], [result, image, source])
+    again = made_again(result, image, source, quiet=quiet)
+    write_all(again.inversion, again.shot, again_out, figure, overwrite)
+    if not quiet:
+        say(rerun_table(again, [again_out, figure]))
+    alarm_unless_converged(again.inversion.report, again_out)
 
 
 FORWARD_EPILOG = """

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv._typing import AnyArray, FloatArray
+    from napari_shadowinv.cli._rerun import Again
     from napari_shadowinv.inversion import Inversion, Report
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Provenance, Radiograph
@@ -48,6 +49,17 @@ def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Tabl
         *closing_rows(inversion.report, written),
     ]
     return two_columns("Inversion", rows)
+
+
+def rerun_table(again: Again, written: list[Path]) -> Table:
+    """Tell what has changed since a result was made first."""
+    rows = [
+        ("image", f"{again.shot.path}, {size_text(again.inversion.image)}"),
+        *[("changed", text) for text in again.changes or ("nothing",)],
+        ("difference", again.difference),
+        *closing_rows(again.inversion.report, written),
+    ]
+    return two_columns("Rerun", rows)
 
 
 def provenance_rows(provenance: Provenance | None) -> Rows:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import FORMAT, VARIABLES, dataset_from_field, label
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Inversion", "Report", "provenance_of"]
+__all__ = ["Inversion", "Report"]
 
 Array = NDArray[np.float64]
 
@@ -233,16 +232,8 @@ class Inversion:
             **arrays,
             report=report,
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
-            provenance=provenance_of(dataset),
+            provenance=Provenance.of(dataset.attrs),
         )
-
-
-def provenance_of(dataset: xarray.Dataset) -> Provenance | None:
-    """Return how a dataset was made; None if it does not say, or in words of another version."""
-    try:
-        return Provenance.model_validate_json(dataset.attrs.get("provenance", ""))
-    except ValidationError:
-        return None
 
 
 def _report(content: dict[str, Any]) -> Report:

@@ -28,9 +28,9 @@ from napari_shadowinv.inversion.labels import (
     dataset_from_field,
     setup_from_dataset,
 )
-from napari_shadowinv.inversion.result import provenance_of
 from napari_shadowinv.io.dataset import require
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
+from napari_shadowinv.preprocessing import Provenance
 
 if TYPE_CHECKING:
     import xarray
@@ -242,7 +242,7 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         "file_date": datetime.now(UTC).date().isoformat(),
         "description": "Power-diagram inversion by napari-shadowinv",
     }
-    provenance = provenance_of(dataset)
+    provenance = Provenance.of(dataset.attrs)
     if provenance is not None:
         attributes["provenance"] = provenance.model_dump_json(exclude_none=True)
         if provenance.image.file:

@@ -1,6 +1,6 @@
+from ._run import Inputs, gathered, run, run_prepared
 from .cache import Cache
 from .files import read_recipe, write_recipe
-from .run import Inputs, gathered, run, run_prepared
 
 __all__ = [
     "Cache",

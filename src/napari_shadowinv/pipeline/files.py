@@ -57,6 +57,17 @@ def _with_files(recipe: Recipe, moved: Any) -> Recipe:
 
 def _without_defaults(recipe: Recipe) -> dict[str, Any]:
     """Options that were chosen, and all that the rest says."""
-    content = recipe.model_dump(mode="json", exclude_none=True)
-    content["options"] = recipe.options.model_dump(mode="json", exclude_defaults=True)
-    return {name: value for name, value in content.items() if value not in ([], {})}
+    content = recipe.model_dump(exclude_none=True)
+    content["options"] = recipe.options.model_dump(exclude_defaults=True)
+    return {name: _plain(value) for name, value in content.items() if value not in ((), {})}
+
+
+def _plain(value: Any) -> Any:
+    """What TOML knows, which is neither paths nor None; ranges as they are typed."""
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], int):
+        return f"{value[0]}:{'' if value[1] is None else value[1]}"
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    return str(value) if isinstance(value, Path) else value

@@ -140,6 +140,7 @@ class LowPassFilter(Filter):
 
     title = "low-pass (smooth)"
     primary = "width"
+    place = 80
     step: Literal["low-pass"] = "low-pass"
     width: float = width_field(1.0, "Standard deviation of the Gaussian blur in px.", 0.1, 20.0)
 
@@ -200,6 +201,7 @@ class HighPassFilter(Filter):
 
     title = "high-pass"
     primary = "width"
+    place = 60
     step: Literal["high-pass"] = "high-pass"
     width: float = width_field(
         50.0, "Structures much larger than this standard deviation, in px, are removed.", 1.0, 200.0
@@ -282,6 +284,7 @@ class ButterworthFilter(Filter):
 
     title = "Butterworth"
     primary = "cutoff"
+    place = 70
     step: Literal["butterworth"] = "butterworth"
     cutoff: float = Field(
         default=100.0,
@@ -387,6 +390,7 @@ class BackgroundFilter(Filter):
     """Flatten by a polynomial."""
 
     title = "flatten (polynomial)"
+    place = 50
     step: Literal["background"] = "background"
     degree: int = degree_field(" that is divided out or subtracted.")
     kind: Literal["divide", "subtract"] = Field(

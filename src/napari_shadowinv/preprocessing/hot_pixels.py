@@ -33,6 +33,7 @@ class HotPixelFilter(Filter):
 
     title = "remove hot pixels"
     primary = "threshold"
+    place = 30
     step: Literal["hot-pixels"] = "hot-pixels"
     threshold: float = Field(
         default=6.0,

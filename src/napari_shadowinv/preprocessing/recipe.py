@@ -10,37 +10,24 @@ from __future__ import annotations
 import base64
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import reduce
+from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.preprocessing import estimates, gaussian, hot_pixels, isotropic  # noqa: F401
 from napari_shadowinv.preprocessing.estimate import Estimate
-from napari_shadowinv.preprocessing.estimates import (
-    InterpolatedEstimate,
-    LowPassEstimate,
-    PolynomialEstimate,
-    TotalVariationEstimate,
-    UniformEstimate,
-)
-from napari_shadowinv.preprocessing.filters import (
-    BackgroundFilter,
-    ButterworthFilter,
-    Filter,
-    HighPassFilter,
-    LowPassFilter,
-)
-from napari_shadowinv.preprocessing.gaussian import GaussianEstimate
-from napari_shadowinv.preprocessing.hot_pixels import HotPixelFilter
-from napari_shadowinv.preprocessing.isotropic import IsotropicEstimate
+from napari_shadowinv.preprocessing.filters import Filter
 from napari_shadowinv.preprocessing.radiograph import Radiograph
-from napari_shadowinv.preprocessing.steps import Bin, Choice, Crop, Rotate, Step
+from napari_shadowinv.preprocessing.steps import Choice, Step, choices_of
 
 if TYPE_CHECKING:
     from napari_shadowinv._system.progress import OnWarning, ShouldStop
@@ -56,6 +43,7 @@ __all__ = [
     "check_masks",
 ]
 
+_CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 _LEAST_VISIBLE = 0.1  # of what the source mask hides in one place, for the inversion to see it
 _LEAST_OBJECT = 10  # pixels
 _MOST_FALL = 10.0  # times below the dimmest pixel seen
@@ -78,35 +66,19 @@ class MeasuredSource(Choice):
     )
 
 
-# In the order in which the command applies them.
-AnyStep = (
-    Rotate
-    | Crop
-    | HotPixelFilter
-    | Bin
-    | BackgroundFilter
-    | HighPassFilter
-    | ButterworthFilter
-    | LowPassFilter
-)
-AnySource = (
-    MeasuredSource
-    | UniformEstimate
-    | IsotropicEstimate
-    | GaussianEstimate
-    | PolynomialEstimate
-    | LowPassEstimate
-    | TotalVariationEstimate
-    | InterpolatedEstimate
-)
+# Whatever is defined in the modules imported here is a step, or a source, of a recipe.
+STEPS = dict(sorted(choices_of(Step).items(), key=lambda item: item[1].place))
+FILTERS = {name: step for name, step in STEPS.items() if issubclass(step, Filter)}
+ESTIMATES = choices_of(Estimate)
 
-STEPS: dict[str, type[Step]] = {step.name(): step for step in get_args(AnyStep)}
-FILTERS: dict[str, type[Filter]] = {
-    name: step for name, step in STEPS.items() if issubclass(step, Filter)
-}
-ESTIMATES: dict[str, type[Estimate]] = {
-    source.name(): source for source in get_args(AnySource) if issubclass(source, Estimate)
-}
+if TYPE_CHECKING:
+    AnyStep = Step
+    AnySource = MeasuredSource | Estimate
+else:
+    AnyStep = Annotated[reduce(or_, STEPS.values()), Field(discriminator="step")]
+    AnySource = Annotated[
+        reduce(or_, ESTIMATES.values(), MeasuredSource), Field(discriminator="method")
+    ]
 
 
 class Recipe(BaseModel):
@@ -119,17 +91,17 @@ class Recipe(BaseModel):
 
     Examples
     --------
-    >>> recipe = Recipe(steps=(Bin(factor=2), LowPassFilter(width=1.5)))
+    >>> recipe = Recipe(steps=[{"step": "bin", "factor": 2}, {"step": "low-pass", "width": 1.5}])
     >>> Recipe.model_validate_json(recipe.model_dump_json()) == recipe
     True
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = _CONFIG
 
-    steps: tuple[Annotated[AnyStep, Field(discriminator="step")], ...] = Field(
+    steps: tuple[AnyStep, ...] = Field(
         default=(), title="Steps", description="What is done to the image first, in this order."
     )
-    source: Annotated[AnySource, Field(discriminator="method")] | None = Field(
+    source: AnySource | None = Field(
         default=None,
         title="Source",
         description="The undisturbed beam. Default: as measured if there is one, else uniform.",
@@ -358,7 +330,7 @@ class Origin(BaseModel):
         Its shape.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = _CONFIG
     file: str = ""
     sha256: str = ""
     variable: str | None = None
@@ -400,7 +372,7 @@ class Provenance(BaseModel):
         What the steps found and did, for people.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = _CONFIG
     version: str
     recipe: Recipe
     image: Origin = Origin()
@@ -409,3 +381,11 @@ class Provenance(BaseModel):
     source_mask: Origin | None = None
     setup: Setup | None = None
     notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, attributes: Mapping[str, Any]) -> Provenance | None:
+        """Read it from a dataset's attributes; None if they do not tell, or as no version does."""
+        try:
+            return cls.model_validate_json(attributes.get("provenance", ""))
+        except ValidationError:
+            return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from napari_shadowinv._system.progress import ShouldStop
     from napari_shadowinv.preprocessing.radiograph import Radiograph
 
-__all__ = ["Bin", "Choice", "Crop", "Rotate", "Step", "degree_field", "width_field"]
+__all__ = ["Bin", "Choice", "Crop", "Rotate", "Step", "choices_of", "degree_field", "width_field"]
 
 _SMALLEST_SIDE = 4  # px of a crop
 _WHOLE = 0.999  # share of a rotated pixel that must be known
@@ -64,6 +64,19 @@ class Choice(BaseModel):
         )
 
 
+C = TypeVar("C", bound=Choice)
+
+
+def choices_of(base: type[C]) -> dict[str, type[C]]:
+    """Return the classes made of a base, by name, in the order of their definition."""
+    found: dict[str, type[C]] = {}
+    for one in base.__subclasses__():
+        if one.key in one.model_fields:
+            found[one.name()] = one
+        found |= choices_of(one)
+    return found
+
+
 def degree_field(description: str) -> Any:
     """Return the field of a polynomial's degree."""
     return Field(
@@ -89,9 +102,16 @@ def width_field(default: float, description: str, least: float, most: float) -> 
 
 
 class Step(Choice):
-    """Something done to a shot before its inversion."""
+    """Something done to a shot before its inversion.
+
+    Attributes
+    ----------
+    place : int
+        Steps that the command's flags ask for are applied by increasing place.
+    """
 
     key = "step"
+    place: ClassVar[int] = 50
 
     @property
     def flattens(self) -> bool:
@@ -139,6 +159,7 @@ class Rotate(Step):
 
     title = "rotate"
     primary = "angle"
+    place = 10
     step: Literal["rotate"] = "rotate"
     angle: float = Field(
         default=90.0,
@@ -219,6 +240,7 @@ class Crop(Step):
     """Keep a rectangle of the image."""
 
     title = "crop"
+    place = 20
     step: Literal["crop"] = "crop"
     y: Range = Field(
         default=(0, None),
@@ -277,6 +299,7 @@ class Bin(Step):
 
     title = "bin"
     primary = "factor"
+    place = 40
     step: Literal["bin"] = "bin"
     factor: int = Field(
         default=2,

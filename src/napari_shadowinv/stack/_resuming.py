@@ -158,7 +158,7 @@ def _difference(before: str, now: str) -> str:
         old, new = json.loads(before), json.loads(now)
         names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
         return ", ".join(f"{name}: {old.get(name)} there, {new.get(name)} now" for name in names)
-    except (ValueError, TypeError, AttributeError):
+    except (ValueError, AttributeError, TypeError):
         return f"{shorten(before or 'none', 80)} there, {shorten(now or 'none', 80)} now"
 
 

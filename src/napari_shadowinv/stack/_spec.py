@@ -141,6 +141,10 @@ def describe_stack(
     if measured.variable is not None:
         source_reader = partial(reader, variable=measured.variable)
     sources = find_source(source, reader=source_reader)
+    if sources is None and isinstance(wanted.source, MeasuredSource):
+        raise InputError(
+            "the recipe asks for a measured source, but names no file: name one, or give a source"
+        )
     # Where the source tells it, no shot needs to be read for its shape.
     shape: tuple[int, ...] = () if mask is None else np.shape(mask)
     if sources is not None:

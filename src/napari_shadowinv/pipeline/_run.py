@@ -263,8 +263,8 @@ def gathered(
     beam, wanted = None, recipe.source
     if source is not None:
         beam = _radiograph(source, "the source")
-    elif isinstance(wanted, MeasuredSource) and wanted.file is not None:
-        beam = read_radiograph(wanted.file, variable=wanted.variable)
+    elif isinstance(wanted, MeasuredSource) and (file := _source_file(wanted, whole)) is not None:
+        beam = read_radiograph(file, variable=wanted.variable)
     elif whole.source is not None and recipe.estimate is None:
         beam = replace(whole, image=whole.source, source=None, mask=None)
         if any(step.flattens for step in recipe.steps):
@@ -304,6 +304,11 @@ def gathered(
         source_mask=bare.pixels,
     )
     return Inputs(resolved, complete, provenance)
+
+
+def _source_file(wanted: MeasuredSource, shot: Radiograph) -> Path | None:
+    """File of a measured source; a variable without a file is in that of the shot."""
+    return wanted.file if wanted.file is not None or wanted.variable is None else shot.path
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,325 @@
+"""A recipe applied to shots: the same as doing each of its steps by hand."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import typing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.io import savemat
+
+from napari_shadowinv import (
+    InputError,
+    InversionOptions,
+    OpticalSetup,
+    invert,
+    invert_stack,
+    plan_sites,
+)
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.cli._flags import recipe_of, takes_recipe
+from napari_shadowinv.inversion.normalise import number_of_sites
+from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.pipeline import Cache, read_recipe, run, write_recipe
+from napari_shadowinv.preprocessing import (
+    ESTIMATES,
+    STEPS,
+    BackgroundFilter,
+    Bin,
+    Choice,
+    Crop,
+    IsotropicEstimate,
+    LowPassFilter,
+    MeasuredSource,
+    Origin,
+    PolynomialEstimate,
+    Radiograph,
+    Recipe,
+    Rotate,
+    Step,
+    low_pass,
+    polynomial_source,
+    remove_background,
+)
+
+SHAPE = (40, 52)
+OPTIONS = InversionOptions(n_sites=400)
+MOVES: tuple[tuple[Step, ...], ...] = (
+    (Rotate(angle=90),),
+    (Rotate(angle=-180),),
+    (Rotate(angle=17),),
+    (Crop(y=(3, 31), x=(8, None)),),
+    (Bin(factor=3),),
+    (Rotate(angle=-90), Crop(y=(5, 45), x=(2, 37)), Bin(factor=2)),
+    (Bin(factor=2), Rotate(angle=-8), Crop(x=(1, 22)), Rotate(angle=270)),
+)
+
+
+@pytest.fixture(scope="module")
+def image() -> FloatArray:
+    blob = gaussian_blob(SHAPE, 8.0, 6.0, (18, 27))
+    ramp = np.tile(np.linspace(80, 120, SHAPE[1]), (SHAPE[0], 1))
+    return synthetic_image(blob.displacement, ramp)
+
+
+def assert_same(one: Any, other: Any, rtol: float = 0.0) -> None:
+    for name in ("displacement", "potential", "weights", "image", "source", "residual"):
+        expected = getattr(other, name)
+        scale = rtol * np.abs(expected).max()
+        np.testing.assert_allclose(getattr(one, name), expected, rtol=0, atol=scale)
+
+
+def test_without_steps_it_is_invert(image: FloatArray) -> None:
+    assert_same(run(Recipe(options=OPTIONS), image), invert(image, options=OPTIONS))
+    beam = np.full_like(image, 90)
+    mask = np.ones(SHAPE, bool)
+    mask[5, 7] = False
+    found = run(Recipe(options=OPTIONS), image, source=beam, mask=mask)
+    assert_same(found, invert(image, source=beam, mask=mask, options=OPTIONS))
+
+
+def test_steps_are_done_in_their_order(image: FloatArray) -> None:
+    one, two = BackgroundFilter(degree=1), LowPassFilter(width=2)
+    for steps in ((one, Bin(factor=2), two), (two, Bin(factor=2), one)):
+        expected = image
+        for step in steps:
+            if step is one:
+                expected = remove_background(expected, 1)
+            elif step is two:
+                expected = low_pass(expected, 2.0)
+            else:
+                expected = expected.reshape(20, 2, 26, 2).sum(axis=(1, 3))
+        assert_same(
+            run(Recipe(steps=steps, options=OPTIONS), image), invert(expected, options=OPTIONS)
+        )
+
+
+def test_source_and_masks_go_through_the_same_steps(image: FloatArray) -> None:
+    mask, bare = np.ones(SHAPE, bool), np.ones(SHAPE, bool)
+    mask[2:4, 2:5], bare[12:24, 20:34] = False, False
+    steps = (Rotate(angle=90), Crop(x=(0, 36)), Bin(factor=2), LowPassFilter(width=1))
+
+    def by_hand(array: Any) -> Any:
+        turned = np.rot90(array)[:, :36].reshape(26, 2, 18, 2)
+        return turned.all(axis=(1, 3)) if array.dtype == bool else turned.sum(axis=(1, 3))
+
+    usable = by_hand(mask)
+    small = LowPassFilter(width=1).filtered(by_hand(image), usable)
+    recipe = Recipe(steps=steps, source=PolynomialEstimate(degree=1), options=OPTIONS)
+    source = polynomial_source(small, degree=1, mask=usable & by_hand(bare))
+    found = run(recipe, image, mask=mask, source_mask=bare)
+    # Sums of a turned array are rounded in another order.
+    expected = invert(small, source=source, mask=usable, options=OPTIONS)
+    assert_same(found, expected, rtol=1e-9)
+    measured = LowPassFilter(width=1).filtered(by_hand(1.1 * image + 9), usable)
+    found = run(Recipe(steps=steps, options=OPTIONS), image, source=1.1 * image + 9, mask=mask)
+    expected = invert(small, source=measured, mask=usable, options=OPTIONS)
+    assert_same(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("steps", MOVES)
+def test_the_matrix_says_where_pixels_came_from(steps: tuple[Step, ...]) -> None:
+    """A plane is exact under linear interpolation, so its values tell where a pixel was."""
+    recipe = Recipe(steps=steps, setup=paper_setup())
+    matrix = recipe.matrix(SHAPE)
+    for axis, plane in enumerate(np.indices(SHAPE, dtype=float)):
+        moved = recipe.moved(Radiograph(plane, setup=paper_setup()))
+        assert moved.shape == recipe.shape_after(SHAPE)
+        share = abs(np.linalg.det(matrix))  # pixels of the image in one of the result
+        y, x = np.indices(moved.shape)
+        expected = matrix[axis, 0] * y + matrix[axis, 1] * x + matrix[axis, 2]
+        used = np.ones(moved.shape, bool) if moved.mask is None else moved.mask
+        assert used.mean() > 0.6
+        np.testing.assert_allclose(moved.image[used] / share, expected[used], atol=1e-9)
+        assert moved.setup is not None
+        assert moved.setup.object_pixel_size == pytest.approx(
+            share**0.5 * paper_setup().object_pixel_size
+        )
+
+
+@pytest.mark.parametrize("steps", [steps for steps in MOVES if Rotate(angle=17) not in steps])
+def test_a_point_source_is_where_it_was_in_the_recorded_image(steps: tuple[Step, ...]) -> None:
+    image = np.ones(SHAPE)
+    setup = paper_setup().model_copy(update={"pixel_size": 6.5e-6})
+    for estimate in (IsotropicEstimate(), IsotropicEstimate(centre_y=4, centre_x=11.5)):
+        recipe = Recipe(steps=steps, source=estimate, setup=setup, options=OPTIONS)
+        found = run(recipe, image)
+        whole = run(Recipe(source=estimate, setup=setup, options=OPTIONS), image).source
+        moved = recipe.moved(Radiograph(whole))
+        used = found.mask if moved.mask is None else found.mask & moved.mask
+        ratio = found.source[used] / moved.image[used]
+        # The source sees the same solid angle, up to the curvature within rotated pixels.
+        np.testing.assert_allclose(ratio, ratio.mean(), rtol=2e-4)
+
+
+@given(arrays(bool, st.tuples(st.integers(4, 30), st.integers(4, 30))))
+def test_a_mask_is_kept_whole(mask: Any) -> None:
+    kept = Origin.model_validate_json(Origin.of_mask(mask).model_dump_json())
+    np.testing.assert_array_equal(kept.mask(), mask)
+
+
+def test_a_mask_too_complex_for_an_attribute_is_not_kept_in_part() -> None:
+    noise = np.random.default_rng(0).random((900, 900)) > 0.5
+    assert Origin.of_mask(noise).mask() is None
+
+
+def changed(choice: type[Choice]) -> Choice:
+    """A choice with values other than its defaults."""
+    values: dict[str, Any] = {}
+    for name, field in choice.parameters().items():
+        options = typing.get_args(field.annotation)
+        if isinstance(field.default, str):
+            values[name] = next(one for one in options if one != field.default)
+        elif isinstance(field.default, tuple):
+            values[name] = (1, 9)
+        else:
+            values[name] = (field.default or 0) + 1
+    return choice.model_validate(values)
+
+
+SETUPS = (
+    paper_setup(),
+    OpticalSetup(wavelength=5e-7, object_image_distance=0.1, pixel_size=1e-5),
+)
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("source", [*ESTIMATES.values(), MeasuredSource])
+def test_a_recipe_survives_its_file(tmp_path: Path, source: Any, setup: Any) -> None:
+    chosen = MeasuredSource(file=tmp_path / "beam.tif", variable="b")
+    recipe = Recipe(
+        steps=tuple(changed(step) for step in STEPS.values()),
+        source=chosen if source is MeasuredSource else changed(source),
+        mask=tmp_path / "below" / "mask.png",
+        setup=setup,
+        options=InversionOptions(n_sites=7, boundary="free", flux="known"),
+    )
+    path = tmp_path / "recipe.toml"
+    write_recipe(path, recipe)
+    assert read_recipe(path) == recipe
+    assert str(tmp_path) not in path.read_text()  # paths are relative to the recipe
+    assert Recipe.model_validate_json(recipe.model_dump_json()) == recipe
+
+
+def test_every_parameter_has_a_flag() -> None:
+    @takes_recipe
+    def command(*, flags: dict[str, Any]) -> None:
+        raise AssertionError(flags)
+
+    flags = set(inspect.signature(command).parameters)
+    for name in InversionOptions.model_fields:
+        assert name in flags
+        flags.discard(name)
+    for step in (changed(one) for one in STEPS.values()):
+        assert isinstance(step, Step)
+        given = {
+            (step.name() if name == step.primary else f"{step.name()}-{name}").replace("-", "_"): v
+            for name, v in step.values().items()
+        }
+        assert given.keys() <= flags
+        assert recipe_of(given, Recipe(), {}).steps == (step,)
+        flags -= given.keys()
+    for source in (changed(one) for one in ESTIMATES.values()):
+        given = {f"source_{name}": value for name, value in source.values().items()}
+        assert given.keys() <= flags
+        assert recipe_of({"source_from": source.name(), **given}, Recipe(), {}).source == source
+    assert {name for name in flags if not name.startswith("source_")} == set()
+
+
+OTHER = {
+    "n_sites": 77, "floor": 0.3, "tolerance": 0.05, "lloyd_iterations": 0, "lloyd_tolerance": 1.0,
+    "readout": "centroid", "integration": "y", "solver": "lbfgs", "stages": "single",
+    "max_iterations": 9, "negative": "clip", "boundary": "free", "margin": 9, "decay_length": 3.0,
+    "flux": "known", "caustic_jacobian": 0.5, "seed": 4, "threads": 1,
+}  # fmt: skip
+
+
+def test_what_moves_sites_is_in_their_key(image: FloatArray) -> None:
+    """Of every option, and of no other: the key is what a cache trusts."""
+    assert OTHER.keys() == InversionOptions.model_fields.keys()
+    mask = np.ones(SHAPE, bool)
+    mask[20:, 30:] = False
+    for name, value in OTHER.items():
+        free = name in ("margin", "decay_length", "flux")
+        base = InversionOptions(n_sites=300, boundary="free" if free else "closed")
+        other = base.model_copy(update={name: value})
+        sites = [
+            plan_sites(image, one.model_copy(update={"n_sites": count}), mask=mask).levels[-1].sites
+            for one in (base, other)
+            for count in [number_of_sites(SHAPE, one)]
+        ]
+        same = sites[0].shape == sites[1].shape and np.array_equal(*sites)
+        assert (base.site_key() == other.site_key()) == same, name
+
+
+def test_a_cache_spares_sites_and_estimates_without_changing_results(image: FloatArray) -> None:
+    cache = Cache()
+    recipe = Recipe(source=PolynomialEstimate(degree=1), options=OPTIONS)
+    first = run(recipe, image, cache=cache)
+    sharper = recipe.model_copy(
+        update={"options": OPTIONS.model_copy(update={"tolerance": 1e-5, "threads": 1})}
+    )
+    second = run(sharper, image, cache=cache)
+    assert cache.hits == 1
+    assert_same(second, run(sharper, image))
+    preview = run(sharper, image, cache=cache, preview=True)
+    np.testing.assert_allclose(preview.displacement, second.displacement, atol=1e-3)
+    assert_same(run(recipe, image, cache=cache), first)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "given", "named"),
+    [
+        (Recipe(source=MeasuredSource()), {}, "asks for a measured source, but none is given"),
+        (Recipe(source=PolynomialEstimate()), {"source": 2}, "choose one of them"),
+        (Recipe(steps=(BackgroundFilter(),)), {"source": 2}, "removes the beam"),
+        (Recipe(), {"mask": (3, 4)}, r"mask has shape \(3, 4\), image \(40, 52\)"),
+        (Recipe(), {"source_mask": SHAPE}, "no source estimate to use it"),
+        (Recipe(source=IsotropicEstimate()), {}, "without a setup"),
+        (Recipe(steps=(Crop(y=(38, 90)),)), {}, "contains 52 × 2 pixels"),
+        (Recipe(steps=(Bin(factor=30),)), {}, "cannot bin 40×52 pixels by 30"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(
+    image: FloatArray, recipe: Recipe, given: dict[str, Any], named: str
+) -> None:
+    arguments: dict[str, Any] = {
+        name: value * image if isinstance(value, int) else np.ones(value, bool)
+        for name, value in given.items()
+    }
+    with pytest.raises(InputError, match=named):
+        run(recipe, image, **arguments)
+
+
+def test_a_source_beside_the_shot_in_its_file_is_found(tmp_path: Path, image: FloatArray) -> None:
+    beam = np.full_like(image, 90)
+    savemat(tmp_path / "shots.mat", {"shot": image, "beam": beam})
+    shot = read_radiograph(tmp_path / "shots.mat", variable="shot")
+    recipe = Recipe(source=MeasuredSource(variable="beam"), options=OPTIONS)
+    assert_same(run(recipe, shot), invert(image, source=beam, options=OPTIONS))
+    with pytest.raises(InputError, match="but names no file"):
+        invert_stack(np.stack([image, image]), recipe=recipe)
+    stack = invert_stack(np.stack([image, image]), recipe=recipe, source=beam)
+    np.testing.assert_array_equal(stack.displacement[1], run(recipe, shot).displacement)
+
+
+def test_provenance_says_all_that_is_needed(image: FloatArray) -> None:
+    recipe = Recipe(steps=(Bin(factor=2),), setup=paper_setup(), options=OPTIONS)
+    made = run(recipe, image).provenance
+    assert made is not None
+    told = json.loads(made.model_dump_json())
+    assert told["recipe"]["steps"] == [{"step": "bin", "factor": 2}]
+    assert told["recipe"]["source"] == {"method": "uniform"}
+    assert made.setup is not None
+    assert made.setup.object_pixel_size == 2 * paper_setup().object_pixel_size
+    assert made.notes == ("binned 2 × 2",)
+    assert_same(run(made.recipe, image), run(recipe, image))
