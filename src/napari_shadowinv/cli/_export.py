@@ -78,10 +78,11 @@ def export_shots(
         return [_write_table(store, out, shots, overwrite)]
     dataset = _opened(store, shots)
     jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
+    setup = setup_from_dataset(dataset)  # for the size of a pixel in a TIFF
     make_folder(out)
     for name, _ in jobs:
         check_output(out / name, overwrite)
-    return [write(out / name, load(), overwrite=overwrite) for name, load in jobs]
+    return [write(out / name, load(), setup=setup, overwrite=overwrite) for name, load in jobs]
 
 
 def _stem(shot: xarray.Dataset) -> str:
