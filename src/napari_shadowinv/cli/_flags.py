@@ -28,22 +28,16 @@ _ESTIMATES = "Source estimated from the image (docs/sources.md)"
 _OPTIONS = "Options of the inversion"
 
 ImageFile = Annotated[
-    Path,
-    Argument(
-        help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.",
-        show_default=False,
-    ),
+    Path, Argument(help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.", show_default=False)
 ]
 StoreFolder = Annotated[
     Path, Argument(help="name.shadowinv.zarr, from shadowinv batch.", show_default=False)
 ]
 SourceFile = Annotated[
-    Path | None,
-    Option("--source", help="Image of the undisturbed beam. Default: uniform."),
+    Path | None, Option("--source", help="Image of the undisturbed beam. Default: uniform.")
 ]
 MaskFile = Annotated[
-    Path | None,
-    Option("--mask", help="Image of the same size, 0 at unusable pixels."),
+    Path | None, Option("--mask", help="Image of the same size, 0 at unusable pixels.")
 ]
 RecipeFile = Annotated[
     Path | None,
@@ -62,8 +56,7 @@ SetupFile = Annotated[
 ]
 OptionsFile = Annotated[Path | None, Option("--options", help="TOML file with inversion options.")]
 Channel = Annotated[
-    str | None,
-    Option(help="Channel of a colour image: red, green, blue, mean or an index from 0."),
+    str | None, Option(help="Channel of a colour image: red, green, blue, mean or an index from 0.")
 ]
 Variable = Annotated[
     str | None,
@@ -113,8 +106,7 @@ Result = Annotated[
     ),
 ]
 Figure = Annotated[
-    Path | None,
-    Option(help="Figure file: .png, .pdf or .svg. Default: a PNG next to the result."),
+    Path | None, Option(help="Figure file: .png, .pdf or .svg. Default: a PNG next to the result.")
 ]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]

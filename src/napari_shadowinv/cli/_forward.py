@@ -32,11 +32,7 @@ class Prediction:
 
 
 def seen_with(
-    field: Field,
-    seen: Setup | None,
-    told: Setup | None,
-    deflector: str | None,
-    dispersion: float,
+    field: Field, seen: Setup | None, told: Setup | None, deflector: str | None, dispersion: float
 ) -> Prediction:
     """Find out which experiments are meant."""
     if told is not None and field.setup is not None and told != field.setup:

@@ -315,8 +315,7 @@ def info(
     ] = None,
     variable: Variable = None,
     report: Annotated[
-        bool,
-        typer.Option("--report", help="Print versions and machine instead, for a bug report."),
+        bool, typer.Option("--report", help="Print versions and machine instead, for a bug report.")
     ] = False,
 ) -> None:
     """Describe a file and its contents."""

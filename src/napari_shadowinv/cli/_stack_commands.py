@@ -94,8 +94,7 @@ def batch(
         ),
     ] = None,
     resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Resume an interrupted run and append new shots."),
+        bool, typer.Option("--resume", help="Resume an interrupted run and append new shots.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Discard an earlier run.")] = False,
     redo_failed: Annotated[
@@ -212,13 +211,7 @@ def movie(
     from napari_shadowinv.cli._export import write_movie
 
     frames = write_movie(
-        store,
-        out,
-        variable=variable,
-        shots=shots,
-        rate=rate,
-        limits=limits,
-        overwrite=overwrite,
+        store, out, variable=variable, shots=shots, rate=rate, limits=limits, overwrite=overwrite
     )
     if not quiet:
         say(f"Wrote {out}: {frames} shots, {frames / rate:.1f} s")

@@ -79,8 +79,7 @@ def write(
 
 
 def _dataset(
-    result: Inversion | Uncertainty | xarray.Dataset,
-    setup: Setup | None,
+    result: Inversion | Uncertainty | xarray.Dataset, setup: Setup | None
 ) -> xarray.Dataset:
     import xarray as xr
 
