@@ -24,8 +24,6 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import check_promise
 
-__all__ = ["read_b16", "read_spe"]
-
 _B16_HEADER = 24
 _B16_EXTENDED_HEADER = 128
 

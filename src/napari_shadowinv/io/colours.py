@@ -9,8 +9,6 @@ import numpy as np
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = ["CHANNELS", "film_warnings", "to_grey"]
-
 CHANNELS = ("red", "green", "blue", "mean")
 
 # Of a picture of film that is exposed in its middle: the rim's width over the shorter side, its

@@ -17,8 +17,6 @@ from napari_shadowinv.io.hdf5 import check_arrays, hdf5_in_memory
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["read_result", "require", "write_result", "write_sites"]
-
 _SITE_COLUMNS = "y_px,x_px,weight_px2,mass,flux,displacement_y_px,displacement_x_px"
 
 

@@ -21,17 +21,6 @@ from pathlib import Path
 from napari_shadowinv._system.interrupts import interrupts_put_off
 from napari_shadowinv.errors import FileFormatError
 
-__all__ = [
-    "DEFLATE_RATIO",
-    "check_folder_of",
-    "check_output",
-    "check_promise",
-    "in_counting_order",
-    "replacing",
-    "sha256",
-    "text_of",
-]
-
 DEFLATE_RATIO = 1040
 """The most that zlib can pack into one byte, a little rounded up."""
 

@@ -20,22 +20,6 @@ from typing import Any, Literal
 from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv.errors import FileFormatError
 
-__all__ = [
-    "FIGURE_SUFFIXES",
-    "FORMATS",
-    "IMAGE_TITLES",
-    "IMAGE_WRITERS",
-    "OPENED_BY_NAPARI",
-    "RADIOGRAPH_SUFFIXES",
-    "READABLE",
-    "RESULT_WRITERS",
-    "SCAN_SUFFIXES",
-    "Format",
-    "format_of",
-    "function",
-    "kind_of",
-]
-
 # How much of a file holds every mark, and how much shows what a file without one is.
 _HEAD, _SEEN = 4100, 64
 

@@ -28,17 +28,6 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
-__all__ = [
-    "check_arrays",
-    "hdf5_in_memory",
-    "held_arrays",
-    "load_dataset",
-    "member",
-    "members",
-    "read_hdf5",
-    "read_plane",
-]
-
 # Whoever has more than that to choose from knows what is in the file.
 _MOST_LISTED = 30
 _MOST_LINKS = 16

@@ -24,19 +24,6 @@ from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.colours import film_warnings, to_grey
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
-__all__ = [
-    "read_eight_bits",
-    "read_npy",
-    "read_npy_plane",
-    "read_png",
-    "read_tiff",
-    "read_tiff_page",
-    "tiff_pages",
-    "write_npy",
-    "write_png",
-    "write_tiff",
-]
-
 # LZW at its best packs two and a half times as well as zlib.
 _TIFF_RATIO = 3 * DEFLATE_RATIO
 

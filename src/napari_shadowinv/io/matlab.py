@@ -34,8 +34,6 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 from napari_shadowinv.io.hdf5 import load_dataset, member, members
 
-__all__ = ["Variable", "is_matlab", "mat_variables", "read_mat"]
-
 _HDF5_OFFSET = 512
 # Attributes of pradformat and of .shadowinv, which MATLAB's save does not write.
 _FOREIGN_MARKS = {"object_type", "format"}

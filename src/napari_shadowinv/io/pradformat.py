@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup, Species
 
-__all__ = ["check_pradformat_setup", "is_ours", "is_result", "read_pradformat", "write_pradformat"]
-
 _VERSION = "0.2.0"
 
 _EV_PER_MEV = 1e6

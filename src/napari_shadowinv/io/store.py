@@ -31,23 +31,6 @@ from napari_shadowinv.io.formats import STORE
 if TYPE_CHECKING:
     import xarray
 
-__all__ = [
-    "DONE",
-    "FAILED",
-    "FORMAT",
-    "PENDING",
-    "STATUS_NAMES",
-    "STORE_SUFFIX",
-    "SUMMARY",
-    "ShotWriter",
-    "StackStore",
-    "StoreError",
-    "check_store_path",
-    "is_stack",
-    "read_stack",
-    "store_error",
-]
-
 FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
 # One number for each shot, gathered when a run ends.

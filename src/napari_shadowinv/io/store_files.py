@@ -21,8 +21,6 @@ from zarr.storage import LocalStore
 from napari_shadowinv._system.safety import check_regular, check_size, small_text
 from napari_shadowinv.io.files import check_promise
 
-__all__ = ["CheckedStore"]
-
 _METADATA = "zarr.json"
 _CHUNKS = "/c/"
 # Where the formats of chunks keep the number of texts, and of unpacked bytes.

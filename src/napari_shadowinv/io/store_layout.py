@@ -37,8 +37,6 @@ from napari_shadowinv.io.store import (
     store_error,
 )
 
-__all__ = ["Contents", "Variable", "create_store", "grow_store"]
-
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
 _SMALL = 64  # values that are not worth compressing
 

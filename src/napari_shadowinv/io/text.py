@@ -38,8 +38,6 @@ from napari_shadowinv._system.safety import check_size
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 
-__all__ = ["read_text"]
-
 # A row of 100 000 pixels with all their digits has 2.5 MB.
 _LONGEST_LINE = 4_000_000
 
