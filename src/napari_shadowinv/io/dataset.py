@@ -1,7 +1,4 @@
-"""A result's dataset as one NetCDF4 file, ``.shadowinv``.
-
-- write and read: `write_result`, `read_result`; its sites alone: `write_sites`
-"""
+"""A result's dataset as one NetCDF4 file, ``.shadowinv``, or its sites alone as a table."""
 
 from __future__ import annotations
 
