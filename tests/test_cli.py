@@ -24,7 +24,7 @@ from napari_shadowinv import __version__
 from napari_shadowinv import preprocessing as filters
 from napari_shadowinv import preprocessing as sources
 from napari_shadowinv._system.memory import physical_memory
-from napari_shadowinv.cli import _report, app
+from napari_shadowinv.cli import _info, app
 from napari_shadowinv.cli._flags import recipe_of
 from napari_shadowinv.cli._inputs import read_shot, setup_for
 from napari_shadowinv.errors import InputError
@@ -940,17 +940,17 @@ def test_info_reports_the_installation() -> None:
 
 def test_the_report_tells_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     def without_windows(name: str) -> str:
-        if name in ("napari", "npe2", "qtpy", *_report.QT_BINDINGS):
+        if name in ("napari", "npe2", "qtpy", *_info.QT_BINDINGS):
             raise metadata.PackageNotFoundError(name)
         return metadata.version(name)
 
-    monkeypatch.setattr(_report, "version", without_windows)
+    monkeypatch.setattr(_info, "version", without_windows)
     told = [line.split(maxsplit=1) for line in shadowinv("info", "--report").stdout.splitlines()]
     for name in ("napari", "npe2", "qtpy", "Qt"):
         assert [name, "not installed"] in told
     only = {"PySide6_Essentials": "6.11.0"}
-    monkeypatch.setattr(_report, "_version", only.get)
-    assert _report._qt_bindings() == ["PySide6_Essentials 6.11.0"]
+    monkeypatch.setattr(_info, "_version", only.get)
+    assert _info._qt_bindings() == ["PySide6_Essentials 6.11.0"]
 
 
 def test_the_report_hides_the_home_folder(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
@@ -1081,13 +1081,13 @@ def test_ctrl_c_while_computing_leaves_nothing(folder: Path) -> None:
     np.save("shot.npy", synthetic_image(gaussian_blob((100, 100), 100.0, 12.0).displacement))
     say_when = """
         import contextlib
-        from napari_shadowinv.cli import _progress
+        from napari_shadowinv.cli import _terminal
 
         @contextlib.contextmanager
         def bars():
             yield lambda progress: print("now" if progress.stage == "transport" else "")
 
-        _progress.progress_bars = bars
+        _terminal.progress_bars = bars
     """
     before = content(folder)
     code, errors = interrupted(folder, say_when, ["invert", "shot.npy", "--n-sites", "30000"])

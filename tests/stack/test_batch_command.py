@@ -249,6 +249,29 @@ def test_shots_are_exported_as_tiff(store):
     assert "exists" in again.output
 
 
+def test_an_exported_tiff_tells_the_size_of_its_pixels(store):
+    def pixel_size(path: str) -> float | None:
+        with tifffile.TiffFile(path) as tiff:
+            tags = tiff.pages[0].aspage().tags
+            if tags["ResolutionUnit"].value != tifffile.RESUNIT.CENTIMETER:
+                return None
+            count, per = tags["XResolution"].value
+            return 0.01 * per / count
+
+    assert batch("--overwrite").exit_code == 0
+    shadowinv("export", store, "--format", "tiff", "--shots", "1", "--out", "pixels")
+    assert pixel_size("pixels/0001_shot_1_potential.tif") is None
+    for setup, in_object_plane in ((OPTICAL, 2e-5), (PROTON, 1e-5)):
+        Path("setup.toml").write_text(setup)
+        assert batch("--setup", "setup.toml", "--overwrite").exit_code == 0
+        result = shadowinv(
+            "export", store, "--format", "tiff", "--shots", "1", "--out", "tiffs", "--overwrite"
+        )
+        assert result.exit_code == 0, result.output
+        found = pixel_size("tiffs/0001_shot_1_potential.tif")
+        assert found == pytest.approx(in_object_plane, rel=1e-6)
+
+
 def test_shots_are_exported_as_pradformat_if_the_setup_is_a_particle_beams(store):
     refused = shadowinv("export", store, "--format", "pradformat")
     assert refused.exit_code == 2

@@ -69,6 +69,21 @@ def test_whatever_a_reader_raises_is_one_error_with_its_reason(tmp_path: Path) -
         broken("a.tif", KeyboardInterrupt())
 
 
+def test_a_mistake_in_the_program_is_not_blamed_on_the_file(tmp_path: Path) -> None:
+    @refusing_damage
+    def lacks_a_module(path: Path) -> None:
+        import napari_shadowinv.nowhere  # noqa: F401
+
+    @refusing_damage
+    def lacks_a_name(path: Path) -> None:
+        nowhere  # type: ignore[name-defined]  # noqa: B018, F821
+
+    with pytest.raises(ModuleNotFoundError, match=r"napari_shadowinv\.nowhere"):
+        lacks_a_module(tmp_path / "a.tif")
+    with pytest.raises(NameError, match="'nowhere' is not defined"):
+        lacks_a_name(tmp_path / "a.tif")
+
+
 def write_hdf5(path: Path) -> None:
     with h5py.File(path, "w") as file:
         file.create_dataset("image", data=IMAGE, compression="gzip")

@@ -32,13 +32,15 @@ Content = TypeVar("Content")
 def refusing_damage(
     read: Callable[Concatenate[Path, P], Content],
 ) -> Callable[Concatenate[str | Path, P], Content]:
-    """Turn whatever a reader of a path raises into a `FileFormatError`, with it as the cause."""
+    """Turn what a file makes its reader raise into a `FileFormatError`, with it as the cause."""
 
     @functools.wraps(read)
     def guarded(path: str | Path, *args: P.args, **kwargs: P.kwargs) -> Content:
         try:
             return read(Path(path), *args, **kwargs)
         except (FileFormatError, InputError, InversionCancelled):
+            raise
+        except (ImportError, NameError):  # a mistake in a program, which no file can cause
             raise
         except MemoryError as error:
             raise FileFormatError(

@@ -16,28 +16,25 @@ import numpy as np
 import typer
 from rich import box, progress
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from napari_shadowinv._system.safety import refusing_damage
-from napari_shadowinv.cli._guard import EXIT_CANCELLED, EXIT_NOT_CONVERGED, interrupted
 from napari_shadowinv.cli._tables import Rows, options_text, two_columns
-from napari_shadowinv.cli._terminal import plain, say, say_on_stderr
-from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.io.store import (
-    DONE,
-    FAILED,
-    PENDING,
-    STATUS_NAMES,
-    StackStore,
-    check_store_path,
+from napari_shadowinv.cli._terminal import (
+    EXIT_CANCELLED,
+    EXIT_NOT_CONVERGED,
+    interrupted,
+    plain,
+    say,
+    say_on_stderr,
 )
+from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.io.store import DONE, FAILED, STATUS_NAMES, StackStore, check_store_path
 
 if TYPE_CHECKING:
-    from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunProgress
 
 EXIT_FAILED_SHOTS = 1
-
 _NAMED = 10  # failures that a table names
 
 
@@ -66,7 +63,6 @@ class _Ledger:
 
     @property
     def left_text(self) -> str:
-        """Time that the pending shots will take, at the rate so far."""
         if self.now is None or not self.ended:
             return ""
         pending = self.now.total - self.now.done - self.now.failed
@@ -78,41 +74,31 @@ def run_batch(
     shots: list[str],
     out: Path,
     *,
-    recipe: Recipe,
     channel: str | None,
     variable: str | None,
     variables: str | None,
-    warm_start: int,
-    scheduler: str | None,
-    workers: int | None,
     resume: bool,
-    overwrite: bool,
-    redo_failed: bool,
     quiet: bool,
+    **choices: Any,
 ) -> None:
-    """Invert all shots into a store, tell of it, and end with what became of them."""
+    """Invert all shots into a store, with `choices` of `run_stack`, and tell what became of them."""
     from napari_shadowinv.stack import STORED, read_shot, run_stack
 
-    _check(out, resume or redo_failed, overwrite)
+    _check(out, resume or choices["redo_failed"], choices["overwrite"])
     ledger = _Ledger()
-    reader = functools.partial(read_shot, channel=channel)
+    part: dict[str, Any] = {"channel": channel}
     if variable is not None:
-        reader = functools.partial(reader, variable=variable)
+        part["variable"] = variable
     try:
         with _display(ledger, quiet) as show:
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
-                recipe=recipe,
                 variables=STORED if variables is None else _names(variables),
-                reader=reader,
-                warm_start=warm_start,
-                scheduler=scheduler or "processes",
-                workers=workers,
-                overwrite=overwrite,
-                redo_failed=redo_failed,
+                reader=functools.partial(read_shot, **part),
                 on_progress=show,
                 should_stop=interrupted,
+                **choices,
             )
     except (KeyboardInterrupt, InversionCancelled):
         state = _counts_text(StackStore(out)) if out.exists() else "nothing written"
@@ -185,8 +171,8 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
 
 def _counts_text(store: StackStore) -> str:
     statuses = store.statuses()
-    counts = ((int(np.sum(statuses == status)), status) for status in (DONE, FAILED, PENDING))
-    return ", ".join(f"{count} {STATUS_NAMES[status]}" for count, status in counts)
+    counts = {name: np.sum(statuses == status) for status, name in enumerate(STATUS_NAMES)}
+    return ", ".join(f"{counts[name]} {name}" for name in ("done", "failed", "pending"))
 
 
 def _summary(store: StackStore, ledger: _Ledger) -> Table:
@@ -243,10 +229,8 @@ def status_tables(path: Path, every: bool) -> list[Table]:
     if not every:
         return tables
     store = StackStore(path)
-    shots = Table(box=box.SIMPLE)
     headings = "shot", "name", "status", "seconds", "iterations", "image residual", "how it went"
-    for heading in headings:
-        shots.add_column(heading, overflow="fold")
+    shots = Table(*(Column(heading, overflow="fold") for heading in headings), box=box.SIMPLE)
     for index, (status, report) in enumerate(zip(store.statuses(), store.reports(), strict=True)):
         shots.add_row(
             str(index),
@@ -263,7 +247,6 @@ def status_tables(path: Path, every: bool) -> list[Table]:
 
 @refusing_damage
 def store_rows(path: Path, *, trouble: bool = True) -> Rows:
-    """Tell what a store is."""
     store = StackStore(path)
     attributes = store.attributes
     seconds = [report["seconds"] for report in store.reports() if "stages" in report]

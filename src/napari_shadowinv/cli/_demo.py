@@ -17,10 +17,6 @@ if TYPE_CHECKING:
 
     Fields = Mapping[str, FloatArray]
 
-_SHAPE = (200, 200)
-_SIGMA = 30e-6
-_SEED = 0
-
 
 def simulated_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatArray, FloatArray]:
     """Image with noise, and the displacement that made it."""
@@ -29,9 +25,9 @@ def simulated_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatAr
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.phantoms import toroid
 
-    truth = toroid(_SHAPE, setup, peak=dm, sigma=_SIGMA).displacement
+    truth = toroid((200, 200), setup, peak=dm, sigma=30e-6).displacement
     image = synthetic_image(truth)
-    grain = np.random.default_rng(_SEED).normal(size=image.shape)
+    grain = np.random.default_rng(0).normal(size=image.shape)
     return image + noise * image.mean() * grain, truth
 
 

@@ -23,15 +23,9 @@ if TYPE_CHECKING:
     import xarray
 
 FORMATS = ("tiff", "pradformat", "csv")
-
-# Columns of the table, and what they are called in a shot's report.
-_REPORTED = {
-    "converged": "converged",
-    "flux_residual": "residual",
-    "image_residual": "image_residual",
-    "iterations": "iterations",
-    "reason": "reason",
-}
+# Columns of the table: what a shot's report says, and how it says it.
+_REPORTED = ("converged", "flux_residual", "image_residual", "iterations", "reason")
+_KEYS = ("converged", "residual", "image_residual", "iterations", "reason")
 
 
 def _opened(path: Path, shots: str | None) -> xarray.Dataset:
@@ -78,10 +72,11 @@ def export_shots(
         return [_write_table(store, out, shots, overwrite)]
     dataset = _opened(store, shots)
     jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
+    setup = setup_from_dataset(dataset)  # for the size of a pixel in a TIFF
     make_folder(out)
     for name, _ in jobs:
         check_output(out / name, overwrite)
-    return [write(out / name, load(), overwrite=overwrite) for name, load in jobs]
+    return [write(out / name, load(), setup=setup, overwrite=overwrite) for name, load in jobs]
 
 
 def _stem(shot: xarray.Dataset) -> str:
@@ -143,7 +138,7 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
         rows = csv.writer(f)
         rows.writerow(["shot", "name", "status", *_REPORTED, *headings])
         for index in chosen:
-            report = (reports[index].get(name, "") for name in _REPORTED.values())
+            report = (reports[index].get(name, "") for name in _KEYS)
             peak = (f"{columns[name][index]:.9g}" for name in names)
             status = STATUS_NAMES[statuses[index]]
             rows.writerow([index, content.names[index], status, *report, *peak])
@@ -153,7 +148,6 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
 def write_movie(
     store: Path,
     out: Path,
-    *,
     variable: str | None,
     shots: str | None,
     rate: float,

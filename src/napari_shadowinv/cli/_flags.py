@@ -1,8 +1,7 @@
 """Arguments and options that commands share, each with its name and help.
 
-- written here: what is read and written, such as `ImageFile`, `SetupFile`, `Result`
-- made from the models: `takes_recipe` gives a command a flag for every parameter of a step, of an
-  estimate of the source, and of the options; `recipe_of` makes a recipe of those that were given
+Those of steps, estimates of the source and options are made from the models: `takes_recipe` gives
+them to a command, and `recipe_of` makes a recipe of those that were given.
 """
 
 from __future__ import annotations
@@ -28,22 +27,16 @@ _ESTIMATES = "Source estimated from the image (docs/sources.md)"
 _OPTIONS = "Options of the inversion"
 
 ImageFile = Annotated[
-    Path,
-    Argument(
-        help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.",
-        show_default=False,
-    ),
+    Path, Argument(help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.", show_default=False)
 ]
 StoreFolder = Annotated[
     Path, Argument(help="name.shadowinv.zarr, from shadowinv batch.", show_default=False)
 ]
 SourceFile = Annotated[
-    Path | None,
-    Option("--source", help="Image of the undisturbed beam. Default: uniform."),
+    Path | None, Option("--source", help="Image of the undisturbed beam. Default: uniform.")
 ]
 MaskFile = Annotated[
-    Path | None,
-    Option("--mask", help="Image of the same size, 0 at unusable pixels."),
+    Path | None, Option("--mask", help="Image of the same size, 0 at unusable pixels.")
 ]
 RecipeFile = Annotated[
     Path | None,
@@ -62,8 +55,7 @@ SetupFile = Annotated[
 ]
 OptionsFile = Annotated[Path | None, Option("--options", help="TOML file with inversion options.")]
 Channel = Annotated[
-    str | None,
-    Option(help="Channel of a colour image: red, green, blue, mean or an index from 0."),
+    str | None, Option(help="Channel of a colour image: red, green, blue, mean or an index from 0.")
 ]
 Variable = Annotated[
     str | None,
@@ -77,21 +69,17 @@ SourceVariable = Annotated[
     str | None,
     Option(
         metavar="NAME",
-        help=(
-            "Name of the array with the undisturbed beam, in the --source file or else in the "
-            "image file."
-        ),
+        help="Name of the array with the undisturbed beam, in the --source file or else in the "
+        "image file.",
     ),
 ]
 ChosenShots = Annotated[
     str | None,
     Option(
         "--shots",
-        help=("Shots to use, counted from 0: 3, 3:20, ::10 or 1,4,9. Default: all finished shots."),
+        help="Shots to use, counted from 0: 3, 3:20, ::10 or 1,4,9. Default: all finished shots.",
     ),
 ]
-
-SiteCount = Annotated[int | None, Option(help="Number of sites. Default: one per pixel.")]
 ClipNegative = Annotated[
     bool, Option("--clip-negative", help="Set negative pixels to zero and count them.")
 ]
@@ -102,19 +90,15 @@ SourceMask = Annotated[
         rich_help_panel=_ESTIMATES,
     ),
 ]
-
 Result = Annotated[
     Path | None,
     Option(
-        help=(
-            "Result file: .shadowinv (complete), .h5 (pradformat) or .csv (sites). Default: the "
-            "image's name with .shadowinv, in the current folder."
-        )
+        help="Result file: .shadowinv (complete), .h5 (pradformat) or .csv (sites). Default: the "
+        "image's name with .shadowinv, in the current folder."
     ),
 ]
 Figure = Annotated[
-    Path | None,
-    Option(help="Figure file: .png, .pdf or .svg. Default: a PNG next to the result."),
+    Path | None, Option(help="Figure file: .png, .pdf or .svg. Default: a PNG next to the result.")
 ]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]
@@ -157,9 +141,7 @@ def _all_flags() -> dict[str, inspect.Parameter]:
     flags.append(_flag("source-from", method, _ESTIMATES, told))
     for name in dict.fromkeys(n for one in ESTIMATES.values() for n in one.parameters()):
         users = {key: one.parameters()[name] for key, one in _users(name).items()}
-        told = " ".join(
-            f"For {key}: {_lower(_with_default(field))}" for key, field in users.items()
-        )
+        told = " ".join(f"For {key}: {_lower(_with_default(one))}" for key, one in users.items())
         field = next(iter(users.values()))
         flags.append(_flag(f"source-{name.replace('_', '-')}", field, _ESTIMATES, told))
     for name, field in InversionOptions.model_fields.items():
@@ -216,24 +198,14 @@ def takes_recipe(command: Callable[..., None]) -> Callable[..., None]:
 def recipe_of(
     flags: Mapping[str, Any], base: Recipe, options: Mapping[str, Any], where: str = "options"
 ) -> Recipe:
-    """Put flags on top of a recipe; `options` are those of an options file, named `where`.
-
-    Raises
-    ------
-    InputError
-        If a value cannot be used, or a flag needs another one.
-    """
+    """Put flags on top of a recipe; `options` are those of an options file, named `where`."""
     chosen = {**base.options.model_dump(exclude_unset=True), **options}
     chosen |= {name: flags[name] for name in InversionOptions.model_fields if name in flags}
     if "margin" in flags and chosen.get("boundary") != "free":
         raise InputError("received --margin: it needs --boundary free")
-    return base.model_copy(
-        update={
-            "steps": _steps(flags, base.steps),
-            "source": _estimate(flags, base),
-            "options": validated(InversionOptions, chosen, where),
-        }
-    )
+    steps, source = _steps(flags, base.steps), _estimate(flags, base)
+    made = validated(InversionOptions, chosen, where)
+    return base.model_copy(update={"steps": steps, "source": source, "options": made})
 
 
 def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...]:
@@ -241,11 +213,8 @@ def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...
     order = list(STEPS)
     found = list(steps)
     for key, step in STEPS.items():
-        given = {}
-        for name in step.parameters():
-            flag = _step_flag(step, name)
-            if (dest := flag.replace("-", "_")) in flags:
-                given[name] = flags[dest]
+        named = {name: _step_flag(step, name).replace("-", "_") for name in step.parameters()}
+        given = {name: flags[flag] for name, flag in named.items() if flag in flags}
         if not given:
             continue
         there = next((i for i, one in enumerate(found) if isinstance(one, step)), None)
@@ -273,10 +242,8 @@ def _estimate(flags: Mapping[str, Any], base: Recipe) -> Any:
     method = flags.get("source_from")
     if method is None and not given:
         return base.source
-    if method is None and base.estimate is None:
-        method = ""
-    elif method is None:
-        method = base.estimate.name()  # type: ignore[union-attr]
+    if method is None:
+        method = "" if base.estimate is None else base.estimate.name()
     elif method not in ESTIMATES:
         meant = nearest(method, list(ESTIMATES))
         hint = f"did you mean '{meant}'?" if meant else f"expected one of {', '.join(ESTIMATES)}"

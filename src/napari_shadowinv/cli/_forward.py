@@ -2,84 +2,106 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from napari_shadowinv.cli._inputs import Field
 from napari_shadowinv.cli._tables import setup_text
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
-    from napari_shadowinv._typing import FloatArray
+    from napari_shadowinv._typing import AnyArray, FloatArray
     from napari_shadowinv.physics.setup import Deflector, Setup
 
 
 @dataclass(frozen=True)
-class Prediction:
-    """A field with the experiment that it is from, and the one that it is to be seen in."""
+class Field:
+    """A displacement in px, and where the file has them the source and setup that made it."""
 
     displacement: FloatArray
-    source: FloatArray | None
-    made_with: Setup | None
-    seen: Setup | None
-    deflector: Deflector | None
-    dispersion: float
-
-    @property
-    def is_elsewhere(self) -> bool:
-        """Whether the experiment to predict is another one."""
-        return self.made_with is not None and self.made_with != self.seen
+    source: FloatArray | None = None
+    setup: Setup | None = None
 
 
-def seen_with(
-    field: Field,
-    seen: Setup | None,
-    told: Setup | None,
-    deflector: str | None,
-    dispersion: float,
-) -> Prediction:
-    """Find out which experiments are meant."""
+def field_from(path: Path, variable: str | None = None) -> Field:
+    """Displacement from a result, or from an array of px or px²."""
+    from napari_shadowinv.inversion.labels import setup_from_dataset
+    from napari_shadowinv.io import read_dataset, read_radiograph
+    from napari_shadowinv.io.formats import kind_of
+    from napari_shadowinv.io.hdf5 import read_hdf5
+    from napari_shadowinv.io.images import read_npy
+
+    kind = kind_of(path)
+    if variable is not None and kind in ("hdf5", "shadowinv"):
+        return Field(_displacement(path, read_hdf5(path, variable)))
+    if variable is not None or kind == "mat":
+        return Field(_displacement(path, read_radiograph(path, variable=variable).image))
+    if kind in ("hdf5", "shadowinv"):
+        dataset = read_dataset(path)
+        source = dataset["source"].values if "source" in dataset else None
+        return Field(dataset["displacement"].values, source, setup_from_dataset(dataset))
+    if kind == "npy":
+        return Field(_displacement(path, read_npy(path)))
+    raise _no_field(path, f"a {kind.upper()} picture")
+
+
+def _displacement(path: Path, array: AnyArray) -> FloatArray:
+    from napari_shadowinv.physics.setup import displacement_from_potential
+
+    if array.ndim == 2:
+        return displacement_from_potential(array)
+    if array.ndim == 3 and array.shape[0] == 2:
+        return array.astype(float)
+    raise _no_field(path, f"an array of shape {array.shape}")
+
+
+def _no_field(path: Path, found: str) -> FileFormatError:
+    return FileFormatError(
+        f"{path} is {found}: expected a .shadowinv result, or NPY with a displacement "
+        "(2, height, width) in px or a potential (height, width) in px²"
+    )
+
+
+def experiments(
+    field: Field, seen: Setup | None, told: Setup | None, deflector: str | None, dispersion: float
+) -> tuple[Setup | None, Setup | None]:
+    """Setups that a field was measured with, and that it is to be seen with."""
     if told is not None and field.setup is not None and told != field.setup:
         raise InputError(
             "received --made-with, but the field's file contains its own setup, "
             f"{setup_text(field.setup)}: leave it out"
         )
-    made_with = field.setup if told is None else told
-    meant = Prediction(
-        displacement=field.displacement,
-        source=field.source,
-        made_with=made_with,
-        seen=made_with if seen is None else seen,
-        # Names of two words have a hyphen on the command line.
-        deflector=cast("Deflector | None", deflector and deflector.replace("-", " ")),
-        dispersion=dispersion,
-    )
-    if (deflector is not None or dispersion != 1) and not meant.is_elsewhere:
+    made_with = told or field.setup or seen
+    seen = seen or made_with
+    if (deflector is not None or dispersion != 1) and made_with == seen:
         raise InputError(
             "received --deflector or --dispersion, but only one setup: expected a different one "
             "with --setup, and for a field in px also --made-with"
         )
-    # In another experiment the beam is another one, too.
-    return replace(meant, source=None) if meant.is_elsewhere else meant
+    return made_with, seen
 
 
-def predicted(meant: Prediction, source: FloatArray | None) -> tuple[FloatArray, str]:
+def predicted(
+    displacement: FloatArray,
+    source: FloatArray | None,
+    made_with: Setup | None,
+    seen: Setup | None,
+    what: str | None,
+    dispersion: float,
+) -> tuple[FloatArray, str]:
     """Return the image, and in words what was assumed."""
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.projection import default_deflector, project
 
-    if meant.made_with is None or meant.seen is None or not meant.is_elsewhere:
-        return synthetic_image(meant.displacement, source), ""
-    deflector = meant.deflector or default_deflector(meant.made_with, meant.seen)
+    if made_with is None or seen is None or made_with == seen:
+        return synthetic_image(displacement, source), ""
+    # Names of two words have a hyphen on the command line.
+    named = cast("Deflector | None", what and what.replace("-", " "))
+    deflector = named or default_deflector(made_with, seen)
     image = project(
-        meant.displacement,
-        meant.made_with,
-        meant.seen,
-        deflector=deflector,
-        dispersion=meant.dispersion,
-        source=source,
+        displacement, made_with, seen, deflector=deflector, dispersion=dispersion, source=source
     )
     return image, (
-        f"From {setup_text(meant.made_with)} to {setup_text(meant.seen)}, assuming that only a "
-        f"{deflector} deflects the beam"
+        f"From {setup_text(made_with)} to {setup_text(seen)}, assuming that only a {deflector} "
+        "deflects the beam"
     )

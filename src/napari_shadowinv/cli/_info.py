@@ -1,22 +1,17 @@
-"""What `shadowinv info` tells about a file: an array, a picture, a radiograph or a result."""
+"""What `shadowinv info` tells: of a file, `described`; for a bug report, `report_text`."""
 
 from __future__ import annotations
 
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from napari_shadowinv import __version__
+from napari_shadowinv._system.memory import physical_memory
 from napari_shadowinv._system.safety import refusing_damage
-from napari_shadowinv.cli._tables import (
-    Rows,
-    closing_rows,
-    inversion_rows,
-    options_text,
-    peak_rows,
-    provenance_rows,
-    setup_text,
-    size_text,
-    two_columns,
-)
+from napari_shadowinv.cli import _tables
 
 if TYPE_CHECKING:
     import xarray
@@ -27,14 +22,20 @@ if TYPE_CHECKING:
     from napari_shadowinv.io.formats import Format
     from napari_shadowinv.preprocessing import Provenance
 
+PACKAGES = (
+    "numpy scipy numba llvmlite dask distributed xarray zarr h5py h5netcdf scikit-image matplotlib "
+    "pydantic typer napari npe2 qtpy"
+)
+QT_BINDINGS = ("PyQt6", "PySide6", "PySide6_Essentials", "PyQt5", "PySide2")
+
 
 @refusing_damage
 def described(path: Path, variable: str | None = None) -> Table:
     """Tell what a file is and what is in it."""
-    return two_columns(str(path), _rows(path, variable))
+    return _tables.two_columns(str(path), _rows(path, variable))
 
 
-def _rows(path: Path, variable: str | None) -> Rows:
+def _rows(path: Path, variable: str | None) -> _tables.Rows:
     from napari_shadowinv.cli._batch import store_rows
     from napari_shadowinv.io import Radiograph, is_stack, read
     from napari_shadowinv.io.formats import format_of
@@ -61,7 +62,7 @@ def _rows(path: Path, variable: str | None) -> Rows:
     return _result_rows(content)
 
 
-def _matlab_rows(path: Path, variable: str | None) -> Rows:
+def _matlab_rows(path: Path, variable: str | None) -> _tables.Rows:
     """The image of a MATLAB file, or a list to choose from."""
     from napari_shadowinv.io.matlab import mat_variables, read_mat
 
@@ -75,7 +76,7 @@ def _matlab_rows(path: Path, variable: str | None) -> Rows:
     return [*rows, ("image", metadata["variable"]), *_array_rows(array)]
 
 
-def _picture_rows(path: Path, found: Format) -> Rows:
+def _picture_rows(path: Path, found: Format) -> _tables.Rows:
     from napari_shadowinv.io.colours import film_warnings
 
     array, metadata = found.read(path)
@@ -87,15 +88,13 @@ def _picture_rows(path: Path, found: Format) -> Rows:
     return [*rows, *_array_rows(array), *[("warning", text) for text in warnings]]
 
 
-def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> Rows:
+def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _tables.Rows:
     from napari_shadowinv.io import Radiograph
 
     assert isinstance(shot, Radiograph)
     names = {"text": "numbers as text", "pradformat": "pradformat radiograph"}
-    rows = [
-        ("kind", names.get(str(shot.metadata["kind"]), str(shot.metadata["kind"]))),
-        *_array_rows(shot.image),
-    ]
+    kind = str(shot.metadata["kind"])
+    rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image)]
     if shot.source is not None:
         rows.append(("source", "in the same file, below the image"))
     if shot.mask is not None:
@@ -104,18 +103,16 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> Rows:
         if isinstance(value, int | float):
             unit = "MeV" if name == "energy" else "m"
             rows.append((f"{name.replace('_', ' ')} ({unit})", f"{value:g}"))
-    return [*rows, ("setup", setup_text(shot.setup, shot))]
+    return [*rows, ("setup", _tables.setup_text(shot.setup, shot))]
 
 
-def _array_rows(array: AnyArray) -> Rows:
+def _array_rows(array: AnyArray) -> _tables.Rows:
     import numpy as np
 
     values = array.astype(np.float64)
     finite = values[np.isfinite(values)]
-    rows = [
-        ("shape", f"{array.shape}, [y, x]" if array.ndim == 2 else str(array.shape)),
-        ("dtype", str(array.dtype)),
-    ]
+    shape = f"{array.shape}, [y, x]" if array.ndim == 2 else str(array.shape)
+    rows = [("shape", shape), ("dtype", str(array.dtype))]
     if finite.size:
         rows.append(("min, mean, max", f"{finite.min():g}, {finite.mean():g}, {finite.max():g}"))
     rows.append(("negative", f"{np.count_nonzero(finite < 0)} values"))
@@ -123,36 +120,93 @@ def _array_rows(array: AnyArray) -> Rows:
     return rows
 
 
-def _result_rows(dataset: xarray.Dataset) -> Rows:
+def _result_rows(dataset: xarray.Dataset) -> _tables.Rows:
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.labels import setup_from_dataset
 
     setup = setup_from_dataset(dataset)
     displacement = dataset["displacement"].values
-    experiment = [("image", size_text(displacement[0])), ("setup", setup_text(setup))]
+    experiment = [
+        ("image", _tables.size_text(displacement[0])),
+        ("setup", _tables.setup_text(setup)),
+    ]
     if "options" not in dataset.attrs:
         is_foreign = dataset.attrs.get("format") == "pradformat"
         kind = "pradformat inversion" if is_foreign else "field retrieved by another program"
-        return [("kind", kind), *experiment, *peak_rows(displacement, setup)]
+        return [("kind", kind), *experiment, *_tables.peak_rows(displacement, setup)]
     inversion = Inversion.from_dataset(dataset)
     return [
         ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
         *_origin_rows(inversion.provenance),
         *experiment,
-        *inversion_rows(inversion, setup),
-        *closing_rows(inversion.report),
-        ("options", options_text(inversion.options.model_dump())),
+        *_tables.inversion_rows(inversion, setup),
+        *_tables.closing_rows(inversion.report),
+        ("options", _tables.options_text(inversion.options.model_dump())),
     ]
 
 
-def _origin_rows(provenance: Provenance | None) -> Rows:
+def _origin_rows(provenance: Provenance | None) -> _tables.Rows:
     """Files that a result was made from, and what was done to them."""
     if provenance is None:
         return []
     origins = {"image": provenance.image, "source": provenance.source}
-    rows: Rows = []
+    rows: _tables.Rows = []
     for name, origin in origins.items():
         if origin is not None and origin.file:
             rows += [(f"{name} file", origin.file), (f"{name} sha256", origin.sha256)]
-    return rows + provenance_rows(provenance)
+    return rows + _tables.provenance_rows(provenance)
+
+
+def report_text() -> str:
+    """Versions and the machine, one per line; neither napari nor Qt is loaded, which may fail."""
+    memory = physical_memory()
+    rows = [
+        ("napari-shadowinv", __version__),
+        ("python", f"{platform.python_version()} ({platform.python_implementation()})"),
+        *[(name, _version(name) or "not installed") for name in PACKAGES.split()],
+        ("Qt", ", ".join(_qt_bindings()) or "not installed"),
+        ("platform", f"{platform.platform()}, {platform.machine()}"),
+        ("cores", _cores()),
+        ("memory", "not known" if memory is None else f"{memory / 2**30:.1f} GiB"),
+        ("compiled code", _compiled_code()),
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:{width}}  {value}" for name, value in rows)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _qt_bindings() -> list[str]:
+    found = ((name, _version(name)) for name in QT_BINDINGS)
+    return [f"{name} {number}" for name, number in found if number]
+
+
+def _cores() -> str:
+    count = os.cpu_count()
+    try:
+        usable = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS or Windows
+        usable = count or 1
+    return f"{count or 'not known'}, {usable} usable"
+
+
+def _compiled_code() -> str:
+    """The folder with the machine code; the home folder is written ~ to hide the user's name."""
+    try:
+        from napari_shadowinv.inversion.compilation import code_folder, is_compiled
+
+        folder = code_folder()
+        if folder is None:
+            return "not kept: compiled anew in each process"
+        state = "compiled" if is_compiled() else "not compiled yet"
+    except Exception as error:  # a broken numba must not keep the rest from being reported
+        return f"not known: {type(error).__name__}: {' '.join(str(error).split())}"
+    home = Path.home()
+    shown = Path("~") / folder.relative_to(home) if folder.is_relative_to(home) else folder
+    return f"{shown} ({state})"

@@ -1,18 +1,15 @@
-"""What a command reads: options, the setup, images and fields."""
+"""What a command reads: a recipe, options, the setup and images."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Radiograph, Recipe
@@ -83,24 +80,17 @@ def source_from(recipe: Recipe, image: Path, channel: str | None) -> Radiograph 
 
 def setup_for(path: Path | None, shot: Radiograph, recipe: Recipe) -> Setup | None:
     """Setup from a file, completed by the geometry that the image's file knows."""
-    from napari_shadowinv.io import read_toml
-
     if path is None:
         return recipe.setup or shot.setup
-    return _setup(read_toml(path), shot.metadata.get("geometry", {}), str(path))
+    return setup_from(path, shot.metadata.get("geometry"))
 
 
-def setup_from(path: Path) -> Setup:
-    """Setup from a file that tells all of it."""
+def setup_from(path: Path, known: Mapping[str, Any] | None = None) -> Setup:
+    """Setup from a file; what it leaves out is taken from what is `known` of the geometry."""
     from napari_shadowinv.io import read_toml
-
-    return _setup(read_toml(path), {}, str(path))
-
-
-def _setup(entries: Mapping[str, Any], known: Mapping[str, Any], where: str) -> Setup:
-    """Setup from a file's entries; what they leave out comes from the image's own file."""
     from napari_shadowinv.physics.setup import SETUPS, setup_from_dict
 
+    entries, known = read_toml(path), known or {}
     if "kind" in known and entries.get("kind", known["kind"]) != known["kind"]:
         known = {}
     elif known and "kind" not in known:
@@ -112,60 +102,4 @@ def _setup(entries: Mapping[str, Any], known: Mapping[str, Any], where: str) -> 
     pixel_sizes = {"pixel_size", "detector_pixel_size"}
     if pixel_sizes & entries.keys():
         known = {name: value for name, value in known.items() if name not in pixel_sizes}
-    return setup_from_dict({**known, **entries}, where)
-
-
-@dataclass(frozen=True)
-class Field:
-    """A displacement in px, and where the file has them the source and setup that made it."""
-
-    displacement: NDArray[np.float64]
-    source: NDArray[np.float64] | None = None
-    setup: Setup | None = None
-
-
-def field_from(path: Path, variable: str | None = None) -> Field:
-    """Displacement from a result, or from an array of px or px²."""
-    from napari_shadowinv.inversion.labels import setup_from_dataset
-    from napari_shadowinv.io import read_dataset
-    from napari_shadowinv.io.formats import kind_of
-    from napari_shadowinv.io.images import read_npy
-
-    kind = kind_of(path)
-    if variable is not None or kind == "mat":
-        return Field(_displacement(path, _named_array(path, variable)))
-    if kind in ("hdf5", "shadowinv"):
-        dataset = read_dataset(path)
-        source = dataset["source"].values if "source" in dataset else None
-        return Field(dataset["displacement"].values, source, setup_from_dataset(dataset))
-    if kind == "npy":
-        return Field(_displacement(path, read_npy(path)))
-    raise _no_field(path, f"a {kind.upper()} picture")
-
-
-def _named_array(path: Path, variable: str | None) -> NDArray[Any]:
-    """Plane of a MATLAB file, or array of any HDF5 file."""
-    from napari_shadowinv.io import read_radiograph
-    from napari_shadowinv.io.formats import kind_of
-    from napari_shadowinv.io.hdf5 import read_hdf5
-
-    if variable is not None and kind_of(path) in ("hdf5", "shadowinv"):
-        return read_hdf5(path, variable)
-    return read_radiograph(path, variable=variable).image
-
-
-def _displacement(path: Path, array: NDArray[Any]) -> NDArray[np.float64]:
-    from napari_shadowinv.physics.setup import displacement_from_potential
-
-    if array.ndim == 2:
-        return displacement_from_potential(array)
-    if array.ndim == 3 and array.shape[0] == 2:
-        return array.astype(float)
-    raise _no_field(path, f"an array of shape {array.shape}")
-
-
-def _no_field(path: Path, found: str) -> FileFormatError:
-    return FileFormatError(
-        f"{path} is {found}: expected a .shadowinv result, or NPY with a displacement "
-        "(2, height, width) in px or a potential (height, width) in px²"
-    )
+    return setup_from_dict({**known, **entries}, str(path))

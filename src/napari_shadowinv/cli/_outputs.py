@@ -23,7 +23,7 @@ def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tup
     if report is not None:
         return result, report
     figure = result.with_suffix(PNG.suffix)
-    if _is_same(figure, image):
+    if figure.resolve() == image.resolve():
         figure = result.with_name(f"{result.stem}_report{PNG.suffix}")
     return result, figure
 
@@ -38,8 +38,9 @@ def check_outputs(outputs: Mapping[Path, tuple[str, ...]], overwrite: bool) -> N
 
 def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
     """Refuse to overwrite what is read, whatever --overwrite says."""
+    read = {other.resolve() for other in inputs if other is not None}
     for path in outputs:
-        if any(other is not None and _is_same(path, other) for other in inputs):
+        if path.resolve() in read:
             raise InputError(f"{path} is both read and written: choose another name for the output")
     if len({path.resolve() for path in outputs}) < len(outputs):
         raise InputError(f"{outputs[0]} would be written twice: choose two names")
@@ -51,10 +52,6 @@ def protect_store(store: Path, output: Path) -> None:
         raise InputError(
             f"{output} is inside the store being read: choose another name for the output"
         )
-
-
-def _is_same(first: Path, second: Path) -> bool:
-    return first.resolve() == second.resolve()
 
 
 def check_setup(result: Path, setup: Setup | None) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from napari_shadowinv import __version__
 from napari_shadowinv.cli._inputs import read_shot
-from napari_shadowinv.cli._progress import inverted
+from napari_shadowinv.cli._terminal import inverted
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read_dataset
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Again:
-    """A result made again, what has changed since the first time, and how far apart they are."""
+    """A result made again, and what has changed since the first time."""
 
     inversion: Inversion
     shot: Radiograph
@@ -44,38 +44,23 @@ def made_again(
         )
     folders = [result.parent, Path()]
     shot = _read(made.image, image, folders, "the image")
-    beam = None
-    is_own = made.source is not None and (made.source.file, made.source.variable) == (
-        made.image.file,
-        made.image.variable,
-    )
-    if made.source is not None and not is_own:
+    beam, own = None, (made.image.file, made.image.variable)
+    if made.source is not None and (made.source.file, made.source.variable) != own:
         beam = _read(made.source, source, folders, "the source")
-    inversion = inverted(
-        made.recipe,
-        shot,
-        beam,
-        quiet,
-        mask=_mask(made.mask, "mask"),
-        source_mask=_mask(made.source_mask, "source mask"),
-    )
+    masks = {"mask": made.mask, "source_mask": made.source_mask}
+    drawn = {name: _mask(origin, name.replace("_", " ")) for name, origin in masks.items()}
+    inversion = inverted(made.recipe, shot, beam, quiet, **drawn)
     return Again(inversion, shot, tuple(_changes(made, inversion)), _difference(before, inversion))
 
 
 def _read(origin: Origin, given: Path | None, folders: Sequence[Path], name: str) -> Radiograph:
-    path = given or next(
-        (folder / origin.file for folder in folders if origin.file and _is_there(folder, origin)),
-        None,
-    )
+    places = [folder / origin.file for folder in folders if origin.file]
+    path = given or next((place for place in places if place.is_file()), None)
     if path is None:
         found = f"{origin.file} is not there" if origin.file else "was not made from a file"
         raise FileFormatError(f"{name} {found}: name the file to use")
     channel = None if origin.channel is None else str(origin.channel)
     return read_shot(path, channel, origin.variable)
-
-
-def _is_there(folder: Path, origin: Origin) -> bool:
-    return (folder / origin.file).is_file()
 
 
 def _mask(origin: Origin | None, name: str) -> BoolArray | None:

@@ -8,53 +8,27 @@ from typing import Annotated, Any
 
 import typer
 
-from napari_shadowinv.cli._demo import compared_fields, demo_table, simulated_shot, write_demo
-from napari_shadowinv.cli._flags import (
-    Channel,
-    ClipNegative,
-    Figure,
-    ImageFile,
-    MaskFile,
-    OptionsFile,
-    Overwrite,
-    Quiet,
-    QuietInversion,
-    RecipeFile,
-    Result,
-    SaveRecipe,
-    SetupFile,
-    SourceFile,
-    SourceMask,
-    SourceVariable,
-    Variable,
-    takes_recipe,
-)
-from napari_shadowinv.cli._forward import predicted, seen_with
-from napari_shadowinv.cli._guard import alarm_unless_converged, notify_errors
-from napari_shadowinv.cli._info import described
-from napari_shadowinv.cli._inputs import (
-    field_from,
-    options_from,
-    read_shot,
-    recipe_from,
-    setup_for,
-    setup_from,
-    source_from,
-)
-from napari_shadowinv.cli._outputs import (
-    check_outputs,
-    check_setup,
-    make_folder,
-    protect,
-    result_and_figure,
-    write_all,
-)
-from napari_shadowinv.cli._progress import inverted
-from napari_shadowinv.cli._report import report_text
-from napari_shadowinv.cli._tables import rerun_table, size_text, summary
-from napari_shadowinv.cli._terminal import say
+from napari_shadowinv.cli import _flags, _inputs, _outputs
+from napari_shadowinv.cli._terminal import alarm_unless_converged, inverted, notify_errors, say
 from napari_shadowinv.errors import InputError
 
+# Of arguments whose help is longer than a line.
+HELP = {
+    "image": "Its image, or another one. Default: the file of that name beside the result or in "
+    "the current folder.",
+    "field": ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) "
+    "containing a displacement (2, H, W) in px or a potential (H, W) in px².",
+    "setup": "TOML file with the setup to predict the image for, for example another energy. "
+    "Default: the field's own setup.",
+    "made_with": "TOML file with the setup the field was measured with, if its file does not "
+    "contain it.",
+    "deflector": "What deflects the beam, if --setup differs from the field's: magnetic-field, "
+    "electric-field, plasma or refractive-index.",
+    "dispersion": "For a refractive index: ratio of ln η at the new wavelength to ln η at the old "
+    "one.",
+    "predicted": "Image file: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
+    "Default: the field's name with _image.tif, in the current folder.",
+}
 INVERT_EPILOG = r"""
 [bold]Examples[/bold]
 shadowinv invert shot.tif
@@ -94,24 +68,24 @@ weight = 2                       # px
 
 
 @notify_errors
-@takes_recipe
+@_flags.takes_recipe
 def invert(
-    image: ImageFile,
-    source: SourceFile = None,
-    mask: MaskFile = None,
-    source_mask: SourceMask = None,
-    setup: SetupFile = None,
-    recipe: RecipeFile = None,
-    save_recipe: SaveRecipe = None,
-    options: OptionsFile = None,
-    channel: Channel = None,
-    variable: Variable = None,
-    source_variable: SourceVariable = None,
-    clip_negative: ClipNegative = False,
-    out: Result = None,
-    report: Figure = None,
-    overwrite: Overwrite = False,
-    quiet: QuietInversion = False,
+    image: _flags.ImageFile,
+    source: _flags.SourceFile = None,
+    mask: _flags.MaskFile = None,
+    source_mask: _flags.SourceMask = None,
+    setup: _flags.SetupFile = None,
+    recipe: _flags.RecipeFile = None,
+    save_recipe: _flags.SaveRecipe = None,
+    options: _flags.OptionsFile = None,
+    channel: _flags.Channel = None,
+    variable: _flags.Variable = None,
+    source_variable: _flags.SourceVariable = None,
+    clip_negative: _flags.ClipNegative = False,
+    out: _flags.Result = None,
+    report: _flags.Figure = None,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.QuietInversion = False,
     *,
     flags: dict[str, Any],
 ) -> None:
@@ -120,16 +94,17 @@ def invert(
     Writes potential, displacement, re-projection, residual and all options to one file,
     and a figure next to it.
     """
+    from napari_shadowinv.cli._tables import summary
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
     from napari_shadowinv.pipeline import write_recipe
 
-    result, figure = result_and_figure(image, out, report)
+    result, figure = _outputs.result_and_figure(image, out, report)
     outputs = {result: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
-    check_outputs(outputs, overwrite)
-    protect(list(outputs), [image, source, mask, setup, options, source_mask])
-    chosen = recipe_from(
+    _outputs.check_outputs(outputs, overwrite)
+    _outputs.protect(list(outputs), [image, source, mask, setup, options, source_mask])
+    chosen = _inputs.recipe_from(
         flags,
         recipe,
         options,
@@ -139,16 +114,15 @@ def invert(
         mask=mask,
         source_mask=source_mask,
     )
-    shot = read_shot(image, channel, variable)
-    chosen = chosen.model_copy(update={"setup": setup_for(setup, shot, chosen)})
-    check_setup(result, chosen.setup)
-    inversion = inverted(chosen, shot, source_from(chosen, image, channel), quiet)
-    write_all(inversion, shot, result, figure, overwrite)
+    shot = _inputs.read_shot(image, channel, variable)
+    chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
+    _outputs.check_setup(result, chosen.setup)
+    inversion = inverted(chosen, shot, _inputs.source_from(chosen, image, channel), quiet)
+    _outputs.write_all(inversion, shot, result, figure, overwrite)
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
     if not quiet:
-        written = [path for path in outputs if path.exists()]
-        say(summary(inversion, shot, written))
+        say(summary(inversion, shot, [path for path in outputs if path.exists()]))
     alarm_unless_converged(inversion.report, result)
 
 
@@ -157,39 +131,31 @@ def rerun(
     result: Annotated[
         Path, typer.Argument(help="A .shadowinv result of this program.", show_default=False)
     ],
-    image: Annotated[
-        Path | None,
-        typer.Argument(
-            help=(
-                "Its image, or another one. Default: the file of that name beside the result or in "
-                "the current folder."
-            ),
-            show_default=False,
-        ),
-    ] = None,
+    image: Annotated[Path | None, typer.Argument(help=HELP["image"], show_default=False)] = None,
     source: Annotated[
         Path | None, typer.Option("--source", help="Its measured source, if it has moved.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Result file. Default: the result's name with _again.")
     ] = None,
-    report: Figure = None,
-    overwrite: Overwrite = False,
-    quiet: QuietInversion = False,
+    report: _flags.Figure = None,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.QuietInversion = False,
 ) -> None:
     """Make a result again from the recipe it contains, and say what has changed.
 
     With the same files and version the result is the same, bit for bit.
     """
     from napari_shadowinv.cli._rerun import made_again
+    from napari_shadowinv.cli._tables import rerun_table
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
 
     target = out or Path(f"{result.stem}_again{result.suffix}")
-    again_out, figure = result_and_figure(result, target, report)
-    check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
-    protect([again_out, figure], [result, image, source])
+    again_out, figure = _outputs.result_and_figure(result, target, report)
+    _outputs.check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
+    _outputs.protect([again_out, figure], [result, image, source])
     again = made_again(result, image, source, quiet=quiet)
-    write_all(again.inversion, again.shot, again_out, figure, overwrite)
+    _outputs.write_all(again.inversion, again.shot, again_out, figure, overwrite)
     if not quiet:
         say(rerun_table(again, [again_out, figure]))
     alarm_unless_converged(again.inversion.report, again_out)
@@ -214,93 +180,46 @@ and covers the area where the field is known.
 
 @notify_errors
 def forward(
-    field: Annotated[
-        Path,
-        typer.Argument(
-            help=(
-                ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) "
-                "containing a displacement (2, H, W) in px or a potential (H, W) in px²."
-            ),
-            show_default=False,
-        ),
-    ],
-    source: SourceFile = None,
-    setup: Annotated[
-        Path | None,
-        typer.Option(
-            "--setup",
-            help=(
-                "TOML file with the setup to predict the image for, for example another energy. "
-                "Default: the field's own setup."
-            ),
-        ),
-    ] = None,
-    made_with: Annotated[
-        Path | None,
-        typer.Option(
-            help=(
-                "TOML file with the setup the field was measured with, if its file does not "
-                "contain it."
-            )
-        ),
-    ] = None,
-    deflector: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WHAT",
-            help=(
-                "What deflects the beam, if --setup differs from the field's: magnetic-field, "
-                "electric-field, plasma or refractive-index."
-            ),
-        ),
-    ] = None,
-    dispersion: Annotated[
-        float,
-        typer.Option(
-            help=(
-                "For a refractive index: ratio of ln η at the new wavelength to ln η at the old "
-                "one."
-            )
-        ),
-    ] = 1.0,
-    channel: Channel = None,
-    variable: Variable = None,
+    field: Annotated[Path, typer.Argument(help=HELP["field"], show_default=False)],
+    source: _flags.SourceFile = None,
+    setup: Annotated[Path | None, typer.Option("--setup", help=HELP["setup"])] = None,
+    made_with: Annotated[Path | None, typer.Option(help=HELP["made_with"])] = None,
+    deflector: Annotated[str | None, typer.Option(metavar="WHAT", help=HELP["deflector"])] = None,
+    dispersion: Annotated[float, typer.Option(help=HELP["dispersion"])] = 1.0,
+    channel: _flags.Channel = None,
+    variable: _flags.Variable = None,
     source_variable: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the array in the source file.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help=(
-                "Image file: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
-                "Default: the field's name with _image.tif, in the current folder."
-            )
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    out: Annotated[Path | None, typer.Option(help=HELP["predicted"])] = None,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.Quiet = False,
 ) -> None:
     """Predict the image of a displacement field, with the same setup or another.
 
     Without --source, the result's own source is used if the setup is the same; otherwise
     the source is uniform.
     """
+    from napari_shadowinv.cli._forward import experiments, field_from, predicted
+    from napari_shadowinv.cli._tables import size_text
     from napari_shadowinv.io import read_radiograph, write
     from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
 
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
-    check_outputs({path: tuple(IMAGE_WRITERS)}, overwrite)
-    protect([path], [field, source, setup, made_with])
+    _outputs.check_outputs({path: tuple(IMAGE_WRITERS)}, overwrite)
+    _outputs.protect([path], [field, source, setup, made_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")
-    seen = None if setup is None else setup_from(setup)
-    told = None if made_with is None else setup_from(made_with)
-    known = seen_with(field_from(field, variable), seen, told, deflector, dispersion)
-    beam = known.source
+    seen = None if setup is None else _inputs.setup_from(setup)
+    told = None if made_with is None else _inputs.setup_from(made_with)
+    known = field_from(field, variable)
+    first, second = experiments(known, seen, told, deflector, dispersion)
+    # In another experiment the beam is another one, too.
+    beam = known.source if first == second else None
     if source is not None:
         beam = read_radiograph(source, channel=channel, variable=source_variable).image
-    image, note = predicted(known, beam)
-    write(path, image, setup=known.seen, overwrite=overwrite)
+    image, note = predicted(known.displacement, beam, first, second, deflector, dispersion)
+    write(path, image, setup=second, overwrite=overwrite)
     if not quiet:
         kept = image.sum() / (image.size if beam is None else beam.sum())
         say(f"Wrote {path}: {size_text(image)}, {kept:.2%} of the flux lands inside the image")
@@ -313,21 +232,22 @@ def info(
     file: Annotated[
         Path | None, typer.Argument(help="An image or a result.", show_default=False)
     ] = None,
-    variable: Variable = None,
+    variable: _flags.Variable = None,
     report: Annotated[
-        bool,
-        typer.Option("--report", help="Print versions and machine instead, for a bug report."),
+        bool, typer.Option("--report", help="Print versions and machine instead, for a bug report.")
     ] = False,
 ) -> None:
     """Describe a file and its contents."""
+    from napari_shadowinv.cli import _info
+
     if report:
         if file is not None or variable is not None:
             raise InputError("--report describes the installation: it takes no file or variable")
-        typer.echo(report_text())
+        typer.echo(_info.report_text())
         return
     if file is None:
         raise InputError("no file given: name an image or a result, or use --report")
-    say(described(file, variable))
+    say(_info.described(file, variable))
 
 
 @notify_errors
@@ -348,15 +268,18 @@ def demo(
         raise InputError(f"noise is {noise:g}: it must be 0 or more, as a fraction of the mean")
     if not math.isfinite(dm):
         raise InputError(f"dm is {dm:g}: it must be a finite number, in MG·µm")
-    chosen = options_from({} if n_sites is None else {"n_sites": n_sites}, clip_negative=True)
-    make_folder(out)
+    chosen = _inputs.options_from(
+        {} if n_sites is None else {"n_sites": n_sites}, clip_negative=True
+    )
+    _outputs.make_folder(out)
+    from napari_shadowinv.cli import _demo
     from napari_shadowinv.physics.phantoms import paper_setup
     from napari_shadowinv.preprocessing import Radiograph, Recipe
 
     setup = paper_setup()
-    image, truth = simulated_shot(setup, dm, noise)
+    image, truth = _demo.simulated_shot(setup, dm, noise)
     inversion = inverted(Recipe(setup=setup, options=chosen), Radiograph(image))
-    fields = compared_fields(image, truth, inversion)
-    written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
-    say(demo_table(inversion, setup, fields, written))
+    fields = _demo.compared_fields(image, truth, inversion)
+    written = _demo.write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
+    say(_demo.demo_table(inversion, setup, fields, written))
     alarm_unless_converged(inversion.report, written[0])

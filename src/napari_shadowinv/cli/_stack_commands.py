@@ -7,26 +7,22 @@ from typing import Annotated, Any
 
 import typer
 
-from napari_shadowinv.cli._flags import (
-    Channel,
-    ChosenShots,
-    ClipNegative,
-    MaskFile,
-    OptionsFile,
-    Overwrite,
-    Quiet,
-    RecipeFile,
-    SaveRecipe,
-    SetupFile,
-    SourceMask,
-    StoreFolder,
-    Variable,
-    takes_recipe,
-)
-from napari_shadowinv.cli._guard import notify_errors
+from napari_shadowinv.cli import _flags
 from napari_shadowinv.cli._inputs import recipe_from, setup_from
-from napari_shadowinv.cli._terminal import say
+from napari_shadowinv.cli._terminal import notify_errors, say
 
+# Of options whose help is longer than a line.
+HELP = {
+    "source": "Undisturbed beam: one image, or a glob matching one image per shot. Default: "
+    "uniform.",
+    "variables": "Variables to store, separated by commas. Default: "
+    "potential,displacement,caustic.",
+    "scheduler": "Address of a dask scheduler (tcp://host:8786), threads, or processes (default).",
+    "workers": "Number of shots processed at once on this machine. Default: one per core.",
+    "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
+    "csv (a table with one row per shot).",
+    "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
+}
 BATCH_EPILOG = """
 [bold]Examples[/bold]
 shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr
@@ -41,7 +37,7 @@ shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
 
 
 @notify_errors
-@takes_recipe
+@_flags.takes_recipe
 def batch(
     shots: Annotated[
         list[str],
@@ -51,57 +47,30 @@ def batch(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
-    source: Annotated[
-        str | None,
-        typer.Option(
-            "--source",
-            help=(
-                "Undisturbed beam: one image, or a glob matching one image per shot. Default: "
-                "uniform."
-            ),
-        ),
-    ] = None,
-    mask: MaskFile = None,
-    source_mask: SourceMask = None,
-    recipe: RecipeFile = None,
-    save_recipe: SaveRecipe = None,
-    setup: SetupFile = None,
-    options: OptionsFile = None,
-    channel: Channel = None,
-    variable: Variable = None,
-    clip_negative: ClipNegative = False,
-    variables: Annotated[
-        str | None,
-        typer.Option(
-            help=(
-                "Variables to store, separated by commas. Default: potential,displacement,caustic."
-            )
-        ),
-    ] = None,
+    source: Annotated[str | None, typer.Option("--source", help=HELP["source"])] = None,
+    mask: _flags.MaskFile = None,
+    source_mask: _flags.SourceMask = None,
+    recipe: _flags.RecipeFile = None,
+    save_recipe: _flags.SaveRecipe = None,
+    setup: _flags.SetupFile = None,
+    options: _flags.OptionsFile = None,
+    channel: _flags.Channel = None,
+    variable: _flags.Variable = None,
+    clip_negative: _flags.ClipNegative = False,
+    variables: Annotated[str | None, typer.Option(help=HELP["variables"])] = None,
     warm_start: Annotated[
         int, typer.Option(metavar="N", help="Initialise from the previous shot, in groups of N.")
     ] = 1,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            help="Address of a dask scheduler (tcp://host:8786), threads, or processes (default)."
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            help=("Number of shots processed at once on this machine. Default: one per core.")
-        ),
-    ] = None,
+    scheduler: Annotated[str | None, typer.Option(help=HELP["scheduler"])] = None,
+    workers: Annotated[int | None, typer.Option(help=HELP["workers"])] = None,
     resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Resume an interrupted run and append new shots."),
+        bool, typer.Option("--resume", help="Resume an interrupted run and append new shots.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Discard an earlier run.")] = False,
     redo_failed: Annotated[
         bool, typer.Option("--redo-failed", help="Resume, and retry failed shots.")
     ] = False,
-    quiet: Quiet = False,
+    quiet: _flags.Quiet = False,
     *,
     flags: dict[str, Any],
 ) -> None:
@@ -125,23 +94,23 @@ def batch(
     run_batch(
         shots,
         out,
-        recipe=chosen,
         channel=channel,
         variable=variable,
         variables=variables,
-        warm_start=warm_start,
-        scheduler=scheduler,
-        workers=workers,
         resume=resume,
+        quiet=quiet,
+        recipe=chosen,
+        warm_start=warm_start,
+        scheduler=scheduler or "processes",
+        workers=workers,
         overwrite=overwrite,
         redo_failed=redo_failed,
-        quiet=quiet,
     )
 
 
 @notify_errors
 def status(
-    store: StoreFolder,
+    store: _flags.StoreFolder,
     every: Annotated[bool, typer.Option("--all", help="Show one line per shot.")] = False,
 ) -> None:
     """Show which shots of a store are done, pending or failed, and why."""
@@ -153,31 +122,15 @@ def status(
 
 @notify_errors
 def export(
-    store: StoreFolder,
-    form: Annotated[
-        str,
-        typer.Option(
-            "--format",
-            help=(
-                "tiff (float32, one file per shot and component), pradformat (one file per "
-                "shot), or csv (a table with one row per shot)."
-            ),
-        ),
-    ],
-    shots: ChosenShots = None,
+    store: _flags.StoreFolder,
+    form: Annotated[str, typer.Option("--format", help=HELP["format"])],
+    shots: _flags.ChosenShots = None,
     variables: Annotated[
         str, typer.Option(help="For tiff: variables to export, separated by commas.")
     ] = "potential",
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help=(
-                "Output folder, or file for csv. Default: the store's name, in the current folder."
-            )
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.Quiet = False,
 ) -> None:
     """Write shots of a store in another format."""
     from napari_shadowinv.cli._export import export_shots
@@ -193,32 +146,24 @@ def export(
 
 @notify_errors
 def movie(
-    store: StoreFolder,
+    store: _flags.StoreFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="Output movie: .mp4 or .gif.")],
     variable: Annotated[
         str | None,
         typer.Option(help="Variable to show; for vectors, the magnitude. Default: the potential."),
     ] = None,
-    shots: ChosenShots = None,
+    shots: _flags.ChosenShots = None,
     rate: Annotated[float, typer.Option(help="Shots per second.")] = 10.0,
     limits: Annotated[
         tuple[float, float] | None,
         typer.Option(help="Limits of the colour scale. Default: the range over all shots."),
     ] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.Quiet = False,
 ) -> None:
     """Make a movie of a store, with all shots on one colour scale."""
     from napari_shadowinv.cli._export import write_movie
 
-    frames = write_movie(
-        store,
-        out,
-        variable=variable,
-        shots=shots,
-        rate=rate,
-        limits=limits,
-        overwrite=overwrite,
-    )
+    frames = write_movie(store, out, variable, shots, rate, limits, overwrite)
     if not quiet:
         say(f"Wrote {out}: {frames} shots, {frames / rate:.1f} s")

@@ -1,9 +1,4 @@
-"""What a command prints about an inversion, in two columns.
-
-- after an inversion: `summary`
-- rows that other tables share: `inversion_rows`, `peak_rows`, `closing_rows`
-- texts: `setup_text`, `options_text`, `size_text`
-"""
+"""What a command prints about an inversion, in two columns: `summary`, and rows of other tables."""
 
 from __future__ import annotations
 
@@ -40,12 +35,11 @@ def two_columns(title: str, rows: Rows) -> Table:
 
 def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Table:
     """Tell what was inverted, how well it went, and where the answer is."""
-    setup = inversion.setup
     rows = [
         ("image", f"{shot.path}, {size_text(inversion.image)}"),
         *provenance_rows(inversion.provenance),
-        ("setup", setup_text(setup, shot)),
-        *inversion_rows(inversion, setup),
+        ("setup", setup_text(inversion.setup, shot)),
+        *inversion_rows(inversion, inversion.setup),
         *closing_rows(inversion.report, written),
     ]
     return two_columns("Inversion", rows)
@@ -82,6 +76,7 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
     """How well an inversion went, and the strongest point of its field."""
     report = inversion.report
     verdict = "converged" if report.converged else "NOT converged"
+    free = {"flux left": report.flux_left, "flux entered": report.flux_entered}
     return [
         ("sites", f"{report.n_sites:,}"),
         (
@@ -98,11 +93,8 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
         ("caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
         *[
             (name, ", ".join(f"{side} {share:.2%}" for side, share in shares.items()))
-            for name, shares in [
-                ("flux left", report.flux_left),
-                ("flux entered", report.flux_entered),
-            ]
-            if shares  # where the boundary was free
+            for name, shares in free.items()
+            if shares
         ],
         *peak_rows(inversion.displacement, setup),
     ]
@@ -163,8 +155,3 @@ def options_text(options: Mapping[str, Any]) -> str:
 def size_text(array: AnyArray) -> str:
     """Height and width are given as people do, width first."""
     return f"{array.shape[1]} × {array.shape[0]} px (width × height)"
-
-
-def _times_text(seconds: Mapping[str, float]) -> str:
-    stages = ", ".join(f"{stage} {value:.2f}" for stage, value in seconds.items())
-    return f"{sum(seconds.values()):.2f} s ({stages})"

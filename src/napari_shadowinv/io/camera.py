@@ -1,7 +1,4 @@
-"""Raw frames as scientific cameras save them.
-
-- PCO's ``.b16``: `read_b16`
-- Princeton Instruments' ``.spe``, versions 2.x and 3.0: `read_spe`
+"""Raw frames of cameras: PCO's ``.b16``, and ``.spe`` 2.x and 3.0 of Princeton Instruments.
 
 References
 ----------
@@ -24,16 +21,11 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import check_promise
 
-__all__ = ["read_b16", "read_spe"]
-
-_B16_HEADER = 24
-_B16_EXTENDED_HEADER = 128
-
+_B16_HEADER, _B16_EXTENDED_HEADER = 24, 128
 _SPE_HEADER = 4100
 _SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 5: "<f8", 6: "u1", 8: "<u4"}
 _SPE_REGION = re.compile(rb'<DataBlock\b[^>]*\btype="Region"[^>]*>')
-# The footer of one frame has some kilobytes.
-_LONGEST_FOOTER = 2_000_000
+_LONGEST_FOOTER = 2_000_000  # that of one frame has some kilobytes
 
 
 def read_b16(path: Path) -> tuple[AnyArray, dict[str, Any]]:
@@ -57,10 +49,7 @@ def read_b16(path: Path) -> tuple[AnyArray, dict[str, Any]]:
 
 
 def read_spe(path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Read the only frame of a file of WinSpec, WinView or LightField.
-
-    Returns counts in the file's own dtype, shape (H, W), with ``bits`` and ``version``.
-    """
+    """Read the only frame of a file, in its own dtype, shape (H, W), with ``bits``, ``version``."""
     with path.open("rb") as file:
         header = file.read(_SPE_HEADER)
     check_promise(path, "SPE", _SPE_HEADER, len(header))

@@ -9,8 +9,6 @@ import numpy as np
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = ["CHANNELS", "film_warnings", "to_grey"]
-
 CHANNELS = ("red", "green", "blue", "mean")
 
 # Of a picture of film that is exposed in its middle: the rim's width over the shorter side, its
@@ -19,12 +17,7 @@ _RIM, _AS_BRIGHT, _DARKER = 0.05, 0.9, 0.8
 
 
 def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> FloatArray:
-    """Reduce an image to one plane of float64: the channel that the user chose of a colour image.
-
-    An `array` of shape (H, W, C) is grey and alpha (C = 2), RGB (3) or RGBA (4); alpha counts as
-    no channel. Raises `InputError`, about the image `where`, if the channels differ and none was
-    chosen, or there is no such channel.
-    """
+    """Reduce an image, which may have channels and alpha last, to one plane of float64."""
     if array.ndim == 2:
         return np.ascontiguousarray(array, dtype=np.float64)
     colours = array[..., : {2: 1, 4: 3}.get(array.shape[-1], array.shape[-1])]
@@ -40,47 +33,38 @@ def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> Fl
         )
     if channel == "mean":
         return np.ascontiguousarray(colours.mean(axis=-1, dtype=np.float64))
-    index = _channel_index(channel, colours.shape[-1], where)
-    return np.ascontiguousarray(colours[..., index], dtype=np.float64)
-
-
-def _channel_index(channel: str | int, count: int, where: str | Path) -> int:
-    text = str(channel)
+    text, count = str(channel), colours.shape[-1]
     index = CHANNELS.index(text) if text in CHANNELS else int(text) if text.isdecimal() else -1
     if not 0 <= index < count:
         raise InputError(
             f"{where} has no channel {text!r}: expected "
             f'"red", "green", "blue", "mean" or a number from 0 to {count - 1}'
         )
-    return index
+    return np.ascontiguousarray(colours[..., index], dtype=np.float64)
 
 
 def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[str, ...]:
-    """Warn of a picture that may be a scan of film, whose grey levels fall with dose.
-
-    That is a colour picture, or one whose rim is as bright as anything in it and the middle clearly
-    darker, as where only the middle of a film was exposed. Light or particles that are deflected
-    out of the middle make something else brighter.
-    """
+    """Warn of a picture in colour, or with a bright rim: it may be a film, dark with dose."""
     grey = to_grey(array, "mean", "")
     is_colour = array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, ""))
     if is_colour:
-        return (
-            f"channel {channel!r} of a colour image was used as the fluence: film darkens with "
-            "dose, so a scan gives a field of the wrong sign unless it is converted to dose "
-            "first (napari_shadowinv.preprocessing.film)",
-        )
-    if array.dtype.kind in "iu" and _is_lit_around(grey):
-        return (
+        sign = f"channel {channel!r} of a colour image was used as the fluence"
+    elif array.dtype.kind in "iu" and _is_lit_around(grey):
+        sign = (
             "the rim is as bright as anything in the image and the centre is darker, which "
-            "suggests a film scan: film darkens with dose, so a scan gives a field of the wrong "
-            "sign unless it is converted to dose first (napari_shadowinv.preprocessing.film)",
+            "suggests a film scan"
         )
-    return ()
+    else:
+        return ()
+    return (
+        f"{sign}: film darkens with dose, so a scan gives a field of the wrong sign unless it is "
+        "converted to dose first (napari_shadowinv.preprocessing.film)",
+    )
 
 
 def _is_lit_around(image: FloatArray) -> bool:
     """Whether all four sides are as bright as the brightest part, and the middle is darker."""
+    # Light or particles that are deflected out of the middle make something else brighter.
     height, width = image.shape
     rim = max(1, round(_RIM * min(height, width)))
     sides = (image[:rim], image[-rim:], image[:, :rim], image[:, -rim:])

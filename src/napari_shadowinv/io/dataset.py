@@ -1,7 +1,4 @@
-"""A result's dataset as one NetCDF4 file, ``.shadowinv``.
-
-- write and read: `write_result`, `read_result`; its sites alone: `write_sites`
-"""
+"""A result's dataset as one NetCDF4 file, ``.shadowinv``, or its sites alone as a table."""
 
 from __future__ import annotations
 
@@ -16,8 +13,6 @@ from napari_shadowinv.io.hdf5 import check_arrays, hdf5_in_memory
 
 if TYPE_CHECKING:
     import xarray
-
-__all__ = ["read_result", "require", "write_result", "write_sites"]
 
 _SITE_COLUMNS = "y_px,x_px,weight_px2,mass,flux,displacement_y_px,displacement_x_px"
 

@@ -1,7 +1,6 @@
 """What every file needs, whatever its format.
 
-- its fingerprint: `sha256`; its name as text: `text_of`
-- order many, shot 2 before shot 10: `in_counting_order`
+- its fingerprint: `sha256`; its name as text: `text_of`; many in order: `in_counting_order`
 - refuse a header that promises more than there is: `check_promise`
 - refuse an output before hours of work: `check_output`, `check_folder_of`
 - write all of a file or nothing: `replacing`
@@ -21,29 +20,12 @@ from pathlib import Path
 from napari_shadowinv._system.interrupts import interrupts_put_off
 from napari_shadowinv.errors import FileFormatError
 
-__all__ = [
-    "DEFLATE_RATIO",
-    "check_folder_of",
-    "check_output",
-    "check_promise",
-    "in_counting_order",
-    "replacing",
-    "sha256",
-    "text_of",
-]
-
-DEFLATE_RATIO = 1040
-"""The most that zlib can pack into one byte, a little rounded up."""
-
-# The disk is full, the quota used up, or the file longer than is allowed.
+DEFLATE_RATIO = 1040  # the most that zlib can pack into one byte, a little rounded up
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def check_promise(path: Path, header: str, promised: int, held: int) -> None:
-    """Refuse a file whose `header` promises more bytes than it holds, before memory is asked for.
-
-    How much may be asked for at all is another question: `napari_shadowinv._system.safety`.
-    """
+    """Refuse a file whose `header` promises more than it holds, before memory is asked for."""
     if promised > held:
         raise FileFormatError(
             f"{path} is damaged or truncated: its {header} header implies {promised} bytes, but "
@@ -58,11 +40,7 @@ def sha256(path: str | Path) -> str:
 
 
 def text_of(path: str | Path) -> str:
-    """Return a path as text that can be kept in a file.
-
-    Names that are no text in this system's encoding, as an old disk may hold them, show the
-    bytes that are not understood.
-    """
+    """Return a path as text that can be kept in a file, bytes that are no text as escapes."""
     return os.fsencode(path).decode("utf-8", errors="backslashreplace")
 
 
@@ -96,7 +74,7 @@ def check_output(
     overwrite : bool
         Whether an existing file may be replaced.
     suffixes : collection of str
-        The endings that name a format here; empty if any will do.
+        The endings that are allowed; empty for all.
 
     Returns
     -------
@@ -106,8 +84,7 @@ def check_output(
     Raises
     ------
     FileFormatError
-        If the path exists, is a folder, has no folder to lie in, cannot be written, or
-        has an ending that names no format.
+        If the path exists, is a folder, has no folder to lie in, or cannot be written.
     """
     path = Path(path)
     if suffixes and path.suffix.lower() not in suffixes:
@@ -145,23 +122,19 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
 
     Parameters
     ----------
-    path : str or Path
-        The file to be made.
-    overwrite : bool
-        Whether an existing file may be replaced.
+    path, overwrite
+        As for `check_output`.
 
     Yields
     ------
     Path
-        A new name beside `path`, with the same ending, to write to. It becomes `path`
-        when the block ends well and the disk has taken it, and is removed on any error or
-        interruption.
+        A new name beside `path`, with the same ending, to write to. It becomes `path` when the
+        block ends well and the disk has taken it, and is removed on any error or interruption.
 
     Raises
     ------
     FileFormatError
-        As `check_output`, before the block and again when it has ended; and if there is no
-        room for the file.
+        As `check_output`, before the block and again after it; and if there is no room.
 
     Examples
     --------

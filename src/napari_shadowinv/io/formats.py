@@ -4,8 +4,8 @@
 - the format of a file, by its content: `format_of`, or its name alone: `kind_of`
 
 A new format takes a reader and an entry in `FORMATS`; `napari.yaml` lists the endings once more,
-and a test compares the two. Functions are given as ``module:name``, because the command's help
-lists the formats and must not wait for numpy.
+and a test compares the two. Functions are named and not imported, because the command's help lists
+the formats and must not wait for numpy.
 """
 
 from __future__ import annotations
@@ -20,70 +20,26 @@ from typing import Any, Literal
 from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv.errors import FileFormatError
 
-__all__ = [
-    "FIGURE_SUFFIXES",
-    "FORMATS",
-    "IMAGE_TITLES",
-    "IMAGE_WRITERS",
-    "OPENED_BY_NAPARI",
-    "RADIOGRAPH_SUFFIXES",
-    "READABLE",
-    "RESULT_WRITERS",
-    "SCAN_SUFFIXES",
-    "Format",
-    "format_of",
-    "function",
-    "kind_of",
-]
-
 # How much of a file holds every mark, and how much shows what a file without one is.
 _HEAD, _SEEN = 4100, 64
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of files.
+    """A format of files; functions are named as ``module:name``, of this package."""
 
-    Attributes
-    ----------
-    name : str
-        What `kind_of` answers, and what ``Radiograph.metadata["kind"]`` says.
-    suffixes : tuple of str
-        Endings of its files, in lower case; the usual one first.
-    title : str
-        How messages and the command's help name it; empty if it cannot be read from a file.
-    marks : tuple of (int, bytes)
-        Where its files hold which bytes; one of them is enough.
-    test : str
-        Function of the path that tells whether a file with a mark is of this format, where others
-        begin the same way. Default: it is.
-    unmarked : {"text", "binary", ""}
-        What a file without a mark must look like, if its ending is enough otherwise.
-    holds : tuple of {"image", "result"}
-        What can be read from it.
-    reader : str
-        Function of the path that returns the image and its metadata, or a dataset. An entry of
-        the metadata replaces what `read` says of any file.
-    named_reader : str
-        The same, of the path and the name of an array.
-    image_writer, result_writer : str
-        Functions of the path, and of an image and its pixel size (m) or None, or of a dataset.
-    is_scan : bool
-        Whether it may be a scan of film, whose grey levels fall with dose.
-    """
-
-    name: str
-    suffixes: tuple[str, ...]
-    title: str = ""
-    marks: tuple[tuple[int, bytes], ...] = ()
-    test: str = ""
-    unmarked: Literal["text", "binary", ""] = ""
+    name: str  # also ``Radiograph.metadata["kind"]``
+    suffixes: tuple[str, ...]  # in lower case, the usual one first
+    title: str = ""  # in messages and the command's help; empty if it cannot be read
+    marks: tuple[tuple[int, bytes], ...] = ()  # where its files hold which bytes; one is enough
+    test: str = ""  # tells of a path with a mark whether it is one, where others begin the same way
+    unmarked: Literal["text", "binary", ""] = ""  # what it looks like without a mark
     holds: tuple[Literal["image", "result"], ...] = ("image",)
-    reader: str = ""
-    named_reader: str = ""
-    image_writer: str = ""
-    result_writer: str = ""
-    is_scan: bool = False
+    reader: str = ""  # of a path: image and metadata, which replace what `read` says, or a dataset
+    named_reader: str = ""  # the same, of a path and the name of an array
+    image_writer: str = ""  # of a path, an image and its pixel size (m) or None
+    result_writer: str = ""  # of a path and a dataset
+    is_scan: bool = False  # may it be a scan of film, whose grey levels fall with dose
 
     @property
     def suffix(self) -> str:
@@ -92,9 +48,8 @@ class Format:
 
     def read(self, path: Path, variable: str | None = None) -> Any:
         """Return what a file holds, or one of its arrays; see `reader` and `named_reader`."""
-        if variable is not None:
-            return function(self.named_reader)(path, variable)
-        return function(self.reader)(path)
+        named = () if variable is None else (variable,)
+        return function(self.named_reader if named else self.reader)(path, *named)
 
     def fits(self, path: Path, head: bytes) -> bool:
         """Tell whether a file that begins with `head` is of this format."""
@@ -211,26 +166,20 @@ def _suffixes(formats: Iterable[Format]) -> frozenset[str]:
     return frozenset(suffix for each in formats for suffix in each.suffixes)
 
 
+def _writers(kind: Literal["image_writer", "result_writer"]) -> dict[str, str]:
+    found = {suffix: getattr(each, kind) for each in FORMATS for suffix in each.suffixes}
+    return {suffix: writer for suffix, writer in found.items() if writer}
+
+
 READABLE = _listed(each.title for each in FORMATS)
-"""The formats of files in words."""
 IMAGE_TITLES = _listed(each.title for each in FORMATS if "image" in each.holds)
-"""Those of images."""
 RADIOGRAPH_SUFFIXES = _suffixes(each for each in FORMATS if "image" in each.holds)
-"""Endings of files that may be shots."""
 SCAN_SUFFIXES = _suffixes(each for each in FORMATS if each.is_scan)
-"""Endings of pictures that may be scans of film."""
+# Endings that napari opens itself: the manifest leaves them out, so that nobody has to choose.
 OPENED_BY_NAPARI = SCAN_SUFFIXES | {".npy", SITES.suffix}
-"""Endings that napari opens itself: the manifest leaves them out, so that nobody has to choose."""
-IMAGE_WRITERS = {
-    suffix: each.image_writer for each in FORMATS for suffix in each.suffixes if each.image_writer
-}
-"""What writes an image, by the ending."""
-RESULT_WRITERS = {
-    suffix: each.result_writer for each in FORMATS for suffix in each.suffixes if each.result_writer
-}
-"""What writes a result, by the ending."""
+IMAGE_WRITERS = _writers("image_writer")  # by the ending
+RESULT_WRITERS = _writers("result_writer")
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
-"""Endings of figures, the usual one first."""
 
 _OTHERS = {
     b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
@@ -244,24 +193,9 @@ _OTHERS = {
 
 @refusing_damage
 def format_of(path: Path) -> Format:
-    """Tell the format of a file from its content; its name may lie.
+    """Tell the format of a file from its content, because its name may lie.
 
-    Numbers as text have no mark: they need one of the usual endings too.
-
-    Parameters
-    ----------
-    path : str or Path
-        A file.
-
-    Returns
-    -------
-    Format
-        One of `FORMATS`.
-
-    Raises
-    ------
-    FileFormatError
-        If there is no such file, it cannot be opened, is empty, or of another kind.
+    Numbers as text have no mark: they need one of the usual endings, too.
     """
     check_regular(path, f"a file ({READABLE})")
     with path.open("rb") as file:
@@ -283,10 +217,8 @@ def kind_of(path: str | Path) -> str:
 
 
 def _describe(head: bytes) -> str:
-    for mark, text in _OTHERS.items():
-        if head.startswith(mark):
-            return text
-    return "a text file" if _is_text(head) else "not in a recognised image format"
+    found = next((text for mark, text in _OTHERS.items() if head.startswith(mark)), None)
+    return found or ("a text file" if _is_text(head) else "not in a recognised image format")
 
 
 def _is_text(head: bytes) -> bool:

@@ -1,15 +1,11 @@
 """Any HDF5 file, for its arrays by name.
 
-- the array that the user names: `read_hdf5`, as an image `read_plane`
-- what there is to choose from: `held_arrays`
-- for a module that knows the layout: an item by its name, `member`; the values of an array,
-  `load_dataset`; all arrays at once, `check_arrays`
+- the array that the user names: `read_hdf5`, as an image `read_plane`; the choice: `held_arrays`
+- for those who know the layout: an item, `member`; its values, `load_dataset`; `check_arrays`
 - write one: `hdf5_in_memory`
 
 An HDF5 file can point to others: by external links, external storage and virtual arrays. No
 reader follows them, because whatever lies there would pass for the file's own pixels.
-
-Files of layouts that are known, pradformat and ``.shadowinv``, need no name.
 """
 
 from __future__ import annotations
@@ -28,28 +24,12 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
-__all__ = [
-    "check_arrays",
-    "hdf5_in_memory",
-    "held_arrays",
-    "load_dataset",
-    "member",
-    "members",
-    "read_hdf5",
-    "read_plane",
-]
-
-# Whoever has more than that to choose from knows what is in the file.
 _MOST_LISTED = 30
 _MOST_LINKS = 16
 
 
 def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
-    """Return an item by its name, with those of its groups, without leaving the file.
-
-    None if there is no such item; `FileFormatError`, about `path`, if the name leads into another
-    file. `depth` counts the links that led here.
-    """
+    """Return an item by its name, with those of its groups, or None; refuse one in another file."""
     import h5py
 
     item = group.file if name.startswith("/") else group
@@ -86,11 +66,7 @@ def members(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
 
 
 def load_dataset(path: Path, dataset: Any) -> AnyArray:
-    """Return the values of an array that the file really holds.
-
-    HDF5 would fill what was never written with zeros: an array whose shape promises more than is
-    stored or fits into memory is refused, and so are values in another file.
-    """
+    """Return the values of an array; what the file does not hold, HDF5 would fill with zeros."""
     check_size(path, _unfolded(path, dataset))
     _check_promise(path, dataset)
     return np.asarray(dataset[()])
@@ -143,11 +119,8 @@ def _all_datasets(path: Path, group: Any) -> Iterator[Any]:
 
 @contextmanager
 def hdf5_in_memory(path: Path) -> Iterator[BytesIO]:
-    """Make an HDF5 file in memory, and write it to the disk in one go when the block ends well.
-
-    The HDF5 library ends the process where it cannot write: a full disk, a quota.
-    """
-    content = BytesIO()
+    """Make an HDF5 file in memory, and write it to the disk in one go when the block ends well."""
+    content = BytesIO()  # on a full disk, the HDF5 library would end the process
     yield content
     path.write_bytes(content.getbuffer())
 
@@ -177,10 +150,7 @@ def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
 
 
 def held_arrays(path: Path, file: Any) -> list[str]:
-    """Name the images of an open file, with shape and type: ``'shot' (480×640 uint16)``.
-
-    Groups inside groups are not searched, and a long list is cut.
-    """
+    """Name images of an open file and its groups, with shape and type, in a list that is cut."""
     found = [
         f"{name!r} ({'×'.join(map(str, item.shape))} {item.dtype})"
         for name, item in itertools.islice(_items(path, file), 10 * _MOST_LISTED)

@@ -1,10 +1,4 @@
-"""Pictures (TIFF with 8, 16 or 32 bits, PNG, BMP, JPEG) and numpy's arrays, one plane each.
-
-- read one, with its bits per sample: `read_tiff`, `read_png`, `read_eight_bits`, `read_npy_plane`
-- an array of any shape: `read_npy`; pickled objects are refused
-- a page of a TIFF that holds many: `tiff_pages`, `read_tiff_page`
-- write a plane: `write_tiff`, `write_png`, `write_npy`
-"""
+"""Pictures (TIFF with 8, 16 or 32 bits, PNG, BMP, JPEG) and numpy's arrays, one plane each."""
 
 from __future__ import annotations
 
@@ -24,21 +18,7 @@ from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.colours import film_warnings, to_grey
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
-__all__ = [
-    "read_eight_bits",
-    "read_npy",
-    "read_npy_plane",
-    "read_png",
-    "read_tiff",
-    "read_tiff_page",
-    "tiff_pages",
-    "write_npy",
-    "write_png",
-    "write_tiff",
-]
-
-# LZW at its best packs two and a half times as well as zlib.
-_TIFF_RATIO = 3 * DEFLATE_RATIO
+_TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
 
 
 def _check(path: Path, name: str, array: AnyArray) -> None:
@@ -133,15 +113,11 @@ def _decode(path: Path, page: Any) -> AnyArray:
 def _check_complete(path: Path, page: Any) -> None:
     # tifffile fills missing strips with zeros, which would pass for a void in the beam.
     size = path.stat().st_size
-    ends = [
-        offset + count
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
-        if count
-    ]
-    if not ends or max(ends) > size:
+    places = zip(page.dataoffsets, page.databytecounts, strict=True)
+    end = max((offset + count for offset, count in places if count), default=0)
+    if not 0 < end <= size:
         raise FileFormatError(
-            f"{path} is truncated: its TIFF header implies {max(ends, default=0)} bytes, found "
-            f"{size}; copy it again"
+            f"{path} is truncated: its TIFF header implies {end} bytes, found {size}; copy it again"
         )
     held = sum(page.databytecounts)
     packing = 1 if page.compression.name == "NONE" else _TIFF_RATIO

@@ -1,11 +1,7 @@
 """MATLAB's MAT-files, version 5 to 7 (its own layout) and 7.3 (HDF5).
 
 - the one image of a file, or the variable that the user names: `read_mat`
-- what there is to choose from: `mat_variables`
-- tell MATLAB 7.3 from other HDF5 files: `is_matlab`
-
-An image is a numeric array with two rows and two columns at least, so that scalars and
-vectors beside it do not count. Fields of structs and entries of cells are not searched.
+- what there is to choose from: `mat_variables`; MATLAB 7.3 or other HDF5: `is_matlab`
 
 scipy's reader of MATLAB's own layout asks for the memory that a damaged length names, and a damaged
 type crashes it together with the whole program; so planes of numbers, all that is needed, are read
@@ -23,6 +19,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
@@ -34,51 +31,24 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 from napari_shadowinv.io.hdf5 import load_dataset, member, members
 
-__all__ = ["Variable", "is_matlab", "mat_variables", "read_mat"]
-
 _HDF5_OFFSET = 512
 # Attributes of pradformat and of .shadowinv, which MATLAB's save does not write.
 _FOREIGN_MARKS = {"object_type", "format"}
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
 _COMPLEX, _LOGICAL = 0x0800, 0x0200
-# Enough for a variable's flags, dimensions and name.
-_PREAMBLE = 1024
+_PREAMBLE = 1024  # enough for a variable's flags, dimensions and name
 
-_CLASSES = {
-    1: "cell",
-    2: "struct",
-    3: "object",
-    4: "char",
-    5: "sparse",
-    6: "double",
-    7: "single",
-    8: "int8",
-    9: "uint8",
-    10: "int16",
-    11: "uint16",
-    12: "int32",
-    13: "uint32",
-    14: "int64",
-    15: "uint64",
-    16: "function handle",
-}
+# By their number, from 1.
+_PLAIN = "cell struct object char sparse double single int8 uint8 int16 uint16 int32 uint32"
+_PLAIN += " int64 uint64"
+_CLASSES = {**dict(enumerate(_PLAIN.split(), start=1)), 16: "function handle"}
+_NUMERIC = {*_PLAIN.split()[5:], "logical"}
 _DTYPES = {"double": "f8", "single": "f4", "logical": "?"}
 # Types of the values as they are kept.
-_STORED = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-}
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
+_STORED |= {12: "i8", 13: "u8"}
 _Bytes: TypeAlias = bytes | memoryview
-_NUMERIC = {name for number, name in _CLASSES.items() if 6 <= number <= 15} | {"logical"}
 
 
 @dataclass(frozen=True)
@@ -92,6 +62,7 @@ class Variable:
 
     @property
     def is_image(self) -> bool:
+        # Scalars and vectors beside the image do not count.
         return self.type in _NUMERIC and len(self.shape) == 2 and min(self.shape) >= 2
 
     def __str__(self) -> str:
@@ -114,11 +85,7 @@ def is_matlab(path: Path) -> bool:
 
 
 def read_mat(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:
-    """Read the image of a MAT-file, rows first as MATLAB shows it, in the file's own dtype.
-
-    The name of the variable is not needed if the file holds one image only; `InputError` if it
-    holds several and none was named, or the name is not that of an image.
-    """
+    """Read the only image of a MAT-file, or the named one, rows first as MATLAB shows it."""
     chosen = _choose(path, mat_variables(path), variable)
     array = chosen.load()
     if array.dtype.kind not in "buif" or array.shape != chosen.shape:
@@ -144,10 +111,10 @@ def _choose(path: Path, variables: list[Variable], name: str | None) -> Variable
     held = ", ".join(map(str, variables)) or "nothing"
     images = [item for item in variables if item.is_image]
     if name is not None:
-        for item in images:
-            if item.name == name:
-                return item
-        raise InputError(f"{path} has no numeric plane {name!r}: it holds {held}")
+        images = [item for item in images if item.name == name]
+        if not images:
+            raise InputError(f"{path} has no numeric plane {name!r}: it holds {held}")
+        return images[0]
     if not images:
         raise FileFormatError(
             f"{path} holds {held}: expected a numeric array (height, width); save the image as a "
@@ -183,17 +150,14 @@ def _described(path: Path, name: str, item: Any) -> Variable:
     if not type_name:
         type_name = "double" if item.dtype.kind in "buif" else str(item.dtype)
     # HDF5 counts its axes from the other end than MATLAB does.
-    return Variable(name, item.shape[::-1], type_name, _loader_73(path, name))
+    return Variable(name, item.shape[::-1], type_name, partial(_load_73, path, name))
 
 
-def _loader_73(path: Path, name: str) -> Callable[[], AnyArray]:
-    def load() -> AnyArray:
-        import h5py
+def _load_73(path: Path, name: str) -> AnyArray:
+    import h5py
 
-        with h5py.File(path, "r") as file:
-            return load_dataset(path, member(path, file, name)).T
-
-    return load
+    with h5py.File(path, "r") as file:
+        return load_dataset(path, member(path, file, name)).T
 
 
 def _variables_5(path: Path, file: BinaryIO) -> Iterator[Variable]:
@@ -215,7 +179,7 @@ def _variables_5(path: Path, file: BinaryIO) -> Iterator[Variable]:
             name, shape, type_name, _ = _preamble(body, order)
             check_promise(path, "MATLAB", math.prod(shape), DEFLATE_RATIO * count)
             if name:
-                yield Variable(name, shape, type_name, _loader(path, start, count, shape))
+                yield Variable(name, shape, type_name, partial(_load_5, path, start, count, shape))
         start += 8 + count
 
 
@@ -255,26 +219,20 @@ def _field(body: _Bytes, start: int, order: str) -> tuple[int, _Bytes, int]:
     return kind & 0xFFFF, body[start : start + count], start + (4 if short else -(-count // 8) * 8)
 
 
-def _loader(path: Path, start: int, count: int, shape: tuple[int, ...]) -> Callable[[], AnyArray]:
-    def load() -> AnyArray:
-        check_size(path, 8 * math.prod(shape))
-        with path.open("rb") as file:
-            order = _order(file)
-            file.seek(start)
-            (kind,) = struct.unpack(f"{order}I4x", file.read(8))
-            body = file.read(count)
-        return _values(_unpacked(path, body, order) if kind == _COMPRESSED else body, order)
-
-    return load
-
-
-def _unpacked(path: Path, packed: bytes, order: str) -> bytes:
-    unpacker = zlib.decompressobj()
-    count = struct.unpack(f"{order}4xI", unpacker.decompress(packed, 8))[0]
-    check_size(path, count)
-    body = unpacker.decompress(unpacker.unconsumed_tail, max(count, 1))
-    check_promise(path, "MATLAB", count, len(body))
-    return body
+def _load_5(path: Path, start: int, count: int, shape: tuple[int, ...]) -> AnyArray:
+    check_size(path, 8 * math.prod(shape))
+    with path.open("rb") as file:
+        order = _order(file)
+        file.seek(start)
+        (kind,) = struct.unpack(f"{order}I4x", file.read(8))
+        body = file.read(count)
+    if kind == _COMPRESSED:
+        unpacker = zlib.decompressobj()
+        count = struct.unpack(f"{order}4xI", unpacker.decompress(body, 8))[0]
+        check_size(path, count)
+        body = unpacker.decompress(unpacker.unconsumed_tail, max(count, 1))
+        check_promise(path, "MATLAB", count, len(body))
+    return _values(body, order)
 
 
 def _values(body: bytes, order: str) -> AnyArray:

@@ -1,8 +1,5 @@
 """pradformat, the HDF5 layout that codes for proton radiography exchange files in.
 
-- read a radiograph or an inversion: `read_pradformat`
-- write an inversion: `write_pradformat`
-
 What differs from this package: energies are in eV; a radiograph's ``pixel_width`` is in
 the detector plane; axis 1 is the first of the array, here y; an inversion's ``phi`` (m) has
 the deflection angle as its gradient, where here the angle is *minus* the gradient.
@@ -23,11 +20,7 @@ import numpy as np
 from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import (
-    FORMAT,
-    dataset_from_field,
-    setup_from_dataset,
-)
+from napari_shadowinv.inversion.labels import FORMAT, dataset_from_field, setup_from_dataset
 from napari_shadowinv.io.dataset import require
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
 from napari_shadowinv.preprocessing import Provenance
@@ -37,18 +30,8 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup, Species
 
-__all__ = [
-    "check_pradformat_setup",
-    "is_ours",
-    "is_result",
-    "read_pradformat",
-    "write_pradformat",
-]
-
 _VERSION = "0.2.0"
-
 _EV_PER_MEV = 1e6
-
 _SYMBOLS: dict[Species, str] = {
     "proton": "p+",
     "deuteron": "D 1+",
@@ -77,39 +60,19 @@ def is_ours(path: Path) -> bool:
 
 
 # They are looked up by name: walking all attributes of a damaged file may never end.
-_ATTRIBUTES = (
-    "format",
-    "object_type",
-    "radiograph_type",
-    "inversion_type",
-    "pradformat_version",
-    "pixel_width",
-    "pixel_width_ax2",
-    "dr",
-    "dr_ax2",
-    "scale_factor",
-    "source_object_dist",
-    "object_image_dist",
-    "source_distance",
-    "ROI_distance",
-    "spec_name",
-    "spec_mass",
-    "spec_charge",
-    "spec_energy",
-    "label",
-    "description",
-    "experiment_date",
-    "file_date",
-    "radiograph_filename",
-    "provenance",
-)
+_ATTRIBUTES = """
+    format object_type radiograph_type inversion_type pradformat_version pixel_width
+    pixel_width_ax2 dr dr_ax2 scale_factor source_object_dist object_image_dist source_distance
+    ROI_distance spec_name spec_mass spec_charge spec_energy label description experiment_date
+    file_date radiograph_filename provenance
+"""
 
 
 def _root_attributes(path: Path) -> dict[str, Any]:
     import h5py
 
     with h5py.File(path, "r") as file:
-        known = [name for name in _ATTRIBUTES if name in file.attrs]
+        known = [name for name in _ATTRIBUTES.split() if name in file.attrs]
         return {name: _plain(file.attrs[name]) for name in known}
 
 
@@ -123,12 +86,7 @@ def _plain(value: Any) -> Any:
 
 
 def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Dataset:
-    """Read a radiograph, or a potential or field that some code retrieved.
-
-    A radiograph gives the image and what the file says, in ``geometry`` the fields of `Setup`
-    that it knows; an inversion a dataset with displacement and, where given, potential, in pixels
-    and in SI units.
-    """
+    """Read a radiograph, with its ``geometry``, or the dataset of an inversion of any code."""
     import h5py
 
     attributes = _root_attributes(path)

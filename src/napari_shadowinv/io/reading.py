@@ -1,7 +1,6 @@
 """Read whatever a user points at; the content decides what it is, not the name.
 
-- any file: `read`
-- where only one of them makes sense: `read_radiograph`, `read_dataset`
+- any file: `read`; where only one makes sense: `read_radiograph`, `read_dataset`
 - a file with options or a setup: `read_toml`
 """
 
@@ -41,16 +40,14 @@ def read(
     Parameters
     ----------
     path : str or Path
-        A file of any format in `napari_shadowinv.io.formats`: TIFF (8, 16 or 32 bits, one page)
-        and other pictures, NPY, MATLAB (version 5 to 7.3), frames of cameras (one each), numbers
-        as text, a pradformat radiograph or inversion, a ``.shadowinv`` result; or a
-        ``.shadowinv.zarr`` store of many shots, which is read lazily.
+        TIFF (8, 16 or 32 bits, one page) and other pictures, NPY, MATLAB (version 5 to 7.3), frames
+        of cameras (one each), numbers as text, a pradformat radiograph or inversion, a
+        ``.shadowinv`` result, or a ``.shadowinv.zarr`` store of many shots (read lazily).
     channel : {"red", "green", "blue", "mean"} or int, optional
-        What to take of a colour image. An image whose channels are all equal is grey
-        and needs no choice.
+        What to take of a colour image whose channels differ.
     variable : str, optional
-        Name of the array to take from a MATLAB file that holds several, or from any HDF5
-        file, with its groups: ``"shots/3/image"``.
+        Name of the array to take from a MATLAB file that holds several, or from any HDF5 file,
+        with its groups: ``"shots/3/image"``.
 
     Returns
     -------
@@ -62,8 +59,7 @@ def read(
     FileFormatError
         If the file is missing, empty, damaged or of a kind that cannot be read.
     InputError
-        If it is a colour image and no channel, or one that it has not, was chosen; the
-        same for the variables of a MATLAB or HDF5 file.
+        If the channel or variable is needed and was not chosen, or does not exist.
     """
     if is_stack(path):
         return read_stack(path)
@@ -83,13 +79,9 @@ def read(
 def _radiograph(
     path: Path, found: Format, array: AnyArray, metadata: dict[str, Any], channel: str | int | None
 ) -> Radiograph:
-    described = {
-        "kind": found.name,
-        "dtype": str(array.dtype),
-        "bits": 8 * array.dtype.itemsize,
-        "sha256": sha256(path),
-        **metadata,
-    }
+    described: dict[str, Any]
+    described = {"kind": found.name, "dtype": str(array.dtype), "bits": 8 * array.dtype.itemsize}
+    described |= {"sha256": sha256(path), **metadata}
     if array.dtype.kind not in "buif":
         raise FileFormatError(
             f"{path} holds {array.dtype} pixels: expected whole or real numbers; convert them"
@@ -125,16 +117,7 @@ def _complete_setup(path: Path, geometry: dict[str, Any]) -> Setup | None:
 def read_radiograph(
     path: str | Path, *, channel: str | int | None = None, variable: str | None = None
 ) -> Radiograph:
-    """Read an image; a result is an error.
-
-    Parameters
-    ----------
-    path : str or Path
-        As for `read`.
-    channel : {"red", "green", "blue", "mean"} or int, optional
-        What to take of a colour image.
-    variable : str, optional
-        Name of the array to take from a MATLAB or HDF5 file.
+    """Read an image; the arguments are those of `read`.
 
     Returns
     -------
@@ -155,7 +138,7 @@ def read_radiograph(
 
 
 def read_dataset(path: str | Path) -> xarray.Dataset:
-    """Read a result or an inversion; an image is an error.
+    """Read a result or an inversion.
 
     Parameters
     ----------
@@ -182,17 +165,7 @@ def read_dataset(path: str | Path) -> xarray.Dataset:
 
 @refusing_damage
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read the keys and values of a TOML file.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    dict
-        Its content.
+    """Return the keys and values of a TOML file.
 
     Raises
     ------

@@ -1,9 +1,7 @@
 """Results of many shots in one Zarr store, written shot by shot.
 
-- how it is laid out, and made: `napari_shadowinv.io.store_layout`
 - write one shot, or why it failed: `ShotWriter`
 - what has been written: `read_stack` (lazy, for everyone), `StackStore` (for a run)
-- tell such a store from other folders: `is_stack`
 
 Each variable has one chunk for each shot, each chunk is a file that appears whole or not at
 all, and the last one of a shot is its `status`: what is not marked there is pending and will be
@@ -30,23 +28,6 @@ from napari_shadowinv.io.formats import STORE
 
 if TYPE_CHECKING:
     import xarray
-
-__all__ = [
-    "DONE",
-    "FAILED",
-    "FORMAT",
-    "PENDING",
-    "STATUS_NAMES",
-    "STORE_SUFFIX",
-    "SUMMARY",
-    "ShotWriter",
-    "StackStore",
-    "StoreError",
-    "check_store_path",
-    "is_stack",
-    "read_stack",
-    "store_error",
-]
 
 FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
@@ -86,7 +67,7 @@ def check_store_path(path: str | Path) -> Path:
 
 
 def is_stack(path: str | Path) -> bool:
-    """Tell whether a folder is a store that `create_store` made."""
+    """Tell whether a folder is a store of many shots."""
     return _attributes(Path(path)).get("format") == FORMAT
 
 
@@ -109,25 +90,18 @@ def store_error(path: Path, error: OSError) -> StoreError:
 
 @dataclass(frozen=True)
 class ShotWriter:
-    """Writes shots into a store that is there; it can be sent to a worker.
-
-    Another store may have taken its place, which `store_id` shows, or it may have had fewer `shots`
-    when this process opened it before.
-    """
+    """Writes shots into a store that is there; it can be sent to a worker."""
 
     path: Path
-    store_id: str
-    shots: int
+    store_id: str  # another store may have taken its place
+    shots: int  # it may have had fewer when this process opened it before
 
     def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
-        """Write a shot, its variables and how it went; it is done when this returns.
-
-        It is still pending after a `StoreError`: the store cannot be written, or was replaced.
-        """
+        """Write a shot and how it went; it is done when this returns, pending if this fails."""
         self._commit(index, arrays, report, DONE)
 
     def fail(self, index: int, report: Mapping[str, Any]) -> None:
-        """Write why a shot failed; see `write`."""
+        """Write why a shot failed."""
         self._commit(index, {}, report, FAILED)
 
     def _commit(
@@ -148,13 +122,11 @@ class ShotWriter:
             raise store_error(self.path, error) from error
 
     def arrays(self) -> dict[str, Any]:
-        """Return the arrays by name, to write to."""
         return _opened(self.path, self.store_id, self.shots)
 
 
 @lru_cache(maxsize=4)
 def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
-    """Arrays of a store; it takes milliseconds to open them."""
     import zarr
 
     arrays: dict[str, Any] = dict(zarr.open_group(path, mode="r+").arrays())
@@ -186,11 +158,10 @@ class StackStore:
 
     @property
     def writer(self) -> ShotWriter:
-        """What workers write to it with."""
         return ShotWriter(self.path, self.attributes["store_id"], len(self.names))
 
     def statuses(self) -> AnyArray:
-        """Return the status of each shot, shape (shot,): PENDING, DONE or FAILED."""
+        """Return PENDING, DONE or FAILED for each shot."""
         return self._values("status")
 
     def report(self, index: int) -> dict[str, Any]:
@@ -198,7 +169,6 @@ class StackStore:
         return _parsed(self.path, [str(self._values("report", index))])[0]
 
     def reports(self) -> Sequence[dict[str, Any]]:
-        """Return how each shot went."""
         return _parsed(self.path, self._values("report").tolist())
 
     def _values(self, name: str, which: Any = ...) -> AnyArray:
@@ -222,7 +192,6 @@ class StackStore:
 
 @refusing_damage
 def _readable(path: Path) -> dict[str, Any]:
-    """Arrays of a store by name, as long as what is there."""
     import zarr
 
     from napari_shadowinv.io.store_files import CheckedStore
@@ -247,7 +216,6 @@ def _values(path: Path, array: Any, which: Any) -> AnyArray:
 
 @refusing_damage
 def _parsed(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
-    """Reports from their JSON."""
     return [dict(json.loads(text)) if text else {} for text in texts]
 
 
@@ -258,12 +226,12 @@ def is_along_shots(array: Any) -> bool:
 
 @refusing_damage
 def read_stack(path: Path) -> xarray.Dataset:
-    """Open a store of many shots; arrays are read when they are asked for.
+    """Open a store of many shots, also while it is written; arrays are read when asked for.
 
     Parameters
     ----------
     path : str or Path
-        ``name.shadowinv.zarr``, also while it is being written.
+        ``name.shadowinv.zarr``.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """The files of a Zarr store, each looked at before it is opened: `CheckedStore`.
 
-Zarr opens whatever has the right name and asks for as much memory as the first bytes of a chunk
-name. So a pipe behind a link would block it for ever, and four damaged bytes ask for gigabytes.
+Zarr itself would wait for ever for a pipe behind a link, and ask for as much memory as the first
+bytes of a chunk name, damaged or not.
 """
 
 from __future__ import annotations
@@ -21,10 +21,7 @@ from zarr.storage import LocalStore
 from napari_shadowinv._system.safety import check_regular, check_size, small_text
 from napari_shadowinv.io.files import check_promise
 
-__all__ = ["CheckedStore"]
-
-_METADATA = "zarr.json"
-_CHUNKS = "/c/"
+_METADATA, _CHUNKS = "zarr.json", "/c/"
 # Where the formats of chunks keep the number of texts, and of unpacked bytes.
 _TEXTS, _BLOSC = "vlen-utf8", "blosc"
 

@@ -1,7 +1,4 @@
-"""How a store of many shots is laid out: made once, and made longer when shots arrive.
-
-- make a store for shots that are still to be inverted: `create_store`
-- make room for more shots at its end: `grow_store`
+"""How a store of many shots is laid out: made by `create_store`, made longer by `grow_store`.
 
 The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
 by that copy. So a store changes its length in one moment: when that one file is replaced.
@@ -37,28 +34,21 @@ from napari_shadowinv.io.store import (
     store_error,
 )
 
-__all__ = ["Contents", "Variable", "create_store", "grow_store"]
-
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
 _SMALL = 64  # values that are not worth compressing
 
 
 @dataclass(frozen=True)
 class Variable:
-    """What a store shall hold under one name.
-
-    Without `values`, which are written at once, it is written shot by shot. `attributes` are its
-    units and long name.
-    """
+    """What a store shall hold under one name."""
 
     dims: tuple[str, ...]
     dtype: Any
-    attributes: Mapping[str, Any]
-    values: AnyArray | None = None
+    attributes: Mapping[str, Any]  # its units and long name
+    values: AnyArray | None = None  # written at once; without, it is written shot by shot
 
     @property
     def along_shots(self) -> bool:
-        """Whether there is a value for each shot."""
         return self.dims[:1] == ("shot",)
 
 
@@ -73,11 +63,7 @@ class Contents:
 
 
 def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> StackStore:
-    """Make a store, all its shots pending; it appears whole or not at all.
-
-    `FileFormatError` if there is one and it must not be replaced, `StoreError` if it cannot be
-    written.
-    """
+    """Make a store, all its shots pending; it appears whole or not at all."""
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
     new = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
@@ -102,10 +88,9 @@ def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> 
 def grow_store(
     path: Path, length: int, values: Mapping[str, AnyArray], attributes: Mapping[str, Any]
 ) -> StackStore:
-    """Make room for more shots at the end of a store, all of them pending.
+    """Make room for more shots, pending; a process killed meanwhile leaves the store unchanged.
 
-    The coordinates, `values`, are those of all `length` shots. A `StoreError`, or a process killed
-    while extending the store, leaves it unchanged: it can be read, and be extended again.
+    The coordinates, `values`, are those of all `length` shots.
     """
     import zarr
 
@@ -146,11 +131,8 @@ def _write_template(path: Path, contents: Contents) -> None:
             "coordinates": " ".join(extra),
         },
     )
-    arrays = {
-        **contents.coordinates,
-        **contents.variables,
-        **_own_variables(contents.sizes["shot"]),
-    }
+    own = _own_variables(contents.sizes["shot"])
+    arrays = {**contents.coordinates, **contents.variables, **own}
     for name, variable in arrays.items():
         _create_array(group, name, variable, contents.sizes)
     with warnings.catch_warnings():

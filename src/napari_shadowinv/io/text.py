@@ -38,45 +38,23 @@ from napari_shadowinv._system.safety import check_size
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 
-__all__ = ["read_text"]
-
-# A row of 100 000 pixels with all their digits has 2.5 MB.
-_LONGEST_LINE = 4_000_000
-
-_UNITS = {
-    "m": 1.0,
-    "cm": 1e-2,
-    "mm": 1e-3,
-    "um": 1e-6,
-    "µm": 1e-6,
-    "μm": 1e-6,
-    "micron": 1e-6,
-    "microns": 1e-6,
-    "mev": 1.0,
-    "kev": 1e-3,
-    "ev": 1e-6,
-}
+_LONGEST_LINE = 4_000_000  # a row of 100 000 pixels with all their digits has 2.5 MB
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "mev": 1.0, "kev": 1e-3, "ev": 1e-6}
+_UNITS |= dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e-6)
 _ENERGY_UNITS = {"mev", "kev", "ev"}
 
-_KEYS = {
-    "source_object_distance": "source_object_distance",
-    "source_object_dist": "source_object_distance",
-    "s2r": "source_object_distance",
-    "object_image_distance": "object_image_distance",
-    "object_image_dist": "object_image_distance",
-    "source_image_distance": "source_image_distance",
-    "s2d": "source_image_distance",
+_NAMES = {
+    "source_object_distance": "source_object_distance source_object_dist s2r",
+    "object_image_distance": "object_image_distance object_image_dist",
+    "source_image_distance": "source_image_distance s2d",
     "pixel_size": "pixel_size",
-    "detector_pixel_size": "detector_pixel_size",
-    "pixel_width": "detector_pixel_size",
-    "bin": "detector_pixel_size",
-    "energy": "energy",
-    "ep": "energy",
+    "detector_pixel_size": "detector_pixel_size pixel_width bin",
+    "energy": "energy ep",
 }
+_KEYS = {key: name for name, keys in _NAMES.items() for key in keys.split()}
 # Plain words in other programs' files, where without a unit they mean something else.
 _KEYS_WITH_UNIT = {"s2r", "s2d", "bin", "ep"}
-# Longer comments are prose.
-_LONGEST_ENTRY = 200
+_LONGEST_ENTRY = 200  # longer comments are prose
 _ENTRY = re.compile(
     r"^[#%\s]*(?P<key>[^\W\d][\w\- ()\[\]]*?)\s*(?P<sign>[=:]\s*|\s)(?P<value>[-+.\d].*)$"
 )
@@ -86,13 +64,7 @@ _SELECTED = re.compile(r"^[#%]\s*([xy])-mask\s+([\d.]+)\s*%?\s*-\s*([\d.]+)")
 
 
 def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
-    """Read an image from lines of numbers, the first line on top.
-
-    The metadata hold ``bits``; ``geometry``, the fields of a setup that the comments tell;
-    and, where the file holds them, ``source``, the image without the object, and ``mask``, True
-    where a pixel can be used. A line that is no row of numbers, or is longer or shorter than the
-    first, is refused by its number, and so is a header that tells other blocks than there are.
-    """
+    """Read an image with its ``geometry`` (m, MeV), and ``source`` and ``mask`` where there are."""
     # Once to find mistakes, once to keep: a bad file never fills the memory.
     height = 0
     width: int | None = None
@@ -112,18 +84,19 @@ def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
             height += 1
             if not height % 1000:
                 check_size(path, 8 * height * width)
+    width = width or 0
     if "flux2D" in blocks:
         if selected and "mask" not in blocks and height == 3 * blocks["flux2D"][0]:
             # Some versions write the mask without telling its shape.
             blocks["mask"] = blocks["flux2D"]
-        _check_blocks(path, blocks, (height, width or 0))
-    check_size(path, 8 * height * (width or 0))
-    image = _filled(path, height, width or 0)
+        _check_blocks(path, blocks, (height, width))
+    check_size(path, 8 * height * width)
+    image = _filled(path, height, width)
     metadata: dict[str, Any] = {"bits": 64, "geometry": _complete(told)}
-    if "flux2D" in blocks:
-        image, parts = _split(path, image, blocks, selected)
-        metadata |= parts
-    return image, metadata
+    if "flux2D" not in blocks:
+        return image, metadata
+    image, parts = _split(path, image, blocks, selected)
+    return image, {**metadata, **parts}
 
 
 def _check_blocks(path: Path, blocks: dict[str, tuple[int, int]], found: tuple[int, int]) -> None:
@@ -143,7 +116,6 @@ def _split(
     blocks: dict[str, tuple[int, int]],
     selected: dict[str, tuple[float, float]],
 ) -> tuple[FloatArray, dict[str, AnyArray]]:
-    """Return the image of several blocks, and source and mask where there are some."""
     planes = dict(zip(blocks, np.split(stacked, len(blocks)), strict=True))
     image, parts = planes["flux2D"], {}
     if "flux2D_ref" in planes:
@@ -156,16 +128,14 @@ def _split(
             )
         parts["mask"] = planes["mask"] == 0
     elif any(share != (0, 100) for share in selected.values()):
-        rows = _part(selected.get("x"), image.shape[0])
-        columns = _part(selected.get("y"), image.shape[1])
+        shares = (selected.get(axis, (0.0, 100.0)) for axis in "xy")
+        part = tuple(
+            slice(*(round(end * length / 100) for end in share))
+            for share, length in zip(shares, image.shape, strict=True)
+        )
         parts["mask"] = np.zeros(image.shape, dtype=bool)
-        parts["mask"][rows, columns] = True
+        parts["mask"][part] = True
     return image, parts
-
-
-def _part(share: tuple[float, float] | None, length: int) -> slice:
-    first, last = share or (0.0, 100.0)
-    return slice(round(first * length / 100), round(last * length / 100))
 
 
 def _filled(path: Path, height: int, width: int) -> FloatArray:
@@ -197,17 +167,14 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                     f"{path}, line {number} is longer than {_LONGEST_LINE} bytes: expected one "
                     "row of pixels per line; split it"
                 )
-            text = _decoded(raw.removeprefix(b"\xef\xbb\xbf") if number == 1 else raw).strip()
+            raw = raw.removeprefix(b"\xef\xbb\xbf") if number == 1 else raw
+            try:
+                text = raw.decode("utf-8").strip()
+            except UnicodeDecodeError:
+                # Comments that Windows wrote; numbers look the same in both.
+                text = raw.decode("latin-1").strip()
             if text:
                 yield number, text
-
-
-def _decoded(raw: bytes) -> str:
-    try:
-        return raw.decode("utf-8")
-    except UnicodeDecodeError:
-        # Comments that Windows wrote; numbers look the same in both.
-        return raw.decode("latin-1")
 
 
 def _row(path: Path, number: int, line: str, width: int | None) -> FloatArray:

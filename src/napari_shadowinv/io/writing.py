@@ -1,13 +1,9 @@
-"""Write results and images, each file whole or not at all.
-
-- a result (``.shadowinv``, pradformat ``.h5``, sites as ``.csv``) or an image (``.tif``,
-  ``.npy``, ``.png``): `write`
-"""
+"""Write a result or an image, whole or not at all: `write`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
@@ -68,27 +64,19 @@ def write(
     >>> write(folder / "ones.tif", np.ones((3, 4))).name
     'ones.tif'
     """
-    is_image = isinstance(result, np.ndarray)
-    check_output(path, overwrite, suffixes=IMAGE_WRITERS if is_image else RESULT_WRITERS)
+    suffixes = IMAGE_WRITERS if isinstance(result, np.ndarray) else RESULT_WRITERS
+    check_output(path, overwrite, suffixes=suffixes)
     with replacing(path, overwrite) as temporary:
         if isinstance(result, np.ndarray):
             _write_image(temporary, result, setup)
         else:
-            _write_result(temporary, _dataset(result, setup))
+            dataset = result if _is_dataset(result) else result.to_dataset(setup)
+            function(RESULT_WRITERS[temporary.suffix.lower()])(temporary, dataset)
     return Path(path)
 
 
-def _dataset(
-    result: Inversion | Uncertainty | xarray.Dataset,
-    setup: Setup | None,
-) -> xarray.Dataset:
-    import xarray as xr
-
-    return result if isinstance(result, xr.Dataset) else result.to_dataset(setup)
-
-
-def _write_result(path: Path, dataset: xarray.Dataset) -> None:
-    function(RESULT_WRITERS[path.suffix.lower()])(path, dataset)
+def _is_dataset(result: Any) -> TypeGuard[xarray.Dataset]:
+    return hasattr(result, "data_vars")  # without waiting for xarray's import
 
 
 def _write_image(path: Path, plane: AnyArray, setup: Setup | None) -> None:

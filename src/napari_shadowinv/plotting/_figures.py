@@ -45,10 +45,7 @@ _LARGEST_RESIDUAL = 50.0
 
 
 def report_figure(
-    inversion: Inversion,
-    setup: Setup | None = None,
-    *,
-    title: str | None = None,
+    inversion: Inversion, setup: Setup | None = None, *, title: str | None = None
 ) -> Figure:
     """Show all of one shot on a page.
 

@@ -37,10 +37,7 @@ _LETTER, _LINE = 0.075, 0.15  # inches
 
 
 def stack_frames(
-    stack: xarray.Dataset,
-    variable: str | None = None,
-    *,
-    limits: tuple[float, float] | None = None,
+    stack: xarray.Dataset, variable: str | None = None, *, limits: tuple[float, float] | None = None
 ) -> Iterator[NDArray[np.uint8]]:
     """Draw one variable of every shot, all on one colour scale.
 
