@@ -151,12 +151,7 @@ def invert(
             prepared = prepare(image, source, options, mask, flux_scale=scale)
         weights = None if start is None else _weights_of(start, plan)
         solutions = solve(
-            plan.levels,
-            prepared.floored_image,
-            options,
-            report,
-            start=weights,
-            margin=plan.margin,
+            plan.levels, prepared.floored_image, options, report, start=weights, margin=plan.margin
         )
     with stopwatch("read-out"):
         fields = _read_fields(plan, prepared, solutions[-1], options, report)

@@ -104,10 +104,7 @@ class Uncertainty:
     warnings: tuple[str, ...]
 
     def to_dataset(
-        self,
-        setup: Setup | None = None,
-        *,
-        attributes: Mapping[str, str] | None = None,
+        self, setup: Setup | None = None, *, attributes: Mapping[str, str] | None = None
     ) -> xarray.Dataset:
         """Return the inversion and the scatter of its noisy samples as one dataset.
 

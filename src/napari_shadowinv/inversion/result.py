@@ -166,10 +166,7 @@ class Inversion:
         return replace(self, report=replace(self.report, warnings=warnings))
 
     def to_dataset(
-        self,
-        setup: Setup | None = None,
-        *,
-        attributes: Mapping[str, str] | None = None,
+        self, setup: Setup | None = None, *, attributes: Mapping[str, str] | None = None
     ) -> xarray.Dataset:
         """Return everything as one labelled dataset, with units.
 
