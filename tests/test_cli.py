@@ -23,7 +23,7 @@ from typer.testing import CliRunner, Result
 from napari_shadowinv import __version__
 from napari_shadowinv import preprocessing as filters
 from napari_shadowinv import preprocessing as sources
-from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv.cli import _info, app
 from napari_shadowinv.cli._flags import recipe_of
 from napari_shadowinv.cli._inputs import read_shot, setup_for

@@ -33,7 +33,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv._system import locking
 from napari_shadowinv._system.locking import locked
-from napari_shadowinv._system.threads import available_threads
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import _engines
 from napari_shadowinv.stack._engines import engine_for

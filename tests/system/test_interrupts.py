@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from napari_shadowinv._system.interrupts import interrupts_put_off
+from napari_shadowinv._system.machine import interrupts_put_off
 
 
 def test_ctrl_c_waits_for_the_end_of_the_block() -> None:

@@ -15,7 +15,7 @@ import pytest
 import tifffile
 from scipy.io import savemat
 
-from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import LIMIT_VARIABLE, refusing_damage, size_limit
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 from napari_shadowinv.io import read, read_toml

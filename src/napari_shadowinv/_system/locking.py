@@ -46,15 +46,13 @@ def _opened(path: Path, lock: Path) -> tuple[BinaryIO, bool]:
     flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)
     try:
         while True:
-            try:
+            with suppress(FileExistsError):
                 number, is_new = os.open(lock, flags | os.O_CREAT | os.O_EXCL, 0o666), True
-            except FileExistsError:
-                try:
-                    # Not truncated: who holds it is told in it.
-                    number, is_new = os.open(lock, flags), False
-                except FileNotFoundError:
-                    continue
-            break
+                break
+            with suppress(FileNotFoundError):
+                # Not truncated: who holds it is told in it.
+                number, is_new = os.open(lock, flags), False
+                break
     except OSError as error:
         if lock.is_symlink():
             raise _no_file_of_its_own(path, lock) from None
@@ -80,11 +78,8 @@ def _no_file_of_its_own(path: Path, lock: Path) -> FileFormatError:
 def _take(path: Path, lock: Path, file: BinaryIO, is_new: bool) -> None:
     """Make the lock this process's own."""
     taken = _taken(file)
-    is_ours_to_take = taken is not False
     is_certain = is_new or (taken and _content(file).get("host") in (None, socket.gethostname()))
-    if is_ours_to_take and not is_certain:
-        is_ours_to_take = _is_silent(lock)
-    if not is_ours_to_take:
+    if taken is False or not (is_certain or _is_silent(lock)):
         raise _held(path, file)
     try:
         signature = _sign(file)

@@ -1,9 +1,4 @@
-"""How long work tells its progress and its doubts, and is asked to stop.
-
-The core calls `on_progress` with a `Progress` and asks `should_stop` between
-steps; progress bars of the command line, of napari and of a notebook are
-adapters that live with them.
-"""
+"""How long work tells its progress and its doubts, and is asked to stop."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar, cast
 
-from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 
 LIMIT_VARIABLE = "SHADOWINV_MAX_GB"  # the most gigabytes that a file may unfold to
@@ -52,16 +52,13 @@ def refusing_damage(
                 raise FileFormatError(
                     f"{path} cannot be read ({error.strerror}): check its permissions and the disk"
                 ) from error
+            found = " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
             raise FileFormatError(
-                f"{path} is damaged or truncated ({_one_line(error)}): expected a complete file; "
+                f"{path} is damaged or truncated ({found}): expected a complete file; "
                 "copy or export it again"
             ) from error
 
     return cast("Callable[Concatenate[str | Path, P], Content]", guarded)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
 
 
 def check_regular(path: Path, expected: str) -> None:

@@ -19,7 +19,6 @@ _BOUNDS = {
     "less_than": ("lt", "less than"),
     "less_than_equal": ("le", "at most"),
 }
-_PYDANTIC_OPENING = "Input should be "
 
 
 def validated(
@@ -70,7 +69,13 @@ def _place(
         elif isinstance(part, int) or part == loc[-1]:
             names.append(str(part))
         else:  # the tag of a union
-            models = [one for one in models if _is_tagged(one, part)] or models
+            tagged = [
+                model
+                for model in models
+                for field in model.model_fields.values()
+                if get_origin(field.annotation) is Literal and field.default == part
+            ]
+            models = tagged or models
     return models[0], names
 
 
@@ -78,13 +83,6 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in _models_in(part)]
-
-
-def _is_tagged(model: type[BaseModel], tag: str) -> bool:
-    return any(
-        get_origin(field.annotation) is Literal and field.default == tag
-        for field in model.model_fields.values()
-    )
 
 
 def _clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
@@ -109,8 +107,8 @@ def _clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
         key, words = _BOUNDS[kind]
         return f"{received}: {title} must be {words} {context[key]:g}"
     message = str(context.get("error", detail["msg"]))
-    if message.startswith(_PYDANTIC_OPENING):
-        return f"{received}: {title} must be {message.removeprefix(_PYDANTIC_OPENING)}"
+    if message.startswith(opening := "Input should be "):
+        return f"{received}: {title} must be {message.removeprefix(opening)}"
     return f"{received}: {_lower(message)}"
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli import _tables
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
-from napari_shadowinv._system.threads import available_threads, in_ranges
+from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices

@@ -26,7 +26,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_shadowinv._system.threads import in_ranges
+from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import _flips

@@ -20,22 +20,7 @@ _SIDE = 64  # enough sites for every kernel to be used
 def ensure_compiled(
     on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
 ) -> None:
-    """Compile all kernels, unless an earlier run has; they are kept for later ones.
-
-    Without it the first inversion does the same, in the middle of its stages.
-
-    Parameters
-    ----------
-    on_progress : callable, optional
-        Told of the stage ``"compile"``, where there is something to compile.
-    should_stop : callable, optional
-        Asked between kernels; a true answer cancels.
-
-    Raises
-    ------
-    InversionCancelled
-        If `should_stop` returned true.
-    """
+    """Compile all kernels, as else the first inversion would, unless an earlier run has."""
     if is_compiled():
         return
     from napari_shadowinv.geometry._kernel import is_kept
@@ -53,11 +38,7 @@ def ensure_compiled(
 
 
 def is_compiled() -> bool:
-    """Return whether an earlier run has left its machine code for this one.
-
-    It has not after an installation, where the cache (``NUMBA_CACHE_DIR``, or a folder beside the
-    package) is empty, or where nothing can be kept.
-    """
+    """Return whether an earlier run has left its machine code for this one."""
     kept = code_folder()
     return kept is not None and any(kept.glob("_flips.build-*.nbi"))
 

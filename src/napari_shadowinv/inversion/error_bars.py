@@ -26,14 +26,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
-from napari_shadowinv._system.threads import available_threads
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.inversion._invert import invert
-from napari_shadowinv.inversion._plan import plan_sites
+from napari_shadowinv.inversion._invert import invert, plan_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, label
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import read_out
@@ -70,8 +68,7 @@ class Uncertainty:
         Of the image itself.
     potential_mean, potential_std : ndarray, shape (H, W)
         Mean and standard deviation of the samples' potentials, px². As each potential is zero
-        in the mean over the image's border, the deviation is that of the difference to
-        the border.
+        in the mean over the border, the deviation is that of the difference to the border.
     displacement_mean, displacement_std : ndarray, shape (2, H, W)
         The same of the displacement, px, for each component.
     n : int
@@ -80,12 +77,8 @@ class Uncertainty:
         The noise that was assumed.
     tolerance : float
         Largest relative flux error of a cell that was allowed in a sample.
-    iterations : tuple of int
-        Solver steps of each sample.
-    residuals : tuple of float
-        Largest relative flux error of a cell in each sample.
-    converged : tuple of bool
-        Whether each sample met the tolerance.
+    iterations, residuals, converged : tuple of int, of float, of bool
+        Of each sample: solver steps, largest relative flux error of a cell, tolerance met.
     warnings : tuple of str
         Reasons to doubt the deviations.
     """
@@ -104,24 +97,13 @@ class Uncertainty:
     warnings: tuple[str, ...]
 
     def to_dataset(
-        self,
-        setup: Setup | None = None,
-        *,
-        attributes: Mapping[str, str] | None = None,
+        self, setup: Setup | None = None, *, attributes: Mapping[str, str] | None = None
     ) -> xarray.Dataset:
         """Return the inversion and the scatter of its noisy samples as one dataset.
 
-        Parameters
-        ----------
-        setup, attributes
-            See `Inversion.to_dataset`.
-
-        Returns
-        -------
-        xarray.Dataset
-            As of `Inversion.to_dataset`, with ``potential_mean`` and ``displacement_mean``, and
-            a ``…_std`` beside each potential, displacement and field. How the samples were made
-            is a JSON text in the attribute ``uncertainty``.
+        It is that of `Inversion.to_dataset` with ``potential_mean``, ``displacement_mean`` and
+        a ``…_std`` beside each potential, displacement and field. How the samples were made is a
+        JSON text in the attribute ``uncertainty``.
         """
         samples = ("n", "noise", "tolerance", "iterations", "residuals", "converged", "warnings")
         history = json.dumps({name: getattr(self, name) for name in samples})
@@ -162,12 +144,11 @@ def uncertainty(
 ) -> Uncertainty:
     """Estimate the uncertainty of potential and displacement due to image noise.
 
-    Each of `n` samples is the image with fresh noise on top, inverted like the image. The
-    image has its own noise already, so samples are noisier than the image; but all
-    have that first noise in common, and their scatter about each other is that of one dose
-    of noise: the standard deviation that shots of the same object would show. It is no
-    distance from the truth: what a retrieval gets wrong without noise (a source that is not
-    known, an object at the edge, folds behind caustics) is not in it.
+    Each sample is the image with fresh noise on top, inverted like the image. All have the
+    image's own noise in common, so their scatter is that of one dose of noise: the standard
+    deviation that shots of the same object would show. It is no distance from the truth: what a
+    retrieval gets wrong without noise (an unknown source, an object at the edge, folds behind
+    caustics) is not in it.
 
     Parameters
     ----------
@@ -176,19 +157,17 @@ def uncertainty(
     n : int
         Number of samples, at least two.
     source, mask, options, plan, on_progress, should_stop
-        See `invert`. Samples are worked on side by side in as many threads as the options
-        allow and memory has room for; the result does not depend on it. Random numbers come
-        from the options' `seed`.
+        As of `invert`. Random numbers come from the options' `seed`; samples are worked on side
+        by side in its `threads`, as far as memory has room, which does not change the result.
     noise : "poisson" or float or array_like of shape (H, W)
         ``"poisson"``: each pixel counts quanta (photons, protons), whose number scatters by
-        its square root. A number or an array: the standard deviation of Gaussian noise, in the
-        image's units, the same everywhere or for each pixel. Noise is taken as independent
-        from pixel to pixel. Samples that it drives below zero are clipped there, whatever
-        `options.negative` says of the image.
+        its square root. Else the standard deviation of Gaussian noise, in the image's units.
+        Noise is taken as independent from pixel to pixel. Samples that it drives below zero are
+        clipped there, whatever `options.negative` says of the image.
     gain : float, optional
-        Of Poisson noise only: how many of the image's units one detected quantum makes. A
-        pixel of value v then scatters by √(gain · v). Default: 1 for an image of whole numbers,
-        which are taken as counts; any other image needs it.
+        Of Poisson noise only: the image's units that one detected quantum makes; a pixel of
+        value v then scatters by √(gain · v). Default: 1 for an image of whole numbers, which are
+        taken as counts; any other image needs it.
 
     Returns
     -------

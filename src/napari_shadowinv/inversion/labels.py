@@ -22,15 +22,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup, SIField
 
-__all__ = [
-    "FORMAT",
-    "VARIABLES",
-    "dataset_from_field",
-    "label",
-    "setup_from_dataset",
-    "variable_labels",
-]
-
 FORMAT = "shadowinv result"
 
 _PLANE = ("y", "x")
@@ -62,11 +53,7 @@ def dataset_from_field(
     *,
     attributes: Mapping[str, Any] | None = None,
 ) -> xarray.Dataset:
-    """Label a displacement (px) and, where known, its potential (px²).
-
-    A setup adds the fields in SI units, and coordinates in metres. The dimensions are y, x and
-    component ("y", "x").
-    """
+    """Label a displacement (px) and potential (px²); a setup adds fields and metres in SI units."""
     import xarray as xr
 
     variables: dict[str, Any] = {
@@ -93,15 +80,7 @@ def dataset_from_field(
 def variable_labels(
     setup: Setup | None = None,
 ) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-    """Dimensions, ``units`` and ``long_name`` of every variable of a result by its name.
-
-    A setup adds the fields in SI units.
-
-    Examples
-    --------
-    >>> variable_labels()["potential"]
-    (('y', 'x'), {'units': 'px²', 'long_name': 'Normalised deflection potential'})
-    """
+    """Dimensions, ``units`` and ``long_name`` of every variable of a result by its name."""
     labels = {name: (dims, label(*told)) for name, (dims, *told) in VARIABLES.items()}
     for field in () if setup is None else _vectors_first(setup):
         dims = _VECTORS if field.is_vector else _PLANE

@@ -11,21 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
-
-__all__ = [
-    "Prepared",
-    "checked_mask",
-    "checked_source",
-    "margin_around",
-    "masked_source",
-    "number_of_sites",
-    "power_of_two",
-    "prepare",
-]
 
 _SMALLEST_SIDE = 4
 _LEAST_MARGIN = 4
@@ -39,36 +28,18 @@ _ALIKE = 1e-6  # of the mean: what rounding to 32 bits leaves of a difference
 
 @dataclass(frozen=True)
 class Prepared:
-    """An image and a source, of the same flux unless the image's is known.
+    """An image and a source, shape (H, W), of the same flux unless the image's is known."""
 
-    Attributes
-    ----------
-    image, source : ndarray, shape (H, W)
-        Clipped where asked for, the image scaled to the flux of the source; 0 where masked.
-    floored_image, floored_source : ndarray, shape (H, W)
-        The same as the transport sees them, in units of `unit`: dark pixels of the image raised
-        to the floor, masked pixels of both at the floor.
-    unit : float
-        The source's `power_of_two`.
-    mask : ndarray of bool, shape (H, W)
-        The pixels that are used.
-    clipped_pixels, floored_pixels : int
-        How many pixels were negative, and how many, these included, below the floor.
-    flux_scale : float
-        What the image was divided by.
-    warnings : tuple of str
-        What the user should know.
-    """
-
-    image: FloatArray
-    source: FloatArray
+    image: FloatArray  # clipped where asked for, scaled to the flux of the source; 0 where masked
+    source: FloatArray  # 0 where masked
+    # As the transport sees them, in units of `unit`: dark and masked pixels at the floor.
     floored_image: FloatArray
     floored_source: FloatArray
-    unit: float
-    mask: BoolArray
+    unit: float  # the source's `power_of_two`
+    mask: BoolArray  # the pixels that are used
     clipped_pixels: int
-    floored_pixels: int
-    flux_scale: float
+    floored_pixels: int  # the clipped ones included
+    flux_scale: float  # what the image was divided by
     warnings: tuple[str, ...]
 
 
@@ -80,29 +51,7 @@ def prepare(
     *,
     flux_scale: float | None = None,
 ) -> Prepared:
-    """Check an image and its source, and bring them to the same flux.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-        The shot; counts or any linear measure of fluence.
-    source : array_like, shape (H, W), or None
-        The undisturbed beam; uniform if None.
-    options : InversionOptions
-        Its `floor`, `negative` and `flux` are used.
-    mask : array_like of bool, shape (H, W), optional
-        What other pixels hold, even NaN, does not matter; they carry no flux on either side.
-    flux_scale : float, optional
-        Divide the image by this. Default: what gives it the flux of the source, or 1 where
-        `options.flux` says that it is known.
-
-    Raises
-    ------
-    InputError
-        If an array cannot be an image of a beam: wrong shape, not a number, negative, zero,
-        or so bright or dim that its sums are beyond double precision; or if the source is the
-        image itself.
-    """
+    """Check an image and its source, and bring them to the same flux, or divide by `flux_scale`."""
     shape = _plane(image, "image").shape
     usable = np.ones(shape, bool) if mask is None else checked_mask(mask, shape)
     values = _finite_image(image, "image", usable)
@@ -123,7 +72,12 @@ def prepare(
         beam = np.where(usable, values.sum() / usable.sum(), 0.0)
     else:
         beam = checked_source(source, usable)
-        _refuse_the_image_itself(beam, values, usable)
+        ones, others = (array[usable] / array[usable].mean() for array in (beam, values))
+        if np.abs(ones - others).max() <= _ALIKE and np.ptp(ones) > 2 * _ALIKE:
+            raise InputError(
+                "the source is the image itself, so the deflection would be zero: give an image "
+                "of the beam without the object, or an estimate of it"
+            )
     with np.errstate(over="ignore", under="ignore"):
         ratio = float(values.sum() / beam.sum())
     if not _DIMMEST < ratio < _BRIGHTEST:
@@ -160,16 +114,6 @@ def prepare(
 def power_of_two(source: FloatArray) -> float:
     """Return the power of two next below the brightest pixel: dividing by it rounds nothing."""
     return float(2.0 ** np.floor(np.log2(source.max())))
-
-
-def _refuse_the_image_itself(beam: FloatArray, image: FloatArray, mask: BoolArray) -> None:
-    """Refuse a source that is proportional to the image, unless both are uniform."""
-    ones, others = (values[mask] / values[mask].mean() for values in (beam, image))
-    if np.abs(ones - others).max() <= _ALIKE and np.ptp(ones) > 2 * _ALIKE:
-        raise InputError(
-            "the source is the image itself, so the deflection would be zero: give an image of "
-            "the beam without the object, or an estimate of it"
-        )
 
 
 def masked_source(source: FloatArray, mask: BoolArray, options: InversionOptions) -> FloatArray:
@@ -209,10 +153,7 @@ def _warnings(
 
 
 def checked_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:
-    """Return a source as floats, 0 where masked, or raise an `InputError` that says what is wrong.
-
-    That is another shape than the mask's, or pixels that are not numbers, negative, or all zero.
-    """
+    """Return a source as floats, 0 where masked, or raise an `InputError` that says why not."""
     found = _plane(source, "source").shape
     if mask is not None and found != mask.shape:
         raise InputError(f"source has shape {found}, image {mask.shape}: they must match")
@@ -281,10 +222,7 @@ def _finite_image(values: ArrayLike, name: str, mask: BoolArray) -> FloatArray:
 
 
 def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
-    """Return the pixels beyond each edge that sites cover where the boundary is free.
-
-    More than the image's longer side raise an `InputError`.
-    """
+    """Return the pixels beyond each edge that sites cover where the boundary is free."""
     if options.margin is None:
         return max(_LEAST_MARGIN, round(_MARGIN_SHARE * min(shape)))
     if options.margin > max(shape):

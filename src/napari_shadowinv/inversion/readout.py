@@ -3,6 +3,9 @@
 - by the way that the options name: `read_out`
 - from the dual variables, without any integration: `read_dual` (default)
 - the paper's way, from the cells' centroids: `read_centroids`
+
+Each returns the potential, shape (H, W), px², zero in the mean over the border; and the
+displacement, shape (2, H, W), px. With a margin these cover it too.
 """
 
 from __future__ import annotations
@@ -35,26 +38,7 @@ def read_out(
     options: InversionOptions,
     on_share: OnShare | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Potential and displacement at the pixels, by the read-out that the options name.
-
-    Parameters
-    ----------
-    plan : SitePlan
-        The sites; with a margin, the result covers it too.
-    solution : LevelSolution
-        Of the plan's finest level.
-    options : InversionOptions
-        Its `readout`, `integration` and `threads` are used.
-    on_share : callable, optional
-        Receives the share of the pixels that are read, from 0 to 1; what it raises ends the work.
-
-    Returns
-    -------
-    potential : ndarray, shape (H, W)
-        px².
-    displacement : ndarray, shape (2, H, W)
-        px.
-    """
+    """Read the finest level by the options' way; `on_share` is told what share is done, 0 to 1."""
     level, moves = plan.levels[-1], solution.displacement
     if options.readout == "centroid":
         return read_centroids(level, moves, options.threads, integration=options.integration)
@@ -68,29 +52,7 @@ def read_dual(
     threads: int | None = None,
     on_share: OnShare | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Read the potential off the weights: at a site it is half the weight.
-
-    Parameters
-    ----------
-    level : Level
-        The sites.
-    weights : ndarray, shape (n,)
-        Weights, px².
-    site_displacement : ndarray, shape (n, 2)
-        Displacement of each site, px; see `LevelSolution`.
-    threads : int, optional
-        Default: all cores.
-    on_share : callable, optional
-        See `read_out`.
-
-    Returns
-    -------
-    potential : ndarray, shape (H, W)
-        px², zero in the mean over the border.
-    displacement : ndarray, shape (2, H, W)
-        Minus its gradient by central differences, px; beyond the border, which no flux
-        crosses, the potential is taken as its mirror image.
-    """
+    """Read the potential off the weights, half of which it is at the sites, and differentiate."""
     surface = potential_surface(level, weights, site_displacement, threads=threads)
     potential = np.empty(level.shape)
     count = potential.size
@@ -102,6 +64,7 @@ def read_dual(
         if on_share is not None:
             on_share((first + len(part)) / count)
     potential -= border_mean(potential)
+    # No flux crosses the border, so beyond it the potential is its mirror image.
     gradient = np.array(np.gradient(np.pad(potential, 1, mode="symmetric")))
     return potential, np.ascontiguousarray(-gradient[:, 1:-1, 1:-1])
 
@@ -113,45 +76,20 @@ def read_centroids(
     *,
     integration: Literal["mean", "y", "x"] = "mean",
 ) -> tuple[FloatArray, FloatArray]:
-    """Interpolate the centroids' displacements and integrate them, as the paper does.
-
-    The sites nearest to the corners are moved there, so that the sites' hull covers the
-    image; this distorts the result near the corners.
-
-    Parameters
-    ----------
-    level, site_displacement, threads
-        See `read_dual`.
-    integration : {"mean", "y", "x"}
-        Integrate first along y and then along x, first along x, or take the mean of both.
-
-    Returns
-    -------
-    potential, displacement
-        As of `read_dual`, but the displacement is the natural-neighbour interpolation of that of
-        the sites.
-
-    References
-    ----------
-    Paper, section III and lines 22–26 of its algorithm.
-    """
+    """Interpolate and integrate as in the paper, section III and lines 22–26 of its algorithm."""
     shape = level.shape
     pixels = np.indices(shape, dtype=np.float64).reshape(2, -1).T
-    triangulation = RegularTriangulation(_moved_to_corners(level.sites, shape))
+    # So that the sites' hull covers the image; it distorts the result near the corners.
+    sites = level.sites.copy()
+    for y in (-0.5, shape[0] - 0.5):
+        for x in (-0.5, shape[1] - 0.5):
+            nearest = np.argmin((level.sites[:, 0] - y) ** 2 + (level.sites[:, 1] - x) ** 2)
+            sites[nearest] = y, x
+    triangulation = RegularTriangulation(sites)
     displacement = natural_neighbor(triangulation, site_displacement, pixels, threads=threads)
     displacement = np.ascontiguousarray(displacement.T).reshape(2, *shape)
     potential = _integrated(displacement, integration)
     return potential - border_mean(potential), displacement
-
-
-def _moved_to_corners(sites: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Move the site nearest to each corner of the image to it."""
-    moved = sites.copy()
-    for y in (-0.5, shape[0] - 0.5):
-        for x in (-0.5, shape[1] - 0.5):
-            nearest = np.argmin((sites[:, 0] - y) ** 2 + (sites[:, 1] - x) ** 2)
-            moved[nearest] = y, x
-    return moved
 
 
 def _integrated(displacement: FloatArray, first: Literal["mean", "y", "x"]) -> FloatArray:

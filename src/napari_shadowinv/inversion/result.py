@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import FORMAT, VARIABLES, dataset_from_field, label
 from napari_shadowinv.inversion.trust import image_residual
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["Inversion", "Report"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -128,19 +126,19 @@ class Inversion:
         How it was made and from what, if by a recipe.
     """
 
-    image: Array
-    source: Array
-    potential: Array
-    displacement: Array
-    sites: Array
-    weights: Array
-    site_mass: Array
-    site_flux: Array
-    site_displacement: Array
-    reprojection: Array
-    residual: Array
-    caustic: NDArray[np.bool_]
-    mask: NDArray[np.bool_]
+    image: FloatArray
+    source: FloatArray
+    potential: FloatArray
+    displacement: FloatArray
+    sites: FloatArray
+    weights: FloatArray
+    site_mass: FloatArray
+    site_flux: FloatArray
+    site_displacement: FloatArray
+    reprojection: FloatArray
+    residual: FloatArray
+    caustic: BoolArray
+    mask: BoolArray
     report: Report
     options: InversionOptions
     provenance: Provenance | None = None
@@ -151,25 +149,12 @@ class Inversion:
         return None if self.provenance is None else self.provenance.setup
 
     def with_warnings(self, texts: Iterable[str]) -> Inversion:
-        """Return the same inversion with additional warnings, such as doubts about its source.
-
-        Parameters
-        ----------
-        texts : iterable of str
-            Warnings to append to those of the report.
-
-        Returns
-        -------
-        Inversion
-        """
+        """Return the same inversion with these texts after the warnings of its report."""
         warnings = (*self.report.warnings, *texts)
         return replace(self, report=replace(self.report, warnings=warnings))
 
     def to_dataset(
-        self,
-        setup: Setup | None = None,
-        *,
-        attributes: Mapping[str, str] | None = None,
+        self, setup: Setup | None = None, *, attributes: Mapping[str, str] | None = None
     ) -> xarray.Dataset:
         """Return everything as one labelled dataset, with units.
 
@@ -224,7 +209,9 @@ class Inversion:
                 "inversion"
             )
         arrays = {name: np.ascontiguousarray(dataset[name].values) for name in VARIABLES}
-        report = _report(json.loads(dataset.attrs["report"]))
+        content = json.loads(dataset.attrs["report"])
+        known = {field.name for field in dataclasses.fields(Report)} & content.keys()
+        report = Report(**{name: _tuples(content[name]) for name in known})
         if math.isnan(report.image_residual):  # a file of an older version
             told = image_residual(arrays["image"], arrays["reprojection"], arrays["mask"])
             report = replace(report, image_residual=told)
@@ -234,11 +221,6 @@ class Inversion:
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
             provenance=Provenance.of(dataset.attrs),
         )
-
-
-def _report(content: dict[str, Any]) -> Report:
-    known = {field.name for field in dataclasses.fields(Report)}
-    return Report(**{name: _tuples(value) for name, value in content.items() if name in known})
 
 
 def _tuples(value: Any) -> Any:

@@ -81,15 +81,7 @@ _MASKED_EDGE = 0.2  # of a side
 
 
 def image_residual(image: FloatArray, reprojection: FloatArray, mask: BoolArray) -> float:
-    """How far a re-projection is from its image: r.m.s. difference over mean intensity.
-
-    Both in the same units; only the pixels of the mask count.
-
-    Examples
-    --------
-    >>> image_residual(np.array([[2.0, 4.0]]), np.array([[2.3, 3.7]]), np.array([[True, True]]))
-    0.1
-    """
+    """R.m.s. difference of a re-projection from its image over the mean, inside the mask."""
     difference = (image - reprojection)[mask]
     return float(np.sqrt(np.mean(difference**2)) / image[mask].mean())
 
@@ -102,21 +94,7 @@ def doubts(
     n_sites: int,
     options: InversionOptions,
 ) -> tuple[str, ...]:
-    """Say in plain sentences why a converged answer must not be trusted; empty if nothing does.
-
-    Parameters
-    ----------
-    prepared : Prepared
-        Image, source and mask.
-    displacement : ndarray, shape (2, H, W)
-        The answer, px.
-    reprojection, jacobian : ndarray, shape (H, W)
-        The source as displaced by it, and its Jacobian determinant.
-    n_sites : int
-        Number of sites.
-    options : InversionOptions
-        Its `boundary` is used.
-    """
+    """Say in plain sentences why a converged answer must not be trusted; empty if nothing does."""
     noise = _Noise(prepared)
     square = np.einsum("cyx,cyx->yx", displacement, displacement)
     rms = float(np.sqrt(square[prepared.mask].mean()))
@@ -125,11 +103,9 @@ def doubts(
     nothing = "" if misfit else _nothing_found(noise, rms)
     if nothing:
         return (nothing,)
-    found = [
-        misfit,
-        _deep_folds(jacobian, prepared.mask),
-        "" if options.boundary == "free" else _cut_off(displacement, prepared.mask, noise, rms),
-    ]
+    found = [misfit, _deep_folds(jacobian, prepared.mask)]
+    if options.boundary == "closed":
+        found.append(_cut_off(displacement, prepared.mask, noise, rms))
     return tuple(sentence for sentence in found if sentence)
 
 

@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from napari_shadowinv._system.interrupts import interrupts_put_off
+from napari_shadowinv._system.machine import interrupts_put_off
 from napari_shadowinv.errors import FileFormatError
 
 DEFLATE_RATIO = 1040  # the most that zlib can pack into one byte, a little rounded up

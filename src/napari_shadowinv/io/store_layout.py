@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from napari_shadowinv._system.interrupts import interrupts_put_off
+from napari_shadowinv._system.machine import interrupts_put_off
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import replacing

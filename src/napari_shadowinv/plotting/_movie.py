@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv._system.interrupts import interrupts_put_off
+from napari_shadowinv._system.machine import interrupts_put_off
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset

@@ -14,8 +14,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from typing import Any
 
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import ShouldStop
-from napari_shadowinv._system.threads import available_threads
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.stack._local import local_client
 from napari_shadowinv.stack._references import BlockShot, Shot

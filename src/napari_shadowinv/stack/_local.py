@@ -19,7 +19,7 @@ from multiprocessing import resource_tracker
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from napari_shadowinv._system.interrupts import interrupts_put_off
+from napari_shadowinv._system.machine import interrupts_put_off
 
 _ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
 _TRIMMING = "MALLOC_TRIM_THRESHOLD_"

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
-from napari_shadowinv._system.threads import available_threads
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, plan_sites

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize
 
-from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from napari_shadowinv._system.threads import in_ranges
+from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices

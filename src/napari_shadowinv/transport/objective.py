@@ -20,7 +20,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
-from napari_shadowinv._system.threads import available_threads
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram

@@ -20,8 +20,8 @@ from threading import Event
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
-from napari_shadowinv._system.threads import available_threads
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry._kernel import njit

@@ -31,7 +31,7 @@ from napari_shadowinv._napari.widgets._layers import (
 from napari_shadowinv._napari.widgets._panels import LivePanel, ReportTable, RunPanel, report_rows
 from napari_shadowinv._napari.widgets._qt import notify_errors
 from napari_shadowinv._napari.widgets._results import Origins, place_together, result_frame
-from napari_shadowinv._system.memory import physical_memory
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import text_of
