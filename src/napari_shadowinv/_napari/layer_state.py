@@ -32,6 +32,7 @@ _OWN_ATTRIBUTES = {
     "report",
     "image_residual",
     "setup",
+    "provenance",
     "package_version",
     "created",
     _LOOKS,

@@ -1,18 +1,17 @@
 """What an inversion is given, beside the shots.
 
 - the experiment's geometry: `SetupPicker`; the undisturbed beam: `SourcePicker`
-- what is done to images first: `CleaningSection`; how to invert: `OptionsForm`
+- how to invert: `OptionsForm`
 - all of these and the masks, as the widgets for shots and for stacks have them: `InversionInputs`
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from numpy.typing import ArrayLike
 from pydantic import BaseModel
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QWidget
@@ -29,6 +28,7 @@ from napari_shadowinv._napari.layer_metadata import (
     setup_origin_of,
     source_of,
 )
+from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets._forms import (
     ModelForm,
     ModelPicker,
@@ -37,30 +37,34 @@ from napari_shadowinv._napari.widgets._forms import (
     TomlButtons,
     kinds_of,
     labelled,
-    section,
     wrapping_label,
 )
-from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES
-from napari_shadowinv._napari.widgets._layers import LayerPicker, MaskPicker, image_of
+from napari_shadowinv._napari.widgets._layers import LayerPicker, MaskPicker, image_of, warnings_of
 from napari_shadowinv._napari.widgets._qt import column
 from napari_shadowinv._napari.widgets._results import Origins
+from napari_shadowinv._napari.widgets._steps import StepsSection
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing import ESTIMATES, FILTERS, Estimate, Filter, check_masks
+from napari_shadowinv.pipeline.run import PREVIEW_SITES
+from napari_shadowinv.preprocessing import (
+    ESTIMATES,
+    Estimate,
+    MeasuredSource,
+    Radiograph,
+    Recipe,
+    Step,
+    check_masks,
+)
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
-
-    pass
 
 _NONE = "none"
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
 _OWN, _LAYER, _FILE = "own", "layer", "file"
-# Estimates that do not look at the shot, so that no mask can mislead them.
-_BLIND = ("uniform", "isotropic")
 
 
 def _proton() -> type[BaseModel]:
@@ -269,7 +273,7 @@ class SourcePicker(RowPicker):
     @property
     def is_guessed(self) -> bool:
         """Whether it is an estimate from the shot, which a mask can keep from the object."""
-        return self.picker.kind in ESTIMATES and self.picker.kind not in _BLIND
+        return self.picker.kind in ESTIMATES and ESTIMATES[self.picker.kind].uses_mask
 
     @property
     def described(self) -> str:
@@ -284,8 +288,19 @@ class SourcePicker(RowPicker):
         assert isinstance(model, Estimate)
         return f"estimate: {model.described}" if self.is_guessed else model.described
 
-    def source(self, image_layer: Any) -> ArrayLike | Path | Estimate:
-        """The chosen source of an image layer, as a job takes it, or an `InputError`."""
+    def chosen(self) -> Estimate | MeasuredSource:
+        """What a recipe says of the source, or an `InputError`."""
+        model = self.picker.model()
+        if isinstance(model, Estimate):
+            return model
+        if self.picker.kind != _FILE:
+            return MeasuredSource()
+        if not self.file.path:
+            raise InputError("no source file is selected: choose one, or choose another source")
+        return MeasuredSource(file=Path(self.file.path))
+
+    def measured(self, image_layer: Any) -> Radiograph | None:
+        """The measured source of an image layer unless it is a file, or an `InputError`."""
         kind = self.picker.kind
         if kind == _LAYER:
             if self.layers.layer is None:
@@ -293,21 +308,16 @@ class SourcePicker(RowPicker):
                     "no source layer is selected: choose one below 'a layer', or choose another "
                     "source"
                 )
-            return image_of(self.layers.layer, "source image")
-        if kind == _FILE:
-            if not self.file.path:
-                raise InputError("no source file is selected: choose one, or choose another source")
-            return Path(self.file.path)
+            beam = radiograph_of(self.layers.layer, image_of(self.layers.layer, "source image"))
+            return replace(beam, warnings=warnings_of(self.layers.layer))
         if kind == _OWN:
             own = source_of(image_layer)
             if own is None:
                 raise InputError(
                     f"'{image_layer.name}' has no source of its own: choose another kind of source"
                 )
-            return own
-        model = self.picker.model()
-        assert isinstance(model, Estimate)
-        return model
+            return radiograph_of(image_layer, own)
+        return None
 
     def check(self, mask: BoolArray | None) -> None:
         """Refuse a mask over what the chosen layer was estimated without: the object."""
@@ -361,32 +371,6 @@ class SourcePicker(RowPicker):
         return known[0] if len(known) == 1 else None
 
 
-class CleaningSection(QWidget):
-    """A choice of filters, folded away under a title that tells which."""
-
-    changed = Signal()
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.picker = ModelPicker("Filter", {"none": ("nothing", None), **kinds_of(FILTERS)})
-        self.folded = section("", self.picker)
-        column(self, self.folded)
-        self.picker.changed.connect(self._on_change)
-        self._on_change()
-
-    def model(self) -> Filter | None:
-        model = self.picker.model()
-        assert model is None or isinstance(model, Filter)
-        return model
-
-    def _on_change(self) -> None:
-        # A filter must not work unseen in a folded section.
-        title = f"Filter first: {self.picker.choice.currentText()}"
-        if self.folded.text() != title:
-            self.folded.setText(title)
-        self.changed.emit()
-
-
 class OptionsForm(ModelForm):
     def __init__(self) -> None:
         super().__init__(InversionOptions, first={"n_sites": PREVIEW_SITES})
@@ -413,14 +397,14 @@ class InversionInputs:
         self.masks = MaskPicker(viewer, image, kinds, tips[0])
         self.source_masks = MaskPicker(viewer, image, kinds, tips[1], "Source mask")
         self.setup = SetupPicker()
-        self.cleaning = CleaningSection()
+        self.steps = StepsSection()
         self.options = OptionsForm()
         self.inputs = (
             self.source,
             self.source_masks,
             self.masks,
             self.setup,
-            self.cleaning,
+            self.steps,
             self.options,
         )
         self.source.changed.connect(self._show_source_mask)
@@ -433,11 +417,20 @@ class InversionInputs:
         return {
             "source": self.source,
             "setup": self.setup,
-            "cleaning": self.cleaning.picker,
+            "steps": self.steps,
             "options": self.options,
             "painted_is_unusable": self.masks,
             "painted_is_object": self.source_masks,
         }
+
+    def recipe(self, *first: Step) -> Recipe:
+        """What the controls ask for, after steps of the widget's own; or an `InputError`."""
+        return Recipe(
+            steps=(*first, *self.steps.steps()),
+            source=self.source.chosen(),
+            setup=self.setup.setup(),
+            options=self.options.model(),
+        )
 
     def companions(self, image: Any, *others: Any) -> tuple[Any, ...]:
         """Layers that lie on an image: masks and source, and others if there are any."""
