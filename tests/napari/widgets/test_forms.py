@@ -104,7 +104,7 @@ def test_the_command_line_reads_a_saved_setup(
     assert path.suffix == ".toml"
     assert setup_from(path) == setup
     picker.picker.set_kind("none")
-    picker._take(read_toml(path), str(path))
+    picker.load(read_toml(path), str(path))
     assert picker.setup() == setup
     if isinstance(setup, OpticalSetup):
         assert math.isinf(picker.setup().source_object_distance)

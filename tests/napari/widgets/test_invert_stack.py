@@ -71,7 +71,7 @@ def at_rest(tool: Any) -> bool:
 def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Hold each run at its third shot, as a large image would, until it is stopped or let go."""
     let_go = threading.Event()
-    original = _worker.invert_shot
+    original = _worker.run_prepared
     count = iter(range(1000))
 
     def holding(*args: Any, should_stop: Any = None, **kwargs: Any) -> Any:
@@ -80,7 +80,7 @@ def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
                 time.sleep(0.01)
         return original(*args, should_stop=should_stop, **kwargs)
 
-    monkeypatch.setattr(_worker, "invert_shot", holding)
+    monkeypatch.setattr(_worker, "run_prepared", holding)
     return let_go
 
 

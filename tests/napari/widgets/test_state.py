@@ -34,7 +34,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.pipeline.run import run as run_recipe
-from napari_shadowinv.preprocessing import PolynomialEstimate, Recipe
+from napari_shadowinv.preprocessing import Crop, PolynomialEstimate, Radiograph, Recipe
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
@@ -310,6 +310,9 @@ def test_a_source_mask_hides_the_object_from_the_estimate_alone(
     found = run_recipe(recipe, shot, source_mask=~there)
     assert found.mask.all()
     assert np.ptp(found.potential) == pytest.approx(np.ptp(potential), rel=0.1)
+    cropped = Recipe(steps=(Crop(y=(2, 62), x=(4, 70)),))
+    moved = cropped.moved(Radiograph(shot, source_mask=~there)).source_mask
+    np.testing.assert_array_equal(moved, ~there[2:62, 4:70])
     with pytest.raises(InputError, match="source mask has shape"):
         run_recipe(recipe, shot, source_mask=there[1:])
 

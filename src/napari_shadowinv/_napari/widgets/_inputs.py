@@ -39,8 +39,15 @@ from napari_shadowinv._napari.widgets._forms import (
     labelled,
     wrapping_label,
 )
-from napari_shadowinv._napari.widgets._layers import LayerPicker, MaskPicker, image_of, warnings_of
+from napari_shadowinv._napari.widgets._layers import (
+    LayerPicker,
+    MaskPicker,
+    crop_of,
+    image_of,
+    warnings_of,
+)
 from napari_shadowinv._napari.widgets._qt import column
+from napari_shadowinv._napari.widgets._recipes import RecipeButton
 from napari_shadowinv._napari.widgets._results import Origins
 from napari_shadowinv._napari.widgets._steps import StepsSection
 from napari_shadowinv._system.validation import validated
@@ -50,6 +57,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.pipeline.run import PREVIEW_SITES
 from napari_shadowinv.preprocessing import (
     ESTIMATES,
+    Crop,
     Estimate,
     MeasuredSource,
     Radiograph,
@@ -115,7 +123,7 @@ class SetupPicker(QWidget):
             "0.0013.</qt>"
         )
         self.note = wrapping_label()
-        self.files = TomlButtons("setup", self._to_save, self._take)
+        self.files = TomlButtons("setup", self._to_save, self.load)
         column(self, self.picker, self.note, self.files)
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
@@ -235,7 +243,8 @@ class SetupPicker(QWidget):
         setup = self.setup()
         return {} if setup is None else setup.model_dump()
 
-    def _take(self, loaded: dict[str, object], path: str) -> None:
+    def load(self, loaded: dict[str, Any], path: str) -> None:
+        """Show a setup that a file holds."""
         from napari_shadowinv.physics.setup import setup_from_dict
 
         values = setup_from_dict(loaded, path).model_dump()
@@ -249,6 +258,7 @@ class SourcePicker(RowPicker):
     def __init__(self, viewer: Any) -> None:
         self._image: Any = None
         self._before_own = "uniform"
+        self._loaded = MeasuredSource()
         tip = "Image layer of the undisturbed beam."
         self.layers = LayerPicker(viewer, ("image",), tip, "choose a layer", self._offers)
         self.file = PathEdit("Image of the undisturbed beam")
@@ -276,6 +286,11 @@ class SourcePicker(RowPicker):
         return self.picker.kind in ESTIMATES and ESTIMATES[self.picker.kind].uses_mask
 
     @property
+    def is_own(self) -> bool:
+        """Whether it is the one that came with the shot."""
+        return self.picker.kind == _OWN
+
+    @property
     def described(self) -> str:
         kind = self.picker.kind
         if kind == _LAYER and self.layers.layer is not None:
@@ -297,7 +312,24 @@ class SourcePicker(RowPicker):
             return MeasuredSource()
         if not self.file.path:
             raise InputError("no source file is selected: choose one, or choose another source")
+        if self._loaded.file is not None and str(self._loaded.file) == self.file.path:
+            return self._loaded  # the form has no name for what is in the file
         return MeasuredSource(file=Path(self.file.path))
+
+    def show(self, source: Any) -> None:
+        """Show the source of a recipe; None for uniform."""
+        if isinstance(source, Estimate):
+            name = source.name()
+            self.restore({"kind": name, "values": {name: source.values()}})
+        elif source is None:
+            self.picker.set_kind("uniform")
+        elif source.file is None:
+            self.picker.set_kind(_OWN)
+        else:
+            self._loaded = source
+            self.file.edit.setText(str(source.file))
+            self.picker.set_kind(_FILE)
+            self.changed.emit()
 
     def measured(self, image_layer: Any) -> Radiograph | None:
         """The measured source of an image layer unless it is a file, or an `InputError`."""
@@ -389,6 +421,9 @@ class OptionsForm(ModelForm):
 class InversionInputs:
     """The controls that panels for a shot and for a stack have in common."""
 
+    viewer: Any
+    crop: Any = None  # a picker, where a rectangle can be drawn
+
     def make_inputs(
         self, viewer: Any, image: Callable[[], Any], kinds: tuple[str, ...], tips: tuple[str, str]
     ) -> None:
@@ -399,6 +434,8 @@ class InversionInputs:
         self.setup = SetupPicker()
         self.steps = StepsSection()
         self.options = OptionsForm()
+        self.recipes = RecipeButton(self)
+        self.chosen_image = image
         self.inputs = (
             self.source,
             self.source_masks,
@@ -423,10 +460,23 @@ class InversionInputs:
             "painted_is_object": self.source_masks,
         }
 
-    def recipe(self, *first: Step) -> Recipe:
-        """What the controls ask for, after steps of the widget's own; or an `InputError`."""
+    def all_steps(self) -> tuple[Step, ...]:
+        """What is done to an image first; or an `InputError`."""
+        part = None if self.crop is None else crop_of(self.crop.layer, self.chosen_image())
+        if part is None:
+            return self.steps.steps()
+        rows, columns = part
+        crop = Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
+        return (crop, *self.steps.steps())
+
+    def hidden_from_source(self, image: Any) -> BoolArray | None:
+        """False where the object is, as far as the source is estimated without it."""
+        return self.source_masks.usable(image) if self.source.is_guessed else None
+
+    def recipe(self) -> Recipe:
+        """What the controls ask for, but for masks and layers; or an `InputError`."""
         return Recipe(
-            steps=(*first, *self.steps.steps()),
+            steps=self.all_steps(),
             source=self.source.chosen(),
             setup=self.setup.setup(),
             options=self.options.model(),

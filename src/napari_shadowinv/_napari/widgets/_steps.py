@@ -88,6 +88,9 @@ class StepsSection(QWidget):
         column(self._list)
         self.folded = section("", self._list, labelled("", self.choice))
         column(self, self.folded)
+        # A long list of steps must not widen the window.
+        button = self.folded.toggleButton()
+        button.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
         self.choice.activated.connect(self._on_choice)
         self._on_change()
 
@@ -149,6 +152,7 @@ class StepsSection(QWidget):
         title = f"Steps first: {names or 'nothing'}"
         if self.folded.text() != title:
             self.folded.setText(title)
+            self.folded.setToolTip(title)
         for one in self.forms:
             one.up.setEnabled(one is not self.forms[0])
             one.down.setEnabled(one is not self.forms[-1])

@@ -21,7 +21,6 @@ from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import (
     LayerPicker,
     LayerWatch,
-    crop_of,
     image_of,
     new_shapes,
     shot_picker,
@@ -36,7 +35,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.pipeline.run import PREVIEW_SITES, run
-from napari_shadowinv.preprocessing import Crop, Radiograph, Recipe
+from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 if TYPE_CHECKING:
     import napari
@@ -203,6 +202,7 @@ class InvertShot(InversionInputs, LivePanel):
             self.setup,
             self.steps,
             section("Options", self.options),
+            self.recipes,
             self.live,
             self.keep_earlier,
             self.cost,
@@ -227,14 +227,14 @@ class InvertShot(InversionInputs, LivePanel):
     def request(self, preview: bool = False) -> _Request:
         layer: Any = self.image.layer
         image = image_of(layer)
-        recipe = self.recipe(*self._crop())
+        recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)
         shot = replace(
             radiograph_of(layer, image),
             warnings=warnings_of(layer),
             mask=mask,
-            source_mask=self.source_masks.usable(layer) if self.source.is_guessed else None,
+            source_mask=self.hidden_from_source(layer),
         )
         return _Request(
             recipe,
@@ -247,14 +247,6 @@ class InvertShot(InversionInputs, LivePanel):
             self.origins(layer, layer.name),
             preview,
         )
-
-    def _crop(self) -> tuple[Crop, ...]:
-        """The step that a drawn rectangle asks for, if there is one."""
-        part = crop_of(self.crop.layer, self.image.layer)
-        if part is None:
-            return ()
-        rows, columns = part
-        return (Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop)),)
 
     def show_result(self, value: _Answer, request: _Request) -> None:
         image = request.image
@@ -280,7 +272,7 @@ class InvertShot(InversionInputs, LivePanel):
     def _tell_cost(self) -> None:
         """Say how long it will take, once the image is large."""
         try:
-            recipe = Recipe(steps=(*self._crop(), *self.steps.steps()))
+            recipe = Recipe(steps=self.all_steps())
             shape = recipe.shape_after(image_of(self.image.layer).shape)
             cost = cost_of(shape, self.options.model(), self._pace)  # type: ignore[arg-type]
         except InputError:
