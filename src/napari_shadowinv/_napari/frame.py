@@ -54,7 +54,7 @@ class Frame:
             moved,
             scale=(float(upright[0, 0]), float(upright[1, 1])),
             shear=float(upright[0, 1] / upright[1, 1]),
-            rotate=_matrix(rotate),
+            rotate=matrix_of(rotate),
         )
 
     def keywords(self, *, stacked: bool = False) -> dict[str, Any]:
@@ -103,13 +103,14 @@ def frame_of(layer: Any) -> Frame:
         scale=tuple(float(value) for value in layer.scale[-2:]),  # type: ignore[arg-type]
         translate=tuple(float(value) for value in layer.translate[-2:]),  # type: ignore[arg-type]
         units=tuple(str(unit) for unit in layer.units[-2:]),  # type: ignore[arg-type]
-        rotate=_matrix(layer.rotate[-2:, -2:]),
+        rotate=matrix_of(layer.rotate[-2:, -2:]),
         shear=float(layer.shear[-1]),
-        affine=_matrix(layer.affine.affine_matrix[-3:, -3:]),
+        affine=matrix_of(layer.affine.affine_matrix[-3:, -3:]),
     )
 
 
-def _matrix(values: FloatArray) -> Matrix:
+def matrix_of(values: Any) -> Matrix:
+    """Rows of a matrix as tuples, which can be compared."""
     return tuple(tuple(float(value) for value in row) for row in values)
 
 

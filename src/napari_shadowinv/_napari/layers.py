@@ -104,6 +104,7 @@ def inversion_layers(
     attributes: Mapping[str, str] | None = None,
 ) -> list[FullLayerData]:
     """Describe the layers of a result; the keywords are those of `add_inversion`."""
+    setup = inversion.setup if setup is None else setup
     frame = frame_for(
         inversion.potential.shape, setup, scale=scale, translate=translate, units=units
     )
@@ -129,7 +130,8 @@ def add_inversion(
     inversion : Inversion
         The result.
     setup : ProtonSetup or OpticalSetup, optional
-        Gives the pixel size and the field in SI units; pixels without.
+        Gives the pixel size and the field in SI units; pixels without. Default: that of the
+        inversion's provenance.
     name : str
         Name of the shot; the layers' names begin with it.
     **keywords
