@@ -139,8 +139,8 @@ def add_inversion(
         in the world, where it is not the setup's; a binned or cropped image lies on its
         original with those of the original's layer.
         ``cells`` (bool): whether to add the power cells as polygons, for up to 5,000 sites.
-        ``attributes`` (mapping of str to str): which files the result comes from; kept for
-        writing.
+        ``attributes`` (mapping of str to str): words about its origin, beside its provenance;
+        kept for writing.
 
     Returns
     -------

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qtpy.QtCore import Qt
-from qtpy.QtWidgets import QFileDialog, QMenu, QToolButton
+from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
 from napari_shadowinv._napari.layer_metadata import mark_of, source_of
 from napari_shadowinv._napari.widgets._forms import TOML
@@ -23,19 +22,17 @@ if TYPE_CHECKING:
     from napari_shadowinv._napari.widgets._inputs import InversionInputs
 
 
-class RecipeButton(QToolButton):
+class RecipeButton(QPushButton):
     """A menu to load what is to be done to a shot from a TOML file, or to save it."""
 
     def __init__(self, tool: InversionInputs) -> None:
-        super().__init__()
+        super().__init__("Recipe")
         self._tool = tool
-        self.setText("Recipe")
         self.setToolTip(
             "<qt>Steps, source, masks, setup and options as one TOML file, for here or "
             "<code>shadowinv invert --recipe</code>.</qt>"
         )
-        self.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
-        self.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextOnly)
+        self.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Fixed)
         menu = QMenu(self)
         menu.addAction("Load…").triggered.connect(lambda: self._ask_and_load())
         menu.addAction("Save…").triggered.connect(lambda: self._ask_and_save())
