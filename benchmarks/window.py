@@ -18,12 +18,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from napari_shadowinv._napari.widgets._jobs import PlanCache, ShotJob
 from qtpy.QtCore import QSettings
 from qtpy.QtWidgets import QApplication
 
 import napari
 from napari_shadowinv import InversionOptions
-from napari_shadowinv._napari.widgets._jobs import PlanCache, ShotJob
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 

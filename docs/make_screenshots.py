@@ -110,8 +110,8 @@ def stack_window(folder: Path) -> None:
     viewer.add_image(np.stack(shots), name="burner")
     _, widget = viewer.window.add_plugin_dock_widget(PLUGIN, "Invert stack")
     widget.source.picker.set_kind("polynomial")
-    widget.cleaning.picker.set_kind("hot_pixels")
-    widget.cleaning.folded.expand()
+    widget.steps.add("hot-pixels")
+    widget.steps.folded.expand()
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
         widget.store.edit.setText("burner.shadowinv.zarr")
         widget.panel.button.click()
@@ -185,7 +185,7 @@ def night_window() -> None:
     viewer.open_sample(PLUGIN, "wakefield_run")
     invert_stack = open_widget(viewer, "Invert stack")
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
-        invert_stack.cleaning.picker.set_kind("high_pass")
+        invert_stack.steps.add("high-pass")
         invert_stack.store.edit.setText("night.shadowinv.zarr")
         press_run(invert_stack)
         print(invert_stack.panel.status.text(), [layer.name for layer in viewer.layers])

@@ -92,7 +92,7 @@ def test_all_layers_come_back_as_they_were(
 def test_nothing_of_the_result_is_lost(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
 ) -> None:
-    add_inversion(viewer, solved, proton_setup, attributes={"input_file": "shot.tif"})
+    add_inversion(viewer, solved, proton_setup, attributes={"setup_origin": "typed"})
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     dataset = read(tmp_path / "a.shadowinv")
     expected = solved.to_dataset(proton_setup)
@@ -100,7 +100,7 @@ def test_nothing_of_the_result_is_lost(
         np.testing.assert_array_equal(dataset[name], expected[name])
     assert dataset.attrs["options"] == expected.attrs["options"]
     assert dataset.attrs["setup"] == expected.attrs["setup"]
-    assert dataset.attrs["input_file"] == "shot.tif"
+    assert dataset.attrs["setup_origin"] == "typed"
 
 
 def test_one_layer_stands_for_all_and_the_others_come_back_hidden(

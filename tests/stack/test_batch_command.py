@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import os
 import shutil
 import signal
@@ -21,6 +22,7 @@ from typer.testing import CliRunner, Result
 
 from napari_shadowinv import InversionOptions, invert, read
 from napari_shadowinv.cli import app
+from napari_shadowinv.inversion.result import provenance_of
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.preprocessing import Provenance
 
@@ -281,8 +283,12 @@ def test_shots_are_exported_as_pradformat_if_the_setup_is_a_particle_beams(store
     assert shadowinv("export", store, "--format", "pradformat", "--shots", "4").exit_code == 0
     (path,) = Path("n").iterdir()
     with h5py.File(path) as file:
-        assert file.keys()
+        assert file.attrs["radiograph_filename"] == "shot_4.npy"
     exported = read(path)
+    told, whole = provenance_of(exported), provenance_of(read(store))
+    assert told.image.file == "shot_4.npy"
+    assert told.image.sha256 == hashlib.sha256(Path("shots/shot_4.npy").read_bytes()).hexdigest()
+    assert told.recipe == whole.recipe
     np.testing.assert_allclose(exported.displacement, read(store).displacement[4], atol=1e-6)
 
 

@@ -38,9 +38,9 @@ from napari_shadowinv._napari.notifications import (
     notify_errors,
     show_mistake,
 )
-from napari_shadowinv._napari.shots import shot_layer
+from napari_shadowinv._napari.shots import loaded, radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
     import napari
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.preprocessing import Radiograph
 
 __all__ = ["estimate_source", "high_pass", "invert_uniform", "remove_hot_pixels"]
 
@@ -59,12 +60,16 @@ _HIGH_PASS_SHARE = 0.15
 class _Picked:
     """The image that a command works on."""
 
-    image: AnyArray
+    shot: Radiograph
     name: str
     frame: Frame
     setup: Setup | None
     setup_origin: str
     role: str | None
+
+    @property
+    def image(self) -> FloatArray:
+        return self.shot.image
 
 
 @notify_errors(otherwise=list)
@@ -120,7 +125,7 @@ def _picked(layer: Any, viewer: Any, usable: Callable[[Any], bool] = may_be_shot
         at = tuple(int(step) for step in steps[-data.ndim : -2])
         data, name = data[at], f"{name} {','.join(map(str, at))}"
     known = setup_of(layer), setup_origin_of(layer), role_of(layer)
-    return _Picked(np.asarray(data), name, frame_of(layer), *known)
+    return _Picked(radiograph_of(layer, np.asarray(data)), name, frame_of(layer), *known)
 
 
 Work = Callable[[_Picked, ShouldStop], "list[FullLayerData]"]
@@ -160,9 +165,11 @@ def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
 
 
 def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
-    from napari_shadowinv.inversion import invert
+    from napari_shadowinv.pipeline.run import run
+    from napari_shadowinv.preprocessing import Recipe, UniformEstimate
 
-    inversion = invert(picked.image, should_stop=should_stop)
+    recipe = Recipe(source=UniformEstimate(), setup=picked.setup)
+    inversion = run(recipe, loaded(picked.shot, "the image"), should_stop=should_stop)
     told = {"source_origin": "uniform"}
     if picked.setup_origin:
         told["setup_origin"] = picked.setup_origin

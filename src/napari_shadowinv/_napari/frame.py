@@ -37,12 +37,25 @@ class Frame:
     shear: float = 0.0
     affine: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
-    def cropped(self, y: int, x: int) -> Frame:
-        """Return the frame of a part that begins at pixel (y, x)."""
+    def beneath(self, matrix: FloatArray) -> Frame:
+        """Frame of an image made of this one; `matrix` takes (y, x, 1) in it to (y, x, 1) here."""
         slanted = np.array([[1.0, self.shear], [0.0, 1.0]]) * self.scale
-        shift = np.array(self.rotate) @ slanted @ [y, x]
-        origin = self.translate + shift
-        return replace(self, translate=(float(origin[0]), float(origin[1])))
+        pixels = np.array(self.rotate) @ slanted
+        y, x = (float(value) for value in self.translate + pixels @ matrix[:2, 2])
+        moved = replace(self, translate=(y, x))
+        factor = float(matrix[0, 0])
+        if np.array_equal(matrix[:2, :2], factor * np.eye(2)):
+            return replace(moved, scale=(factor * self.scale[0], factor * self.scale[1]))
+        rotate, upright = np.linalg.qr(pixels @ matrix[:2, :2])
+        # napari's order: first the scale, which alone may mirror, then the shear.
+        signs = np.sign(upright[0, 0]) * np.array([1.0, np.round(np.linalg.det(rotate))])
+        rotate, upright = rotate * signs, signs[:, None] * upright
+        return replace(
+            moved,
+            scale=(float(upright[0, 0]), float(upright[1, 1])),
+            shear=float(upright[0, 1] / upright[1, 1]),
+            rotate=matrix_of(rotate),
+        )
 
     def keywords(self, *, stacked: bool = False) -> dict[str, Any]:
         """Return the keywords that place a layer; `stacked` if an axis of shots comes first."""
@@ -90,13 +103,14 @@ def frame_of(layer: Any) -> Frame:
         scale=tuple(float(value) for value in layer.scale[-2:]),  # type: ignore[arg-type]
         translate=tuple(float(value) for value in layer.translate[-2:]),  # type: ignore[arg-type]
         units=tuple(str(unit) for unit in layer.units[-2:]),  # type: ignore[arg-type]
-        rotate=_matrix(layer.rotate[-2:, -2:]),
+        rotate=matrix_of(layer.rotate[-2:, -2:]),
         shear=float(layer.shear[-1]),
-        affine=_matrix(layer.affine.affine_matrix[-3:, -3:]),
+        affine=matrix_of(layer.affine.affine_matrix[-3:, -3:]),
     )
 
 
-def _matrix(values: FloatArray) -> Matrix:
+def matrix_of(values: Any) -> Matrix:
+    """Rows of a matrix as tuples, which can be compared."""
     return tuple(tuple(float(value) for value in row) for row in values)
 
 

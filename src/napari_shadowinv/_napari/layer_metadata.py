@@ -62,7 +62,7 @@ class Result:
 
     content: Inversion | xarray.Dataset  # a dataset where a file holds no more than a field
     setup: Setup | None = None
-    attributes: Mapping[str, str] = field(default_factory=dict)  # which files it was made from
+    attributes: Mapping[str, str] = field(default_factory=dict)  # words about its origin
 
 
 def mark(role: str | None, unit: str, setup: Setup | None = None, **more: Any) -> dict[str, Any]:

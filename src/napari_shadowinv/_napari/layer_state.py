@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._napari.frame import frame_for
+from napari_shadowinv._napari.frame import frame_for, matrix_of
 from napari_shadowinv._napari.layer_metadata import Result, role_of
 from napari_shadowinv._napari.layers import FullLayerData, result_layers
 from napari_shadowinv.inversion.labels import setup_from_dataset
@@ -32,12 +32,14 @@ _OWN_ATTRIBUTES = {
     "report",
     "image_residual",
     "setup",
+    "provenance",
     "package_version",
     "created",
     _LOOKS,
 }
 
 _PLACE = ("scale", "translate", "units")
+_TURN = ("rotate", "shear", "affine")
 _KEPT: dict[str, tuple[str, ...]] = {
     "image": ("colormap", "contrast_limits", "gamma", "interpolation2d"),
     "labels": (),
@@ -45,7 +47,7 @@ _KEPT: dict[str, tuple[str, ...]] = {
     "vectors": ("length", "edge_width", "vector_style"),
     "shapes": ("edge_width",),
 }
-_KEPT_BY_ALL = ("name", "visible", "opacity", "blending", *_PLACE)
+_KEPT_BY_ALL = ("name", "visible", "opacity", "blending", *_PLACE, *_TURN)
 
 
 def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]:
@@ -62,6 +64,13 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
     place = next(iter(looks.values()), {})
     shape = dataset["displacement"].shape[-2:]
     frame = frame_for(shape, setup, **{key: place.get(key) for key in _PLACE})
+    if all(name in place for name in _TURN):  # not in files of older versions
+        frame = replace(
+            frame,
+            rotate=matrix_of(place["rotate"]),
+            shear=float(place["shear"][-1]),
+            affine=matrix_of(place["affine"]),
+        )
     layers = result_layers(result, frame, name, cells="cells" in looks)
     if not looks:
         return layers

@@ -104,6 +104,7 @@ def inversion_layers(
     attributes: Mapping[str, str] | None = None,
 ) -> list[FullLayerData]:
     """Describe the layers of a result; the keywords are those of `add_inversion`."""
+    setup = inversion.setup if setup is None else setup
     frame = frame_for(
         inversion.potential.shape, setup, scale=scale, translate=translate, units=units
     )
@@ -129,7 +130,8 @@ def add_inversion(
     inversion : Inversion
         The result.
     setup : ProtonSetup or OpticalSetup, optional
-        Gives the pixel size and the field in SI units; pixels without.
+        Gives the pixel size and the field in SI units; pixels without. Default: that of the
+        inversion's provenance.
     name : str
         Name of the shot; the layers' names begin with it.
     **keywords
@@ -137,8 +139,8 @@ def add_inversion(
         in the world, where it is not the setup's; a binned or cropped image lies on its
         original with those of the original's layer.
         ``cells`` (bool): whether to add the power cells as polygons, for up to 5,000 sites.
-        ``attributes`` (mapping of str to str): which files the result comes from; kept for
-        writing.
+        ``attributes`` (mapping of str to str): words about its origin, beside its provenance;
+        kept for writing.
 
     Returns
     -------

@@ -2,6 +2,7 @@
 
 - one image, with what its file tells: `radiograph_layers`
 - any image or stack of images: `shot_layer`
+- a layer as what an inversion takes: `radiograph_of`, `loaded`
 - many files along an axis of shots, each read when it is shown: `stack_layers`
 - any planes that are made when they are looked at: `lazy_stack`
 - the images in a folder, shot 2 before shot 10: `images_in`
@@ -12,6 +13,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,12 +22,12 @@ import numpy as np
 
 from napari_shadowinv import io
 from napari_shadowinv._napari.frame import Frame, frame_for
-from napari_shadowinv._napari.layer_metadata import CAME_WITH, MASK, SHOT, SOURCE, mark
+from napari_shadowinv._napari.layer_metadata import CAME_WITH, MASK, SHOT, SOURCE, mark, mark_of
 from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
 from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.files import in_counting_order
+from napari_shadowinv.io.files import in_counting_order, sha256
 from napari_shadowinv.io.formats import RADIOGRAPH_SUFFIXES
 
 if TYPE_CHECKING:
@@ -34,7 +36,9 @@ if TYPE_CHECKING:
 __all__ = [
     "images_in",
     "lazy_stack",
+    "loaded",
     "radiograph_layers",
+    "radiograph_of",
     "shot_layer",
     "stack_layers",
 ]
@@ -105,6 +109,27 @@ def _frame(shot: io.Radiograph) -> Frame:
     if shot.setup is not None or side is None:
         return frame_for(shot.image.shape, shot.setup)
     return Frame(scale=(side * 1e6, side * 1e6), units=("um", "um"))
+
+
+def radiograph_of(layer: Any, image: Any) -> io.Radiograph:
+    """An image of a layer, which may be lazy still, with what is known of the layer's file."""
+    known = mark_of(layer)
+    path = known.get("path") or layer.source.path
+    shot = io.Radiograph(image, warnings=tuple(known.get("warnings", ())))
+    # What was split off a stack still knows the first of its files.
+    if layer.ndim != 2 or len(known.get("paths", ())) > 1 or path is None:
+        return shot
+    return replace(shot, path=Path(path), metadata=known.get("file") or {})
+
+
+def loaded(shot: io.Radiograph, name: str) -> io.Radiograph:
+    """The same with its image read, and with the checksum of its file."""
+    from napari_shadowinv.pipeline.run import plane_of
+
+    told = dict(shot.metadata)
+    if shot.path is not None and "sha256" not in told and shot.path.is_file():
+        told["sha256"] = sha256(shot.path)
+    return replace(shot, image=plane_of(shot.image, name), metadata=told)
 
 
 def images_in(folder: Path) -> list[Path]:

@@ -78,7 +78,7 @@ def _first_done(dataset: xarray.Dataset, path: Path) -> int:
 
 
 def _shot_names(dataset: xarray.Dataset) -> list[str]:
-    for name in ("input_file", "name", "shot"):
+    for name in ("name", "shot"):
         if name in dataset.variables and dataset[name].dims == ("shot",):
             return [str(value) for value in dataset[name].values]
     return [str(shot) for shot in range(dataset.sizes["shot"])]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import json
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from napari_shadowinv.cli._outputs import make_folder, protect_store
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.result import provenance_of
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
@@ -114,9 +116,20 @@ def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
 def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[_Job]:
     check_pradformat_setup(setup_from_dataset(dataset))
     for index in range(dataset.sizes["shot"]):
-        shot = dataset.isel(shot=index)
-        named = shot.assign_attrs(input_file=str(shot["name"].values))
-        yield f"{_stem(shot)}{PRADFORMAT.suffix}", named.compute
+        shot = _with_origin(dataset.isel(shot=index))
+        yield f"{_stem(shot)}{PRADFORMAT.suffix}", shot.compute
+
+
+def _with_origin(shot: xarray.Dataset) -> xarray.Dataset:
+    """A shot of a store with the store's provenance, but for its own image."""
+    provenance = provenance_of(shot)
+    if provenance is None:
+        return shot
+    report = json.loads(str(shot["report"].values))
+    origin = {"file": str(shot["name"].values), "sha256": report.get("sha256", "")}
+    image = provenance.image.model_copy(update=origin)
+    own = provenance.model_copy(update={"image": image})
+    return shot.assign_attrs(provenance=own.model_dump_json(exclude_none=True))
 
 
 def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:

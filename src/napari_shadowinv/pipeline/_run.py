@@ -37,10 +37,10 @@ from napari_shadowinv.preprocessing import (
 )
 from napari_shadowinv.preprocessing.isotropic import centre_within
 
-__all__ = ["PREVIEW_SITES", "Inputs", "gathered", "run", "run_prepared"]
+__all__ = ["PREVIEW_PIXELS", "PREVIEW_SITES", "Inputs", "gathered", "run", "run_prepared"]
 
 PREVIEW_SITES = 5_000
-_PREVIEW_PIXELS = 10_000
+PREVIEW_PIXELS = 10_000
 
 Shot = Radiograph | ArrayLike | str | Path
 
@@ -236,7 +236,7 @@ def _source(
     assert estimate is not None
     estimate = estimate.placed(shot.setup, recorded, matrix)
     report("source", 0, None, estimate.title)
-    kept = partial(cache.source, estimate, most_pixels=_PREVIEW_PIXELS if preview else None)
+    kept = partial(cache.source, estimate, most_pixels=PREVIEW_PIXELS if preview else None)
     return estimated_source(estimate, shot, should_stop, doubts.append, by=kept)
 
 

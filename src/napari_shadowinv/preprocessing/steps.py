@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
 from pydantic.fields import FieldInfo
 
 from napari_shadowinv._typing import AnyArray, FloatArray
@@ -224,14 +224,22 @@ def _as_range(value: Any) -> Any:
         return value
     first, colon, last = value.partition(":")
     try:
-        return (int(first or 0), int(last) if last else None) if colon else value
+        if colon:
+            return int(first or 0), int(last) if last.strip() else None
     except ValueError:
-        return value
+        pass
+    raise ValueError("expected the first pixel and the one after the last, such as 10:200")
+
+
+def _as_text(range_: tuple[int, int | None]) -> str:
+    first, last = range_
+    return f"{first}:{'' if last is None else last}"
 
 
 Range = Annotated[
     tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)] | None],
     BeforeValidator(_as_range),
+    PlainSerializer(_as_text, when_used="json"),  # TOML has no None
 ]
 """First pixel, and the one after the last; None for the end of the image."""
 

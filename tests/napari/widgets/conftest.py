@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from napari_shadowinv._napari.widgets._jobs import ShotJob
+from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.preprocessing import UniformEstimate
 
 
 @pytest.fixture(autouse=True)
@@ -36,8 +35,7 @@ def shot() -> np.ndarray[Any, Any]:
 @pytest.fixture(scope="session")
 def _compiled(shot: np.ndarray[Any, Any]) -> None:
     """Compile what an inversion needs, so that no test waits for it."""
-    job = ShotJob(shot, UniformEstimate(), options=InversionOptions(n_sites=700))
-    job.run()
+    invert(shot, options=InversionOptions(n_sites=700))
 
 
 @pytest.fixture

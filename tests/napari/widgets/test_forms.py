@@ -13,7 +13,7 @@ from napari_shadowinv import InputError, InversionOptions, OpticalSetup, ProtonS
 from napari_shadowinv._napari.widgets._forms import ModelForm, ModelPicker, dump_toml, kinds_of
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._qt import StateKeeper
-from napari_shadowinv.cli._inputs import options_from, setup_from
+from napari_shadowinv.cli._inputs import recipe_from, setup_from
 from napari_shadowinv.io import read_toml
 from napari_shadowinv.preprocessing import ESTIMATES
 
@@ -104,7 +104,7 @@ def test_the_command_line_reads_a_saved_setup(
     assert path.suffix == ".toml"
     assert setup_from(path) == setup
     picker.picker.set_kind("none")
-    picker._take(read_toml(path), str(path))
+    picker.load(read_toml(path), str(path))
     assert picker.setup() == setup
     if isinstance(setup, OpticalSetup):
         assert math.isinf(picker.setup().source_object_distance)
@@ -114,7 +114,7 @@ def test_the_command_line_reads_saved_options(qtbot: Any, tmp_path: Path) -> Non
     form = the_form(qtbot, InversionOptions)
     form.set_values(CHANGED)
     path = dump_toml(form.values(), tmp_path / "options.toml")
-    assert options_from(path, {}, False) == InversionOptions(**CHANGED)
+    assert recipe_from({}, None, path, clip_negative=False).options == InversionOptions(**CHANGED)
 
 
 def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> None:
@@ -156,9 +156,9 @@ def test_a_picker_remembers_what_each_kind_holds(qtbot: Any) -> None:
     picker.set_kind("polynomial")
     assert picker.form is not None
     picker.form.editors["degree"].set_value(7)
-    picker.set_kind("low_pass")
+    picker.set_kind("low-pass")
     other.restore(picker.state())
-    assert other.kind == "low_pass"
+    assert other.kind == "low-pass"
     other.set_kind("polynomial")
     assert other.model() == ESTIMATES["polynomial"](degree=7)  # type: ignore[call-arg]
 

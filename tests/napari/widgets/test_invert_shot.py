@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import subprocess
 import sys
 import threading
@@ -22,11 +21,12 @@ from qtpy.QtCore import QTimer
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.layer_metadata import mark, result_of, role_of, unit_of
-from napari_shadowinv._napari.widgets import _runner
-from napari_shadowinv._napari.widgets._jobs import ShotJob
+from napari_shadowinv._napari.widgets import _runner, invert_shot
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv.inversion.result import provenance_of
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.preprocessing import STEPS, Crop, LowPassFilter, PolynomialEstimate, Recipe
 
 Array = np.ndarray[Any, Any]
 FEW = {"n_sites": 500}
@@ -74,7 +74,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 def computed(tool: Any) -> Any:
     """The inversion that the controls ask for, without its layers."""
-    return tool.request().job.run()
+    return tool.request().inversion()
 
 
 def slowdown() -> float:
@@ -246,7 +246,7 @@ def test_crop_mask_and_source_are_used(
     tool.source.picker.set_kind("own")
     tool.image.layer = window.layers["shot"]
     assert tool.source.picker.kind == "uniform"
-    tool.source.picker.set_kind("low_pass")
+    tool.source.picker.set_kind("low-pass")
     estimated = computed(tool).source
     assert 0 < estimated.std() < 0.2 * estimated.mean()
 
@@ -269,21 +269,21 @@ def test_a_saved_result_tells_how_it_was_made(
     np.save(tmp_path / "flame.npy", shot)
     window.open(str(tmp_path / "flame.npy"), plugin="napari")
     tool.image.layer = window.layers["flame"]
-    tool.cleaning.picker.set_kind("low_pass")
+    tool.steps.add("low-pass")
     tool.source.picker.set_kind("polynomial")
     tool.crop.layer = window.add_shapes(np.array([[4, 8], [4, 50], [40, 50], [40, 8]]))
     run(tool)
     window.layers.save(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
-    told = read(tmp_path / "a.shadowinv").attrs
-    assert told["input_file"] == "flame.npy"
-    assert json.loads(told["input_preparation"]) == {
-        "crop": {"y": [4, 41], "x": [8, 51]},
-        "low_pass": {"width": 1.0},
-    }
-    assert json.loads(told["source_preparation"]) == {
-        "source_from": "polynomial_source",
-        "degree": 2,
-    }
+    told = provenance_of(read(tmp_path / "a.shadowinv"))
+    assert told is not None
+    file = (tmp_path / "flame.npy").read_bytes()
+    assert told.image.file == "flame.npy"
+    assert told.image.sha256 == hashlib.sha256(file).hexdigest()
+    assert told.recipe == Recipe(
+        steps=(Crop(y=(4, 41), x=(8, 51)), LowPassFilter(width=1.0)),
+        source=PolynomialEstimate(degree=2),
+        options=InversionOptions(**FEW),
+    )
 
 
 def test_cancel_takes_effect_within_a_second(
@@ -427,10 +427,10 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
     expect("energy")
     tool.setup.picker.set_kind("none")
 
-    def broken(*_: Any) -> None:
+    def broken(*_: Any, **__: Any) -> None:
         raise ZeroDivisionError("a fault of the program's")
 
-    monkeypatch.setattr(ShotJob, "run", broken)
+    monkeypatch.setattr(invert_shot, "run", broken)
     expect("a fault of the program's")
 
 
@@ -520,8 +520,8 @@ def test_the_preview_follows_in_its_own_layers(
         return time.perf_counter() - start
 
     tool.masks.paint()
-    follows(lambda: tool.cleaning.picker.set_kind("low_pass"))
-    follows(lambda: tool.cleaning.picker.form.editors["width"].set_value(2.0))
+    follows(lambda: tool.steps.add("low-pass"))
+    follows(lambda: tool.steps.forms[0].form.editors["width"].set_value(2.0))
     follows(lambda: tool.options.editors["floor"].set_value(0.5))
     follows(lambda: tool.masks.layer.paint((30, 10), 1))
     assert not result_of(potential).content.mask.all()
@@ -532,7 +532,7 @@ def test_the_preview_follows_in_its_own_layers(
     follows(lambda: tool.crop.layer.add_rectangles(corners))
     assert potential.data.shape == (200, 151)
     follows(lambda: setattr(tool.crop, "layer", None))
-    follows(lambda: tool.source.picker.set_kind("low_pass"))
+    follows(lambda: tool.source.picker.set_kind("low-pass"))
     width = tool.source.picker.form.editors["width"]
     times, others = [], []
     for value in range(31, 38):
@@ -553,7 +553,7 @@ def test_the_preview_follows_in_its_own_layers(
         width.set_value(value)
         qtbot.wait(2)
     qtbot.waitUntil(lambda: settled(tool), timeout=PATIENCE)
-    assert outcomes[-1].tag.job.source.width == pytest.approx(60)
+    assert outcomes[-1].tag.recipe.source.width == pytest.approx(60)
     assert outcomes[-1].value is not None
     assert len(outcomes) < 21
     assert [a is b for a, b in zip(before, tool.previewed.layers, strict=True)] == [True] * 3
@@ -564,8 +564,9 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
     tool.options.set_values({"seed": 5})
     tool.source.picker.set_kind("interpolated")
     tool.setup.show_setup(paper_setup().model_dump())
-    tool.cleaning.picker.set_kind("background")
-    tool.cleaning.folded.expand()
+    for name in STEPS:
+        tool.steps.add(name)
+    tool.steps.folded.expand()
     assert_it_fits(tool)
     tool._keeper.write()
     again = InvertShot(window)
@@ -573,4 +574,5 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
     assert again.options.model() == InversionOptions(seed=5)
     assert again.setup.setup() == paper_setup()
     assert again.source.picker.model() == tool.source.picker.model()
-    assert "flatten" in again.cleaning.folded.text()
+    assert again.steps.steps() == tuple(step() for step in STEPS.values())
+    assert again.steps.folded.text().startswith("Steps first: rotate, crop, remove hot pixels, bin")

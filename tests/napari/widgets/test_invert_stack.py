@@ -71,7 +71,7 @@ def at_rest(tool: Any) -> bool:
 def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Hold each run at its third shot, as a large image would, until it is stopped or let go."""
     let_go = threading.Event()
-    original = _worker.invert_shot
+    original = _worker.run_prepared
     count = iter(range(1000))
 
     def holding(*args: Any, should_stop: Any = None, **kwargs: Any) -> Any:
@@ -80,7 +80,7 @@ def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
                 time.sleep(0.01)
         return original(*args, should_stop=should_stop, **kwargs)
 
-    monkeypatch.setattr(_worker, "invert_shot", holding)
+    monkeypatch.setattr(_worker, "run_prepared", holding)
     return let_go
 
 
@@ -274,7 +274,7 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool.options.set_values({**FEW, "seed": 7})
     expect("started with different options (seed: 0 there, 7 now)")
     tool.options.set_values(FEW)
-    tool.source.picker.set_kind("low_pass")
+    tool.source.picker.set_kind("low-pass")
     expect("started with a different source")
     tool.source.picker.set_kind("uniform")
     assert written(out) == before
@@ -321,9 +321,9 @@ def test_shots_are_filtered_and_their_sources_guessed(
     mask[:3, :4] = False
     tool.masks.paint()
     tool.masks.layer.data[:3, :4] = 1
-    tool.source.picker.set_kind("low_pass")
+    tool.source.picker.set_kind("low-pass")
     tool.source.picker.form.editors["width"].set_value(6.0)
-    tool.cleaning.picker.set_kind("low_pass")
+    tool.steps.add("low-pass")
     run(tool)
     clean = LowPassFilter(width=1.0).filtered(stack[1], mask)
     source = LowPassEstimate(width=6.0).source(np.where(mask, clean, 0), mask)

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from napari.layers import Image, Labels, Shapes
-from napari_shadowinv.cli._choices import Choices
-from napari_shadowinv.cli._preparing import filtered
 
 from napari_shadowinv import (
     InputError,
@@ -22,9 +19,9 @@ from napari_shadowinv import (
 )
 from napari_shadowinv._napari.widgets._fields import parsed, shown
 from napari_shadowinv._napari.widgets._forecast import BlobRecipe, ForwardJob, ToroidRecipe
-from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob, SourceJob
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._stacking import StackJob
+from napari_shadowinv._napari.widgets.estimate_source import SourceRequest
 from napari_shadowinv._napari.widgets.invert_shot import cost_of
 from napari_shadowinv._napari.widgets.line_profile import (
     Profile,
@@ -36,8 +33,30 @@ from napari_shadowinv._napari.widgets.line_profile import (
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.pipeline import Cache, run
 from napari_shadowinv.pipeline.cache import quick_source
-from napari_shadowinv.preprocessing import Radiograph, filters, isotropic_source, recipes
+from napari_shadowinv.pipeline.run import PREVIEW_SITES
+from napari_shadowinv.preprocessing import (
+    BackgroundFilter,
+    ButterworthFilter,
+    Crop,
+    Estimate,
+    GaussianEstimate,
+    HighPassFilter,
+    InterpolatedEstimate,
+    IsotropicEstimate,
+    LowPassEstimate,
+    LowPassFilter,
+    MeasuredSource,
+    PolynomialEstimate,
+    Radiograph,
+    Recipe,
+    Step,
+    TotalVariationEstimate,
+    UniformEstimate,
+    filters,
+    isotropic_source,
+)
 
 FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]
@@ -72,9 +91,9 @@ def test_what_is_no_quantity_is_refused(text: str, unit: str) -> None:
 
 def test_a_crop_gives_the_field_of_the_cropped_image(shot: Array) -> None:
     rows, columns = slice(4, 44), slice(10, 58)
-    uniform = recipes.UniformEstimate()
-    cropped = ShotJob(shot, uniform, crop=(rows, columns), options=FEW).run()
-    alone = ShotJob(shot[rows, columns], uniform, options=FEW).run()
+    crop = Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
+    cropped = run(Recipe(steps=(crop,), options=FEW), shot)
+    alone = run(Recipe(options=FEW), shot[rows, columns])
     np.testing.assert_array_equal(cropped.displacement, alone.displacement)
 
 
@@ -83,94 +102,82 @@ def test_what_the_mask_hides_does_not_matter(shot: Array) -> None:
     usable[30:36, 5:12] = False
     spoiled = shot.copy()
     spoiled[~usable] = np.nan
-    jobs = [
-        ShotJob(
-            image, recipes.LowPassEstimate(), usable, None, recipes.LowPassFilter(), options=FEW
-        )
-        for image in (spoiled, np.where(usable, shot, 1e4))
-    ]
-    first, second = (job.run() for job in jobs)
+    recipe = Recipe(steps=(LowPassFilter(),), source=LowPassEstimate(), options=FEW)
+    first, second = (
+        run(recipe, image, mask=usable) for image in (spoiled, np.where(usable, shot, 1e4))
+    )
     np.testing.assert_allclose(first.potential, second.potential, atol=1e-9)
 
 
 def test_sites_are_kept_while_the_source_stays(shot: Array) -> None:
-    cache = PlanCache()
+    cache = Cache()
     source = np.full(shot.shape, 7.0)
 
-    def run(image: Array, source: Any, **options: Any) -> None:
-        chosen = FEW.model_copy(update=options)
-        ShotJob(image, source, options=chosen, cache=cache).run()
+    def inverted(image: Array, source: Any, **options: Any) -> None:
+        run(Recipe(options=FEW.model_copy(update=options)), image, source=source, cache=cache)
 
-    run(shot, source)
-    run(shot, source)
-    run(filters.low_pass(shot, 1.0), source, tolerance=1e-2)
+    inverted(shot, source)
+    inverted(shot, source)
+    inverted(filters.low_pass(shot, 1.0), source, tolerance=1e-2)
     assert cache.hits == 2
-    run(shot, source + np.linspace(0, 1, shot.shape[1]))
-    run(shot, source, seed=1)
+    inverted(shot, source + np.linspace(0, 1, shot.shape[1]))
+    inverted(shot, source, seed=1)
     assert cache.hits == 2
 
 
 def test_other_boundaries_have_other_sites(shot: Array) -> None:
-    cache = PlanCache()
+    cache = Cache()
     for boundary in ("closed", "free"):
-        options = FEW.model_copy(update={"boundary": boundary})
-        ShotJob(shot, recipes.UniformEstimate(), options=options, cache=cache).run()
+        run(Recipe(options=FEW.model_copy(update={"boundary": boundary})), shot, cache=cache)
     assert cache.hits == 0
 
 
 def test_a_preview_starts_from_the_one_before_and_a_run_does_not() -> None:
     shot = synthetic_image(gaussian_blob((48, 60), 45.0, 8.0).displacement)
-    cache = PlanCache()
-    job = ShotJob(shot, recipes.UniformEstimate(), options=FEW, cache=cache)
+    cache = Cache()
 
-    def run(width: float, preview: bool) -> Inversion:
-        cleaned = replace(job, cleaning=recipes.LowPassFilter(width=width))
-        return (cleaned.for_preview() if preview else cleaned).run()
+    def inverted(width: float, preview: bool, cache: Cache = cache) -> Inversion:
+        recipe = Recipe(steps=(LowPassFilter(width=width),), options=FEW)
+        return run(recipe, shot, cache=cache, preview=preview)
 
-    run(1.0, preview=True)
-    warm, cold = run(1.2, preview=True), run(1.2, preview=False)
-    assert run(1.2, preview=True).report.iterations < cold.report.iterations
+    inverted(1.0, preview=True)
+    warm, cold = inverted(1.2, preview=True), inverted(1.2, preview=False)
+    assert inverted(1.2, preview=True).report.iterations < cold.report.iterations
     assert warm.report.residual <= FEW.tolerance
     np.testing.assert_allclose(warm.displacement, cold.displacement, atol=0.01)
     # The same whatever was tried before.
-    alone = replace(job, cleaning=recipes.LowPassFilter(width=1.2), cache=PlanCache()).run()
+    alone = inverted(1.2, preview=False, cache=Cache())
     # But for the last digit of the uniform source, which another filter rounds otherwise.
     np.testing.assert_allclose(cold.displacement, alone.displacement, atol=1e-11)
     assert cold.report.iterations == alone.report.iterations
-    other = cache.plan(2 + np.eye(*shot.shape), None, FEW, None, None)
+    other = cache.plan(2 + np.eye(*shot.shape), None, FEW)
     assert cache.solved(other) is None
 
 
-def test_a_filter_does_the_same_as_that_of_the_command_line(shot: Array) -> None:
+def test_a_step_does_the_same_to_image_and_source_as_alone(shot: Array) -> None:
     usable = np.ones(shot.shape, bool)
     usable[5:9, 7:12] = False
     image = np.where(usable, shot, np.nan)
     beam = 1 + np.random.default_rng(0).random(shot.shape)
-    cleaning = recipes.LowPassFilter(width=1.5)
-    mine = ShotJob(image, beam, usable, cleaning=cleaning, options=FEW).run()
-    chosen = Choices(low_pass=1.5)
-    told = filtered(Radiograph(image, mask=usable), chosen).image
-    source = filtered(Radiograph(beam, mask=usable), chosen).image
+    recipe = Recipe(steps=(LowPassFilter(width=1.5),), options=FEW)
+    mine = run(recipe, image, source=beam, mask=usable)
+    told, source = (LowPassFilter(width=1.5).filtered(one, usable) for one in (image, beam))
     alone = invert(told, source=source, mask=usable, options=FEW)
     np.testing.assert_array_equal(mine.displacement, alone.displacement)
     assert np.isfinite(told).all()
 
 
-@pytest.mark.parametrize(
-    "cleaning",
-    [recipes.HighPassFilter(), recipes.BackgroundFilter(), recipes.ButterworthFilter()],
-)
+@pytest.mark.parametrize("step", [HighPassFilter(), BackgroundFilter(), ButterworthFilter()])
 def test_what_flattens_the_image_fits_no_measured_source(
-    shot: Array, tmp_path: Path, cleaning: recipes.Filter
+    shot: Array, tmp_path: Path, step: Step
 ) -> None:
-    beam, out = np.ones(shot.shape), tmp_path / "a.shadowinv.zarr"
-    jobs = (
-        ShotJob(shot, beam, cleaning=cleaning),
-        StackJob(shot[None], out, beam, cleaning=cleaning),
-    )
-    for job in jobs:
-        with pytest.raises(InputError, match="removes the beam from the image"):
-            job.run(lambda _: None, lambda: False)
+    beam, recipe = np.ones(shot.shape), Recipe(steps=(step,), source=MeasuredSource())
+    with pytest.raises(InputError, match="removes the beam from the image"):
+        run(recipe, shot, source=beam)
+    with pytest.raises(InputError, match="removes the beam from the image"):
+        StackJob(shot[None], tmp_path / "a.shadowinv.zarr", recipe, beam).run(
+            lambda _: None, lambda: False
+        )
 
 
 def test_a_stack_tells_that_it_compiles(
@@ -178,22 +185,22 @@ def test_a_stack_tells_that_it_compiles(
 ) -> None:
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     stages: list[str] = []
-    job = StackJob(shot[None], tmp_path / "a.shadowinv.zarr", options=FEW)
+    job = StackJob(shot[None], tmp_path / "a.shadowinv.zarr", Recipe(options=FEW))
     books = job.run(lambda news: stages.append(news.stage), lambda: False)
     assert list(dict.fromkeys(stages)) == ["prepare", "compile", "shots"]
     assert books.text == "1 of 1 done"
 
 
 def test_a_uniform_source_is_the_same_after_a_filter(shot: Array) -> None:
-    cache = PlanCache()
+    cache = Cache()
     for width in (1.0, 1.5, 2.0):
-        cleaning = recipes.LowPassFilter(width=width)
-        ShotJob(shot, recipes.UniformEstimate(), cleaning=cleaning, options=FEW, cache=cache).run()
+        recipe = Recipe(steps=(LowPassFilter(width=width),), options=FEW)
+        run(recipe, shot, cache=cache)
     assert cache.hits == 2
 
 
 def test_seconds_of_all_stages_are_told(shot: Array) -> None:
-    report = ShotJob(shot, recipes.LowPassEstimate(), options=FEW).run().report
+    report = run(Recipe(source=LowPassEstimate(), options=FEW), shot).report
     assert set(report.seconds) == {"source", "prepare", "sites", "transport", "read-out"}
     assert report.seconds["sites"] > 0
     assert not report.warnings
@@ -202,48 +209,48 @@ def test_seconds_of_all_stages_are_told(shot: Array) -> None:
 def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
     near = paper_setup().model_copy(update={"pixel_size": 2e-5})
 
-    def warnings(job: ShotJob) -> str:
-        return "; ".join(job.run().report.warnings)
+    def warnings(source: Estimate, image: Array = shot, **more: Any) -> str:
+        recipe = Recipe(source=source, options=FEW, setup=near)
+        return "; ".join(run(recipe, image, **more).report.warnings)
 
-    uniform = ShotJob(shot, recipes.UniformEstimate(), options=FEW, setup=near)
-    assert "choose the source 'isotropic'" in warnings(uniform)
-    assert "isotropic" not in warnings(replace(uniform, source=recipes.IsotropicEstimate()))
+    assert "choose the source 'isotropic'" in warnings(UniformEstimate())
+    assert "isotropic" not in warnings(IsotropicEstimate())
     # Also of an estimate that was made before.
     y, x = np.mgrid[: shot.shape[0], : shot.shape[1]]
     beam = 100 * np.exp(-((y - 24) ** 2 + (x - 30) ** 2) / 2 / 8**2) + 1
     hidden = np.hypot(y - 24, x - 30) > 10
-    spot = ShotJob(beam * shot, recipes.GaussianEstimate(), hidden, options=FEW)
-    assert "the Gaussian beam rises to" in warnings(spot)
-    assert "the Gaussian beam rises to" in warnings(spot)
+    cache = Cache()
+    for _ in range(2):
+        told = warnings(GaussianEstimate(), beam * shot, mask=hidden, cache=cache)
+        assert "the Gaussian beam rises to" in told
 
 
 def test_the_axis_of_an_isotropic_source_is_in_the_middle_of_the_whole_image(shot: Array) -> None:
     near = paper_setup().model_copy(update={"pixel_size": 2e-5})
     crop = slice(20, 40), slice(5, 35)
-    job = ShotJob(shot, recipes.IsotropicEstimate(), crop=crop, options=FEW, setup=near)
+    recipe = Recipe(
+        steps=(Crop(y=(20, 40), x=(5, 35)),), source=IsotropicEstimate(), options=FEW, setup=near
+    )
     expected = isotropic_source(np.ones(shot.shape), near)[crop]
-    for one in (job, job.for_preview()):
-        source = one.run().source
+    for preview in (False, True):
+        source = run(recipe, shot, preview=preview).source
         np.testing.assert_allclose(source / source.mean(), expected / expected.mean())
 
 
 def test_the_image_itself_is_refused_as_its_source(shot: Array) -> None:
     with pytest.raises(InputError, match="the source is the image itself"):
-        ShotJob(shot, 3 * shot, options=FEW).run()
+        run(Recipe(options=FEW), shot, source=3 * shot)
 
 
 def test_a_preview_has_few_sites(shot: Array) -> None:
-    job = ShotJob(shot, recipes.UniformEstimate())
-    assert job.for_preview().options.n_sites == PREVIEW_SITES
-    assert (
-        ShotJob(shot, recipes.UniformEstimate(), options=FEW).for_preview().options.n_sites == 500
-    )
+    many = np.tile(shot, (2, 2))
+    assert many.size > PREVIEW_SITES
+    assert run(Recipe(), many, preview=True).report.n_sites == PREVIEW_SITES
+    assert run(Recipe(options=FEW), many, preview=True).report.n_sites == 500
 
 
-@pytest.mark.parametrize(
-    "estimate", [recipes.LowPassEstimate(width=40), recipes.PolynomialEstimate()]
-)
-def test_a_quick_estimate_is_close_to_the_exact_one(estimate: recipes.Estimate) -> None:
+@pytest.mark.parametrize("estimate", [LowPassEstimate(width=40), PolynomialEstimate()])
+def test_a_quick_estimate_is_close_to_the_exact_one(estimate: Estimate) -> None:
     y, x = np.mgrid[:90, :121]
     beam = 100 * np.exp(-((y - 40) ** 2 + (x - 70) ** 2) / 9000)
     usable = np.ones(beam.shape, bool)
@@ -258,7 +265,7 @@ def test_a_quick_total_variation_removes_the_object_and_keeps_the_edge() -> None
     y, x = np.mgrid[:90, :120]
     beam = np.where(x < 60, 100.0, 60.0)
     shot = beam + 30 * (np.hypot(y - 45, x - 30) < 5)
-    estimate = recipes.TotalVariationEstimate(weight=1.0)
+    estimate = TotalVariationEstimate(weight=1.0)
     quick, exact = quick_source(estimate, shot, None, 3000), estimate.source(shot, None)
     away = abs(x - 59.5) > 6
     assert abs(quick - exact)[away].max() < 3
@@ -275,14 +282,15 @@ def test_a_quick_total_variation_removes_the_object_and_keeps_the_edge() -> None
         ({"source": np.ones((20, 21))}, "must match"),
         ({"source": Path("no such file.tif")}, "no such file"),
         ({"mask": np.ones((20, 21), bool)}, "must match"),
-        ({"crop": (slice(3, 4), slice(0, 20))}, "larger rectangle"),
-        ({"source": recipes.InterpolatedEstimate()}, "without a source mask"),
+        ({"recipe": Recipe(steps=(Crop(y=(3, 4)),))}, "larger rectangle"),
+        ({"recipe": Recipe(source=InterpolatedEstimate())}, "without a source mask"),
     ],
 )
 def test_a_mistake_gets_a_sentence(change: dict[str, Any], words: str) -> None:
-    good = {"image": np.ones((20, 20)), "source": recipes.UniformEstimate()}
+    good = {"recipe": Recipe(), "image": np.ones((20, 20))}
+    given = {**good, **change}
     with pytest.raises((InputError, OSError), match=words):
-        ShotJob(**{**good, **change}).run()
+        run(given.pop("recipe"), given.pop("image"), **given)
 
 
 def test_a_job_ends_when_it_is_asked_to(shot: Array) -> None:
@@ -295,26 +303,34 @@ def test_a_job_ends_when_it_is_asked_to(shot: Array) -> None:
             stop.set()
 
     with pytest.raises(InversionCancelled):
-        ShotJob(shot, recipes.UniformEstimate(), options=FEW).run(hear, stop.is_set)
+        run(Recipe(options=FEW), shot, on_progress=hear, should_stop=stop.is_set)
     assert "read-out" not in stages
 
 
 LARGE = np.random.default_rng(0).normal(100, 5, (1024, 1024))
 
 
+def running(recipe: Recipe) -> Any:
+    return lambda hear, stop: run(recipe, LARGE, on_progress=hear, should_stop=stop)
+
+
 @pytest.mark.parametrize(
     "job",
     [
-        lambda tmp_path: SourceJob(LARGE, recipes.TotalVariationEstimate()),
-        lambda tmp_path: ShotJob(LARGE, recipes.TotalVariationEstimate()),
-        lambda tmp_path: ShotJob(
-            LARGE, recipes.UniformEstimate(), cleaning=recipes.BackgroundFilter(degree=10)
+        lambda tmp_path: (
+            SourceRequest(TotalVariationEstimate(), Radiograph(LARGE), None, {}, preview=False).run
         ),
-        lambda tmp_path: StackJob(
-            LARGE[None], tmp_path / "a.shadowinv.zarr", recipes.TotalVariationEstimate()
+        lambda tmp_path: running(Recipe(source=TotalVariationEstimate())),
+        lambda tmp_path: running(Recipe(steps=(BackgroundFilter(degree=10),))),
+        lambda tmp_path: (
+            StackJob(
+                LARGE[None],
+                tmp_path / "a.shadowinv.zarr",
+                Recipe(source=TotalVariationEstimate()),
+            ).run
         ),
     ],
-    ids=["source", "shot", "cleaning", "stack"],
+    ids=["source", "shot", "step", "stack"],
 )
 def test_a_megapixel_is_let_go_within_a_second(job: Any, tmp_path: Path) -> None:
     stop = threading.Event()
@@ -322,7 +338,7 @@ def test_a_megapixel_is_let_go_within_a_second(job: Any, tmp_path: Path) -> None
 
     def work() -> None:
         with pytest.raises(InversionCancelled):
-            job(tmp_path).run(lambda _: None, stop.is_set)
+            job(tmp_path)(lambda _: None, stop.is_set)
         ended.append(time.perf_counter())
 
     thread = threading.Thread(target=work)
@@ -336,7 +352,8 @@ def test_a_megapixel_is_let_go_within_a_second(job: Any, tmp_path: Path) -> None
 
 
 def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Path) -> None:
-    job = StackJob(np.stack([shot, shot]), tmp_path / "a.shadowinv.zarr", options=FEW, workers=1)
+    stack, out = np.stack([shot, shot]), tmp_path / "a.shadowinv.zarr"
+    job = StackJob(stack, out, Recipe(options=FEW), workers=1)
     counted: list[tuple[int | None, int]] = []
     job.run(lambda _: None, lambda: False, lambda index: counted.append((index, job.books.ended)))
     assert counted == [(0, 0), (1, 1)]

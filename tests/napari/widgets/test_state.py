@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,9 @@ from napari_shadowinv._napari.layer_metadata import (
     source_of,
 )
 from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.widgets import invert_shot
 from napari_shadowinv._napari.widgets._forms import dump_toml
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
-from napari_shadowinv._napari.widgets._jobs import ShotJob
 from napari_shadowinv._napari.widgets._stacking import StackJob
 from napari_shadowinv._napari.widgets.estimate_source import EstimateSource
 from napari_shadowinv._napari.widgets.forward_model import ForwardModel
@@ -34,7 +33,8 @@ from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
-from napari_shadowinv.preprocessing import PolynomialEstimate
+from napari_shadowinv.pipeline.run import run as run_recipe
+from napari_shadowinv.preprocessing import Crop, PolynomialEstimate, Radiograph, Recipe
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
@@ -281,12 +281,12 @@ def test_the_source_that_was_chosen_comes_back_after_a_sample(
     viewer: ViewerModel, opened: Any, plain: Any
 ) -> None:
     tool = opened(InvertShot)
-    tool.source.picker.set_kind("low_pass")
+    tool.source.picker.set_kind("low-pass")
     *_, sample = viewer.open_sample(PLUGIN, "toroid")
     tool.image.layer = sample
     assert tool.source.picker.kind == "own"
     tool.image.layer = plain
-    assert tool.source.picker.kind == "low_pass"
+    assert tool.source.picker.kind == "low-pass"
 
 
 # The two masks
@@ -306,21 +306,20 @@ def test_a_source_mask_hides_the_object_from_the_estimate_alone(
     hump: tuple[Array, Array, Array],
 ) -> None:
     shot, potential, there = hump
-    job = ShotJob(
-        shot,
-        PolynomialEstimate(degree=2),
-        source_mask=~there,
-        options=InversionOptions(n_sites=1500),
-    )
-    found = job.run()
+    recipe = Recipe(source=PolynomialEstimate(degree=2), options=InversionOptions(n_sites=1500))
+    found = run_recipe(recipe, shot, source_mask=~there)
     assert found.mask.all()
     assert np.ptp(found.potential) == pytest.approx(np.ptp(potential), rel=0.1)
-    cropped = ShotJob(
-        shot, PolynomialEstimate(degree=2), source_mask=~there, crop=(slice(2, 62), slice(4, 70))
-    )
-    assert cropped._image_and_masks()[2].shape == (60, 66)
+    cropped = Recipe(steps=(Crop(y=(2, 62), x=(4, 70)),))
+    moved = cropped.moved(Radiograph(shot, source_mask=~there)).source_mask
+    np.testing.assert_array_equal(moved, ~there[2:62, 4:70])
     with pytest.raises(InputError, match="source mask has shape"):
-        ShotJob(shot, PolynomialEstimate(degree=2), source_mask=there[1:]).run()
+        run_recipe(recipe, shot, source_mask=there[1:])
+
+
+def the_masks(tool: Any) -> Any:
+    """What holds the masks that a run would be given."""
+    return tool.request().shot if isinstance(tool, InvertShot) else tool.request().job
 
 
 @pytest.mark.parametrize("kind", [InvertShot, InvertStack])
@@ -341,13 +340,13 @@ def test_both_masks_can_be_chosen(
     tool.source_masks.layer.data = there.astype(int)
     tool.masks.paint()
     tool.masks.layer.data[:3, :3] = 1
-    job = tool.request().job
-    np.testing.assert_array_equal(job.source_mask, ~there)
-    assert (~job.mask).sum() == 9
+    given = the_masks(tool)
+    np.testing.assert_array_equal(given.source_mask, ~there)
+    assert (~given.mask).sum() == 9
     # A mask that is not shown has no say.
     tool.source.picker.set_kind("uniform")
     assert tool.source_masks.isHidden()
-    assert tool.request().job.source_mask is None
+    assert the_masks(tool).source_mask is None
 
 
 def test_a_mask_over_the_object_is_refused(
@@ -393,9 +392,8 @@ def test_a_stack_is_inverted_with_both_masks(
     job = StackJob(
         np.stack([shot]),
         tmp_path / "a.shadowinv.zarr",
-        PolynomialEstimate(degree=2),
+        Recipe(source=PolynomialEstimate(degree=2), options=InversionOptions(n_sites=1500)),
         source_mask=~there,
-        options=InversionOptions(n_sites=1500),
         scheduler="synchronous",
     )
     job.run(lambda _: None, lambda: False)
@@ -438,7 +436,9 @@ def test_a_result_says_where_everything_came_from(
     assert told["source_origin"] == rows["Source"]
     assert told["source_mask_origin"] == rows["Source mask"]
     assert dict(result_of(field).attributes) == told  # type: ignore[union-attr]
-    assert json.loads(told["source_preparation"])["source_from"] == "polynomial_source"
+    provenance = result_of(field).content.provenance  # type: ignore[union-attr]
+    assert provenance.recipe.source == PolynomialEstimate()
+    assert provenance.source_mask.mask() is not None
 
 
 def test_the_report_of_one_run_does_not_stand_beside_another(
@@ -477,10 +477,10 @@ def test_the_report_of_one_run_does_not_stand_beside_another(
 def test_what_the_core_refuses_stays_in_the_widget(
     opened: Any, plain: Any, qtbot: Any, told: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*_: Any) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
         raise InputError("both masks hide the object")
 
-    monkeypatch.setattr(ShotJob, "run", refuse)
+    monkeypatch.setattr(invert_shot, "run", refuse)
     tool = opened(InvertShot)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)

@@ -26,7 +26,7 @@ from napari_shadowinv.physics.phantoms import (
 )
 from napari_shadowinv.physics.projection import project
 from napari_shadowinv.physics.setup import Deflector, displacement_from_potential
-from napari_shadowinv.preprocessing import sources
+from napari_shadowinv.preprocessing import polynomial_source
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
@@ -75,7 +75,7 @@ def test_an_estimate_becomes_a_layer_after_its_preview(
     source = window.layers["shot source"]
     usable = np.ones(shot.shape, bool)
     usable[10:20, 20:30] = False
-    expected = sources.polynomial_source(shot, degree=2, mask=usable)
+    expected = polynomial_source(shot, degree=2, mask=usable)
     np.testing.assert_allclose(source.data, expected)
     assert tuple(source.scale) == (2, 2)
     assert tuple(source.translate) == (5, 7)
@@ -241,7 +241,7 @@ def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
     np.testing.assert_allclose(layer.data, synthetic_image(phantom.displacement, dark))
     np.testing.assert_array_equal(source_of(layer), dark)
     shot = open_widget("Invert shot")
-    np.testing.assert_array_equal(shot.source.source(shot.image.layer), dark)
+    np.testing.assert_array_equal(shot.source.measured(shot.image.layer).image, dark)
     assert told == []
 
 

@@ -245,6 +245,27 @@ class _Quantity(Editor):
         self.inner.setCursorPosition(0)
 
 
+class _Range(Editor):
+    """First pixel and the one after the last, as text; empty for all."""
+
+    def __init__(self) -> None:
+        super().__init__(QLineEdit())
+        self.inner.setPlaceholderText("all, or such as 10:200")
+        self.inner.setMinimumWidth(80)
+        self.inner.editingFinished.connect(self.changed)
+
+    def value(self) -> str | None:
+        """The text, for the model to understand or refuse."""
+        return self.inner.text().strip() or None
+
+    def set_value(self, value: Any) -> None:
+        if not isinstance(value, str):
+            first, last = (0, None) if value is None else value
+            value = f"{first}:{'' if last is None else last}" if first or last else ""
+        self.inner.setText(value)
+        self.changed.emit()
+
+
 class _Optional(Editor):
     """Another editor behind a check box; None while it is not checked."""
 
@@ -307,6 +328,8 @@ def _plain_editor(kind: Any, field: FieldInfo) -> Editor:
         return _Integer(*_integer_bounds(field))
     if kind is float:
         return _Quantity(unit_of_title(field.title or "")[1])
+    if get_origin(kind) is tuple:
+        return _Range()
     raise TypeError(f"no editor for a field of type {kind}")
 
 

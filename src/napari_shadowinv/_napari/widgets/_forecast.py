@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field
 
-from napari_shadowinv._napari.widgets._jobs import plane_of
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.pipeline.run import plane_of
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.phantoms import Phantom

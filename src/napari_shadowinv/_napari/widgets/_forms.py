@@ -43,7 +43,7 @@ Kinds = dict[str, tuple[str, Callable[[], type[BaseModel]] | None]]
 PROBLEM_STYLE = "color: #d9822b;"
 _LABEL_WIDTH = 54
 _INDENT = 12
-_TOML = "TOML (*.toml)"
+TOML = "TOML (*.toml)"
 # Of these optional fields only one may be given: checking one unchecks the other.
 _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
 
@@ -354,7 +354,7 @@ class TomlButtons(QWidget):
     def _load(self) -> None:
         from napari_shadowinv.io import read_toml
 
-        path, _ = QFileDialog.getOpenFileName(self, f"Load {self._what}", "", _TOML)
+        path, _ = QFileDialog.getOpenFileName(self, f"Load {self._what}", "", TOML)
         if path:
             self._take(read_toml(path), path)
 
@@ -364,7 +364,7 @@ class TomlButtons(QWidget):
         if not values:
             raise InputError(f"there is no {self._what} to save: choose one first")
         path, _ = QFileDialog.getSaveFileName(
-            self, f"Save {self._what}", f"{self._what}.toml", _TOML
+            self, f"Save {self._what}", f"{self._what}.toml", TOML
         )
         if path:
             dump_toml(values, path)

@@ -1,18 +1,17 @@
 """What an inversion is given, beside the shots.
 
 - the experiment's geometry: `SetupPicker`; the undisturbed beam: `SourcePicker`
-- what is done to images first: `CleaningSection`; how to invert: `OptionsForm`
+- how to invert: `OptionsForm`
 - all of these and the masks, as the widgets for shots and for stacks have them: `InversionInputs`
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from numpy.typing import ArrayLike
 from pydantic import BaseModel
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QWidget
@@ -29,6 +28,7 @@ from napari_shadowinv._napari.layer_metadata import (
     setup_origin_of,
     source_of,
 )
+from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets._forms import (
     ModelForm,
     ModelPicker,
@@ -37,30 +37,42 @@ from napari_shadowinv._napari.widgets._forms import (
     TomlButtons,
     kinds_of,
     labelled,
-    section,
     wrapping_label,
 )
-from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES
-from napari_shadowinv._napari.widgets._layers import LayerPicker, MaskPicker, image_of
+from napari_shadowinv._napari.widgets._layers import (
+    LayerPicker,
+    MaskPicker,
+    crop_of,
+    image_of,
+    warnings_of,
+)
 from napari_shadowinv._napari.widgets._qt import column
+from napari_shadowinv._napari.widgets._recipes import RecipeButton
 from napari_shadowinv._napari.widgets._results import Origins
+from napari_shadowinv._napari.widgets._steps import StepsSection
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing import ESTIMATES, FILTERS, Estimate, Filter, check_masks
+from napari_shadowinv.pipeline.run import PREVIEW_SITES
+from napari_shadowinv.preprocessing import (
+    ESTIMATES,
+    Crop,
+    Estimate,
+    MeasuredSource,
+    Radiograph,
+    Recipe,
+    Step,
+    check_masks,
+)
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
-
-    pass
 
 _NONE = "none"
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
 _OWN, _LAYER, _FILE = "own", "layer", "file"
-# Estimates that do not look at the shot, so that no mask can mislead them.
-_BLIND = ("uniform", "isotropic")
 
 
 def _proton() -> type[BaseModel]:
@@ -111,7 +123,7 @@ class SetupPicker(QWidget):
             "0.0013.</qt>"
         )
         self.note = wrapping_label()
-        self.files = TomlButtons("setup", self._to_save, self._take)
+        self.files = TomlButtons("setup", self._to_save, self.load)
         column(self, self.picker, self.note, self.files)
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
@@ -231,7 +243,8 @@ class SetupPicker(QWidget):
         setup = self.setup()
         return {} if setup is None else setup.model_dump()
 
-    def _take(self, loaded: dict[str, object], path: str) -> None:
+    def load(self, loaded: dict[str, Any], path: str) -> None:
+        """Show a setup that a file holds."""
         from napari_shadowinv.physics.setup import setup_from_dict
 
         values = setup_from_dict(loaded, path).model_dump()
@@ -245,6 +258,7 @@ class SourcePicker(RowPicker):
     def __init__(self, viewer: Any) -> None:
         self._image: Any = None
         self._before_own = "uniform"
+        self._loaded = MeasuredSource()
         tip = "Image layer of the undisturbed beam."
         self.layers = LayerPicker(viewer, ("image",), tip, "choose a layer", self._offers)
         self.file = PathEdit("Image of the undisturbed beam")
@@ -269,7 +283,12 @@ class SourcePicker(RowPicker):
     @property
     def is_guessed(self) -> bool:
         """Whether it is an estimate from the shot, which a mask can keep from the object."""
-        return self.picker.kind in ESTIMATES and self.picker.kind not in _BLIND
+        return self.picker.kind in ESTIMATES and ESTIMATES[self.picker.kind].uses_mask
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it is the one that came with the shot."""
+        return self.picker.kind == _OWN
 
     @property
     def described(self) -> str:
@@ -284,8 +303,36 @@ class SourcePicker(RowPicker):
         assert isinstance(model, Estimate)
         return f"estimate: {model.described}" if self.is_guessed else model.described
 
-    def source(self, image_layer: Any) -> ArrayLike | Path | Estimate:
-        """The chosen source of an image layer, as a job takes it, or an `InputError`."""
+    def chosen(self) -> Estimate | MeasuredSource:
+        """What a recipe says of the source, or an `InputError`."""
+        model = self.picker.model()
+        if isinstance(model, Estimate):
+            return model
+        if self.picker.kind != _FILE:
+            return MeasuredSource()
+        if not self.file.path:
+            raise InputError("no source file is selected: choose one, or choose another source")
+        if self._loaded.file is not None and str(self._loaded.file) == self.file.path:
+            return self._loaded  # the form has no name for what is in the file
+        return MeasuredSource(file=Path(self.file.path))
+
+    def show(self, source: Any) -> None:
+        """Show the source of a recipe; None for uniform."""
+        if isinstance(source, Estimate):
+            name = source.name()
+            self.restore({"kind": name, "values": {name: source.values()}})
+        elif source is None:
+            self.picker.set_kind("uniform")
+        elif source.file is None:
+            self.picker.set_kind(_OWN)
+        else:
+            self._loaded = source
+            self.file.edit.setText(str(source.file))
+            self.picker.set_kind(_FILE)
+            self.changed.emit()
+
+    def measured(self, image_layer: Any) -> Radiograph | None:
+        """The measured source of an image layer unless it is a file, or an `InputError`."""
         kind = self.picker.kind
         if kind == _LAYER:
             if self.layers.layer is None:
@@ -293,21 +340,16 @@ class SourcePicker(RowPicker):
                     "no source layer is selected: choose one below 'a layer', or choose another "
                     "source"
                 )
-            return image_of(self.layers.layer, "source image")
-        if kind == _FILE:
-            if not self.file.path:
-                raise InputError("no source file is selected: choose one, or choose another source")
-            return Path(self.file.path)
+            beam = radiograph_of(self.layers.layer, image_of(self.layers.layer, "source image"))
+            return replace(beam, warnings=warnings_of(self.layers.layer))
         if kind == _OWN:
             own = source_of(image_layer)
             if own is None:
                 raise InputError(
                     f"'{image_layer.name}' has no source of its own: choose another kind of source"
                 )
-            return own
-        model = self.picker.model()
-        assert isinstance(model, Estimate)
-        return model
+            return radiograph_of(image_layer, own)
+        return None
 
     def check(self, mask: BoolArray | None) -> None:
         """Refuse a mask over what the chosen layer was estimated without: the object."""
@@ -361,32 +403,6 @@ class SourcePicker(RowPicker):
         return known[0] if len(known) == 1 else None
 
 
-class CleaningSection(QWidget):
-    """A choice of filters, folded away under a title that tells which."""
-
-    changed = Signal()
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.picker = ModelPicker("Filter", {"none": ("nothing", None), **kinds_of(FILTERS)})
-        self.folded = section("", self.picker)
-        column(self, self.folded)
-        self.picker.changed.connect(self._on_change)
-        self._on_change()
-
-    def model(self) -> Filter | None:
-        model = self.picker.model()
-        assert model is None or isinstance(model, Filter)
-        return model
-
-    def _on_change(self) -> None:
-        # A filter must not work unseen in a folded section.
-        title = f"Filter first: {self.picker.choice.currentText()}"
-        if self.folded.text() != title:
-            self.folded.setText(title)
-        self.changed.emit()
-
-
 class OptionsForm(ModelForm):
     def __init__(self) -> None:
         super().__init__(InversionOptions, first={"n_sites": PREVIEW_SITES})
@@ -405,6 +421,9 @@ class OptionsForm(ModelForm):
 class InversionInputs:
     """The controls that panels for a shot and for a stack have in common."""
 
+    viewer: Any
+    crop: Any = None  # a picker, where a rectangle can be drawn
+
     def make_inputs(
         self, viewer: Any, image: Callable[[], Any], kinds: tuple[str, ...], tips: tuple[str, str]
     ) -> None:
@@ -413,14 +432,16 @@ class InversionInputs:
         self.masks = MaskPicker(viewer, image, kinds, tips[0])
         self.source_masks = MaskPicker(viewer, image, kinds, tips[1], "Source mask")
         self.setup = SetupPicker()
-        self.cleaning = CleaningSection()
+        self.steps = StepsSection()
         self.options = OptionsForm()
+        self.recipes = RecipeButton(self)
+        self.chosen_image = image
         self.inputs = (
             self.source,
             self.source_masks,
             self.masks,
             self.setup,
-            self.cleaning,
+            self.steps,
             self.options,
         )
         self.source.changed.connect(self._show_source_mask)
@@ -433,11 +454,33 @@ class InversionInputs:
         return {
             "source": self.source,
             "setup": self.setup,
-            "cleaning": self.cleaning.picker,
+            "steps": self.steps,
             "options": self.options,
             "painted_is_unusable": self.masks,
             "painted_is_object": self.source_masks,
         }
+
+    def all_steps(self) -> tuple[Step, ...]:
+        """What is done to an image first; or an `InputError`."""
+        part = None if self.crop is None else crop_of(self.crop.layer, self.chosen_image())
+        if part is None:
+            return self.steps.steps()
+        rows, columns = part
+        crop = Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
+        return (crop, *self.steps.steps())
+
+    def hidden_from_source(self, image: Any) -> BoolArray | None:
+        """False where the object is, as far as the source is estimated without it."""
+        return self.source_masks.usable(image) if self.source.is_guessed else None
+
+    def recipe(self) -> Recipe:
+        """What the controls ask for, but for masks and layers; or an `InputError`."""
+        return Recipe(
+            steps=self.all_steps(),
+            source=self.source.chosen(),
+            setup=self.setup.setup(),
+            options=self.options.model(),
+        )
 
     def companions(self, image: Any, *others: Any) -> tuple[Any, ...]:
         """Layers that lie on an image: masks and source, and others if there are any."""

@@ -169,13 +169,25 @@ def _in_pixels(layer: Any, image: Any) -> list[FloatArray]:
     ]
 
 
-def new_mask(viewer: Any, image: Any, title: str) -> Any:
-    """Add labels of an image's or a stack's size, ready to paint; their name ends with `title`."""
-    shape = (image_of(image) if image is None or image.ndim != 3 else stack_of(image)).shape[-2:]
-    labels = _added(viewer, image, "labels", np.zeros(shape, np.uint8), title)
+def new_mask(viewer: Any, image: Any, title: str, painted: BoolArray | None = None) -> Any:
+    """Add labels of an image's or a stack's size, painted or ready to be; named with `title`."""
+    if painted is not None:
+        labels = _added(viewer, image, "labels", painted.astype(np.uint8), title)
+    else:
+        is_stack = image is not None and image.ndim == 3
+        shape = (stack_of(image) if is_stack else image_of(image)).shape[-2:]
+        labels = _added(viewer, image, "labels", np.zeros(shape, np.uint8), title)
+        labels.mode = "paint"
     labels.metadata = mark(MASK, "")
-    labels.mode = "paint"
     return labels
+
+
+def new_crop(viewer: Any, image: Any, part: tuple[slice, slice]) -> Any:
+    """Add shapes with a rectangle around rows and columns of an image."""
+    shapes = new_shapes(viewer, image, "crop", "pan_zoom")
+    (top, bottom), (left, right) = ((one.start - 0.5, one.stop - 0.5) for one in part)
+    shapes.add_rectangles(np.array([[top, left], [top, right], [bottom, right], [bottom, left]]))
+    return shapes
 
 
 def new_shapes(viewer: Any, image: Any, title: str, mode: str) -> Any:
@@ -191,7 +203,9 @@ def new_shapes(viewer: Any, image: Any, title: str, mode: str) -> Any:
 def _added(viewer: Any, image: Any, kind: str, data: Any, title: str, **keywords: Any) -> Any:
     from napari.layers import Layer
 
-    keywords |= {"name": f"{image.name} {title}", **frame_of(image).keywords()}
+    keywords["name"] = title
+    if image is not None:  # files, whose images are no layers
+        keywords |= {"name": f"{image.name} {title}", **frame_of(image).keywords()}
     layer = Layer.create(data, keywords, kind)
     viewer.layers.append(layer)
     viewer.layers.selection.active = layer
@@ -291,7 +305,7 @@ class MaskPicker(QWidget):
         title: str = "Mask",
     ) -> None:
         super().__init__()
-        self._viewer, self._image, self._title = viewer, image, title
+        self._viewer, self._image, self.title = viewer, image, title
         self.layers = LayerPicker(viewer, kinds, f"<qt>{tip}</qt>", "none", may_be_mask)
         self.painted_is_unusable = QCheckBox("painted = unusable")
         self.painted_is_unusable.setChecked(True)
@@ -345,7 +359,7 @@ class MaskPicker(QWidget):
 
     @notify_errors
     def paint(self) -> None:
-        self.layer = new_mask(self._viewer, self._image(), self._title.lower())
+        self.layer = new_mask(self._viewer, self._image(), self.title.lower())
 
 
 class LayerWatch(QObject):

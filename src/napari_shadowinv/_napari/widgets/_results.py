@@ -23,17 +23,19 @@ from napari_shadowinv._napari.widgets._qt import timer
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
+    from napari_shadowinv.preprocessing import Recipe
 
 _VISIBLE = 0.02  # of what limits span
 
 
-def result_frame(image: Any, setup: Any | None, crop: tuple[slice, slice] | None) -> Frame:
+def result_frame(image: Any, recipe: Recipe) -> Frame:
     """Frame of a result, so that it lies on its image once that is placed by the setup."""
     frame = frame_of(image)
-    if setup is not None:
-        upright = frame_for(image.data.shape, setup)
+    if recipe.setup is not None:
+        upright = frame_for(image.data.shape, recipe.setup)
         frame = replace(frame, scale=upright.scale, units=upright.units)
-    return frame if crop is None else frame.cropped(crop[0].start, crop[1].start)
+    height, width = image.data.shape[-2:]
+    return frame.beneath(recipe.matrix((height, width)))
 
 
 def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> None:

@@ -20,12 +20,10 @@ from napari_shadowinv._napari.widgets._results import Origins, result_frame
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing import Estimate, Filter, UniformEstimate
+from napari_shadowinv.preprocessing import Recipe
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
-    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.stack import RunProgress
 
 
@@ -59,17 +57,15 @@ class StackJob:
 
     shots: Any  # an array (shot, y, x), also a lazy one, or files
     out: Path
-    source: ArrayLike | Path | Estimate = field(default_factory=UniformEstimate)
+    recipe: Recipe = field(default_factory=Recipe)
+    source: ArrayLike | None = None  # measured; also one for each shot
     mask: BoolArray | None = None
-    cleaning: Filter | None = None
-    options: InversionOptions = field(default_factory=InversionOptions)
-    setup: Setup | None = None
+    source_mask: BoolArray | None = None
     scheduler: str = "threads"
     workers: int | None = None
     overwrite: bool = False
     redo_failed: bool = False
     books: RunBooks = field(default_factory=RunBooks)
-    source_mask: BoolArray | None = None
 
     def run(
         self,
@@ -102,12 +98,10 @@ class StackJob:
         run_stack(
             self.shots,
             self.out,
+            recipe=self.recipe,
             source=self.source,
             mask=self.mask,
             source_mask=self.source_mask,
-            filters=() if self.cleaning is None else (self.cleaning,),
-            options=self.options,
-            setup=self.setup,
             scheduler=self.scheduler,
             workers=self.workers,
             overwrite=self.overwrite,
@@ -226,9 +220,9 @@ def _widened(limits: tuple[float, float], plane: AnyArray) -> tuple[float, float
     return low, high
 
 
-def place_on(layer: Any, setup: Any) -> dict[str, Any]:
+def place_on(layer: Any, recipe: Recipe) -> dict[str, Any]:
     """Keywords that lay results on their stack, once that is placed by the setup."""
-    keywords = result_frame(layer, setup, None).keywords(stacked=True)
+    keywords = result_frame(layer, recipe).keywords(stacked=True)
     first = {"scale": layer.scale, "translate": layer.translate, "units": layer.units}
     for name, values in first.items():
         keywords[name] = (values[0], *keywords[name][1:])

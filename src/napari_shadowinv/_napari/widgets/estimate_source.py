@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.frame import frame_of
@@ -12,26 +13,37 @@ from napari_shadowinv._napari.layer_metadata import (
     setup_of,
     setup_origin_of,
 )
+from napari_shadowinv._napari.shots import loaded
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
-from napari_shadowinv._napari.widgets._jobs import SourceJob
 from napari_shadowinv._napari.widgets._layers import LayerWatch, MaskPicker, image_of, shot_picker
 from napari_shadowinv._napari.widgets._panels import LivePanel, RunPanel
-from napari_shadowinv._system.progress import OnProgress, ShouldStop
-from napari_shadowinv.preprocessing import ESTIMATES
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.pipeline import Cache
+from napari_shadowinv.pipeline.run import PREVIEW_PIXELS
+from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Radiograph, estimated_source
 
 if TYPE_CHECKING:
     import napari
 
 
 @dataclass(frozen=True, eq=False)
-class _Request:
-    job: SourceJob
+class SourceRequest:
+    estimate: Estimate
+    shot: Radiograph  # its image may be not read yet
     image: Any
     made_from: dict[str, str]
     preview: bool
 
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
-        return self.job.run(on_progress, should_stop)
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FloatArray:
+        report = Reporter(on_progress, should_stop)
+        report("source", 0, None, self.estimate.title)
+        shot = loaded(self.shot, "the image")
+        most_pixels = PREVIEW_PIXELS if self.preview else None
+        by = partial(Cache().source, self.estimate, most_pixels=most_pixels)
+        source = estimated_source(self.estimate, shot, should_stop, by=by)
+        report("source", 1, 1)
+        return source
 
 
 class EstimateSource(LivePanel):
@@ -53,7 +65,7 @@ class EstimateSource(LivePanel):
             "Labels or shapes marking pixels that the estimate ignores.",
         )
         self.method = ModelPicker("Method", kinds_of(ESTIMATES))
-        self.method.set_kind("total_variation")
+        self.method.set_kind("total-variation")
         self.live.setToolTip("Update the estimate after every change.")
         for row in (
             labelled("Image", self.image),
@@ -73,7 +85,7 @@ class EstimateSource(LivePanel):
     def parts(self) -> dict[str, Any]:
         return {"method": self.method, "painted_is_unusable": self.masks}
 
-    def request(self, preview: bool = False) -> _Request:
+    def request(self, preview: bool = False) -> SourceRequest:
         layer: Any = self.image.layer
         image = image_of(layer)
         mask = self.masks.usable(layer)
@@ -82,10 +94,11 @@ class EstimateSource(LivePanel):
         made_from = {"image": layer.name, "estimate": estimate.described}
         if mask is not None:
             made_from["source_mask"] = self.masks.described(layer)
-        job = SourceJob(image, estimate, mask, quick=preview)
-        return _Request(job, layer, made_from, preview)
+        return SourceRequest(
+            estimate, Radiograph(image, source_mask=mask), layer, made_from, preview
+        )
 
-    def show_result(self, value: Any, request: _Request) -> None:
+    def show_result(self, value: Any, request: SourceRequest) -> None:
         layer, preview = request.image, request.preview
         described = (
             value,
@@ -97,7 +110,7 @@ class EstimateSource(LivePanel):
                     setup_of(layer),
                     setup_origin=setup_origin_of(layer),
                     made_from=request.made_from,
-                    source_mask=request.job.mask,
+                    source_mask=request.shot.source_mask,
                 ),
                 "colormap": layer.colormap.name,
                 "contrast_limits": tuple(layer.contrast_limits),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from napari.utils.notifications import show_warning
 
 from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, role_of
+from napari_shadowinv._napari.shots import loaded, radiograph_of
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
     labelled,
@@ -18,11 +18,9 @@ from napari_shadowinv._napari.widgets._forms import (
     wrapping_label,
 )
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
-from napari_shadowinv._napari.widgets._jobs import PREVIEW_SITES, PlanCache, ShotJob
 from napari_shadowinv._napari.widgets._layers import (
     LayerPicker,
     LayerWatch,
-    crop_of,
     image_of,
     new_shapes,
     shot_picker,
@@ -34,9 +32,10 @@ from napari_shadowinv._napari.widgets._results import Origins, place_together, r
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.files import text_of
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
-from napari_shadowinv.pipeline.cache import SourceCache
+from napari_shadowinv.pipeline import Cache
+from napari_shadowinv.pipeline.run import PREVIEW_SITES, run
+from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 if TYPE_CHECKING:
     import napari
@@ -111,30 +110,43 @@ class _Answer:
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    job: ShotJob
+    recipe: Recipe
+    shot: Radiograph  # with masks, its image and that of the source not read yet
+    source: Radiograph | None
+    cache: Cache
     image: Any
     companions: tuple[Any, ...]
-    setup: Any
     frame: Frame
     origins: Origins
     preview: bool
 
+    def inversion(
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+    ) -> Inversion:
+        source = None if self.source is None else loaded(self.source, "the source")
+        return run(
+            self.recipe,
+            loaded(self.shot, "the image"),
+            source=source,
+            on_progress=on_progress,
+            should_stop=should_stop,
+            cache=self.cache,
+            preview=self.preview,
+        )
+
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> _Answer:
         """Invert the shot and describe its layers, all of it beside the window."""
-        inversion = self.job.run(on_progress, should_stop)
+        inversion = self.inversion(on_progress, should_stop)
         from napari_shadowinv._napari.layers import result_layers
 
         name = f"{self.image.name} preview" if self.preview else self.image.name
-        file = self.image.source.path
-        told = {} if file is None else {"input_file": text_of(Path(file).name)}
-        attributes = {**told, **self.job.attributes(), **self.origins.attributes()}
-        result = Result(inversion, self.setup, attributes)
+        result = Result(inversion, inversion.setup, self.origins.attributes())
         described = result_layers(result, self.frame, name)
-        bare = self.job.source_mask
+        bare = self.shot.source_mask
         for _, keywords, _ in described:
             if role_of(keywords) == SOURCE and bare is not None:
-                part = bare if self.job.crop is None else bare[self.job.crop]
-                keywords["metadata"][KEY]["source_mask"] = part
+                hidden = Radiograph(bare.astype(float), source_mask=bare)
+                keywords["metadata"][KEY]["source_mask"] = self.recipe.moved(hidden).source_mask
         if self.preview:
             described = [layer for layer in described if role_of(layer[1]) in _PREVIEW_ROLES]
         return _Answer(inversion, described)
@@ -149,7 +161,7 @@ class InvertShot(InversionInputs, LivePanel):
             "invert-shot",
             RunPanel("Invert shot", "Run", "Invert the image and show the result as layers."),
         )
-        self._cache, self._estimates = PlanCache(), SourceCache()
+        self._cache = Cache()
         self._build()
         self._connect()
         self.restore_last()
@@ -188,8 +200,9 @@ class InvertShot(InversionInputs, LivePanel):
             self.masks,
             labelled("Crop", with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)),
             self.setup,
-            self.cleaning,
+            self.steps,
             section("Options", self.options),
+            self.recipes,
             self.live,
             self.keep_earlier,
             self.cost,
@@ -214,28 +227,23 @@ class InvertShot(InversionInputs, LivePanel):
     def request(self, preview: bool = False) -> _Request:
         layer: Any = self.image.layer
         image = image_of(layer)
-        setup = self.setup.setup()
+        recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)
-        job = ShotJob(
-            image=image,
-            source=self.source.source(layer),
-            mask=mask,
-            source_mask=self.source_masks.usable(layer) if self.source.is_guessed else None,
-            crop=crop_of(self.crop.layer, layer),
-            cleaning=self.cleaning.model(),
-            options=self.options.model(),  # type: ignore[arg-type]
-            cache=self._cache,
-            estimates=self._estimates,
-            setup=setup,
+        shot = replace(
+            radiograph_of(layer, image),
             warnings=warnings_of(layer),
+            mask=mask,
+            source_mask=self.hidden_from_source(layer),
         )
         return _Request(
-            job.for_preview() if preview else job,
+            recipe,
+            shot,
+            self.source.measured(layer),
+            self._cache,
             layer,
             self.companions(layer, self.crop.layer),
-            setup,
-            result_frame(layer, setup, job.crop),
+            result_frame(layer, recipe),
             self.origins(layer, layer.name),
             preview,
         )
@@ -246,8 +254,8 @@ class InvertShot(InversionInputs, LivePanel):
             show_warning(
                 f"'{image.name}' was deleted during its inversion; the result is shown anyway"
             )
-        if request.setup is not None:
-            place_together(self.viewer, image, request.setup, request.companions)
+        if request.recipe.setup is not None:
+            place_together(self.viewer, image, request.recipe.setup, request.companions)
         if request.preview:
             self.show_layers(image, value.described, preview=True)
             if not value.inversion.report.converged:
@@ -264,10 +272,8 @@ class InvertShot(InversionInputs, LivePanel):
     def _tell_cost(self) -> None:
         """Say how long it will take, once the image is large."""
         try:
-            shape = image_of(self.image.layer).shape
-            crop = crop_of(self.crop.layer, self.image.layer)
-            if crop is not None:
-                shape = tuple(part.stop - part.start for part in crop)
+            recipe = Recipe(steps=self.all_steps())
+            shape = recipe.shape_after(image_of(self.image.layer).shape)
             cost = cost_of(shape, self.options.model(), self._pace)  # type: ignore[arg-type]
         except InputError:
             self.cost.setVisible(False)  # Run tells what is wrong

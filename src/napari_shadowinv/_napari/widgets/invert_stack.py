@@ -243,8 +243,9 @@ class InvertStack(InversionInputs, ToolPanel):
             self.source_masks,
             self.masks,
             self.setup,
-            self.cleaning,
+            self.steps,
             section("Options", self.options),
+            self.recipes,
             labelled("Store", self.store),
             labelled("", self.overwrite),
             labelled("", self.redo_failed),
@@ -267,19 +268,17 @@ class InvertStack(InversionInputs, ToolPanel):
 
     def request(self) -> StackRequest:
         layer = self.shots.layer
-        setup = self.setup.setup()
+        recipe = self.recipe()
         scheduler, workers = self.engine.engine()
         mask = self.masks.usable(layer)
         self.source.check(mask)
         job = StackJob(
             shots=self.shots.shots(),
             out=self.store.store,
+            recipe=recipe,
             source=self._source(layer),
             mask=mask,
-            source_mask=self.source_masks.usable(layer) if self.source.is_guessed else None,
-            cleaning=self.cleaning.model(),
-            options=self.options.model(),  # type: ignore[arg-type]
-            setup=setup,
+            source_mask=self.hidden_from_source(layer),
             scheduler=scheduler,
             workers=workers,
             overwrite=self.overwrite.isChecked(),
@@ -289,16 +288,17 @@ class InvertStack(InversionInputs, ToolPanel):
             job,
             layer,
             self.companions(layer),
-            {} if layer is None else place_on(layer, setup),
+            {} if layer is None else place_on(layer, recipe),
             self.origins(layer, self.shots.name),
         )
 
-    def _source(self, layer: Any) -> ArrayLike:
+    def _source(self, layer: Any) -> ArrayLike | None:
         # A run may have a source for each shot.
         chosen = self.source.layers.layer
         if self.source.picker.kind == "layer" and chosen is not None and chosen.ndim == 3:
             return stack_of(chosen)
-        return self.source.source(layer)  # type: ignore[return-value]
+        beam = self.source.measured(layer)
+        return None if beam is None else beam.image
 
     # A run
 
@@ -322,8 +322,9 @@ class InvertStack(InversionInputs, ToolPanel):
     def _show_layers(self, request: StackRequest) -> None:
         earlier, self._shown = self._shown, request
         again = earlier is not None and earlier.job.out == request.job.out
-        if request.image is not None and request.job.setup is not None:
-            place_together(self.viewer, request.image, request.job.setup, request.companions)
+        setup = request.job.recipe.setup
+        if request.image is not None and setup is not None:
+            place_together(self.viewer, request.image, setup, request.companions)
         if earlier is not None and again:
             request.go_on_from(earlier, self.results.layers)
         else:

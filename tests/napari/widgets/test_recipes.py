@@ -1,0 +1,449 @@
+"""Recipes: the list of steps, where results lie, and the same file for window and command."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.components import ViewerModel
+from qtpy.QtWidgets import QFileDialog
+from typer.testing import CliRunner
+
+from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
+from napari_shadowinv._napari.frame import Frame, frame_of
+from napari_shadowinv._napari.layer_metadata import mark, role_of, setup_origin_of
+from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.widgets._steps import StepsSection
+from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv.cli import app
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion.result import provenance_of
+from napari_shadowinv.io.store import read_stack
+from napari_shadowinv.pipeline import read_recipe, write_recipe
+from napari_shadowinv.pipeline.run import run as run_recipe
+from napari_shadowinv.preprocessing import (
+    STEPS,
+    Bin,
+    Crop,
+    HotPixelFilter,
+    LowPassFilter,
+    MeasuredSource,
+    PolynomialEstimate,
+    Recipe,
+    Rotate,
+    Step,
+    UniformEstimate,
+)
+
+Array = np.ndarray[Any, Any]
+FEW = InversionOptions(n_sites=300)
+PATIENCE = 60_000  # ms
+
+
+@pytest.fixture
+def opened(viewer: ViewerModel, qtbot: Any) -> Iterator[Callable[..., Any]]:
+    """Make a widget of a class, with few sites."""
+    made: list[Any] = []
+
+    def make(kind: Any = InvertShot) -> Any:
+        made.append(kind(viewer))
+        qtbot.addWidget(made[-1])
+        made[-1].options.set_values({"n_sites": 300})
+        return made[-1]
+
+    yield make
+    for widget in made:
+        widget._keeper._timer.stop()
+
+
+@pytest.fixture
+def shot_file(shot: Array, tmp_path: Path) -> Path:
+    np.save(tmp_path / "shot.npy", shot)
+    return tmp_path / "shot.npy"
+
+
+@pytest.fixture
+def image(viewer: ViewerModel, shot_file: Path) -> Any:
+    """The shot as a layer, read from its file."""
+    (layer,) = viewer.open(str(shot_file), plugin="napari")
+    return layer
+
+
+@pytest.fixture
+def run(qtbot: Any) -> Any:
+    def pressed(tool: Any) -> None:
+        before = getattr(tool, "results", None)
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: getattr(tool, "results", None) is not before, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
+
+    return pressed
+
+
+def by_command(*arguments: Any) -> None:
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert done.exit_code == 0, done.output
+
+
+# The list of steps
+
+
+def test_steps_are_added_moved_and_removed(qtbot: Any) -> None:
+    section = StepsSection()
+    qtbot.addWidget(section)
+    heard: list[None] = []
+    section.changed.connect(lambda: heard.append(None))
+    assert section.folded.text() == "Steps first: nothing"
+    assert not section.folded.isExpanded()
+    offered = [section.choice.itemData(i) for i in range(1, section.choice.count())]
+    assert offered == list(STEPS)
+    for name in ("low-pass", "bin"):
+        section.choice.activated.emit(section.choice.findData(name))
+    first, second = section.forms
+    assert section.folded.text() == "Steps first: low-pass (smooth), bin"
+    assert set(second.form.editors) == {"factor"}
+    second.form.editors["factor"].set_value(3)
+    assert not first.up.isEnabled()
+    second.up.click()
+    assert section.steps() == (Bin(factor=3), LowPassFilter(width=1.0))
+    assert section.forms == [second, first]
+    assert not second.up.isEnabled()
+    assert not first.down.isEnabled()
+    second.title.click()
+    assert second.form.isHidden()
+    assert second.title.text() == "bin, factor 3"
+    second.remove.click()
+    first.remove.click()
+    assert section.folded.text() == "Steps first: nothing"
+    assert section.steps() == ()
+    assert len(heard) >= 6
+
+
+def test_every_step_comes_back_from_its_state(qtbot: Any) -> None:
+    section, later = StepsSection(), StepsSection()
+    steps = tuple(
+        Crop(y=(3, 40), x=(5, None)) if name == "crop" else kind() for name, kind in STEPS.items()
+    )
+    for one in (section, later):
+        qtbot.addWidget(one)
+    section.show_steps(steps)
+    later.restore(section.state())
+    assert later.steps() == steps
+    later.restore([{"step": "sharpen"}, "nonsense", {"step": "bin", "factor": 2}])
+    assert later.steps() == (Bin(factor=2),)
+
+
+def test_a_range_that_is_none_is_refused_where_it_is_typed(qtbot: Any) -> None:
+    section = StepsSection()
+    qtbot.addWidget(section)
+    rows = section.add("crop").form.editors["y"].inner
+    for text, kept in (("10:40", (10, 40)), ("10:", (10, None)), ("", (0, None))):
+        rows.setText(text)
+        rows.editingFinished.emit()
+        assert section.steps() == (Crop(y=kept),)
+    rows.setText("ten")
+    rows.editingFinished.emit()
+    with pytest.raises(InputError, match="such as 10:200"):
+        section.steps()
+
+
+# Where results lie
+
+PLACED = {
+    "upright": {},
+    "scaled": {"scale": (2, 3), "translate": (7, -4)},
+    "turned": {
+        "rotate": 30, "shear": [0.2], "scale": (2, 3), "translate": (7, -4),
+        "affine": [[1, 0.1, 5], [0, 1.2, 6], [0, 0, 1]],
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("place", PLACED)
+@pytest.mark.parametrize(
+    "steps",
+    [
+        (Bin(factor=3),),
+        (Crop(y=(4, 40), x=(10, 57)),),
+        (Rotate(angle=90),),
+        (Rotate(angle=10),),
+        (Rotate(angle=90), Crop(y=(3, None)), Bin(factor=2), Rotate(angle=-25)),
+    ],
+)
+def test_a_result_lies_on_its_image_after_all_steps(
+    viewer: ViewerModel, steps: tuple[Step, ...], place: str
+) -> None:
+    image = viewer.add_image(np.ones((48, 60)), **PLACED[place])
+    recipe = Recipe(steps=steps)
+    matrix = recipe.matrix((48, 60))
+    frame = frame_of(image).beneath(matrix)
+    result = viewer.add_image(np.ones(recipe.shape_after((48, 60))), **frame.keywords())
+    stacked = viewer.add_image(np.ones((2, 9, 9)), **frame.keywords(stacked=True))
+    for y, x in ((0.0, 0.0), (11.0, 4.0), (3.0, 17.0)):
+        expected = image.data_to_world((matrix @ [y, x, 1.0])[:2])
+        np.testing.assert_allclose(result.data_to_world((y, x)), expected, atol=1e-9)
+        np.testing.assert_allclose(stacked.data_to_world((1, y, x))[1:], expected, atol=1e-9)
+    assert frame_of(image).beneath(np.eye(3)) == frame_of(image)
+
+
+@pytest.mark.parametrize(
+    "steps", [(Bin(factor=2),), (Crop(y=(8, 44)), Rotate(angle=90)), (Rotate(angle=10),)]
+)
+def test_a_feature_of_image_and_result_is_at_one_place(
+    viewer: ViewerModel,
+    opened: Any,
+    run: Any,
+    shot: Array,
+    proton_setup: ProtonSetup,
+    steps: tuple[Step, ...],
+) -> None:
+    bright = shot.copy()
+    bright[24:28, 36:40] = 5 * shot.mean()
+    image = viewer.add_image(bright, name="shot", translate=(100.0, 50.0))
+    tool = opened()
+    tool.setup.show_setup(proton_setup.model_dump())
+    tool.steps.show_steps(steps)
+    run(tool)
+    (seen,) = (layer for layer in viewer.layers if role_of(layer) == "image")
+    spot = np.argwhere(np.asarray(seen.data) > 0.9 * seen.data.max()).mean(axis=0)
+    expected = image.data_to_world((25.5, 37.5))
+    np.testing.assert_allclose(seen.data_to_world(spot), expected, atol=0.75 * image.scale[0])
+    assert str(seen.units[0]) == "micrometer"
+    size = recipe_size(tool, proton_setup)
+    assert np.hypot(seen.scale[0], 0) == pytest.approx(size)
+
+
+def recipe_size(tool: Any, setup: ProtonSetup) -> float:
+    """Side of a result's pixel in µm."""
+    after = Recipe(steps=tool.steps.steps(), setup=setup).setup_after((48, 60))
+    assert after is not None
+    return after.object_pixel_size * 1e6
+
+
+def test_a_result_of_larger_pixels_is_in_the_units_of_these(
+    viewer: ViewerModel, opened: Any, run: Any, image: Any, shot: Array, proton_setup: ProtonSetup
+) -> None:
+    tool = opened()
+    tool.setup.show_setup(proton_setup.model_dump())
+    tool.steps.show_steps((Bin(factor=2),))
+    run(tool)
+    recipe = Recipe(steps=(Bin(factor=2),), setup=proton_setup, options=FEW)
+    alone = run_recipe(recipe, shot)
+    fresh = add_inversion(ViewerModel(), alone)
+    mine, other = (
+        next(one for one in layers if role_of(one) == "field") for layers in (viewer.layers, fresh)
+    )
+    assert mine.name.removeprefix("shot ") == other.name
+    np.testing.assert_allclose(mine.data, other.data)
+
+
+def test_a_turned_result_comes_back_where_it_was(
+    viewer: ViewerModel, opened: Any, run: Any, image: Any, tmp_path: Path
+) -> None:
+    tool = opened()
+    tool.steps.show_steps((Rotate(angle=10), Crop(y=(5, 40), x=(8, 50))))
+    run(tool)
+    before = next(one for one in viewer.layers if role_of(one) == "field")
+    viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
+    later = ViewerModel()
+    later.open(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
+    for layer in later.layers:
+        assert frame_of(layer).rotate != Frame().rotate
+        np.testing.assert_allclose(layer.data_to_world((3, 4)), before.data_to_world((3, 4)))
+
+
+# One file for window and command
+
+
+STEPS_FIRST = (Crop(y=(4, 44), x=(10, 58)), HotPixelFilter(threshold=9.0), Bin(factor=2))
+
+
+def test_the_command_does_what_the_window_saves(
+    viewer: ViewerModel, opened: Any, run: Any, image: Any, shot_file: Path, tmp_path: Path,
+    proton_setup: ProtonSetup,
+) -> None:  # fmt: skip
+    tool = opened()
+    tool._draw_crop()
+    tool.crop.layer.add_rectangles(np.array([[4, 10], [4, 57], [43, 57], [43, 10]]))
+    tool.steps.show_steps(STEPS_FIRST[1:])
+    tool.source.show(PolynomialEstimate(degree=1))
+    tool.masks.paint()
+    tool.masks.layer.data[6:9, 12:15] = 1
+    tool.source_masks.paint()
+    tool.source_masks.layer.data[12:30, 22:45] = 1
+    tool.setup.show_setup(proton_setup.model_dump())
+    run(tool)
+    field = next(one for one in viewer.layers if role_of(one) == "field")
+    mine = field.metadata["napari-shadowinv"]["result"].content
+    tool.recipes.save(tmp_path / "how.toml")
+    assert {path.name for path in tmp_path.glob("how*")} == {
+        "how.toml",
+        "how_mask.png",
+        "how_source_mask.png",
+    }
+    by_command(
+        "invert", shot_file, "--recipe", tmp_path / "how.toml", "--out", tmp_path / "a.shadowinv"
+    )
+    told = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))
+    np.testing.assert_array_equal(told.displacement, mine.displacement)
+    assert told.provenance is not None
+    assert told.provenance.recipe == mine.provenance.recipe
+    assert told.provenance.image.sha256 == mine.provenance.image.sha256
+    assert told.provenance.setup == mine.provenance.setup
+    np.testing.assert_array_equal(told.provenance.mask.mask(), mine.provenance.mask.mask())
+
+
+def test_the_window_does_what_the_command_saves(
+    viewer: ViewerModel, opened: Any, image: Any, shot: Array, shot_file: Path, tmp_path: Path,
+    proton_setup: ProtonSetup,
+) -> None:  # fmt: skip
+    np.save(tmp_path / "beam.npy", 300 + 20 * np.linspace(0, 1, shot.shape[1]) + 0 * shot)
+    (tmp_path / "setup.toml").write_text(
+        'kind = "proton"\nenergy = 14.7\nsource_object_distance = 0.01\n'
+        "object_image_distance = 1.0\npixel_size = 2e-6\n"
+    )
+    by_command(
+        "invert", shot_file, "--crop-y", "4:44", "--crop-x", "10:", "--bin", 2, "--low-pass", 1.5,
+        "--source", tmp_path / "beam.npy", "--setup", tmp_path / "setup.toml", "--n-sites", 300,
+        "--save-recipe", tmp_path / "how.toml", "--out", tmp_path / "a.shadowinv",
+    )  # fmt: skip
+    told = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))
+    tool = opened()
+    tool.recipes.load(tmp_path / "how.toml")
+    assert tool.crop.layer.name == "shot crop"
+    assert tool.steps.steps() == (Bin(factor=2), LowPassFilter(width=1.5))
+    assert tool.setup.setup().pixel_size == 2e-6
+    assert setup_origin_of(image) == "loaded from how.toml for 'shot'"
+    mine = tool.request().inversion()
+    np.testing.assert_array_equal(mine.displacement, told.displacement)
+    assert mine.provenance.recipe.steps[0] == Crop(y=(4, 44), x=(10, 60))
+    assert mine.provenance.source.file == "beam.npy"
+    assert mine.provenance.source.shape == shot.shape
+
+
+def test_a_recipe_comes_back_from_its_file(
+    viewer: ViewerModel, opened: Any, image: Any, shot: Array, tmp_path: Path
+) -> None:
+    tool = opened()
+    recipe = Recipe(
+        steps=(Bin(factor=2), Crop(x=(3, None)), Rotate(angle=-7.5)),
+        source=MeasuredSource(file=tmp_path / "beams.h5", variable="second"),
+        options=InversionOptions(n_sites=120, floor=2e-3),
+    )
+    write_recipe(tmp_path / "in.toml", recipe)
+    tool.recipes.load(tmp_path / "in.toml")
+    assert tool.crop.layer is None
+    tool.recipes.save(tmp_path / "out.toml")
+    assert read_recipe(tmp_path / "out.toml") == recipe
+    assert not list(tmp_path.glob("out_*"))
+    # Another one leaves nothing of it behind.
+    tool.masks.paint()
+    write_recipe(tmp_path / "plain.toml", Recipe())
+    tool.recipes.load(tmp_path / "plain.toml")
+    assert tool.recipe() == Recipe(source=UniformEstimate())
+    assert tool.masks.layer is None
+
+
+def test_a_source_that_is_no_file_is_written_beside_the_recipe(
+    viewer: ViewerModel, opened: Any, image: Any, shot: Array, shot_file: Path, tmp_path: Path
+) -> None:
+    beam = 300 + np.random.default_rng(0).random(shot.shape)
+    tool = opened()
+    tool.source.layers.layer = viewer.add_image(beam, name="beam", metadata=mark("source", ""))
+    tool.source.picker.set_kind("layer")
+    tool.recipes.save(tmp_path / "how.toml")
+    np.testing.assert_array_equal(np.load(tmp_path / "how_source.npy"), beam)
+    out = tmp_path / "a.shadowinv"
+    by_command("invert", shot_file, "--recipe", tmp_path / "how.toml", "--out", out)
+    told = Inversion.from_dataset(read(out))
+    np.testing.assert_array_equal(tool.request().inversion().displacement, told.displacement)
+
+
+def test_a_stack_is_inverted_by_a_saved_recipe(
+    viewer: ViewerModel, opened: Any, shot: Array, tmp_path: Path, qtbot: Any
+) -> None:
+    usable = np.ones(shot.shape, bool)
+    usable[:4, :6] = False
+    recipe = Recipe(steps=(Crop(y=(2, 46)), Bin(factor=2)), mask=tmp_path / "mask.png", options=FEW)
+    from napari_shadowinv.io import write
+
+    write(tmp_path / "mask.png", usable.astype(float))
+    write_recipe(tmp_path / "how.toml", recipe)
+    stack = viewer.add_image(np.stack([shot, shot[::-1]]), name="shots", scale=(1, 2, 2))
+    tool = opened(InvertStack)
+    tool.recipes.load(tmp_path / "how.toml")
+    assert tool.steps.steps() == recipe.steps
+    tool.store.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: any(role_of(one) == "field" for one in viewer.layers), timeout=PATIENCE)
+    qtbot.waitUntil(
+        lambda: not tool.panel.runner.running and not tool.results.busy, timeout=PATIENCE
+    )
+    alone = run_recipe(recipe, shot[::-1])
+    dataset = read_stack(tmp_path / "a.shadowinv.zarr")
+    found = dataset["displacement"].values[1]
+    np.testing.assert_allclose(found, alone.displacement, atol=1e-5)
+    field = next(one for one in viewer.layers if role_of(one) == "field")
+    assert field.data.shape == (2, 22, 30)
+    np.testing.assert_allclose(field.data_to_world((1, 0, 0)), stack.data_to_world((1, 2.5, 0.5)))
+    told = provenance_of(dataset)
+    assert told is not None
+    np.testing.assert_array_equal(told.mask.mask(), usable)
+
+
+def test_what_cannot_be_loaded_or_saved_is_one_sentence_and_changes_nothing(
+    viewer: ViewerModel, opened: Any, image: Any, tmp_path: Path, told: list[str]
+) -> None:
+    tool = opened()
+    tool.steps.add("bin")
+    before, layers = tool.recipe(), list(viewer.layers)
+    from napari_shadowinv.io import write
+
+    write(tmp_path / "small.png", np.eye(9))
+    wrong = {
+        "typo": ("[[steps]]\nstep = 'binn'\n", "did you mean 'bin'"),
+        "mask": ("mask = 'small.png'\n", "mask has shape (9, 9), image (48, 60)"),
+        "gone": ("mask = 'gone.png'\n", "gone.png"),
+        "crop": ("[[steps]]\nstep = 'crop'\ny = '3:4'\n", "contains 60 × 1 pixels"),
+        "own": ("[source]\nmethod = 'measured'\n", "the shot's own file"),
+        "toml": ("steps = [\n", "toml"),
+    }
+    for name, (text, words) in wrong.items():
+        path = tmp_path / f"{name}.toml"
+        path.write_text(text)
+        told.clear()
+        tool.recipes.load(path)
+        assert len(told) == 1, (name, told)
+        assert words in told[0]
+        assert "\n" not in told[0]
+        assert tool.panel.status.text() == told[0]
+        assert tool.recipe() == before
+        assert list(viewer.layers) == layers
+    (tmp_path / "new_mask.png").write_text("somebody's")
+    tool.masks.paint()
+    tool.masks.layer.data[2:4] = 1
+    told.clear()
+    tool.recipes.save(tmp_path / "new.toml")
+    assert "new_mask.png exists" in told[0]
+    assert not (tmp_path / "new.toml").exists()
+    assert (tmp_path / "new_mask.png").read_text() == "somebody's"
+
+
+def test_the_menu_asks_for_a_file(
+    opened: Any, image: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = str(tmp_path / "how.toml")
+    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (path, ""))
+    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (path, ""))
+    tool = opened()
+    load, save = tool.recipes.menu().actions()
+    assert (load.text(), save.text()) == ("Load…", "Save…")
+    tool.steps.add("bin")
+    save.trigger()
+    tool.steps.show_steps(())
+    load.trigger()
+    assert tool.steps.steps() == (Bin(),)
