@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.preprocessing.estimate import Estimate
-from napari_shadowinv.preprocessing.estimates import uniform_source
+from napari_shadowinv.preprocessing.estimates import Estimate, uniform_source
 from napari_shadowinv.preprocessing.pixels import (
     MOST_EXTRAPOLATION,
     NORMAL_MAD,
@@ -57,29 +56,20 @@ def gaussian_source(
 ) -> FloatArray:
     """Elliptical Gaussian plus a constant, fitted to the image.
 
+    An estimate like those of `napari_shadowinv.preprocessing.estimates`.
+
     Parameters
     ----------
     image : array_like, shape (H, W)
-        The shot; counts or any linear measure of fluence.
     mask : array_like of bool, shape (H, W), optional
-        True where a pixel is usable. Default: everywhere.
     should_stop : callable, optional
-        Asked at each step; when it returns true the estimate ends.
     on_warning : callable, optional
         Receives a sentence where the fit has to be doubted. Default: `warnings.warn`.
 
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The fitted beam, in the unit of `image`; the same everywhere if the fit rises, where
-        nothing is seen, to ten times what is seen.
-
-    Raises
-    ------
-    InputError
-        If image and mask cannot be used, or the image has no flux.
-    InversionCancelled
-        If `should_stop` returned true.
+        The same everywhere if the fit rises, where nothing is seen, to ten times what is seen.
 
     Notes
     -----
@@ -213,10 +203,8 @@ def _first_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatAr
 
 
 def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
-    """Height · exp(-½(u² + v²)) + constant, with u = a·dy + b·dx and v = c·dx.
-
-    The factors of the inverse covariance, unlike its entries, may take any value.
-    """
+    """Height · exp(-½(u² + v²)) + constant, with u = a·dy + b·dx and v = c·dx."""
+    # The factors of the inverse covariance, unlike its entries, may take any value.
     height, constant, centre_y, centre_x, a, b, c = parameters
     u = a * (y - centre_y) + b * (x - centre_x)
     v = c * (x - centre_x)

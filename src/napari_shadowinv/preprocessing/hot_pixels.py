@@ -91,8 +91,7 @@ def remove_hot_pixels(
     Raises
     ------
     InputError
-        If the image is not two-dimensional and finite, the threshold not positive, or the
-        size not an odd number of at least 3.
+        If the image is not two-dimensional and finite, or a parameter out of range.
     InversionCancelled
         If `should_stop` returned true.
 
@@ -139,10 +138,8 @@ def remove_hot_pixels(
 def _neighbours(
     values: FloatArray, size: int, report: Reporter
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Median of the pixels around each, and the brightest and darkest that may be sound.
-
-    The pixel itself does not count: with it, the noise would seem smaller than it is.
-    """
+    """Median of the pixels around each, and the brightest and darkest that may be sound."""
+    # The pixel itself does not count: with it, the noise would seem smaller than it is.
     footprint = np.ones((size, size), dtype=np.bool_)
     footprint[size // 2, size // 2] = False
     n = size * size - 1

@@ -38,34 +38,9 @@ MOST_EXTRAPOLATION = 10.0  # times the brightest pixel seen
 def checked_pixels(
     image: ArrayLike, mask: ArrayLike | None = None, *, name: str = "image"
 ) -> tuple[FloatArray, BoolArray]:
-    """Return an image as floats and its usable pixels, or say what is wrong with them.
+    """Return a copy of an image as floats and its usable pixels, or say what is wrong with them.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-        An image or a potential.
-    mask : array_like of bool, shape (H, W), optional
-        True where a pixel is usable. Default: everywhere.
-    name : str, optional
-        What the error messages call the image.
-
-    Returns
-    -------
-    values : ndarray of float64, shape (H, W)
-        A copy; masked pixels, which may be NaN, are set to the mean of the usable ones.
-    usable : ndarray of bool, shape (H, W)
-        The mask.
-
-    Raises
-    ------
-    InputError
-        If the image is not two-dimensional, has no pixels, is not real, or a usable pixel is
-        not finite; if the mask has another shape, is not boolean, or leaves no pixel.
-
-    Examples
-    --------
-    >>> checked_pixels([[1.0, 3.0]], [[True, False]])[0]
-    array([[1., 1.]])
+    Masked pixels, which may be NaN, are set to the mean of the usable ones.
     """
     array = np.asarray(image)
     if array.ndim != 2 or array.size == 0:
@@ -104,13 +79,7 @@ def _checked_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str) -> 
 
 
 def checked_number(name: str, value: float, *, above: float, unit: str) -> float:
-    """Return a finite number above a limit, or say what was received instead.
-
-    Raises
-    ------
-    InputError
-        If the value is no finite number above the limit.
-    """
+    """Return a finite number above a limit, or say what was received instead."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -121,13 +90,7 @@ def checked_number(name: str, value: float, *, above: float, unit: str) -> float
 
 
 def checked_integer(name: str, value: int, *, least: int, most: int | None = None) -> int:
-    """Return an integer within limits, or say what was received instead.
-
-    Raises
-    ------
-    InputError
-        If the value is no integer or out of range.
-    """
+    """Return an integer within limits, or say what was received instead."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -252,11 +215,9 @@ def _basis(side: int, degree: int) -> FloatArray:
 def _weighted_fit(
     values: FloatArray, weights: FloatArray, rows: FloatArray, columns: FloatArray
 ) -> FloatArray:
-    """Polynomial of least weighted squares, from bases along y and x.
-
-    The normal equations need sums of the weights over products of the bases only; those
-    separate into y and x, so no matrix of pixels × coefficients is formed.
-    """
+    """Polynomial of least weighted squares, from bases along y and x."""
+    # The normal equations need sums of the weights over products of the bases only; those
+    # separate into y and x, so no matrix of pixels × coefficients is formed.
     n = rows.shape[1]
     pairs = [
         (basis[:, :, None] * basis[:, None, :]).reshape(-1, n * n) for basis in (rows, columns)

@@ -21,8 +21,8 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.preprocessing.estimate import Estimate
 from napari_shadowinv.preprocessing.estimates import (
+    Estimate,
     InterpolatedEstimate,
     LowPassEstimate,
     PolynomialEstimate,
