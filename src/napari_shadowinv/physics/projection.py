@@ -118,10 +118,7 @@ class _Keywords(TypedDict, total=False):
 
 
 def project_potential(
-    potential: ArrayLike,
-    made_with: Setup,
-    setup: Setup,
-    **keywords: Unpack[_Keywords],
+    potential: ArrayLike, made_with: Setup, setup: Setup, **keywords: Unpack[_Keywords]
 ) -> FloatArray:
     """Image that a potential in SI units makes, in its own or in another experiment.
 

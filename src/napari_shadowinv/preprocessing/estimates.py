@@ -84,8 +84,8 @@ class Estimate(Choice):
         shape : tuple of int
             Shape (H, W) of the image as recorded.
         matrix : ndarray, shape (3, 3), optional
-            What takes (y, x, 1) from the image whose source is to be estimated to the image as
-            recorded. Default: they are the same.
+            Takes (y, x, 1) from the image whose source is to be estimated to the image as recorded.
+            Default: they are the same.
 
         Raises
         ------
@@ -142,10 +142,6 @@ def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatA
     image : array_like, shape (H, W)
     mask : array_like of bool, shape (H, W), optional
 
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-
     Examples
     --------
     >>> uniform_source([[1, 2], [3, 6]])
@@ -180,8 +176,7 @@ def polynomial_source(
     image : array_like, shape (H, W)
     degree : int, default 2
         Total degree of the polynomial in y and x, from 0 to 10.
-    mask : array_like of bool, shape (H, W), optional
-    should_stop : callable, optional
+    mask, should_stop : optional
 
     Returns
     -------
@@ -223,8 +218,7 @@ def low_pass_source(
     image : array_like, shape (H, W)
     width : float
         Standard deviation of the Gaussian blur in px; a few times the size of the object.
-    mask : array_like of bool, shape (H, W), optional
-    should_stop : callable, optional
+    mask, should_stop : optional
 
     Returns
     -------
@@ -304,10 +298,6 @@ def total_variation_source(
     mask : array_like of bool, shape (H, W), optional
         Unusable pixels are first filled as by `interpolated_source`.
     should_stop : callable, optional
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
 
     References
     ----------

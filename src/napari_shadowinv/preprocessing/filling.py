@@ -22,8 +22,6 @@ from napari_shadowinv.preprocessing.pixels import (
     with_flux_of,
 )
 
-__all__ = ["FILL_WIDTH", "filled", "interpolated_source", "without_masked"]
-
 FILL_WIDTH = 5.0  # px
 _COARSEST_SIDE = 32
 _TOLERANCE = 1e-6

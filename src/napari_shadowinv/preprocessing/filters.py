@@ -139,10 +139,6 @@ def high_pass(image: ArrayLike, width: float, *, keep_mean: bool = True) -> Floa
         Put the mean of `image` back, so that the total flux stays. Without it,
         ``high_pass(image, width, keep_mean=False) + low_pass(image, width)`` is the image.
 
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-
     Notes
     -----
     With the mean kept, a positive image stays positive wherever its blur exceeds it by less

@@ -22,8 +22,6 @@ from napari_shadowinv.preprocessing.pixels import (
     with_flux_of,
 )
 
-__all__ = ["GaussianEstimate", "gaussian_source"]
-
 _MOST_FITTED_PIXELS = 2**16
 _MOST_FITS = 10
 _NOTABLE_EXTRAPOLATION = 1.5  # times the brightest pixel seen
@@ -129,18 +127,27 @@ def _fitted_gaussian(
 ) -> FloatArray:
     """Parameters of `_gaussian` that fit samples, by repeated robust least squares."""
     bounds = _bounds(y, x)
-    parameters = np.clip(_first_gaussian(y, x, sample), *bounds)
+
+    def excess(p: FloatArray) -> FloatArray:
+        report("source", 0)
+        return _gaussian(p, y, x) - sample
+
+    def fitted(start: FloatArray, loss: str, scale: float) -> FloatArray:
+        fit = scipy.optimize.least_squares(
+            excess, start, lambda p: _gaussian_slopes(p, y, x), bounds,
+            loss=loss, f_scale=scale, x_scale="jac", max_nfev=200,
+        )  # fmt: skip
+        return np.asarray(fit.x)
+
     # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
-    parameters = _refitted(parameters, y, x, sample, report, bounds, loss="linear", scale=1.0)
+    parameters = fitted(np.clip(_first_gaussian(y, x, sample), *bounds), "linear", 1.0)
     scale = 0.0
     for _ in range(_MOST_FITS):
         residual = _gaussian(parameters, y, x) - sample
         previous, scale = scale, max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
         if abs(scale - previous) < 1e-2 * scale:
             break
-        parameters = _refitted(
-            parameters, y, x, sample, report, bounds, loss="soft_l1", scale=scale
-        )
+        parameters = fitted(parameters, "soft_l1", scale)
     return parameters
 
 

@@ -20,8 +20,6 @@ from napari_shadowinv.preprocessing.pixels import (
     checked_pixels,
 )
 
-__all__ = ["HotPixelFilter", "remove_hot_pixels"]
-
 _NORMAL_MEAN = 1.2533  # standard deviation over mean absolute deviation, normal noise
 _PIXELS_PER_NOISE_BIN = 400
 _MOST_NOISE_BINS = 16

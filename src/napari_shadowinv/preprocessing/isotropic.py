@@ -19,15 +19,19 @@ from napari_shadowinv.physics.setup import Setup, binned_setup
 from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.pixels import beam_pixels
 
-__all__ = [
-    "IsotropicEstimate",
-    "centre_within",
-    "isotropic_source",
-    "point_distance",
-    "uniform_warnings",
-]
-
 _NOTABLE_FALL = 0.01  # of the fluence, from the brightest pixel to the dimmest
+
+
+def _centre_field(axis: str, line: str) -> Any:
+    return Field(
+        default=None,
+        allow_inf_nan=False,
+        title=f"Centre {axis} (px)",
+        description=(
+            f"{line} of the recorded image at which the detector faces the source. Default: its "
+            "centre."
+        ),
+    )
 
 
 class IsotropicEstimate(Estimate):
@@ -36,23 +40,8 @@ class IsotropicEstimate(Estimate):
     title = "isotropic point source"
     uses_mask = False
     method: Literal["isotropic"] = "isotropic"
-    centre_y: float | None = Field(
-        default=None,
-        allow_inf_nan=False,
-        title="Centre y (px)",
-        description=(
-            "Row of the recorded image at which the detector faces the source. Default: its centre."
-        ),
-    )
-    centre_x: float | None = Field(
-        default=None,
-        allow_inf_nan=False,
-        title="Centre x (px)",
-        description=(
-            "Column of the recorded image at which the detector faces the source. Default: its "
-            "centre."
-        ),
-    )
+    centre_y: float | None = _centre_field("y", "Row")
+    centre_x: float | None = _centre_field("x", "Column")
     # Not a parameter: every face of the package asks for the setup elsewhere.
     _setup: Any = PrivateAttr(default=None)
 
@@ -103,10 +92,7 @@ def _without_setup() -> InputError:
 
 
 def uniform_warnings(
-    shape: tuple[int, int],
-    setup: Setup | None,
-    *,
-    centre: tuple[float, float] | None = None,
+    shape: tuple[int, int], setup: Setup | None, *, centre: tuple[float, float] | None = None
 ) -> tuple[str, ...]:
     """Say whether a point source would light an image too unevenly to be taken as uniform.
 
@@ -171,10 +157,6 @@ def isotropic_source(
     centre_y, centre_x : float, optional
         Pixel in which the detector faces the point. Default: the middle of the image.
     mask : array_like of bool, shape (H, W), optional
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
 
     Notes
     -----

@@ -17,16 +17,6 @@ from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = [
-    "beam_pixels",
-    "block_means",
-    "checked_integer",
-    "checked_number",
-    "checked_pixels",
-    "fit_polynomial",
-    "with_flux_of",
-]
-
 _HIGHEST_DEGREE = 10
 _MOST_REWEIGHTINGS = 50
 NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal noise
@@ -190,7 +180,9 @@ def fit_polynomial(
             f"degree {degree} has {terms} coefficients, image has {int(usable.sum())} usable "
             "pixels: use a lower degree or mask fewer pixels"
         )
-    rows, columns = (_basis(side, degree) for side in values.shape)
+    rows, columns = (
+        np.asarray(legvander(np.linspace(-1, 1, side), degree), np.float64) for side in values.shape
+    )
     fit = _weighted_fit(values, usable.astype(np.float64), rows, columns)
     rounding = 1e-12 * float(np.abs(values).max())
     report = Reporter(None, should_stop)
@@ -205,11 +197,6 @@ def fit_polynomial(
         if np.abs(fit - previous).max() < 1e-6 * scale:
             break
     return fit
-
-
-def _basis(side: int, degree: int) -> FloatArray:
-    """Legendre polynomials along an axis, shape (side, degree + 1)."""
-    return np.asarray(legvander(np.linspace(-1, 1, side), degree), dtype=np.float64)
 
 
 def _weighted_fit(

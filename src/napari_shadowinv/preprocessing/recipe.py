@@ -21,21 +21,9 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.preprocessing.estimates import (
-    Estimate,
-    InterpolatedEstimate,
-    LowPassEstimate,
-    PolynomialEstimate,
-    TotalVariationEstimate,
-    UniformEstimate,
-)
-from napari_shadowinv.preprocessing.filters import (
-    BackgroundFilter,
-    ButterworthFilter,
-    Filter,
-    HighPassFilter,
-    LowPassFilter,
-)
+from napari_shadowinv.preprocessing import estimates, filters
+from napari_shadowinv.preprocessing.estimates import Estimate
+from napari_shadowinv.preprocessing.filters import Filter
 from napari_shadowinv.preprocessing.gaussian import GaussianEstimate
 from napari_shadowinv.preprocessing.hot_pixels import HotPixelFilter
 from napari_shadowinv.preprocessing.isotropic import IsotropicEstimate
@@ -45,16 +33,6 @@ from napari_shadowinv.preprocessing.steps import Bin, Choice, Crop, Rotate, Step
 if TYPE_CHECKING:
     from napari_shadowinv._system.progress import OnWarning, ShouldStop
 
-__all__ = [
-    "ESTIMATES",
-    "FILTERS",
-    "STEPS",
-    "MeasuredSource",
-    "Origin",
-    "Provenance",
-    "Recipe",
-    "check_masks",
-]
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 _LEAST_VISIBLE = 0.1  # of what the source mask hides in one place, for the inversion to see it
@@ -73,9 +51,7 @@ class MeasuredSource(Choice):
         default=None, title="File", description="Image of the undisturbed beam."
     )
     variable: str | None = Field(
-        default=None,
-        title="Variable",
-        description="Name of the array in a file with several.",
+        default=None, title="Variable", description="Name of the array in a file with several."
     )
 
 
@@ -85,20 +61,20 @@ AnyStep = (
     | Crop
     | HotPixelFilter
     | Bin
-    | BackgroundFilter
-    | HighPassFilter
-    | ButterworthFilter
-    | LowPassFilter
+    | filters.BackgroundFilter
+    | filters.HighPassFilter
+    | filters.ButterworthFilter
+    | filters.LowPassFilter
 )
 AnySource = (
     MeasuredSource
-    | UniformEstimate
+    | estimates.UniformEstimate
     | IsotropicEstimate
     | GaussianEstimate
-    | PolynomialEstimate
-    | LowPassEstimate
-    | TotalVariationEstimate
-    | InterpolatedEstimate
+    | estimates.PolynomialEstimate
+    | estimates.LowPassEstimate
+    | estimates.TotalVariationEstimate
+    | estimates.InterpolatedEstimate
 )
 
 STEPS: dict[str, type[Step]] = {step.name(): step for step in get_args(AnyStep)}
@@ -120,7 +96,7 @@ class Recipe(BaseModel):
 
     Examples
     --------
-    >>> recipe = Recipe(steps=(Bin(factor=2), LowPassFilter(width=1.5)))
+    >>> recipe = Recipe(steps=(Bin(factor=2), Crop(y=(10, 200))))
     >>> Recipe.model_validate_json(recipe.model_dump_json()) == recipe
     True
     """
@@ -141,9 +117,7 @@ class Recipe(BaseModel):
         description="Image of the same size, 0 where the object covers the beam.",
     )
     mask: Path | None = Field(
-        default=None,
-        title="Mask",
-        description="Image of the same size, 0 at unusable pixels.",
+        default=None, title="Mask", description="Image of the same size, 0 at unusable pixels."
     )
     setup: Setup | None = Field(
         default=None,
@@ -187,11 +161,6 @@ class Recipe(BaseModel):
     def check(self, shot: Radiograph) -> None:
         """Reject choices that contradict each other, or the shot, before any work is done.
 
-        Parameters
-        ----------
-        shot : Radiograph
-            The shot with its source and masks.
-
         Raises
         ------
         InputError
@@ -234,22 +203,7 @@ class Recipe(BaseModel):
             )
 
     def prepared(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
-        """Return a shot, with its source and masks, after all steps.
-
-        Parameters
-        ----------
-        shot : Radiograph
-            The shot as recorded.
-        should_stop : callable, optional
-            Asked now and then.
-
-        Raises
-        ------
-        InputError
-            If a step cannot be done.
-        InversionCancelled
-            If `should_stop` returned true.
-        """
+        """Return a shot, with its source and masks, after all steps; see `Step.applied`."""
         for step in self.steps:
             shot = step.applied(shot, should_stop)
         return shot
@@ -258,15 +212,10 @@ class Recipe(BaseModel):
 def check_masks(mask: BoolArray | None, bare: BoolArray | None) -> None:
     """Reject a mask that excludes the object, as marked by the source mask, from the inversion.
 
-    Parameters
-    ----------
-    mask, bare : ndarray of bool, shape (H, W), or None
-        The pixels that can be used, and those where the object is not.
-
     Raises
     ------
     InputError
-        If next to nothing of the object is left.
+        If next to nothing of the object, where `bare` is False, is left.
     """
     if mask is None or bare is None or bare.all():
         return
@@ -303,15 +252,10 @@ def estimated_source(
     estimate : Estimate
         How, placed for the shot.
     shot : Radiograph
-        The shot.
     should_stop, on_warning : callable, optional
-        See `Estimate.source`.
+        For `Estimate.source`.
     by : callable, optional
         Called in place of `Estimate.source`, such as one that remembers.
-
-    Returns
-    -------
-    ndarray, shape (H, W)
     """
     masks = [mask for mask in (shot.mask, shot.source_mask) if mask is not None]
     usable = np.logical_and.reduce(masks) if masks else None
@@ -353,10 +297,8 @@ class Origin(BaseModel):
         Checksum of the file; of the array's values if it was no file.
     variable, channel : str or int or None
         What of the file was taken.
-    pixels : str or None
-        A mask that was drawn, packed.
-    shape : tuple of int or None
-        Its shape.
+    pixels, shape : str and tuple of int, or None
+        A mask that was drawn, packed, and its shape.
     """
 
     model_config = _CONFIG

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from napari_shadowinv._system.progress import ShouldStop
     from napari_shadowinv.preprocessing.radiograph import Radiograph
 
-__all__ = ["Bin", "Choice", "Crop", "Rotate", "Step", "degree_field", "width_field"]
 
 _SMALLEST_SIDE = 4  # px of a crop
 _WHOLE = 0.999  # share of a rotated pixel that must be known
@@ -101,19 +100,12 @@ class Step(Choice):
     def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         """Return the shot with this done to image, source, masks and setup.
 
-        Parameters
-        ----------
-        shot : Radiograph
-            The shot.
-        should_stop : callable, optional
-            Asked now and then by steps that take long.
-
         Raises
         ------
         InputError
             If it cannot be done to this image.
         InversionCancelled
-            If `should_stop` returned true.
+            If `should_stop`, asked now and then by steps that take long, returned true.
         """
         raise NotImplementedError
 
@@ -232,13 +224,7 @@ class Crop(Step):
     )
 
     def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Return the rows and columns that are kept of an image.
-
-        Raises
-        ------
-        InputError
-            If fewer than 4 × 4 pixels would be left.
-        """
+        """Return the rows and columns that are kept of an image; at least 4 × 4 pixels."""
         rows, columns = (
             slice(*slice(*part).indices(side))
             for part, side in zip((self.y, self.x), shape, strict=True)

@@ -7,7 +7,7 @@ minimum is a little below zero, as for the paper's toroid of 194 MG µm.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -31,25 +31,6 @@ from napari_shadowinv.physics.setup import ProtonSetup
 # and width, angle in rad.
 Part = tuple[float, Radii, tuple[float, float], float]
 
-_FOUR_TOROIDS: tuple[Part, ...] = (
-    (135.0, 0.07, (0.31, 0.30), 0.0),
-    (75.0, 0.05, (0.30, 0.69), 0.0),
-    (100.0, 0.06, (0.69, 0.32), 0.0),
-    (125.0, 0.08, (0.67, 0.67), 0.0),
-)
-_COSINE_ELLIPSES: tuple[Part, ...] = (
-    (64.0, (0.24, 0.14), (0.37, 0.31), 0.35),
-    (62.0, (0.14, 0.24), (0.66, 0.67), 0.20),
-)
-_FOCUSING_PAIR: tuple[Part, ...] = (
-    (-63.0, (0.12, 0.07), (0.5, 0.38), 0.2),
-    (-63.0, (0.12, 0.07), (0.5, 0.61), -0.2),
-)
-_OPPOSITE_PAIR: tuple[Part, ...] = (
-    (154.0, 0.08, (0.5, 0.33), 0.0),
-    (-68.0, 0.08, (0.5, 0.67), 0.0),
-)
-
 
 def paper_setup() -> ProtonSetup:
     """Experiment of the paper's benchmark (Section IV A).
@@ -71,7 +52,13 @@ def four_toroids(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1
     Positions and radii scale with the image. `strength` is a factor on the fields, whose largest
     peak is then 135 MG µm.
     """
-    return _scene(toroid, _FOUR_TOROIDS, shape, setup, strength)
+    parts = [
+        (135.0, 0.07, (0.31, 0.30), 0.0),
+        (75.0, 0.05, (0.30, 0.69), 0.0),
+        (100.0, 0.06, (0.69, 0.32), 0.0),
+        (125.0, 0.08, (0.67, 0.67), 0.0),
+    ]
+    return _scene(toroid, parts, shape, setup, strength)
 
 
 def cosine_ellipses(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
@@ -79,7 +66,8 @@ def cosine_ellipses(shape: tuple[int, int], setup: ProtonSetup, strength: float 
 
     Scaled as `four_toroids`; the peak fields are 64 and 62 MG µm.
     """
-    return _scene(cosine_toroid, _COSINE_ELLIPSES, shape, setup, strength)
+    parts = [(64.0, (0.24, 0.14), (0.37, 0.31), 0.35), (62.0, (0.14, 0.24), (0.66, 0.67), 0.20)]
+    return _scene(cosine_toroid, parts, shape, setup, strength)
 
 
 def focusing_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
@@ -87,7 +75,8 @@ def focusing_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 
 
     Scaled as `four_toroids`; the peak fields are 63 MG µm.
     """
-    return _scene(toroid, _FOCUSING_PAIR, shape, setup, strength)
+    parts = [(-63.0, (0.12, 0.07), (0.5, 0.38), 0.2), (-63.0, (0.12, 0.07), (0.5, 0.61), -0.2)]
+    return _scene(toroid, parts, shape, setup, strength)
 
 
 def opposite_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
@@ -96,7 +85,8 @@ def opposite_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 
     Scaled as `four_toroids`; the peak fields are 154 and 68 MG µm, as it takes less to make rays
     meet than to drive them apart until they meet others.
     """
-    return _scene(toroid, _OPPOSITE_PAIR, shape, setup, strength)
+    parts = [(154.0, 0.08, (0.5, 0.33), 0.0), (-68.0, 0.08, (0.5, 0.67), 0.0)]
+    return _scene(toroid, parts, shape, setup, strength)
 
 
 def coaxial_line(
@@ -179,7 +169,7 @@ def ellipse_pair(shape: tuple[int, int], strength: float = 1.0) -> Phantom:
 
 
 def _scene(
-    make: Callable[..., Phantom], parts: tuple[Part, ...], shape: tuple[int, int],
+    make: Callable[..., Phantom], parts: Iterable[Part], shape: tuple[int, int],
     setup: ProtonSetup, strength: float,
 ) -> Phantom:  # fmt: skip
     """Sum of the parts, each made by `toroid` or `cosine_toroid`."""

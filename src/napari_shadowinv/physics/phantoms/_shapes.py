@@ -86,12 +86,7 @@ def toroid(
     sigma : float or tuple of float
         Radius σ in m, in the object plane; two radii (σ_u, σ_v) stretch the potential to
         an ellipse, whose field reaches the peak on its shorter axis.
-    center : tuple of float, optional
-    angle : float, default 0
-
-    Returns
-    -------
-    Phantom
+    center, angle : optional
 
     References
     ----------
@@ -126,12 +121,7 @@ def gaussian_blob(
         Amplitude A in px²; positive drives rays apart, negative gathers them.
     sigma : float or tuple of float
         Radius in px, or the radii (σ_u, σ_v); without rotation u is along y, v along x.
-    center : tuple of float, optional
-    angle : float, default 0
-
-    Returns
-    -------
-    Phantom
+    center, angle : optional
 
     Examples
     --------
@@ -167,12 +157,7 @@ def cosine_toroid(
         Largest path-integrated field in MG µm, half-way to the rim on the shorter axis.
     radius : float or tuple of float
         Radius, or the half axes (R_u, R_v), in m in the object plane.
-    center : tuple of float, optional
-    angle : float, default 0
-
-    Returns
-    -------
-    Phantom
+    center, angle : optional
     """
     radii = _pixels_of(setup, "radius", radius)
     require_finite(peak=peak, angle=angle)

@@ -164,7 +164,10 @@ class ProtonSetup(BeamSetup):
 
     def _rigidity(self, unit: FieldUnit) -> float:
         """Magnetic field, integrated along the beam, that deflects by 1 rad: p / q."""
-        return self.momentum / self.particle.charge / _tesla_metres(unit)
+        if unit not in _TESLA_METRES:
+            units = ", ".join(get_args(FieldUnit))
+            raise InputError(f"unit is {unit!r}: it must be one of {units}")
+        return self.momentum / self.particle.charge / _TESLA_METRES[unit]
 
     @property
     def _electric_rigidity(self) -> float:
@@ -232,9 +235,3 @@ def _vector(name: str, values: ArrayLike) -> FloatArray:
             f"{name} has shape {field.shape}: expected (2, ...), the y component first"
         )
     return field
-
-
-def _tesla_metres(unit: str) -> float:
-    if unit not in _TESLA_METRES:
-        raise InputError(f"unit is {unit!r}: it must be one of {', '.join(get_args(FieldUnit))}")
-    return _TESLA_METRES[unit]
