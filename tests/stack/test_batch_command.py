@@ -22,7 +22,6 @@ from typer.testing import CliRunner, Result
 
 from napari_shadowinv import InversionOptions, invert, read
 from napari_shadowinv.cli import app
-from napari_shadowinv.inversion.result import provenance_of
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.preprocessing import Provenance
 
@@ -285,7 +284,7 @@ def test_shots_are_exported_as_pradformat_if_the_setup_is_a_particle_beams(store
     with h5py.File(path) as file:
         assert file.attrs["radiograph_filename"] == "shot_4.npy"
     exported = read(path)
-    told, whole = provenance_of(exported), provenance_of(read(store))
+    told, whole = Provenance.of(exported.attrs), Provenance.of(read(store).attrs)
     assert told.image.file == "shot_4.npy"
     assert told.image.sha256 == hashlib.sha256(Path("shots/shot_4.npy").read_bytes()).hexdigest()
     assert told.recipe == whole.recipe

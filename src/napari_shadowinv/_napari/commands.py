@@ -165,7 +165,7 @@ def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
 
 
 def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
-    from napari_shadowinv.pipeline.run import run
+    from napari_shadowinv.pipeline._run import run
     from napari_shadowinv.preprocessing import Recipe, UniformEstimate
 
     recipe = Recipe(source=UniformEstimate(), setup=picked.setup)

@@ -124,7 +124,7 @@ def radiograph_of(layer: Any, image: Any) -> io.Radiograph:
 
 def loaded(shot: io.Radiograph, name: str) -> io.Radiograph:
     """The same with its image read, and with the checksum of its file."""
-    from napari_shadowinv.pipeline.run import plane_of
+    from napari_shadowinv.pipeline._run import plane_of
 
     told = dict(shot.metadata)
     if shot.path is not None and "sha256" not in told and shot.path.is_file():

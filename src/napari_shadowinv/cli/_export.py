@@ -15,11 +15,11 @@ import numpy as np
 from napari_shadowinv.cli._outputs import make_folder, protect_store
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset
-from napari_shadowinv.inversion.result import provenance_of
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import DONE, STATUS_NAMES, StackStore, read_stack
+from napari_shadowinv.preprocessing import Provenance
 
 if TYPE_CHECKING:
     import xarray
@@ -122,7 +122,7 @@ def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[_Job]:
 
 def _with_origin(shot: xarray.Dataset) -> xarray.Dataset:
     """A shot of a store with the store's provenance, but for its own image."""
-    provenance = provenance_of(shot)
+    provenance = Provenance.of(shot.attrs)
     if provenance is None:
         return shot
     report = json.loads(str(shot["report"].values))

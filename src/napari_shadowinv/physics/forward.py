@@ -55,9 +55,8 @@ def synthetic_image(
     Parameters
     ----------
     displacement : array_like, shape (2, H, W)
-        Displacement in px, axis order (y, x), of the ray that starts at each pixel's
-        centre. It is interpolated by cubic splines, exact for cubic polynomials up
-        to the border.
+        Displacement in px, axis order (y, x), of the ray that starts at each pixel's centre;
+        interpolated by cubic splines, exact for cubic polynomials up to the border.
     source : array_like, shape (H, W), optional
         Flux of each pixel without the object, constant within a pixel. Default: 1.
     rays_per_pixel : int, default 16
@@ -65,7 +64,7 @@ def synthetic_image(
     threads : int, optional
         Threads to use. Default: all cores. The result does not depend on it.
     on_progress : callable, optional
-        Receives a `napari_shadowinv._system.progress.Progress` for each band of rows.
+        Receives a `Progress` for each band of rows.
     should_stop : callable, optional
         Asked after each band; when it returns true the work ends.
 
@@ -129,9 +128,10 @@ def synthetic_image(
 
 
 def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
-    """Area, in the image, of each pixel of the source: det(1 + ∇d).
+    """Area, in the image, of each pixel of the source: det(1 + ∇d), Eq. 4 of the paper.
 
-    Negative where the map has folded the pixel over; small where rays crowd.
+    Negative where the map has folded the pixel over; small where rays crowd. Made of
+    differences that are of second order up to the border.
 
     Parameters
     ----------
@@ -141,16 +141,11 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The determinant, by differences that are of second order up to the border.
 
     Raises
     ------
     InputError
         If the shape does not fit or a value is not finite.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Eq. 4.
 
     Examples
     --------
@@ -229,11 +224,9 @@ def _spline_coefficients(values: FloatArray) -> FloatArray:
 
 
 def _line_coefficients(values: FloatArray) -> FloatArray:
-    """B-spline coefficients along the first axis, shape (n + 4, m).
-
-    The first and last polynomial pieces continue across one more knot ("not a knot") and on to
-    the rim of the image, half a pixel outside the last centres.
-    """
+    """B-spline coefficients along the first axis, shape (n + 4, m)."""
+    # The first and last polynomial pieces continue across one more knot ("not a knot") and on
+    # to the rim of the image, half a pixel outside the last centres.
     n = values.shape[0]
     coefficients = np.empty((n + 4, values.shape[1]))
     inner = coefficients[2:-2]

@@ -48,8 +48,7 @@ def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> Floa
 
     References
     ----------
-    Kasim et al., arXiv:1607.04179, Section IV A ("Poisson's equation solver") and Eq. 4 for
-    small deflections.
+    Kasim et al., arXiv:1607.04179, Section IV A ("Poisson's equation solver"), and Eq. 4.
 
     Examples
     --------
@@ -76,20 +75,8 @@ def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> Floa
 def border_mean(potential: ArrayLike) -> float:
     """Mean over the outermost pixels; a potential minus this is in the package's gauge.
 
-    Parameters
-    ----------
-    potential : array_like, shape (H, W)
-        A potential, or any other image.
-
-    Returns
-    -------
-    float
-        The mean, each pixel of the border counted once.
-
-    Raises
-    ------
-    InputError
-        If the array is not two-dimensional or is empty.
+    Each pixel of the border counts once. An `InputError` if the potential, shape (H, W), is no
+    plane or empty.
 
     Examples
     --------
@@ -105,11 +92,8 @@ def border_mean(potential: ArrayLike) -> float:
 
 
 def _solve_neumann(laplacian: FloatArray) -> FloatArray:
-    """Solve ∇²φ = laplacian - mean(laplacian) with no gradient across the border.
-
-    The cosines of the transform are even about the image's edges, half a pixel outside
-    the outermost centres, so each has exactly that border.
-    """
+    """Solve ∇²φ = laplacian - mean(laplacian) with no gradient across the border."""
+    # The cosines are even about the image's edges, half a pixel outside the outermost centres.
     height, width = laplacian.shape
     wave_y = np.pi * np.arange(height) / height
     wave_x = np.pi * np.arange(width) / width

@@ -72,12 +72,12 @@ def project(
     made_with, setup : Setup
         The experiment that the displacement belongs to, and the one to predict.
     deflector, dispersion, shape
-        See `transferred_displacement`.
+        As for `transferred_displacement`.
     source : array_like, shape (H', W'), optional
         Flux of each pixel of `setup` without the object; gives the shape if that is left out.
         Default: 1.
     rays_per_pixel, threads
-        See `synthetic_image`.
+        As for `synthetic_image`.
 
     Returns
     -------
@@ -118,10 +118,7 @@ class _Keywords(TypedDict, total=False):
 
 
 def project_potential(
-    potential: ArrayLike,
-    made_with: Setup,
-    setup: Setup,
-    **keywords: Unpack[_Keywords],
+    potential: ArrayLike, made_with: Setup, setup: Setup, **keywords: Unpack[_Keywords]
 ) -> FloatArray:
     """Image that a potential in SI units makes, in its own or in another experiment.
 
@@ -130,20 +127,9 @@ def project_potential(
     potential : array_like, shape (H, W)
         Potential Φ in m at the centres of the pixels of `made_with`, as its `potential` gives
         it; `displacement_from_potential` takes the gradient.
-    made_with, setup : Setup
-        The experiment that the potential belongs to, and the one to predict.
-    deflector, dispersion, source, shape, rays_per_pixel, threads
-        See `project`.
-
-    Returns
-    -------
-    ndarray of float64, shape (H', W')
-        Flux of each pixel of the predicted image, in the unit of the source.
-
-    Raises
-    ------
-    InputError
-        As `project`, and if the potential is no plane.
+    made_with, setup, **keywords
+        As for `project`, whose result and errors this has; also refused is a potential that is
+        no plane.
     """
     displacement = made_with.displacement_from_potential(potential)
     return project(displacement, made_with, setup, **keywords)
@@ -172,7 +158,7 @@ def transferred_displacement(
         For a refractive index: ln η at the wavelength of `setup` over that of `made_with`.
     shape : tuple of int, optional
         Height and width of the other image in its own pixels. Default: as many as the known
-        field covers; the same as before if the pixels are.
+        field covers.
 
     Returns
     -------
@@ -213,13 +199,8 @@ def default_deflector(made_with: Setup, setup: Setup) -> Deflector:
     """What is taken to bend the beam if nobody says so.
 
     A magnetic field for particles; for light a refractive index, if the wavelength is the same:
-    then a plasma comes to the same.
-
-    Raises
-    ------
-    InputError
-        If the wavelengths differ: then it has to be told. Also if one experiment uses
-        particles and the other light.
+    then a plasma comes to the same. An `InputError` if the wavelengths differ, or if one
+    experiment uses particles and the other light.
     """
     _require_same_kind(made_with, setup)
     return setup.default_deflector(made_with)

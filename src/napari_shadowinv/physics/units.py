@@ -42,11 +42,7 @@ class ShownField:
     Attributes
     ----------
     vectors : ndarray, shape (2, H, W)
-        Components in axis order (y, x).
-    name, symbol, unit : str
-        What it is.
-    components : tuple of str
-        Symbols of the y and the x component.
+        Components, whose symbols `components` holds.
     arrows : str
         Title of the field's arrows; empty where they would point along the displacement.
     """

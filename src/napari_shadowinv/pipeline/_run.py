@@ -95,7 +95,7 @@ def run(
     source_mask : array_like of bool, shape (H, W), optional
         True where the object is not. Default: what the recipe says.
     on_progress, should_stop : callable, optional
-        See `napari_shadowinv.invert`.
+        As for `napari_shadowinv.invert`.
     cache : Cache, optional
         Sites and estimates of earlier runs.
     preview : bool, default False
@@ -152,7 +152,7 @@ def run_prepared(
     start: Inversion | None = None,
     began: float | None = None,
 ) -> Inversion:
-    """Invert a shot whose steps were done.
+    """Invert a shot whose steps were done, otherwise as `run`.
 
     Parameters
     ----------
@@ -160,16 +160,10 @@ def run_prepared(
         The shot as recorded and its recipe.
     shot : Radiograph
         The shot after the recipe's steps.
-    on_progress, should_stop, cache, preview
-        See `run`.
     start : Inversion, optional
-        See `napari_shadowinv.invert`.
+        As for `napari_shadowinv.invert`.
     began : float, optional
         Value of `time.perf_counter` when the work began. Default: now.
-
-    Returns
-    -------
-    Inversion
     """
     report = Reporter(on_progress, should_stop)
     cache = Cache() if cache is None else cache
@@ -248,17 +242,7 @@ def gathered(
     mask: ArrayLike | None = None,
     source_mask: ArrayLike | None = None,
 ) -> Inputs:
-    """Bring together what a recipe is applied to: files are read, defaults of the shot filled in.
-
-    Parameters
-    ----------
-    recipe, shot, source, mask, source_mask
-        See `run`.
-
-    Returns
-    -------
-    Inputs
-    """
+    """Bring together what a recipe is applied to: read files, fill in defaults of the shot."""
     whole = _radiograph(shot, "the image")
     beam, wanted = None, recipe.source
     if source is not None:

@@ -19,15 +19,9 @@ __all__ = ["Cache", "quick_source", "same_array"]
 
 @dataclass
 class Cache:
-    """Sites and estimated source of the last run, for the next one with the same beam or image.
+    """Sites and estimated source of the last run, for the next one with the same beam or image."""
 
-    Attributes
-    ----------
-    hits : int
-        How often sites were used again.
-    """
-
-    hits: int = 0
+    hits: int = 0  # how often sites were used again
     _plan: tuple[str, FloatArray, BoolArray | None, SitePlan] | None = field(
         default=None, repr=False
     )
@@ -106,10 +100,8 @@ def quick_source(
     should_stop: ShouldStop | None = None,
     on_warning: OnWarning | None = None,
 ) -> FloatArray:
-    """Estimate a source from an image whose pixels are merged until there are few enough.
-
-    It is linear between the middles of the merged pixels; its flux is that of the image.
-    """
+    """Estimate a source from an image whose pixels are merged until there are few enough."""
+    # Linear between the middles of the merged pixels; its flux is that of the image.
     factor = int(np.ceil(np.sqrt(image.size / most_pixels)))
     if factor == 1 or min(image.shape) < 8 * factor:
         return estimate.source(image, mask, should_stop, on_warning)

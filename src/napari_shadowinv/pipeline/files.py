@@ -16,12 +16,8 @@ __all__ = ["read_recipe", "write_recipe"]
 def read_recipe(path: Path) -> Recipe:
     """Read a recipe; files that it names are looked for from its own folder.
 
-    Raises
-    ------
-    InputError
-        If the recipe is not understood; the message names the entry.
-    FileFormatError
-        If the file cannot be read.
+    An `InputError` names the entry that is not understood, a `FileFormatError` says why the file
+    cannot be read.
     """
     return _with_files(validated(Recipe, read_toml(path), str(path)), Path(path).parent.joinpath)
 
@@ -29,10 +25,7 @@ def read_recipe(path: Path) -> Recipe:
 def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None:
     """Write a recipe; files that it names are written relative to its own folder.
 
-    Raises
-    ------
-    FileFormatError
-        If the file exists, unless `overwrite`, or cannot be written.
+    A `FileFormatError` says why not: the file exists, unless `overwrite`, or cannot be written.
     """
     import tomli_w
 

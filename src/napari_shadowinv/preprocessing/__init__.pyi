@@ -1,5 +1,5 @@
-from .estimate import Estimate
 from .estimates import (
+    Estimate,
     InterpolatedEstimate,
     LowPassEstimate,
     PolynomialEstimate,

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 
 __all__ = ["least_variation"]
-
-FloatArray = NDArray[np.float64]
 
 _STEP = 0.25  # the largest for which the iteration is known to converge in two dimensions
 _TOLERANCE = 1e-7  # change of the energy in one step, as a share of the energy at the start
@@ -21,39 +19,10 @@ _TOLERANCE = 1e-7  # change of the energy in one step, as a share of the energy 
 def least_variation(
     image: FloatArray, weight: float, iterations: int, report: Reporter
 ) -> FloatArray:
-    """Minimise half the squared distance to an image plus its weighted total variation.
+    """The u that minimises ½∑(u - image)² + weight·∑|∇u|, differences forward up to the border.
 
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-        The image f.
-    weight : float
-        What a unit of total variation costs.
-    iterations : int
-        Most steps.
-    report : Reporter
-        Asked at each step whether to stop.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        The u that minimises ½∑(u - f)² + weight·∑|∇u|, with forward differences that end at
-        the border.
-
-    Raises
-    ------
-    InversionCancelled
-        If `report` says so.
-
-    Notes
-    -----
-    Chambolle's fixed-point iteration for the dual field p, u being f plus the divergence of p.
-    It ends when a step changes the energy by less than 1e-7 of what it was at first.
-
-    References
-    ----------
-    A. Chambolle, "An algorithm for total variation minimization and applications", Journal
-    of Mathematical Imaging and Vision 20, 89 (2004), equation (9).
+    Chambolle's fixed-point iteration for the dual field p, u being the image plus the divergence
+    of p: Journal of Mathematical Imaging and Vision 20, 89 (2004), equation (9).
     """
     image = np.ascontiguousarray(image)
     dual_y, dual_x = np.zeros_like(image), np.zeros_like(image)
@@ -78,10 +47,8 @@ _FAST = {"reassoc", "contract", "nsz"}
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
 def _step(image: FloatArray, dual_y: FloatArray, dual_x: FloatArray, weight: float) -> float:
-    """One step of the iteration in place; returns the energy before it.
-
-    A single pass: the smooth rows here and below are made of what the step has not changed yet.
-    """
+    """One step of the iteration in place; returns the energy before it."""
+    # A single pass: the smooth rows here and below are made of what is not changed yet.
     height, width = image.shape
     here, below = np.empty(width), np.empty(width)
     energy = 0.0

@@ -9,12 +9,17 @@ none was recorded, or the beam changes from shot to shot, it must be estimated f
 - the beam varies slowly, in no known way: `polynomial_source`, `low_pass_source`
 - the beam has edges that matter: `total_variation_source`
 - the object covers a known part of the image: `interpolated_source`
+- what all have in common in a recipe: `Estimate`
 
-Each takes an image ``[y, x]`` and returns one of the same shape that is positive everywhere
-and has the same flux over the usable pixels. A `mask` is True where a pixel is usable; the
-others (dead areas, handwriting, a shadow) may hold anything, NaN too, and are filled in.
-An estimate that rises there to ten times the brightest pixel it saw is refused.
-Those that take long ask `should_stop` at each of their steps.
+Each takes an image ``[y, x]``, counts or any linear measure of fluence, and returns float64
+of the same shape and unit that is positive everywhere and has the same flux over the usable
+pixels. A `mask` is True where a pixel is usable; the others (dead areas, handwriting, a shadow)
+may hold anything, NaN too, and are filled in. Default: all are usable.
+
+An `InputError` refuses an image and a mask that cannot be used, an image without flux, a parameter
+out of range, and an estimate that rises, where it sees nothing, to ten times the brightest pixel
+it saw. Estimates that take long ask `should_stop` at each of their steps, and raise
+`InversionCancelled` when it returns true.
 
 Structure that an estimate attributes to the beam is lost from the object, and vice versa. The
 choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179, section V.
@@ -22,7 +27,8 @@ choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import scipy
@@ -31,7 +37,7 @@ from pydantic import Field
 
 from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.preprocessing.estimate import Estimate
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing.filling import FILL_WIDTH, filled, interpolated_source
 from napari_shadowinv.preprocessing.filters import low_pass
 from napari_shadowinv.preprocessing.pixels import (
@@ -41,10 +47,91 @@ from napari_shadowinv.preprocessing.pixels import (
     fit_polynomial,
     with_flux_of,
 )
-from napari_shadowinv.preprocessing.steps import degree_field, width_field
+from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import Setup
 
 _LEAST_SUPPORT = 1e-6
 _NARROWEST_WAVES = 2.0  # px; a Gaussian that is narrower has waves too short for the pixels
+
+
+class Estimate(Choice):
+    """A way to guess the undisturbed beam from the shot.
+
+    Attributes
+    ----------
+    function : callable
+        Makes the source; takes the image, the parameters, ``mask`` and ``should_stop``.
+    needs_mask, uses_mask : bool
+        Whether it does nothing without a mask, or anything with one.
+    """
+
+    key = "method"
+    function: ClassVar[Callable[..., FloatArray]]
+    needs_mask: ClassVar[bool] = False
+    uses_mask: ClassVar[bool] = True
+
+    def placed(
+        self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
+    ) -> Estimate:
+        """Return the same for the images of an experiment; most estimates do not depend on it.
+
+        Parameters
+        ----------
+        setup : Setup or None
+            Of the image whose source is to be estimated, None if it is not known.
+        shape : tuple of int
+            Shape (H, W) of the image as recorded.
+        matrix : ndarray, shape (3, 3), optional
+            Takes (y, x, 1) from the image whose source is to be estimated to the image as recorded.
+            Default: they are the same.
+
+        Raises
+        ------
+        InputError
+            If the estimate needs another setup.
+        """
+        return self
+
+    def source(
+        self,
+        image: FloatArray,
+        mask: BoolArray | None,
+        should_stop: ShouldStop | None = None,
+        on_warning: OnWarning | None = None,
+    ) -> FloatArray:
+        """Estimate the source; `on_warning` receives a sentence where it has to be doubted.
+
+        Raises
+        ------
+        InputError
+            If the image cannot be used, or there is no mask where one is needed.
+        """
+        if self.needs_mask and mask is None:
+            raise InputError(
+                f"got the estimate '{self.title}' without a mask: it fills in the masked pixels; "
+                "choose a mask that covers the object"
+            )
+        return self._source(image, mask, should_stop, on_warning)
+
+    def _source(
+        self,
+        image: FloatArray,
+        mask: BoolArray | None,
+        should_stop: ShouldStop | None,
+        on_warning: OnWarning | None,
+    ) -> FloatArray:
+        return self.function(image, mask=mask, should_stop=should_stop, **self.values())
+
+    def coarser(self, factor: int) -> Estimate:
+        """Return the same for an image with pixels `factor` times as large."""
+        lengths = {
+            name: getattr(self, name) / factor
+            for name, field in self.parameters().items()
+            if (field.title or "").endswith("(px)")
+        }
+        return self.model_copy(update=lengths)
 
 
 def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatArray:
@@ -53,19 +140,7 @@ def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatA
     Parameters
     ----------
     image : array_like, shape (H, W)
-        The shot; counts or any linear measure of fluence.
     mask : array_like of bool, shape (H, W), optional
-        True where a pixel is usable. Default: everywhere.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        The same number everywhere, in the unit of `image`.
-
-    Raises
-    ------
-    InputError
-        If image and mask cannot be used, or the image has no flux.
 
     Examples
     --------
@@ -81,15 +156,10 @@ class UniformEstimate(Estimate):
 
     title = "uniform"
     uses_mask = False
+    place = 10
     method: Literal["uniform"] = "uniform"
 
-    def _source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None,
-        on_warning: OnWarning | None,
-    ) -> FloatArray:
+    def _source(self, image: FloatArray, mask: BoolArray | None, *_: Any) -> FloatArray:
         return uniform_source(image, mask=mask)
 
 
@@ -100,36 +170,19 @@ def polynomial_source(
     mask: ArrayLike | None = None,
     should_stop: ShouldStop | None = None,
 ) -> FloatArray:
-    """Polynomial in y and x, fitted to the image and little moved by its modulation.
+    """Polynomial in y and x, fitted to the image as by `fit_polynomial`.
 
     Parameters
     ----------
     image : array_like, shape (H, W)
-        The shot; counts or any linear measure of fluence.
     degree : int, default 2
         Total degree of the polynomial in y and x, from 0 to 10.
-    mask : array_like of bool, shape (H, W), optional
-        True where a pixel is usable. Default: everywhere.
-    should_stop : callable, optional
-        Asked at each step; when it returns true the estimate ends.
+    mask, should_stop : optional
 
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The fitted beam in the unit of `image`; where the polynomial falls below 0.001 of the
-        image's mean, it is that.
-
-    Raises
-    ------
-    InputError
-        If image and mask cannot be used, the image has no flux, the degree is out of range,
-        or there are fewer usable pixels than coefficients.
-    InversionCancelled
-        If `should_stop` returned true.
-
-    See Also
-    --------
-    napari_shadowinv.preprocessing.filters.remove_background : flatten an image by the same fit.
+        Where the polynomial falls below 0.001 of the image's mean, it is that.
 
     Examples
     --------
@@ -147,17 +200,10 @@ class PolynomialEstimate(Estimate):
     """A fitted polynomial."""
 
     title = "fitted polynomial"
+    function = staticmethod(polynomial_source)
+    place = 40
     method: Literal["polynomial"] = "polynomial"
     degree: int = degree_field(": 0 is flat, 2 is bowl-shaped, 10 follows fine detail.")
-
-    def _source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None,
-        on_warning: OnWarning | None,
-    ) -> FloatArray:
-        return polynomial_source(image, degree=self.degree, mask=mask, should_stop=should_stop)
 
 
 def low_pass_source(
@@ -172,30 +218,15 @@ def low_pass_source(
     Parameters
     ----------
     image : array_like, shape (H, W)
-        The shot; counts or any linear measure of fluence.
     width : float
         Standard deviation of the Gaussian blur in px; a few times the size of the object.
-    mask : array_like of bool, shape (H, W), optional
-        True where a pixel is usable. Default: everywhere.
-    should_stop : callable, optional
-        Asked at each step; when it returns true the estimate ends.
+    mask, should_stop : optional
 
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The blurred image in its own unit: at each pixel the mean of the usable pixels around
-        it, weighted by the Gaussian. Its border is mirrored.
-
-    Raises
-    ------
-    InputError
-        If image and mask cannot be used, the image has no flux, or the width is not positive.
-    InversionCancelled
-        If `should_stop` returned true.
-
-    Notes
-    -----
-    Where no usable pixel is within reach, the width is doubled until there is one.
+        At each pixel the mean of the usable pixels around it, weighted by the Gaussian; its border
+        is mirrored. Where none is within reach, the width is doubled until there is one.
 
     Examples
     --------
@@ -219,6 +250,8 @@ class LowPassEstimate(Estimate):
     """The blurred shot."""
 
     title = "blurred shot"
+    function = staticmethod(low_pass_source)
+    place = 50
     method: Literal["low-pass"] = "low-pass"
     width: float = width_field(
         30.0,
@@ -226,15 +259,6 @@ class LowPassEstimate(Estimate):
         1.0,
         200.0,
     )
-
-    def _source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None,
-        on_warning: OnWarning | None,
-    ) -> FloatArray:
-        return low_pass_source(image, self.width, mask=mask, should_stop=should_stop)
 
 
 def _masked_blur(
@@ -269,30 +293,14 @@ def total_variation_source(
     Parameters
     ----------
     image : array_like, shape (H, W)
-        The shot; counts or any linear measure of fluence.
     weight : float, default 2
         Strength of the smoothing, in px: a disc of radius r px is lowered by 2·weight/r of the
         image's mean. So it takes c·r/2 to remove a disc of contrast c.
     iterations : int, default 1000
         Maximum iterations; an object of radius r px needs about r².
     mask : array_like of bool, shape (H, W), optional
-        True where a pixel is usable. Default: everywhere. The others are first filled as by
-        `interpolated_source`.
+        Unusable pixels are first filled as by `interpolated_source`.
     should_stop : callable, optional
-        Asked at each step; when it returns true the estimate ends.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        The smoothed image, in its own unit.
-
-    Raises
-    ------
-    InputError
-        If image and mask cannot be used, the image has no flux, or the weight or the number
-        of iterations is not positive.
-    InversionCancelled
-        If `should_stop` returned true.
 
     References
     ----------
@@ -324,6 +332,8 @@ class TotalVariationEstimate(Estimate):
     """The shot without small structures, but with its edges."""
 
     title = "total variation"
+    function = staticmethod(total_variation_source)
+    place = 60
     method: Literal["total-variation"] = "total-variation"
     weight: float = Field(
         default=2.0,
@@ -346,27 +356,14 @@ class TotalVariationEstimate(Estimate):
         steps = max(1, self.iterations // factor**2)
         return super().coarser(factor).model_copy(update={"iterations": steps})
 
-    def _source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None,
-        on_warning: OnWarning | None,
-    ) -> FloatArray:
-        return total_variation_source(
-            image,
-            weight=self.weight,
-            iterations=self.iterations,
-            mask=mask,
-            should_stop=should_stop,
-        )
-
 
 class InterpolatedEstimate(Estimate):
     """The shot, with the masked part filled in from around it."""
 
     needs_mask = True
     title = "filled in under the mask"
+    function = staticmethod(interpolated_source)
+    place = 70
     method: Literal["interpolated"] = "interpolated"
     width: float = width_field(
         5.0,
@@ -384,15 +381,3 @@ class InterpolatedEstimate(Estimate):
             "gaps at the edge."
         ),
     )
-
-    def _source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None,
-        on_warning: OnWarning | None,
-    ) -> FloatArray:
-        assert mask is not None  # checked before
-        return interpolated_source(
-            image, mask, width=self.width, kind=self.kind, should_stop=should_stop
-        )

@@ -22,8 +22,6 @@ from napari_shadowinv.preprocessing.pixels import (
     with_flux_of,
 )
 
-__all__ = ["FILL_WIDTH", "filled", "interpolated_source", "without_masked"]
-
 FILL_WIDTH = 5.0  # px
 _COARSEST_SIDE = 32
 _TOLERANCE = 1e-6
@@ -48,10 +46,11 @@ def interpolated_source(
 ) -> FloatArray:
     """The image itself, with the part that the object covers filled in from around it.
 
+    An estimate like those of `napari_shadowinv.preprocessing.estimates`.
+
     Parameters
     ----------
     image : array_like, shape (H, W)
-        The shot; counts or any linear measure of fluence.
     mask : array_like of bool, shape (H, W)
         True where the image shows the bare beam, False where the object is.
     width : float, default 5
@@ -61,20 +60,11 @@ def interpolated_source(
         "biharmonic" continues slope and curvature of the beam: for gaps inside the image.
         "laplace" never leaves the range of the surroundings: for gaps at the image's edge.
     should_stop : callable, optional
-        Asked at each step; when it returns true the estimate ends.
 
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The beam in the unit of `image`; where the mask is true, the image itself.
-
-    Raises
-    ------
-    InputError
-        If image and mask cannot be used, the image has no flux, the width is not positive, or
-        the kind unknown.
-    InversionCancelled
-        If `should_stop` returned true.
+        Where the mask is true, the image itself.
 
     Notes
     -----

@@ -7,7 +7,8 @@
 Film darkens with dose; the net optical density log10(unexposed / exposed) does not depend
 on the scanner's gain, so a table can serve scans of another day if unexposed film was
 scanned with them. Fluence is proportional to dose as long as the particles of a layer lose
-about the same energy in it.
+about the same energy in it. Doses are in Gy; a `channel` is "red", the default, which tells
+small doses best, "green" or "blue".
 
 References
 ----------
@@ -21,17 +22,16 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 
 __all__ = ["Calibration", "DoseMap", "dose", "net_optical_density"]
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 _CHANNELS = ("red", "green", "blue")
 
@@ -42,13 +42,13 @@ class DoseMap(NamedTuple):
     Attributes
     ----------
     dose : ndarray of float64, shape (H, W)
-        Dose in Gy, held at the nearer end of the calibrated range outside of it.
+        Held at the nearer end of the calibrated range outside of it.
     outside : ndarray of bool, shape (H, W)
         True where the film is lighter or darker than any that was calibrated.
     """
 
     dose: FloatArray
-    outside: NDArray[np.bool_]
+    outside: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,6 @@ class Calibration:
     Attributes
     ----------
     doses : ndarray, shape (n,)
-        Doses in Gy.
     pixels : ndarray, shape (n, 3)
         Mean red, green and blue pixel of each film.
     background : ndarray, shape (3,)
@@ -73,10 +72,8 @@ class Calibration:
     --------
     >>> grey = np.array([[40000.0], [4000.0], [400.0]])
     >>> film = Calibration(np.array([1.0, 10.0, 100.0]), np.repeat(grey, 3, axis=1))
-    >>> film.optical_density([1.0, 10.0, 100.0])
-    array([0., 1., 2.])
-    >>> film.dose_range()
-    (1.0, 100.0)
+    >>> film.optical_density([1.0, 10.0, 100.0]), film.dose_range()
+    (array([0., 1., 2.]), (1.0, 100.0))
     """
 
     doses: FloatArray
@@ -119,11 +116,11 @@ class Calibration:
         path : str or Path
             Comma-separated values. The first line names the columns: one holds "dose" but not
             "log", others begin with "red", "green" and "blue"; the rest is ignored. A second
-            line may tell units; doses are in Gy.
+            line may tell units.
         background : array_like, shape (3,), optional
             Pixel of unexposed film.
         dose_range : tuple of float
-            Smallest and largest dose in Gy of the rows to use. Tables are often continued by
+            Smallest and largest dose of the rows to use. Tables are often continued by
             extrapolation; leave that part out here.
 
         Raises
@@ -143,14 +140,10 @@ class Calibration:
         return cls(used[:, 0], used[:, 1:], empty)
 
     def curve(self, channel: str = "red") -> tuple[FloatArray, FloatArray]:
-        """Return the calibration of one channel as a curve that rises everywhere.
+        """Return net optical density and dose of one channel, both strictly increasing, shape (m,).
 
-        Returns
-        -------
-        density, dose : ndarray, shape (m,)
-            Net optical density and dose in Gy, both strictly increasing. Neighbours that noise
-            put in the wrong order count as one film, with their mean density and geometric
-            mean dose.
+        Neighbours that noise put in the wrong order count as one film, with their mean density and
+        geometric mean dose.
         """
         from scipy.optimize import isotonic_regression
 
@@ -169,12 +162,12 @@ class Calibration:
         return density, 10 ** (np.add.reduceat(logarithms, blocks[:-1]) / count)
 
     def dose_range(self, channel: str = "red") -> tuple[float, float]:
-        """Return the smallest and the largest dose in Gy that a channel can tell."""
+        """Return the smallest and the largest dose that a channel can tell."""
         doses = self.curve(channel)[1]
         return float(doses[0]), float(doses[-1])
 
     def optical_density(self, doses: ArrayLike, channel: str = "red") -> FloatArray:
-        """Return the net optical density that doses in Gy give, held at the range's ends.
+        """Return the net optical density that doses give, held at the range's ends.
 
         It is linear in the logarithm of the dose between films; `dose` is its inverse.
         """
@@ -196,7 +189,6 @@ def net_optical_density(
         Pixel of unexposed film, one for each channel, or a scan of it: then the median of
         its middle half in height and width counts, since its rim shows the scanner's bed.
     channel : {"red", "green", "blue"}
-        Which channel; the red one sees small doses best.
 
     Returns
     -------
@@ -220,7 +212,7 @@ def net_optical_density(
     return density
 
 
-def _plane(scan: NDArray[Any], channel: str, name: str) -> FloatArray:
+def _plane(scan: AnyArray, channel: str, name: str) -> FloatArray:
     column = _channel(channel)
     is_colour = scan.ndim == 3 and scan.shape[-1] in (3, 4)
     if scan.size == 0 or not (scan.ndim == 2 or is_colour):
@@ -233,7 +225,7 @@ def _plane(scan: NDArray[Any], channel: str, name: str) -> FloatArray:
     return plane
 
 
-def _unexposed(background: NDArray[Any], channel: str) -> float:
+def _unexposed(background: AnyArray, channel: str) -> float:
     if background.ndim == 0:
         value = float(background)
     elif background.shape == (3,):
@@ -265,20 +257,11 @@ def dose(
 
     Parameters
     ----------
-    scan : array_like, shape (H, W, 3) or (H, W, 4) or (H, W)
-        Scan of the film, as for `net_optical_density`.
+    scan, background, channel
+        As for `net_optical_density`. The default background is the calibration's: then the scan
+        must have been made with the same scanner and settings.
     calibration : Calibration
         Table for this kind of film.
-    background : float or array_like, optional
-        Unexposed film, as for `net_optical_density`. The calibration's own if not given: then
-        the scan must have been made with the same scanner and settings.
-    channel : {"red", "green", "blue"}
-        Which channel. Red tells small doses, green and blue larger ones.
-
-    Returns
-    -------
-    DoseMap
-        Dose in Gy, and where it lies outside of the calibrated range.
 
     Raises
     ------

@@ -3,7 +3,11 @@
 - keep only small or only large structures: `high_pass`, `low_pass`, `butterworth`
 - flatten an uneven beam: `remove_background`
 - each with its parameters, to be one step of a recipe: `LowPassFilter`, `HighPassFilter`,
-  `ButterworthFilter`, `BackgroundFilter`
+  `ButterworthFilter`, `BackgroundFilter`; what they have in common: `Filter`
+
+All take an image or a potential ``[y, x]``, in any unit, and return float64 of the same shape
+and unit. An `InputError` refuses an image that is not two-dimensional and finite, and a parameter
+out of range.
 
 An inversion amplifies low frequencies: a source that is wrong by little on a large scale
 makes a large false potential. Filtering the image, the potential, or both is the simple
@@ -16,8 +20,9 @@ around, and each cosine that fits the image is attenuated by exactly its gain.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import scipy
@@ -55,38 +60,20 @@ __all__ = [
 class Filter(Step):
     """A step that changes the values of the image, and of a measured source alike."""
 
+    function: ClassVar[Callable[..., FloatArray]]
+    """Filters an image by the parameters."""
+
     def filtered(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
     ) -> FloatArray:
-        """Apply it, so that what is masked, even NaN, does not touch the rest.
-
-        Parameters
-        ----------
-        image : ndarray, shape (H, W)
-            The shot.
-        mask : ndarray of bool, shape (H, W), or None
-            The pixels that can be used.
-        should_stop : callable, optional
-            Asked now and then by filters that take long.
-
-        Returns
-        -------
-        ndarray, shape (H, W)
-
-        Raises
-        ------
-        InputError
-            If the image cannot be used.
-        InversionCancelled
-            If `should_stop` returned true.
-        """
+        """Apply it, so that what is masked, even NaN, does not touch the rest."""
         values = np.asarray(image, dtype=np.float64)
         return self._filtered(without_masked(values, mask, should_stop), mask, should_stop)
 
     def _filtered(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
     ) -> FloatArray:
-        raise NotImplementedError
+        return self.function(image, **self.values())
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
         """Say what was done."""
@@ -107,7 +94,6 @@ def low_pass(image: ArrayLike, width: float) -> FloatArray:
     Parameters
     ----------
     image : array_like, shape (H, W)
-        An image or a potential, any unit.
     width : float
         Standard deviation σ of the Gaussian in px. A wave of wave number k (rad/px) keeps
         exp(-k²σ²/2) of its amplitude: half of it at a wavelength of 5.3 σ.
@@ -115,13 +101,8 @@ def low_pass(image: ArrayLike, width: float) -> FloatArray:
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The blurred image. Never below the least nor above the largest value of `image`,
-        apart from rounding and, for σ below 1 px, ringing.
-
-    Raises
-    ------
-    InputError
-        If the image is not two-dimensional and finite, or the width not positive.
+        Never below the least nor above the largest value of `image`, apart from rounding and,
+        for σ below 1 px, ringing.
 
     Examples
     --------
@@ -139,15 +120,11 @@ class LowPassFilter(Filter):
     """Take away small structures."""
 
     title = "low-pass (smooth)"
+    function = staticmethod(low_pass)
     primary = "width"
     place = 80
     step: Literal["low-pass"] = "low-pass"
     width: float = width_field(1.0, "Standard deviation of the Gaussian blur in px.", 0.1, 20.0)
-
-    def _filtered(
-        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
-    ) -> FloatArray:
-        return low_pass(image, self.width)
 
 
 def high_pass(image: ArrayLike, width: float, *, keep_mean: bool = True) -> FloatArray:
@@ -156,23 +133,12 @@ def high_pass(image: ArrayLike, width: float, *, keep_mean: bool = True) -> Floa
     Parameters
     ----------
     image : array_like, shape (H, W)
-        An image or a potential, any unit.
     width : float
         Standard deviation σ of the Gaussian in px: structures much larger than σ vanish. A
         wave of wave number k keeps 1 - exp(-k²σ²/2) of its amplitude.
     keep_mean : bool, default True
         Put the mean of `image` back, so that the total flux stays. Without it,
         ``high_pass(image, width, keep_mean=False) + low_pass(image, width)`` is the image.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        The filtered image.
-
-    Raises
-    ------
-    InputError
-        If the image is not two-dimensional and finite, or the width not positive.
 
     Notes
     -----
@@ -200,6 +166,7 @@ class HighPassFilter(Filter):
     """Take away large structures."""
 
     title = "high-pass"
+    function = staticmethod(high_pass)
     primary = "width"
     place = 60
     step: Literal["high-pass"] = "high-pass"
@@ -210,11 +177,6 @@ class HighPassFilter(Filter):
     @property
     def flattens(self) -> bool:
         return True
-
-    def _filtered(
-        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
-    ) -> FloatArray:
-        return high_pass(image, self.width)
 
 
 def butterworth(
@@ -230,7 +192,6 @@ def butterworth(
     Parameters
     ----------
     image : array_like, shape (H, W)
-        An image or a potential, any unit.
     cutoff : float
         Wavelength in px at which the amplitude falls by 1/√2.
     order : int, default 2
@@ -244,13 +205,7 @@ def butterworth(
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The filtered image; it can be negative, see `high_pass`.
-
-    Raises
-    ------
-    InputError
-        If the image is not two-dimensional and finite, the cutoff not positive, the order no
-        integer of at least 1, or the kind unknown.
+        It can be negative, see `high_pass`.
 
     References
     ----------
@@ -283,6 +238,7 @@ class ButterworthFilter(Filter):
     """Take away large or small structures, with a chosen steepness."""
 
     title = "Butterworth"
+    function = staticmethod(butterworth)
     primary = "cutoff"
     place = 70
     step: Literal["butterworth"] = "butterworth"
@@ -314,11 +270,6 @@ class ButterworthFilter(Filter):
     def flattens(self) -> bool:
         return self.kind == "high"
 
-    def _filtered(
-        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
-    ) -> FloatArray:
-        return butterworth(image, self.cutoff, self.order, kind=self.kind)
-
 
 def remove_background(
     image: ArrayLike,
@@ -328,12 +279,11 @@ def remove_background(
     mask: ArrayLike | None = None,
     should_stop: ShouldStop | None = None,
 ) -> FloatArray:
-    """Flatten an image by a polynomial fitted to it; the mean stays.
+    """Flatten an image by a polynomial fitted to it as by `fit_polynomial`; the mean stays.
 
     Parameters
     ----------
     image : array_like, shape (H, W)
-        An image or a potential, any unit.
     degree : int, default 2
         Total degree of the polynomial in y and x, from 0 to 10.
     kind : {"divide", "subtract"}, default "divide"
@@ -353,15 +303,10 @@ def remove_background(
     Raises
     ------
     InputError
-        If the image is not two-dimensional and finite, the mask of another shape or without
-        enough pixels, the degree or kind unknown, or the polynomial to divide by is not
-        positive all over the image.
+        Also if the mask leaves too few pixels, or the polynomial to divide by is not positive
+        all over the image.
     InversionCancelled
         If `should_stop` returned true.
-
-    See Also
-    --------
-    polynomial_source : the same fit, as the source of an inversion.
 
     Examples
     --------

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.preprocessing.estimate import Estimate
-from napari_shadowinv.preprocessing.estimates import uniform_source
+from napari_shadowinv.preprocessing.estimates import Estimate, uniform_source
 from napari_shadowinv.preprocessing.pixels import (
     MOST_EXTRAPOLATION,
     NORMAL_MAD,
@@ -22,8 +21,6 @@ from napari_shadowinv.preprocessing.pixels import (
     block_means,
     with_flux_of,
 )
-
-__all__ = ["GaussianEstimate", "gaussian_source"]
 
 _MOST_FITTED_PIXELS = 2**16
 _MOST_FITS = 10
@@ -36,6 +33,7 @@ class GaussianEstimate(Estimate):
     """A fitted elliptical spot."""
 
     title = "fitted Gaussian"
+    place = 30
     method: Literal["gaussian"] = "gaussian"
 
     def _source(
@@ -57,29 +55,20 @@ def gaussian_source(
 ) -> FloatArray:
     """Elliptical Gaussian plus a constant, fitted to the image.
 
+    An estimate like those of `napari_shadowinv.preprocessing.estimates`.
+
     Parameters
     ----------
     image : array_like, shape (H, W)
-        The shot; counts or any linear measure of fluence.
     mask : array_like of bool, shape (H, W), optional
-        True where a pixel is usable. Default: everywhere.
     should_stop : callable, optional
-        Asked at each step; when it returns true the estimate ends.
     on_warning : callable, optional
         Receives a sentence where the fit has to be doubted. Default: `warnings.warn`.
 
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The fitted beam, in the unit of `image`; the same everywhere if the fit rises, where
-        nothing is seen, to ten times what is seen.
-
-    Raises
-    ------
-    InputError
-        If image and mask cannot be used, or the image has no flux.
-    InversionCancelled
-        If `should_stop` returned true.
+        The same everywhere if the fit rises, where nothing is seen, to ten times what is seen.
 
     Notes
     -----
@@ -139,18 +128,27 @@ def _fitted_gaussian(
 ) -> FloatArray:
     """Parameters of `_gaussian` that fit samples, by repeated robust least squares."""
     bounds = _bounds(y, x)
-    parameters = np.clip(_first_gaussian(y, x, sample), *bounds)
+
+    def excess(p: FloatArray) -> FloatArray:
+        report("source", 0)
+        return _gaussian(p, y, x) - sample
+
+    def fitted(start: FloatArray, loss: str, scale: float) -> FloatArray:
+        fit = scipy.optimize.least_squares(
+            excess, start, lambda p: _gaussian_slopes(p, y, x), bounds,
+            loss=loss, f_scale=scale, x_scale="jac", max_nfev=200,
+        )  # fmt: skip
+        return np.asarray(fit.x)
+
     # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
-    parameters = _refitted(parameters, y, x, sample, report, bounds, loss="linear", scale=1.0)
+    parameters = fitted(np.clip(_first_gaussian(y, x, sample), *bounds), "linear", 1.0)
     scale = 0.0
     for _ in range(_MOST_FITS):
         residual = _gaussian(parameters, y, x) - sample
         previous, scale = scale, max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
         if abs(scale - previous) < 1e-2 * scale:
             break
-        parameters = _refitted(
-            parameters, y, x, sample, report, bounds, loss="soft_l1", scale=scale
-        )
+        parameters = fitted(parameters, "soft_l1", scale)
     return parameters
 
 
@@ -213,10 +211,8 @@ def _first_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatAr
 
 
 def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
-    """Height · exp(-½(u² + v²)) + constant, with u = a·dy + b·dx and v = c·dx.
-
-    The factors of the inverse covariance, unlike its entries, may take any value.
-    """
+    """Height · exp(-½(u² + v²)) + constant, with u = a·dy + b·dx and v = c·dx."""
+    # The factors of the inverse covariance, unlike its entries, may take any value.
     height, constant, centre_y, centre_x, a, b, c = parameters
     u = a * (y - centre_y) + b * (x - centre_x)
     v = c * (x - centre_x)

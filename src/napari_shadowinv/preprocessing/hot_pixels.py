@@ -20,8 +20,6 @@ from napari_shadowinv.preprocessing.pixels import (
     checked_pixels,
 )
 
-__all__ = ["HotPixelFilter", "remove_hot_pixels"]
-
 _NORMAL_MEAN = 1.2533  # standard deviation over mean absolute deviation, normal noise
 _PIXELS_PER_NOISE_BIN = 400
 _MOST_NOISE_BINS = 16
@@ -92,8 +90,7 @@ def remove_hot_pixels(
     Raises
     ------
     InputError
-        If the image is not two-dimensional and finite, the threshold not positive, or the
-        size not an odd number of at least 3.
+        If the image is not two-dimensional and finite, or a parameter out of range.
     InversionCancelled
         If `should_stop` returned true.
 
@@ -140,10 +137,8 @@ def remove_hot_pixels(
 def _neighbours(
     values: FloatArray, size: int, report: Reporter
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Median of the pixels around each, and the brightest and darkest that may be sound.
-
-    The pixel itself does not count: with it, the noise would seem smaller than it is.
-    """
+    """Median of the pixels around each, and the brightest and darkest that may be sound."""
+    # The pixel itself does not count: with it, the noise would seem smaller than it is.
     footprint = np.ones((size, size), dtype=np.bool_)
     footprint[size // 2, size // 2] = False
     n = size * size - 1

@@ -13,22 +13,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, PrivateAttr
 
-from napari_shadowinv._system.progress import OnWarning, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import Setup, binned_setup
-from napari_shadowinv.preprocessing.estimate import Estimate
+from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.pixels import beam_pixels
 
-__all__ = [
-    "IsotropicEstimate",
-    "centre_within",
-    "isotropic_source",
-    "point_distance",
-    "uniform_warnings",
-]
-
 _NOTABLE_FALL = 0.01  # of the fluence, from the brightest pixel to the dimmest
+
+
+def _centre_field(axis: str, line: str) -> Any:
+    return Field(
+        default=None,
+        allow_inf_nan=False,
+        title=f"Centre {axis} (px)",
+        description=(
+            f"{line} of the recorded image at which the detector faces the source. Default: its "
+            "centre."
+        ),
+    )
 
 
 class IsotropicEstimate(Estimate):
@@ -36,24 +39,10 @@ class IsotropicEstimate(Estimate):
 
     title = "isotropic point source"
     uses_mask = False
+    place = 20
     method: Literal["isotropic"] = "isotropic"
-    centre_y: float | None = Field(
-        default=None,
-        allow_inf_nan=False,
-        title="Centre y (px)",
-        description=(
-            "Row of the recorded image at which the detector faces the source. Default: its centre."
-        ),
-    )
-    centre_x: float | None = Field(
-        default=None,
-        allow_inf_nan=False,
-        title="Centre x (px)",
-        description=(
-            "Column of the recorded image at which the detector faces the source. Default: its "
-            "centre."
-        ),
-    )
+    centre_y: float | None = _centre_field("y", "Row")
+    centre_x: float | None = _centre_field("x", "Column")
     # Not a parameter: every face of the package asks for the setup elsewhere.
     _setup: Any = PrivateAttr(default=None)
 
@@ -71,13 +60,7 @@ class IsotropicEstimate(Estimate):
         y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
         return self._at(y, x, binned_setup(self._setup, factor))
 
-    def _source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None,
-        on_warning: OnWarning | None,
-    ) -> FloatArray:
+    def _source(self, image: FloatArray, mask: BoolArray | None, *_: Any) -> FloatArray:
         if self._setup is None:
             raise _without_setup()
         return isotropic_source(image, self._setup, mask=mask, **self.values())
@@ -94,10 +77,7 @@ def centre_within(
     y: float | None = None,
     x: float | None = None,
 ) -> tuple[float, float]:
-    """Return where a place in the image as recorded, by default its centre, lies in part of it.
-
-    `shape` and `matrix` are those of `Estimate.placed`.
-    """
+    """Return where a place in the image as recorded, by default its centre, lies in part of it."""
     middle = [(side - 1) / 2 for side in shape]
     recorded = [m if given is None else given for m, given in zip(middle, (y, x), strict=True)]
     if matrix is not None:
@@ -113,10 +93,7 @@ def _without_setup() -> InputError:
 
 
 def uniform_warnings(
-    shape: tuple[int, int],
-    setup: Setup | None,
-    *,
-    centre: tuple[float, float] | None = None,
+    shape: tuple[int, int], setup: Setup | None, *, centre: tuple[float, float] | None = None
 ) -> tuple[str, ...]:
     """Say whether a point source would light an image too unevenly to be taken as uniform.
 
@@ -124,10 +101,10 @@ def uniform_warnings(
     ----------
     shape : tuple of int
         Height and width of the image.
-    setup : Setup, optional
-        The experiment. Default: not known, and nothing is said.
+    setup : Setup or None
+        The experiment; nothing is said where it is not known.
     centre : tuple of float, optional
-        See `isotropic_source`, there `centre_y` and `centre_x`.
+        Pixel (y, x) in which the detector faces the point. Default: the middle of the image.
 
     Returns
     -------
@@ -169,6 +146,9 @@ def isotropic_source(
 ) -> FloatArray:
     """Beam of a point that shines evenly in all directions, on a flat detector.
 
+    An estimate like those of `napari_shadowinv.preprocessing.estimates`; an `InputError` refuses a
+    setup whose beam is collimated, too.
+
     Parameters
     ----------
     image : array_like, shape (H, W)
@@ -178,18 +158,6 @@ def isotropic_source(
     centre_y, centre_x : float, optional
         Pixel in which the detector faces the point. Default: the middle of the image.
     mask : array_like of bool, shape (H, W), optional
-        True where a pixel is usable. Default: everywhere.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        The beam, in the unit of `image`.
-
-    Raises
-    ------
-    InputError
-        If image and mask cannot be used, the image has no flux, the beam of the setup is
-        collimated, or the centre is not finite.
 
     Notes
     -----
@@ -217,13 +185,7 @@ def isotropic_source(
 
 
 def point_distance(setup: Setup) -> float:
-    """Return how far the point source is from the detector, in px of the detector.
-
-    Raises
-    ------
-    InputError
-        If the beam is collimated.
-    """
+    """Return how far the point source is from the detector, in px of the detector."""
     if setup.collimated:
         raise InputError(
             "got the source 'isotropic' and a setup with a collimated beam "

@@ -17,16 +17,6 @@ from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = [
-    "beam_pixels",
-    "block_means",
-    "checked_integer",
-    "checked_number",
-    "checked_pixels",
-    "fit_polynomial",
-    "with_flux_of",
-]
-
 _HIGHEST_DEGREE = 10
 _MOST_REWEIGHTINGS = 50
 NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal noise
@@ -38,34 +28,9 @@ MOST_EXTRAPOLATION = 10.0  # times the brightest pixel seen
 def checked_pixels(
     image: ArrayLike, mask: ArrayLike | None = None, *, name: str = "image"
 ) -> tuple[FloatArray, BoolArray]:
-    """Return an image as floats and its usable pixels, or say what is wrong with them.
+    """Return a copy of an image as floats and its usable pixels, or say what is wrong with them.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-        An image or a potential.
-    mask : array_like of bool, shape (H, W), optional
-        True where a pixel is usable. Default: everywhere.
-    name : str, optional
-        What the error messages call the image.
-
-    Returns
-    -------
-    values : ndarray of float64, shape (H, W)
-        A copy; masked pixels, which may be NaN, are set to the mean of the usable ones.
-    usable : ndarray of bool, shape (H, W)
-        The mask.
-
-    Raises
-    ------
-    InputError
-        If the image is not two-dimensional, has no pixels, is not real, or a usable pixel is
-        not finite; if the mask has another shape, is not boolean, or leaves no pixel.
-
-    Examples
-    --------
-    >>> checked_pixels([[1.0, 3.0]], [[True, False]])[0]
-    array([[1., 1.]])
+    Masked pixels, which may be NaN, are set to the mean of the usable ones.
     """
     array = np.asarray(image)
     if array.ndim != 2 or array.size == 0:
@@ -104,13 +69,7 @@ def _checked_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str) -> 
 
 
 def checked_number(name: str, value: float, *, above: float, unit: str) -> float:
-    """Return a finite number above a limit, or say what was received instead.
-
-    Raises
-    ------
-    InputError
-        If the value is no finite number above the limit.
-    """
+    """Return a finite number above a limit, or say what was received instead."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -121,13 +80,7 @@ def checked_number(name: str, value: float, *, above: float, unit: str) -> float
 
 
 def checked_integer(name: str, value: int, *, least: int, most: int | None = None) -> int:
-    """Return an integer within limits, or say what was received instead.
-
-    Raises
-    ------
-    InputError
-        If the value is no integer or out of range.
-    """
+    """Return an integer within limits, or say what was received instead."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -227,7 +180,9 @@ def fit_polynomial(
             f"degree {degree} has {terms} coefficients, image has {int(usable.sum())} usable "
             "pixels: use a lower degree or mask fewer pixels"
         )
-    rows, columns = (_basis(side, degree) for side in values.shape)
+    rows, columns = (
+        np.asarray(legvander(np.linspace(-1, 1, side), degree), np.float64) for side in values.shape
+    )
     fit = _weighted_fit(values, usable.astype(np.float64), rows, columns)
     rounding = 1e-12 * float(np.abs(values).max())
     report = Reporter(None, should_stop)
@@ -244,19 +199,12 @@ def fit_polynomial(
     return fit
 
 
-def _basis(side: int, degree: int) -> FloatArray:
-    """Legendre polynomials along an axis, shape (side, degree + 1)."""
-    return np.asarray(legvander(np.linspace(-1, 1, side), degree), dtype=np.float64)
-
-
 def _weighted_fit(
     values: FloatArray, weights: FloatArray, rows: FloatArray, columns: FloatArray
 ) -> FloatArray:
-    """Polynomial of least weighted squares, from bases along y and x.
-
-    The normal equations need sums of the weights over products of the bases only; those
-    separate into y and x, so no matrix of pixels × coefficients is formed.
-    """
+    """Polynomial of least weighted squares, from bases along y and x."""
+    # The normal equations need sums of the weights over products of the bases only; those
+    # separate into y and x, so no matrix of pixels × coefficients is formed.
     n = rows.shape[1]
     pairs = [
         (basis[:, :, None] * basis[:, None, :]).reshape(-1, n * n) for basis in (rows, columns)

@@ -15,8 +15,6 @@ from napari_shadowinv.errors import InputError
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Radiograph"]
-
 
 @dataclass(frozen=True, eq=False)
 class Radiograph:
@@ -68,9 +66,7 @@ class Radiograph:
         return replace(self, metadata={**self.metadata, "notes": (*self.notes, *notes)})
 
     def mapped(
-        self,
-        values: Callable[[FloatArray], FloatArray],
-        masks: Callable[[BoolArray], BoolArray],
+        self, values: Callable[[FloatArray], FloatArray], masks: Callable[[BoolArray], BoolArray]
     ) -> Radiograph:
         """Return the same with a function applied to image and source, another to the masks."""
         return replace(
@@ -82,30 +78,20 @@ class Radiograph:
         )
 
     def binned(self, factor: int) -> Radiograph:
-        """Sum blocks of pixels; the setup's pixel grows with them.
+        """Sum blocks of `factor` × `factor` pixels; the setup's pixel grows with them.
 
-        Parameters
-        ----------
-        factor : int
-            Side of a block in pixels. Rows and columns that fill no block are cut off at
-            the end.
-
-        Returns
-        -------
-        Radiograph
-            A smaller one, with ``bin`` in its metadata. A block can be used if all its
-            pixels can.
+        Rows and columns that fill no block are cut off at the end. A block can be used if all its
+        pixels can. The metadata's ``bin`` tells the factor.
 
         Raises
         ------
         InputError
-            If `factor` is less than 1 or leaves less than 2×2 blocks, or there are none.
+            If `factor` is less than 1 or leaves less than 2×2 blocks.
 
         Examples
         --------
         >>> Radiograph(np.ones((5, 6))).binned(2).image
-        array([[4., 4., 4.],
-               [4., 4., 4.]])
+        array([[4., 4., 4.], [4., 4., 4.]])
         """
         from napari_shadowinv.physics.setup import binned_setup
 

@@ -23,8 +23,8 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.preprocessing import estimates, gaussian, hot_pixels, isotropic  # noqa: F401
-from napari_shadowinv.preprocessing.estimate import Estimate
+from napari_shadowinv.preprocessing import gaussian, hot_pixels, isotropic  # noqa: F401
+from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.filters import Filter
 from napari_shadowinv.preprocessing.radiograph import Radiograph
 from napari_shadowinv.preprocessing.steps import Choice, Step, choices_of
@@ -32,16 +32,6 @@ from napari_shadowinv.preprocessing.steps import Choice, Step, choices_of
 if TYPE_CHECKING:
     from napari_shadowinv._system.progress import OnWarning, ShouldStop
 
-__all__ = [
-    "ESTIMATES",
-    "FILTERS",
-    "STEPS",
-    "MeasuredSource",
-    "Origin",
-    "Provenance",
-    "Recipe",
-    "check_masks",
-]
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 _LEAST_VISIBLE = 0.1  # of what the source mask hides in one place, for the inversion to see it
@@ -60,14 +50,12 @@ class MeasuredSource(Choice):
         default=None, title="File", description="Image of the undisturbed beam."
     )
     variable: str | None = Field(
-        default=None,
-        title="Variable",
-        description="Name of the array in a file with several.",
+        default=None, title="Variable", description="Name of the array in a file with several."
     )
 
 
 # Whatever is defined in the modules imported here is a step, or a source, of a recipe.
-STEPS = dict(sorted(choices_of(Step).items(), key=lambda item: item[1].place))
+STEPS = choices_of(Step)
 FILTERS = {name: step for name, step in STEPS.items() if issubclass(step, Filter)}
 ESTIMATES = choices_of(Estimate)
 
@@ -112,9 +100,7 @@ class Recipe(BaseModel):
         description="Image of the same size, 0 where the object covers the beam.",
     )
     mask: Path | None = Field(
-        default=None,
-        title="Mask",
-        description="Image of the same size, 0 at unusable pixels.",
+        default=None, title="Mask", description="Image of the same size, 0 at unusable pixels."
     )
     setup: Setup | None = Field(
         default=None,
@@ -158,11 +144,6 @@ class Recipe(BaseModel):
     def check(self, shot: Radiograph) -> None:
         """Reject choices that contradict each other, or the shot, before any work is done.
 
-        Parameters
-        ----------
-        shot : Radiograph
-            The shot with its source and masks.
-
         Raises
         ------
         InputError
@@ -205,22 +186,7 @@ class Recipe(BaseModel):
             )
 
     def prepared(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
-        """Return a shot, with its source and masks, after all steps.
-
-        Parameters
-        ----------
-        shot : Radiograph
-            The shot as recorded.
-        should_stop : callable, optional
-            Asked now and then.
-
-        Raises
-        ------
-        InputError
-            If a step cannot be done.
-        InversionCancelled
-            If `should_stop` returned true.
-        """
+        """Return a shot, with its source and masks, after all steps; see `Step.applied`."""
         for step in self.steps:
             shot = step.applied(shot, should_stop)
         return shot
@@ -229,15 +195,10 @@ class Recipe(BaseModel):
 def check_masks(mask: BoolArray | None, bare: BoolArray | None) -> None:
     """Reject a mask that excludes the object, as marked by the source mask, from the inversion.
 
-    Parameters
-    ----------
-    mask, bare : ndarray of bool, shape (H, W), or None
-        The pixels that can be used, and those where the object is not.
-
     Raises
     ------
     InputError
-        If next to nothing of the object is left.
+        If next to nothing of the object, where `bare` is False, is left.
     """
     if mask is None or bare is None or bare.all():
         return
@@ -274,15 +235,10 @@ def estimated_source(
     estimate : Estimate
         How, placed for the shot.
     shot : Radiograph
-        The shot.
     should_stop, on_warning : callable, optional
-        See `Estimate.source`.
+        For `Estimate.source`.
     by : callable, optional
         Called in place of `Estimate.source`, such as one that remembers.
-
-    Returns
-    -------
-    ndarray, shape (H, W)
     """
     masks = [mask for mask in (shot.mask, shot.source_mask) if mask is not None]
     usable = np.logical_and.reduce(masks) if masks else None
@@ -324,10 +280,8 @@ class Origin(BaseModel):
         Checksum of the file; of the array's values if it was no file.
     variable, channel : str or int or None
         What of the file was taken.
-    pixels : str or None
-        A mask that was drawn, packed.
-    shape : tuple of int or None
-        Its shape.
+    pixels, shape : str and tuple of int, or None
+        A mask that was drawn, packed, and its shape.
     """
 
     model_config = _CONFIG

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from napari_shadowinv._system.progress import ShouldStop
     from napari_shadowinv.preprocessing.radiograph import Radiograph
 
-__all__ = ["Bin", "Choice", "Crop", "Rotate", "Step", "choices_of", "degree_field", "width_field"]
 
 _SMALLEST_SIDE = 4  # px of a crop
 _WHOLE = 0.999  # share of a rotated pixel that must be known
@@ -35,12 +34,15 @@ class Choice(BaseModel):
         The field that names it in files, ``"step"`` or ``"method"``.
     primary : str
         The parameter that the command's flag of the same name sets; "" if each has its own flag.
+    place : int
+        Where it stands in lists; steps that flags ask for are done in the order of their places.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     title: ClassVar[str]
     key: ClassVar[str]
     primary: ClassVar[str] = ""
+    place: ClassVar[int] = 100
 
     @classmethod
     def name(cls) -> str:
@@ -68,13 +70,12 @@ C = TypeVar("C", bound=Choice)
 
 
 def choices_of(base: type[C]) -> dict[str, type[C]]:
-    """Return the classes made of a base, by name, in the order of their definition."""
-    found: dict[str, type[C]] = {}
-    for one in base.__subclasses__():
-        if one.key in one.model_fields:
-            found[one.name()] = one
-        found |= choices_of(one)
-    return found
+    """Return the classes made of a base, by name, in the order of their places."""
+    classes = [base]
+    for one in classes:
+        classes += one.__subclasses__()
+    named = sorted((c for c in classes if c.key in c.model_fields), key=lambda c: c.place)
+    return {one.name(): one for one in named}
 
 
 def degree_field(description: str) -> Any:
@@ -102,16 +103,9 @@ def width_field(default: float, description: str, least: float, most: float) -> 
 
 
 class Step(Choice):
-    """Something done to a shot before its inversion.
-
-    Attributes
-    ----------
-    place : int
-        Steps that the command's flags ask for are applied by increasing place.
-    """
+    """Something done to a shot before its inversion."""
 
     key = "step"
-    place: ClassVar[int] = 50
 
     @property
     def flattens(self) -> bool:
@@ -121,19 +115,12 @@ class Step(Choice):
     def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         """Return the shot with this done to image, source, masks and setup.
 
-        Parameters
-        ----------
-        shot : Radiograph
-            The shot.
-        should_stop : callable, optional
-            Asked now and then by steps that take long.
-
         Raises
         ------
         InputError
             If it cannot be done to this image.
         InversionCancelled
-            If `should_stop` returned true.
+            If `should_stop`, asked now and then by steps that take long, returned true.
         """
         raise NotImplementedError
 
@@ -262,13 +249,7 @@ class Crop(Step):
     )
 
     def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Return the rows and columns that are kept of an image.
-
-        Raises
-        ------
-        InputError
-            If fewer than 4 × 4 pixels would be left.
-        """
+        """Return the rows and columns that are kept of an image; at least 4 × 4 pixels."""
         rows, columns = (
             slice(*slice(*part).indices(side))
             for part, side in zip((self.y, self.x), shape, strict=True)

@@ -23,10 +23,16 @@ from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.layer_metadata import mark, result_of, role_of, unit_of
 from napari_shadowinv._napari.widgets import _runner, invert_shot
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
-from napari_shadowinv.inversion.result import provenance_of
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
-from napari_shadowinv.preprocessing import STEPS, Crop, LowPassFilter, PolynomialEstimate, Recipe
+from napari_shadowinv.preprocessing import (
+    STEPS,
+    Crop,
+    LowPassFilter,
+    PolynomialEstimate,
+    Provenance,
+    Recipe,
+)
 
 Array = np.ndarray[Any, Any]
 FEW = {"n_sites": 500}
@@ -274,7 +280,7 @@ def test_a_saved_result_tells_how_it_was_made(
     tool.crop.layer = window.add_shapes(np.array([[4, 8], [4, 50], [40, 50], [40, 8]]))
     run(tool)
     window.layers.save(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
-    told = provenance_of(read(tmp_path / "a.shadowinv"))
+    told = Provenance.of(read(tmp_path / "a.shadowinv").attrs)
     assert told is not None
     file = (tmp_path / "flame.npy").read_bytes()
     assert told.image.file == "flame.npy"

@@ -21,10 +21,9 @@ from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.cli import app
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.result import provenance_of
 from napari_shadowinv.io.store import read_stack
 from napari_shadowinv.pipeline import read_recipe, write_recipe
-from napari_shadowinv.pipeline.run import run as run_recipe
+from napari_shadowinv.pipeline import run as run_recipe
 from napari_shadowinv.preprocessing import (
     STEPS,
     Bin,
@@ -33,6 +32,7 @@ from napari_shadowinv.preprocessing import (
     LowPassFilter,
     MeasuredSource,
     PolynomialEstimate,
+    Provenance,
     Recipe,
     Rotate,
     Step,
@@ -390,7 +390,7 @@ def test_a_stack_is_inverted_by_a_saved_recipe(
     field = next(one for one in viewer.layers if role_of(one) == "field")
     assert field.data.shape == (2, 22, 30)
     np.testing.assert_allclose(field.data_to_world((1, 0, 0)), stack.data_to_world((1, 2.5, 0.5)))
-    told = provenance_of(dataset)
+    told = Provenance.of(dataset.attrs)
     assert told is not None
     np.testing.assert_array_equal(told.mask.mask(), usable)
 

@@ -33,7 +33,7 @@ from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
-from napari_shadowinv.pipeline.run import run as run_recipe
+from napari_shadowinv.pipeline import run as run_recipe
 from napari_shadowinv.preprocessing import Crop, PolynomialEstimate, Radiograph, Recipe
 
 Array = np.ndarray[Any, Any]

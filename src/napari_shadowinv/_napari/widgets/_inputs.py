@@ -54,7 +54,7 @@ from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.pipeline.run import PREVIEW_SITES
+from napari_shadowinv.pipeline._run import PREVIEW_SITES
 from napari_shadowinv.preprocessing import (
     ESTIMATES,
     Crop,

@@ -15,7 +15,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import check_output, write
 from napari_shadowinv.pipeline import read_recipe, write_recipe
-from napari_shadowinv.pipeline.run import picture_mask, plane_of
+from napari_shadowinv.pipeline._run import picture_mask, plane_of
 from napari_shadowinv.preprocessing import Crop, MeasuredSource, Recipe
 
 if TYPE_CHECKING:

@@ -34,7 +34,7 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.pipeline import Cache
-from napari_shadowinv.pipeline.run import PREVIEW_SITES, run
+from napari_shadowinv.pipeline._run import PREVIEW_SITES, run
 from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 if TYPE_CHECKING:

@@ -8,6 +8,14 @@
   added with ``+``
 - an object that no flip, shift or swap of axes leaves as it is: `ellipse_pair`
 - what they are: `Phantom`
+
+All take `shape`, the image's height and width; magnetic fields also `setup`, the beam. `center`
+is (y, x) in px, may be fractional, and is the image's centre by default. `angle`, in rad, turns
+an ellipse's u axis from y towards x. A positive `peak`, in MG µm, deflects positive charges
+outwards: the field runs counter-clockwise. An `InputError` refuses a shape or length that is not
+positive and a number that is not finite.
+
+The paper is Kasim et al., arXiv:1607.04179.
 """
 
 from napari_shadowinv.physics.phantoms._scenes import (

@@ -7,7 +7,7 @@ minimum is a little below zero, as for the paper's toroid of 194 MG µm.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -31,38 +31,12 @@ from napari_shadowinv.physics.setup import ProtonSetup
 # and width, angle in rad.
 Part = tuple[float, Radii, tuple[float, float], float]
 
-_FOUR_TOROIDS: tuple[Part, ...] = (
-    (135.0, 0.07, (0.31, 0.30), 0.0),
-    (75.0, 0.05, (0.30, 0.69), 0.0),
-    (100.0, 0.06, (0.69, 0.32), 0.0),
-    (125.0, 0.08, (0.67, 0.67), 0.0),
-)
-_COSINE_ELLIPSES: tuple[Part, ...] = (
-    (64.0, (0.24, 0.14), (0.37, 0.31), 0.35),
-    (62.0, (0.14, 0.24), (0.66, 0.67), 0.20),
-)
-_FOCUSING_PAIR: tuple[Part, ...] = (
-    (-63.0, (0.12, 0.07), (0.5, 0.38), 0.2),
-    (-63.0, (0.12, 0.07), (0.5, 0.61), -0.2),
-)
-_OPPOSITE_PAIR: tuple[Part, ...] = (
-    (154.0, 0.08, (0.5, 0.33), 0.0),
-    (-68.0, 0.08, (0.5, 0.67), 0.0),
-)
-
 
 def paper_setup() -> ProtonSetup:
-    """Return the experiment of the paper's benchmark.
+    """Experiment of the paper's benchmark (Section IV A).
 
-    Returns
-    -------
-    ProtonSetup
-        Protons of 14.7 MeV, 1.3 mm from source to object, 2 cm on to the detector, pixels
-        of 1.5 µm in the object plane: 200 pixels are ten times the toroid's σ of 30 µm.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Section IV A.
+    Protons of 14.7 MeV, 1.3 mm from source to object, 2 cm on to the detector, pixels
+    of 1.5 µm in the object plane: 200 pixels are ten times the toroid's σ of 30 µm.
 
     Examples
     --------
@@ -73,69 +47,46 @@ def paper_setup() -> ProtonSetup:
 
 
 def four_toroids(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
-    """Four Gaussian toroids of different strength and size, all counter-clockwise.
+    """Four Gaussian toroids of different strength and size, all counter-clockwise: Fig. 6 (a).
 
-    Parameters
-    ----------
-    shape : tuple of int
-        Height and width of the image; positions and radii scale with it.
-    setup : ProtonSetup
-        The beam.
-    strength : float, default 1
-        Factor on the fields, whose largest peak is then 135 MG µm.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape is not positive, or the strength is not finite.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Fig. 6 (a).
+    Positions and radii scale with the image. `strength` is a factor on the fields, whose largest
+    peak is then 135 MG µm.
     """
-    return _scene(toroid, _FOUR_TOROIDS, shape, setup, strength)
+    parts = [
+        (135.0, 0.07, (0.31, 0.30), 0.0),
+        (75.0, 0.05, (0.30, 0.69), 0.0),
+        (100.0, 0.06, (0.69, 0.32), 0.0),
+        (125.0, 0.08, (0.67, 0.67), 0.0),
+    ]
+    return _scene(toroid, parts, shape, setup, strength)
 
 
 def cosine_ellipses(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
-    """Two elliptical toroids whose potentials are cos² up to a rim, counter-clockwise.
+    """Two elliptical toroids, cos² up to a rim, counter-clockwise: Fig. 6 (b).
 
-    The peak fields are 64 and 62 MG µm; for the rest see `four_toroids`.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Fig. 6 (b).
+    Scaled as `four_toroids`; the peak fields are 64 and 62 MG µm.
     """
-    return _scene(cosine_toroid, _COSINE_ELLIPSES, shape, setup, strength)
+    parts = [(64.0, (0.24, 0.14), (0.37, 0.31), 0.35), (62.0, (0.14, 0.24), (0.66, 0.67), 0.20)]
+    return _scene(cosine_toroid, parts, shape, setup, strength)
 
 
 def focusing_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
-    """Two elliptical Gaussian toroids close together, clockwise: they focus protons.
+    """Two elliptical Gaussian toroids close together, clockwise: they focus protons; Fig. 6 (c).
 
-    The peak fields are 63 MG µm; for the rest see `four_toroids`.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Fig. 6 (c).
+    Scaled as `four_toroids`; the peak fields are 63 MG µm.
     """
-    return _scene(toroid, _FOCUSING_PAIR, shape, setup, strength)
+    parts = [(-63.0, (0.12, 0.07), (0.5, 0.38), 0.2), (-63.0, (0.12, 0.07), (0.5, 0.61), -0.2)]
+    return _scene(toroid, parts, shape, setup, strength)
 
 
 def opposite_pair(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
-    """Gaussian toroids of opposite direction: counter-clockwise left, clockwise right.
+    """Gaussian toroids, counter-clockwise left and clockwise right: Fig. 6 (d).
 
-    The peak fields are 154 and 68 MG µm, as it takes less to make rays meet than to drive them
-    apart until they meet others; for the rest see `four_toroids`.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Fig. 6 (d).
+    Scaled as `four_toroids`; the peak fields are 154 and 68 MG µm, as it takes less to make rays
+    meet than to drive them apart until they meet others.
     """
-    return _scene(toroid, _OPPOSITE_PAIR, shape, setup, strength)
+    parts = [(154.0, 0.08, (0.5, 0.33), 0.0), (-68.0, 0.08, (0.5, 0.67), 0.0)]
+    return _scene(toroid, parts, shape, setup, strength)
 
 
 def coaxial_line(
@@ -145,7 +96,7 @@ def coaxial_line(
     radii: tuple[float, float, float] = (21e-6, 66e-6, 78e-6),
     center: Center = None,
 ) -> tuple[Phantom, BoolArray]:
-    """Coaxial line along the beam: a field between two conductors that stop the beam.
+    """Coaxial line along the beam: a field between two conductors that stop the beam; Fig. 6 (e).
 
     The currents of the two conductors are equal and opposite, and uniform inside each. So
     the field rises ∝ r in the inner conductor, falls ∝ 1/r between the two and to zero
@@ -154,16 +105,12 @@ def coaxial_line(
     Parameters
     ----------
     shape : tuple of int
-        Height and width of the image.
     setup : ProtonSetup
-        The beam.
     peak : float, default 60
-        Path-integrated field at the inner conductor's surface in MG µm; positive deflects
-        positive charges outwards.
+        Path-integrated field at the inner conductor's surface in MG µm.
     radii : tuple of float
-        Radius of the inner conductor, inner and outer radius of the outer one, in m.
+        Radius of the inner conductor, inner and outer radius of the outer one, in m; increasing.
     center : tuple of float, optional
-        Centre (y, x) in px. Default: the image's centre.
 
     Returns
     -------
@@ -171,15 +118,6 @@ def coaxial_line(
         Potential and displacement, inside the conductors too.
     obstructed : ndarray of bool, shape (H, W)
         Pixels whose centres are in a conductor: there the source of the image is dark.
-
-    Raises
-    ------
-    InputError
-        If the radii are not positive and increasing, or a number is not finite.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Fig. 6 (e).
 
     Examples
     --------
@@ -218,25 +156,8 @@ def ellipse_pair(shape: tuple[int, int], strength: float = 1.0) -> Phantom:
     """Two different elliptical blobs off the centre, turned, of opposite sign.
 
     No symmetry of the square maps it onto itself: an inversion that mixes up axes, signs or
-    half pixels cannot get it right.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Height and width of the image; the blobs scale with the smaller one.
-    strength : float, default 1
-        Factor on both amplitudes. At 1 the Jacobian is between 0.5 and 2.5; folds form
-        from about 2.4.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape is not positive, or the strength is not finite.
+    half pixels cannot get it right. The blobs scale with the image's smaller side, both amplitudes
+    with `strength`: at 1 the Jacobian is between 0.5 and 2.5; folds form from about 2.4.
     """
     height, width = shape
     unit = min(height, width) / 100
@@ -248,7 +169,7 @@ def ellipse_pair(shape: tuple[int, int], strength: float = 1.0) -> Phantom:
 
 
 def _scene(
-    make: Callable[..., Phantom], parts: tuple[Part, ...], shape: tuple[int, int],
+    make: Callable[..., Phantom], parts: Iterable[Part], shape: tuple[int, int],
     setup: ProtonSetup, strength: float,
 ) -> Phantom:  # fmt: skip
     """Sum of the parts, each made by `toroid` or `cosine_toroid`."""

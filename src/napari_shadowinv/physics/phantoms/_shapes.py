@@ -77,34 +77,16 @@ def toroid(
 ) -> Phantom:
     """Toroidal magnetic field with -∫B × dz = D_m exp(-r²/2σ² + ½) r/σ.
 
-    A positive peak deflects positive charges outwards: the field runs counter-clockwise
-    in the paper's words.
-
     Parameters
     ----------
     shape : tuple of int
-        Height and width of the image.
     setup : ProtonSetup
-        The beam; its momentum is relativistic.
     peak : float
         Path-integrated field D_m in MG µm, reached at r = σ.
     sigma : float or tuple of float
         Radius σ in m, in the object plane; two radii (σ_u, σ_v) stretch the potential to
         an ellipse, whose field reaches the peak on its shorter axis.
-    center : tuple of float, optional
-        Centre (y, x) in px, may be fractional. Default: the image's centre.
-    angle : float, default 0
-        Angle in rad by which the u axis is turned from y towards x.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape or sigma is not positive, or a number is not finite.
+    center, angle : optional
 
     References
     ----------
@@ -135,25 +117,11 @@ def gaussian_blob(
     Parameters
     ----------
     shape : tuple of int
-        Height and width of the image.
     amplitude : float
         Amplitude A in px²; positive drives rays apart, negative gathers them.
     sigma : float or tuple of float
         Radius in px, or the radii (σ_u, σ_v); without rotation u is along y, v along x.
-    center : tuple of float, optional
-        Centre (y, x) in px, may be fractional. Default: the image's centre.
-    angle : float, default 0
-        Angle in rad by which the u axis is turned from y towards x.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape or a radius is not positive, or a number is not finite.
+    center, angle : optional
 
     Examples
     --------
@@ -175,7 +143,7 @@ def cosine_toroid(
     center: Center = None,
     angle: float = 0.0,
 ) -> Phantom:
-    """Toroidal magnetic field whose potential is a cos² that ends at a rim.
+    """Toroidal magnetic field whose potential is a cos² that ends at a rim; Fig. 6 (b).
 
     The potential is A cos²(πρ/2) inside the ellipse ρ² = u²/R_u² + v²/R_v² < 1 and zero
     outside. Potential and field are continuous; the field's slope jumps at the rim, so the
@@ -184,30 +152,12 @@ def cosine_toroid(
     Parameters
     ----------
     shape : tuple of int
-        Height and width of the image.
     setup : ProtonSetup
-        The beam.
     peak : float
-        Largest path-integrated field in MG µm, reached half-way to the rim on the shorter
-        axis; positive deflects positive charges outwards.
+        Largest path-integrated field in MG µm, half-way to the rim on the shorter axis.
     radius : float or tuple of float
         Radius, or the half axes (R_u, R_v), in m in the object plane.
-    center, angle
-        See `toroid`.
-
-    Returns
-    -------
-    Phantom
-        Potential and displacement.
-
-    Raises
-    ------
-    InputError
-        If the shape or a radius is not positive, or a number is not finite.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Fig. 6 (b).
+    center, angle : optional
     """
     radii = _pixels_of(setup, "radius", radius)
     require_finite(peak=peak, angle=angle)

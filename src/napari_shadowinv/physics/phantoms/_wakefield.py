@@ -22,34 +22,21 @@ PAPER_DENSITY = 1.65e25
 
 
 def wakefield_setup() -> OpticalSetup:
-    """Return an optical probe of the paper's plasma wave.
+    """Optical probe of the paper's plasma wave: collimated light of 810 nm (Section V).
 
-    Returns
-    -------
-    OpticalSetup
-        Collimated light of 810 nm, as in the paper. The image is of a plane 20 µm behind
-        the wave, at 0.25 µm per pixel. The paper gives neither distance nor pixel; farther
-        behind, diffraction at a wave of 8 µm would no longer be small.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Section V.
+    The image is of a plane 20 µm behind the wave, at 0.25 µm per pixel. The paper gives neither
+    distance nor pixel; farther behind, diffraction at a wave of 8 µm would no longer be small.
     """
     return OpticalSetup.example()
 
 
 def plasma_wavelength(density: float) -> float:
-    """Wavelength 2πc/ω_p of the density wave in a cold plasma.
+    """Wavelength 2πc/ω_p in m of the density wave in a cold plasma.
 
     Parameters
     ----------
     density : float
         Electron density n₀ in m⁻³.
-
-    Returns
-    -------
-    float
-        Wavelength in m.
 
     Raises
     ------
@@ -91,9 +78,7 @@ def wakefield(
     Parameters
     ----------
     shape : tuple of int
-        Height and width of the image.
     setup : OpticalSetup
-        The probe.
     amplitude : float, default 0.8
         Amplitude A of Δn/n₀ in the centre; below 1 the density stays positive.
     density : float, default 1.65e25
@@ -104,18 +89,11 @@ def wakefield(
         Radius R of the wavefronts on the axis in m; negative bends them the other way,
         infinite makes them plane.
     center : tuple of float, optional
-        Centre (y, x) in px. Default: the image's centre.
 
     Returns
     -------
     Phantom
-        Potential and displacement; `OpticalSetup.relative_density_modulation` of the
-        potential is the exact integral ∫Δn/n₀ dz.
-
-    Raises
-    ------
-    InputError
-        If a length or the density is not positive, or the amplitude is not finite.
+        `OpticalSetup.relative_density_modulation` of its potential is the exact ∫Δn/n₀ dz.
 
     Notes
     -----

@@ -3,29 +3,22 @@
 - describe an experiment: `ProtonSetup`, `OpticalSetup`; any of them: `Setup`, by kind `SETUPS`
 - what a kind of setup says of itself: `BeamSetup`, `SIField`, `MainField`, `Deflector`
 - get it back from a file's content: `setup_from_dict`; with larger pixels: `binned_setup`
-- convert pixels to SI and back: `BeamSetup.deflection_angle`, `BeamSetup.displacement`,
-  `BeamSetup.potential`, `BeamSetup.normalized_potential`
-- the gradient of a potential in pixels: `displacement_from_potential`; of one in SI:
-  `BeamSetup.displacement_from_potential`
-- path-integrated fields of particles: `ProtonSetup.path_integrated_b`,
-  `ProtonSetup.path_integrated_e`; back: `ProtonSetup.displacement_from_path_integrated_b`,
-  `ProtonSetup.displacement_from_path_integrated_e`
-- line integrals of light: `OpticalSetup.line_integrated_log_index`,
-  `OpticalSetup.line_integrated_density`, `OpticalSetup.relative_density_modulation`; back:
-  `OpticalSetup.normalized_potential_from_log_index`,
-  `OpticalSetup.normalized_potential_from_density`,
-  `OpticalSetup.normalized_potential_from_modulation`
+- convert pixels to SI and back: methods of `BeamSetup`; path-integrated fields: of `ProtonSetup`;
+  line integrals of the refractive index or the density: of `OpticalSetup`
+- the gradient of a potential in pixels: `displacement_from_potential`
 - the same object in another experiment: `napari_shadowinv.physics.projection`
+
+Conversions take an array_like of any shape and return an ndarray of float64 of the same
+shape; vectors, in axis order (y, x), lie along the first axis. With x to the right, y down and
+the beam into the screen the frame is right-handed.
 
 Displacements d and potentials φ are in pixels of the object plane, px and px². With the
 pixel's side p, the distance L from object to detector and the magnification M, the
 deflection angle is a = d p M / L and the potential Φ = φ p² M / L, so that a = -∇Φ where
-d = -∇φ (Eq. 1 of the paper). Vectors are in axis order (y, x), with x to the right, y down
-and the beam into the screen: a right-handed frame.
+d = -∇φ (Eq. 1 of the paper, Kasim et al., arXiv:1607.04179).
 
 A potential is known up to a constant: only its gradient deflects. Whatever is
-proportional to it (∫ln η dz, ∫n dz) has the same freedom, and is relative to the
-place where the potential is zero.
+proportional to it (∫ln η dz, ∫n dz) is relative to the place where the potential is zero.
 """
 
 from __future__ import annotations
@@ -97,11 +90,6 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
     where : str, optional
         Where the mapping comes from; an error's message begins with it.
 
-    Returns
-    -------
-    Setup
-        Of the class that `kind` names.
-
     Raises
     ------
     InputError
@@ -109,14 +97,8 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
 
     Examples
     --------
-    >>> setup_from_dict(
-    ...     {
-    ...         "kind": "optical",
-    ...         "wavelength": 810e-9,
-    ...         "object_image_distance": 0.01,
-    ...         "pixel_size": 1e-6,
-    ...     }
-    ... ).collimated
+    >>> light = {"wavelength": 810e-9, "object_image_distance": 0.01, "pixel_size": 1e-6}
+    >>> setup_from_dict({"kind": "optical", **light}).collimated
     True
     """
     if not isinstance(mapping, Mapping):

@@ -57,9 +57,7 @@ class BeamSetup(BaseModel):
     title, beam : str
         What the kind is called in a form, and what its beam is made of.
     si_fields : tuple of SIField
-        What a result holds in SI units.
-    main_field : MainField
-        The one of them that is shown.
+        What a result holds in SI units; `main_field` is the one of them that is shown.
     deflectors : tuple of str
         What can deflect the beam; see `angle_ratio`.
     in_pradformat : bool
@@ -127,12 +125,7 @@ class BeamSetup(BaseModel):
 
     @property
     def magnification(self) -> float:
-        """Magnification M = 1 + L / l of the object on the detector; 1 if collimated.
-
-        References
-        ----------
-        Kasim et al., arXiv:1607.04179, text after Eq. 3.
-        """
+        """Magnification M = 1 + L / l of the object on the detector; 1 if collimated."""
         return 1 + self.object_image_distance / self.source_object_distance
 
     @property
@@ -153,71 +146,19 @@ class BeamSetup(BaseModel):
         return self.object_pixel_size * self.magnification / self.object_image_distance
 
     def deflection_angle(self, displacement: ArrayLike) -> FloatArray:
-        """Angle a = d p M / L by which rays are deflected.
-
-        Parameters
-        ----------
-        displacement : array_like
-            Displacement d in px of the object plane.
-
-        Returns
-        -------
-        ndarray, of the same shape
-            Angle in rad.
-
-        References
-        ----------
-        Kasim et al., arXiv:1607.04179, Eq. 3.
-        """
+        """Angle a = d p M / L in rad of rays displaced by d px (Eq. 3 of the paper)."""
         return scaled(displacement, self._angle_per_pixel)
 
     def displacement(self, angle: ArrayLike) -> FloatArray:
-        """Displacement d = a L / (p M); the inverse of `deflection_angle`.
-
-        Parameters
-        ----------
-        angle : array_like
-            Deflection angle a in rad.
-
-        Returns
-        -------
-        ndarray, of the same shape
-            Displacement in px of the object plane.
-        """
+        """Displacement d = a L / (p M) in px of rays deflected by a in rad."""
         return scaled(angle, 1 / self._angle_per_pixel)
 
     def potential(self, phi: ArrayLike) -> FloatArray:
-        """Deflection potential in SI units, Φ = φ p² M / L, with a = -∇Φ.
-
-        Parameters
-        ----------
-        phi : array_like
-            Normalised potential φ in px².
-
-        Returns
-        -------
-        ndarray, of the same shape
-            Potential Φ in m (rad m).
-
-        References
-        ----------
-        Kasim et al., arXiv:1607.04179, Eq. 1.
-        """
+        """Potential Φ = φ p² M / L in m, with a = -∇Φ, from φ in px² (Eq. 1 of the paper)."""
         return scaled(phi, self.object_pixel_size * self._angle_per_pixel)
 
     def normalized_potential(self, potential: ArrayLike) -> FloatArray:
-        """Potential in pixels, φ = Φ L / (p² M); the inverse of `potential`.
-
-        Parameters
-        ----------
-        potential : array_like
-            Potential Φ in m.
-
-        Returns
-        -------
-        ndarray, of the same shape
-            Normalised potential in px².
-        """
+        """Potential φ = Φ L / (p² M) in px², from Φ in m."""
         return scaled(potential, 1 / (self.object_pixel_size * self._angle_per_pixel))
 
     def displacement_from_potential(self, potential: ArrayLike) -> FloatArray:
@@ -247,13 +188,7 @@ class BeamSetup(BaseModel):
 
     @abstractmethod
     def default_deflector(self, made_with: Any) -> str:
-        """Say what deflects the beam if nobody does, here and with a setup of the same kind.
-
-        Raises
-        ------
-        InputError
-            If it has to be told.
-        """
+        """What deflects the beam if nobody says so; an `InputError` if it has to be told."""
 
     @abstractmethod
     def angle_ratio(self, made_with: Any, deflector: str) -> float:
@@ -271,12 +206,12 @@ def displacement_from_potential(potential: ArrayLike) -> FloatArray:
     Returns
     -------
     ndarray, shape (2, H, W)
-        Displacement in px, axis order (y, x), of second order up to the border.
+        Displacement in px, of second order up to the border.
 
     Raises
     ------
     InputError
-        If the potential is no plane or too small to have a gradient.
+        If the potential is no plane, or smaller than 3 × 3.
 
     Examples
     --------

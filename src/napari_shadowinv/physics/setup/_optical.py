@@ -32,10 +32,8 @@ class OpticalSetup(BeamSetup):
     Examples
     --------
     >>> setup = OpticalSetup(wavelength=810e-9, object_image_distance=0.01, pixel_size=1e-6)
-    >>> setup.magnification
-    1.0
-    >>> round(setup.critical_density * 1e-27, 2)
-    1.7
+    >>> setup.magnification, round(setup.critical_density * 1e-27, 2)
+    (1.0, 1.7)
     """
 
     title: ClassVar = "light"
@@ -101,82 +99,27 @@ class OpticalSetup(BeamSetup):
         return density
 
     def line_integrated_log_index(self, phi: ArrayLike) -> FloatArray:
-        """Logarithm of the refractive index integrated along the beam: ∫ln η dz = -Φ.
-
-        Parameters
-        ----------
-        phi : array_like
-            Normalised potential φ in px².
-
-        Returns
-        -------
-        ndarray, of the same shape
-            ∫ln η dz in m, relative to where the potential is zero.
-
-        References
-        ----------
-        Kasim et al., arXiv:1607.04179, Eq. 2a.
-        """
+        """Refractive index along the beam, ∫ln η dz = -Φ in m, from φ in px² (Eq. 2a)."""
         return -self.potential(phi)
 
     def normalized_potential_from_log_index(self, integral: ArrayLike) -> FloatArray:
-        """Potential φ of a refracting object; the inverse of `line_integrated_log_index`.
-
-        Parameters
-        ----------
-        integral : array_like
-            ∫ln η dz in m.
-
-        Returns
-        -------
-        ndarray, of the same shape
-            Normalised potential in px².
-        """
+        """Potential φ in px² of a refracting object, from ∫ln η dz in m."""
         return -self.normalized_potential(integral)
 
     def line_integrated_density(self, phi: ArrayLike) -> FloatArray:
-        """Electron density of a thin plasma integrated along the beam: ∫n dz = 2 n_c Φ.
+        """Electron density of a thin plasma along the beam, ∫n dz = 2 n_c Φ in m⁻², from φ in px².
 
-        To first order in n / n_c, ln η = ½ ln(1 - n/n_c) ≈ -n / (2 n_c).
-
-        Parameters
-        ----------
-        phi : array_like
-            Normalised potential φ in px².
-
-        Returns
-        -------
-        ndarray, of the same shape
-            ∫n dz in m⁻², relative to where the potential is zero.
-
-        Notes
-        -----
-        Eq. 12 of the paper leaves out the ½ that the root in Eq. 11 brings; its
-        densities are half of these.
-
-        References
-        ----------
-        Kasim et al., arXiv:1607.04179, Eqs. 2a, 11 and 12.
+        To first order in n / n_c, ln η = ½ ln(1 - n/n_c) ≈ -n / (2 n_c). Eq. 12 of the paper leaves
+        out the ½ that the root in Eq. 11 brings; its densities are half of these.
         """
         return 2 * self.critical_density * self.potential(phi)
 
     def normalized_potential_from_density(self, integral: ArrayLike) -> FloatArray:
-        """Potential φ of a thin plasma; the inverse of `line_integrated_density`.
-
-        Parameters
-        ----------
-        integral : array_like
-            ∫n dz in m⁻².
-
-        Returns
-        -------
-        ndarray, of the same shape
-            Normalised potential in px².
-        """
+        """Potential φ in px² of a thin plasma, from ∫n dz in m⁻²."""
         return self.normalized_potential(integral) / (2 * self.critical_density)
 
     def relative_density_modulation(self, phi: ArrayLike, density: float) -> FloatArray:
-        """Modulation of a plasma's density, relative to its mean: ∫Δn/n₀ dz.
+        """Modulation of a plasma's density, relative to its mean: ∫Δn/n₀ dz in m.
 
         Parameters
         ----------
@@ -185,45 +128,17 @@ class OpticalSetup(BeamSetup):
         density : float
             Density n₀ of the undisturbed plasma in m⁻³.
 
-        Returns
-        -------
-        ndarray, of the same shape
-            ∫Δn/n₀ dz in m.
-
         Raises
         ------
         InputError
             If the density is not positive and finite.
-
-        References
-        ----------
-        Kasim et al., arXiv:1607.04179, Section V; see `line_integrated_density` for the
-        factor of 2.
         """
         return self.line_integrated_density(phi) / _positive_density(density)
 
     def normalized_potential_from_modulation(
         self, modulation: ArrayLike, density: float
     ) -> FloatArray:
-        """Potential φ of a modulated plasma; the inverse of `relative_density_modulation`.
-
-        Parameters
-        ----------
-        modulation : array_like
-            ∫Δn/n₀ dz in m.
-        density : float
-            Density n₀ of the undisturbed plasma in m⁻³.
-
-        Returns
-        -------
-        ndarray, of the same shape
-            Normalised potential in px².
-
-        Raises
-        ------
-        InputError
-            If the density is not positive and finite.
-        """
+        """Potential φ in px² of a modulated plasma, from ∫Δn/n₀ dz in m and n₀ in m⁻³."""
         return self.normalized_potential_from_density(
             scaled(modulation, _positive_density(density))
         )

@@ -27,15 +27,7 @@ _JOULES_PER_MEV = 1e6 * _ELEMENTARY_CHARGE
 
 @dataclass(frozen=True)
 class Particle:
-    """A species of beam particle.
-
-    Attributes
-    ----------
-    mass : float
-        Rest mass in kg.
-    charge : float
-        Charge in C, with its sign.
-    """
+    """Rest mass in kg and charge in C, with its sign, of a species of beam particle."""
 
     mass: float
     charge: float
@@ -172,7 +164,10 @@ class ProtonSetup(BeamSetup):
 
     def _rigidity(self, unit: FieldUnit) -> float:
         """Magnetic field, integrated along the beam, that deflects by 1 rad: p / q."""
-        return self.momentum / self.particle.charge / _tesla_metres(unit)
+        if unit not in _TESLA_METRES:
+            units = ", ".join(get_args(FieldUnit))
+            raise InputError(f"unit is {unit!r}: it must be one of {units}")
+        return self.momentum / self.particle.charge / _TESLA_METRES[unit]
 
     @property
     def _electric_rigidity(self) -> float:
@@ -188,14 +183,14 @@ class ProtonSetup(BeamSetup):
         Parameters
         ----------
         displacement : array_like, shape (2, ...)
-            Displacement in px, axis order (y, x).
+            Displacement in px.
         unit : {"T m", "MG um"}, default "T m"
             Unit of the result; 1 MG µm is 1e-4 T m.
 
         Returns
         -------
         ndarray, of the same shape
-            (∫B_y dz, ∫B_x dz): components in axis order (y, x).
+            (∫B_y dz, ∫B_x dz).
 
         Raises
         ------
@@ -204,8 +199,7 @@ class ProtonSetup(BeamSetup):
 
         References
         ----------
-        Kasim et al., arXiv:1607.04179, Section IV A (the deflection angle, there with the
-        non-relativistic momentum √(2 m W)).
+        Kasim et al., arXiv:1607.04179, Section IV A (there with the momentum √(2 m W)).
         """
         angle_y, angle_x = self.deflection_angle(_vector("displacement", displacement))
         rigidity = self._rigidity(unit)
@@ -214,74 +208,22 @@ class ProtonSetup(BeamSetup):
     def displacement_from_path_integrated_b(
         self, field: ArrayLike, unit: FieldUnit = "T m"
     ) -> FloatArray:
-        """Displacement by a magnetic field; the inverse of `path_integrated_b`.
-
-        Parameters
-        ----------
-        field : array_like, shape (2, ...)
-            (∫B_y dz, ∫B_x dz).
-        unit : {"T m", "MG um"}, default "T m"
-            Unit of the field.
-
-        Returns
-        -------
-        ndarray, of the same shape
-            Displacement in px of the object plane, axis order (y, x).
-
-        Raises
-        ------
-        InputError
-            If the field has not two components, or the unit is unknown.
-        """
+        """Displacement in px by (∫B_y dz, ∫B_x dz); the inverse of `path_integrated_b`."""
         field_y, field_x = _vector("field", field)
         rigidity = self._rigidity(unit)
         return self.displacement(np.stack([field_x / rigidity, -field_y / rigidity]))
 
     def path_integrated_e(self, displacement: ArrayLike) -> FloatArray:
-        """Electric field integrated along the beam, if it alone deflects.
+        """Electric field integrated along the beam, (∫E_y dz, ∫E_x dz) in V, if it alone deflects.
 
-        From a = q ∫E dz / (p v), the relativistic form of the paper's q / (2 W).
-
-        Parameters
-        ----------
-        displacement : array_like, shape (2, ...)
-            Displacement in px, axis order (y, x).
-
-        Returns
-        -------
-        ndarray, of the same shape
-            (∫E_y dz, ∫E_x dz) in V.
-
-        Raises
-        ------
-        InputError
-            If the displacement has not two components.
-
-        References
-        ----------
-        Kasim et al., arXiv:1607.04179, Eq. 2b.
+        From a = q ∫E dz / (p v), the relativistic form of the paper's q / (2 W) in Eq. 2b. An
+        `InputError` if the displacement, in px, has not two components.
         """
         angle = self.deflection_angle(_vector("displacement", displacement))
         return angle * self._electric_rigidity
 
     def displacement_from_path_integrated_e(self, field: ArrayLike) -> FloatArray:
-        """Displacement by an electric field; the inverse of `path_integrated_e`.
-
-        Parameters
-        ----------
-        field : array_like, shape (2, ...)
-            (∫E_y dz, ∫E_x dz) in V.
-
-        Returns
-        -------
-        ndarray, of the same shape
-            Displacement in px of the object plane, axis order (y, x).
-
-        Raises
-        ------
-        InputError
-            If the field has not two components.
-        """
+        """Displacement in px by (∫E_y dz, ∫E_x dz) in V; the inverse of `path_integrated_e`."""
         volts = _vector("field", field)
         return self.displacement(volts / self._electric_rigidity)
 
@@ -293,9 +235,3 @@ def _vector(name: str, values: ArrayLike) -> FloatArray:
             f"{name} has shape {field.shape}: expected (2, ...), the y component first"
         )
     return field
-
-
-def _tesla_metres(unit: str) -> float:
-    if unit not in _TESLA_METRES:
-        raise InputError(f"unit is {unit!r}: it must be one of {', '.join(get_args(FieldUnit))}")
-    return _TESLA_METRES[unit]
