@@ -31,8 +31,7 @@ from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_al
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.colours import film_warnings
-
-_PICTURES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
+from napari_shadowinv.io.formats import SCAN_SUFFIXES
 
 
 def kind_of(layer: Any) -> str:
@@ -105,7 +104,7 @@ def warnings_of(layer: Any) -> tuple[str, ...]:
     """What the reader of a grey image said against it, or that it looks like scanned film."""
     known = mark_of(layer)
     path = str(layer.source.path or "").lower()
-    if known or not path.endswith(_PICTURES) or not isinstance(layer.data, np.ndarray):
+    if known or not path.endswith(tuple(SCAN_SUFFIXES)) or not isinstance(layer.data, np.ndarray):
         return tuple(known.get("warnings", ()))
     return film_warnings(layer.data, None)
 
