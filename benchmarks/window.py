@@ -18,14 +18,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from napari_shadowinv._napari.widgets._jobs import PlanCache, ShotJob
 from qtpy.QtCore import QSettings
 from qtpy.QtWidgets import QApplication
 
 import napari
-from napari_shadowinv import InversionOptions
+from napari_shadowinv import InversionOptions, Recipe, run
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.pipeline import Cache
 
 
 def noisy_toroid(side: int) -> np.ndarray[Any, Any]:
@@ -48,7 +48,7 @@ def alone(shot: np.ndarray[Any, Any], n_sites: int) -> Cost:
     """Invert without a window."""
     options = InversionOptions(n_sites=n_sites)
     used, start = time.process_time(), time.perf_counter()
-    ShotJob(shot, np.ones(shot.shape), options=options).run()
+    run(Recipe(options=options), shot)
     return Cost(time.process_time() - used, time.perf_counter() - start)
 
 
@@ -70,7 +70,7 @@ class Window:
 
     def run(self) -> Cost:
         """Press Run and wait for the answer, without its layers."""
-        self.tool._cache = PlanCache()
+        self.tool._cache = Cache()
         self.tool.show_result = lambda *_: None
         runner, ended = self.tool.panel.runner, []
         runner.ended.connect(ended.append)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
@@ -14,18 +14,16 @@ from napari_shadowinv._napari.widgets._qt import notify_errors
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import check_output, write
+from napari_shadowinv.io.formats import NPY, PNG
 from napari_shadowinv.pipeline import read_recipe, write_recipe
 from napari_shadowinv.pipeline._run import picture_mask, plane_of
 from napari_shadowinv.preprocessing import Crop, MeasuredSource, Recipe
 
-if TYPE_CHECKING:
-    from napari_shadowinv._napari.widgets._inputs import InversionInputs
-
 
 class RecipeButton(QPushButton):
-    """A menu to load what is to be done to a shot from a TOML file, or to save it."""
+    """A menu to load what a tool with `InversionInputs` is to do from a TOML file, or to save it."""
 
-    def __init__(self, tool: InversionInputs) -> None:
+    def __init__(self, tool: Any) -> None:
         super().__init__("Recipe")
         self._tool = tool
         self.setToolTip(
@@ -88,12 +86,12 @@ class RecipeButton(QPushButton):
             "source_mask": tool.hidden_from_source(image),
         }
         pictures = {
-            path.with_name(f"{path.stem}_{name}.png"): (name, pixels)
+            path.with_name(f"{path.stem}_{name}{PNG.suffix}"): (name, pixels)
             for name, pixels in drawn.items()
             if pixels is not None
         }
         beam = None if _is_in_file(recipe, image, tool.source) else tool.source.measured(image)
-        beside = path.with_name(f"{path.stem}_source.npy")
+        beside = path.with_name(f"{path.stem}_source{NPY.suffix}")
         for file in (path, *pictures, *(() if beam is None else (beside,))):
             check_output(file, overwrite)
         changes: dict[str, Any] = {}
