@@ -190,7 +190,8 @@ class PowerDiagram:
 
     @cached_property
     def _first_moments(self) -> FloatArray:
-        self._need_moments()
+        if not self._with_moments:
+            raise ValueError("this diagram was made without moments: pass with_moments=True")
         corner = np.stack([self._cell_sums(2), self._cell_sums(3)], axis=1)
         return corner - 0.5 * self.masses[:, None]
 
@@ -205,17 +206,12 @@ class PowerDiagram:
     @cached_property
     def inertia(self) -> FloatArray:
         """∫ |r - r_i|² I dr over each cell about its site, shape (n,)."""
-        self._need_moments()
         # the walk's moments are about the image's corner, (-0.5, -0.5)
         site = self.sites + 0.5
         corner = self._first_moments + 0.5 * self.masses[:, None]
         shifted = (site**2).sum(axis=1) * self.masses - 2 * (site * corner).sum(axis=1)
         inertia: FloatArray = self._cell_sums(4) + shifted
         return inertia
-
-    def _need_moments(self) -> None:
-        if not self._with_moments:
-            raise ValueError("this diagram was made without moments: pass with_moments=True")
 
     def laplacian(self) -> csr_array:
         """Return ∂T_i/∂w_j, shape (n, n): the Hessian of the paper's Eq. 6.
