@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from napari_shadowinv import synthetic_image
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.power_diagram import PowerDiagram, power_diagram
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.inversion.readout import read_centroids
 from napari_shadowinv.physics import phantoms
@@ -46,7 +46,8 @@ def figure_diagrams(path: Path) -> None:
         (panels[2], 1200.0, "(c) Power diagram, site 1 heavier"),
     ):
         weights = np.array([weight, 0.0, 0.0])
-        diagram = power_diagram(sites, density, weights)
+        triangulation = RegularTriangulation(sites, weights, region=density.region)
+        diagram = PowerDiagram(triangulation, density, with_moments=True)
         draw_cells(axes, diagram, shape, GREY, facecolors=["#cfe3f8", "#d7f0df", "#fbe3cf"])
         label_sites(axes, sites)
         empty_square(axes, shape, title)

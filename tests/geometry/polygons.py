@@ -1,8 +1,16 @@
-"""Independent formulae for polygons, slow and plain: shoelace sums and clipping."""
+"""Independent formulae for polygons, slow and plain: shoelace sums and clipping; diagrams."""
 
 from __future__ import annotations
 
 import numpy as np
+
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+
+
+def power_diagram(sites, density, weights=None) -> PowerDiagram:
+    triangulation = RegularTriangulation(sites, weights, region=density.region)
+    return PowerDiagram(triangulation, density, with_moments=True)
 
 
 def clipped(polygon: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:

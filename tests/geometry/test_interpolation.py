@@ -6,7 +6,7 @@ import pytest
 from napari_shadowinv.geometry.interpolation import (
     CloughTocher,
     fit_gradients,
-    mirrored_across_border,
+    with_mirror_images,
 )
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
@@ -89,14 +89,15 @@ def test_fitted_gradients_bend_the_edges_least(sites):
 
 def test_mirror_images_lie_beyond_the_border_at_the_same_distance():
     sites = np.array([[0.0, 5.0], [5.0, 5.0], [9.2, 9.0]])
-    mirrored, origin, sense = mirrored_across_border(sites, (10, 10), 1.5)
+    points, origin, sense = with_mirror_images(sites, (10, 10), 1.5)
+    np.testing.assert_array_equal(points[:3], sites)
     expected = {
         (-1.0, 5.0, 0, -1, 1),
         (9.8, 9.0, 2, -1, 1),
         (9.2, 10.0, 2, 1, -1),
         (9.8, 10.0, 2, -1, -1),
     }
-    found = np.column_stack([mirrored, origin, sense]).round(9)
+    found = np.column_stack([points, origin, sense])[3:].round(9)
     assert set(map(tuple, found.tolist())) == expected
 
 

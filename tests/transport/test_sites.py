@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from polygons import power_diagram
 
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.power_diagram import PowerDiagram, power_diagram
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.sites import lloyd, plan_levels, sample_sites
 

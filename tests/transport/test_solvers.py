@@ -10,8 +10,7 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.transport.continuation import blurred
-from napari_shadowinv.transport.descent import descend
-from napari_shadowinv.transport.newton import newton
+from napari_shadowinv.transport.minimise import descend, newton
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import plan_levels
 from napari_shadowinv.transport.solvers import solve

@@ -32,8 +32,13 @@ def locked(path: Path) -> Iterator[None]:
     with file:
         _take(path, lock, file, is_new)
         ended = threading.Event()
-        beating = threading.Thread(target=_beat, args=(lock, ended), daemon=True, name="lock")
-        beating.start()
+
+        def beat() -> None:
+            while not ended.wait(_BEAT):
+                with suppress(OSError):
+                    os.utime(lock)
+
+        threading.Thread(target=beat, daemon=True, name="lock").start()
         try:
             yield
         finally:
@@ -118,12 +123,6 @@ def _look(lock: Path) -> tuple[int, bytes] | None:
             return os.fstat(file.fileno()).st_mtime_ns, file.read()
     except OSError:
         return None
-
-
-def _beat(lock: Path, ended: threading.Event) -> None:
-    while not ended.wait(_BEAT):
-        with suppress(OSError):
-            os.utime(lock)
 
 
 def _give_back(file: BinaryIO, lock: Path) -> None:

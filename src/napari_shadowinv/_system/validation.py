@@ -89,13 +89,19 @@ def _clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
     model, names = _place(model_class, detail["loc"])
     name = ".".join(names)
     kind, context = detail["type"], detail.get("ctx", {})
+    tag_key = context.get("discriminator", "").strip("'")
     if kind == "extra_forbidden":
         known = list(model.model_fields)
         match = nearest(names[-1], known)
         hint = f", did you mean '{match}'?" if match else f"; known keys are {', '.join(known)}"
         return f"unknown key '{name}'{hint}"
+    if kind == "union_tag_not_found":
+        return f"'{name}' has no '{tag_key}': give it, to say which"
     if kind.startswith("union_tag"):
-        return _tag_clause(name, kind, context)
+        expected = [tag.strip("' ") for tag in context["expected_tags"].split(",")]
+        match = nearest(str(context["tag"]), expected)
+        hint = f"did you mean '{match}'?" if match else f"expected one of {', '.join(expected)}"
+        return f"'{name}.{tag_key}' is '{context['tag']}', {hint}"
     field = model.model_fields.get(names[-1]) if names else None
     title = _lower(field.title) if field is not None and field.title else "it"
     if kind == "missing":
@@ -110,16 +116,6 @@ def _clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
     if message.startswith(opening := "Input should be "):
         return f"{received}: {title} must be {message.removeprefix(opening)}"
     return f"{received}: {_lower(message)}"
-
-
-def _tag_clause(name: str, kind: str, context: dict[str, Any]) -> str:
-    key = context["discriminator"].strip("'")
-    if kind == "union_tag_not_found":
-        return f"'{name}' has no '{key}': give it, to say which"
-    expected = [tag.strip("' ") for tag in context["expected_tags"].split(",")]
-    match = nearest(str(context["tag"]), expected)
-    hint = f"did you mean '{match}'?" if match else f"expected one of {', '.join(expected)}"
-    return f"'{name}.{key}' is '{context['tag']}', {hint}"
 
 
 def _lower(text: str) -> str:

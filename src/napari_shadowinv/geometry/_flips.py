@@ -136,14 +136,10 @@ def _irregular_edges(mesh: Mesh, t: int) -> int:
     x0, y0, w0 = points[i, 0], points[i, 1], weights[i]
     ax, ay, a_gain = points[j, 0] - x0, points[j, 1] - y0, weights[j] - w0
     bx, by, b_gain = points[k, 0] - x0, points[k, 1] - y0, weights[k] - w0
-    a_square = ax * ax + ay * ay
-    b_square = bx * bx + by * by
-    a_lift = a_square - a_gain
-    b_lift = b_square - b_gain
-    a_size = a_square + abs(a_gain)
-    b_size = b_square + abs(b_gain)
-    area = ax * by - ay * bx
-    area_size = abs(ax * by) + abs(ay * bx)
+    a_square, b_square = ax * ax + ay * ay, bx * bx + by * by
+    a_lift, b_lift = a_square - a_gain, b_square - b_gain
+    a_size, b_size = a_square + abs(a_gain), b_square + abs(b_gain)
+    area, area_size = ax * by - ay * bx, abs(ax * by) + abs(ay * bx)
     for h in range(e, e + 3):
         g = twins[h]
         if g > h:
@@ -360,23 +356,19 @@ def _start(mesh: Mesh) -> None:
     """Make two triangles of ghosts, with no site."""
     n = mesh.hidden.size
     mesh.counters[:] = 0
-    mesh.counters[_mesh.FREE] = -1
-    mesh.counters[_mesh.POLICY] = REMOVE
-    mesh.counters[_mesh.SIZE] = 2
-    mesh.counters[_mesh.LIMIT] = 100 * n + 1000
+    mesh.counters[_mesh.SIZE], mesh.counters[_mesh.FREE] = 2, -1
+    mesh.counters[_mesh.POLICY], mesh.counters[_mesh.LIMIT] = REMOVE, 100 * n + 1000
     mesh.hidden[:] = True
     for h, corner in enumerate((n, n + 1, n + 2, n + 2, n + 3, n)):
         mesh.corners[h] = corner
     mesh.twins[:6] = -1
-    mesh.twins[1] = 4
-    mesh.twins[4] = 1
+    mesh.twins[1], mesh.twins[4] = 4, 1
 
 
 @kernel_that_allocates
 def _sort_triangles(mesh: Mesh) -> None:
     """Store the triangles in the order of their smallest corner: neighbours close in memory."""
-    m = mesh.counters[_mesh.SIZE]
-    n = mesh.hidden.size
+    m, n = mesh.counters[_mesh.SIZE], mesh.hidden.size
     starts = np.zeros(n + 5, dtype=np.int32)
     smallest = np.empty(m, dtype=np.int32)
     for t in range(m):
@@ -426,8 +418,7 @@ def _stay_behind(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
             found = True
             for v in (i, j, k):
                 if v < strays.size:
-                    mesh.points[v, 0] = origins[v, 0]
-                    mesh.points[v, 1] = origins[v, 1]
+                    mesh.points[v, 0], mesh.points[v, 1] = origins[v, 0], origins[v, 1]
                     strays[v] = True
     return found
 

@@ -20,15 +20,12 @@ def _distance_along(x: int, y: int) -> int:
     """Return the distance of grid cell (x, y) along the curve, without branches to mispredict."""
     distance = 0
     for bit in range(BITS - 1, -1, -1):
-        right = (x >> bit) & 1
-        up = (y >> bit) & 1
+        right, up = (x >> bit) & 1, (y >> bit) & 1
         distance = (distance << 2) | ((3 * right) ^ up)
         turned = -(right & (1 - up))
-        x ^= turned
-        y ^= turned
+        x, y = x ^ turned, y ^ turned
         swapped = (x ^ y) & (up - 1)
-        x ^= swapped
-        y ^= swapped
+        x, y = x ^ swapped, y ^ swapped
     return distance
 
 

@@ -85,16 +85,13 @@ def _join(mesh: Mesh, h: int, twin: int) -> None:
 
 @kernel
 def _set_triangle(mesh: Mesh, t: int, a: int, b: int, c: int) -> None:
-    mesh.corners[3 * t] = a
-    mesh.corners[3 * t + 1] = b
-    mesh.corners[3 * t + 2] = c
+    mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2] = a, b, c
 
 
 @kernel
 def push_triangle(mesh: Mesh, t: int) -> None:
-    push(mesh, 3 * t)
-    push(mesh, 3 * t + 1)
-    push(mesh, 3 * t + 2)
+    for h in range(3 * t, 3 * t + 3):
+        push(mesh, h)
 
 
 @kernel
@@ -134,8 +131,7 @@ def split_triangle(mesh: Mesh, t: int, v: int) -> None:
     """Put v, which lies strictly inside triangle t, into it and push the three edges of t."""
     a, b, c = mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2]
     b_outer, c_outer = mesh.twins[3 * t + 1], mesh.twins[3 * t + 2]
-    u = _new_triangle(mesh)
-    s = _new_triangle(mesh)
+    u, s = _new_triangle(mesh), _new_triangle(mesh)
     mesh.corners[3 * t] = v
     _set_triangle(mesh, u, v, c, a)
     _set_triangle(mesh, s, v, a, b)
@@ -144,9 +140,8 @@ def split_triangle(mesh: Mesh, t: int, v: int) -> None:
     _join(mesh, 3 * t + 1, 3 * u + 2)
     _join(mesh, 3 * u + 1, 3 * s + 2)
     _join(mesh, 3 * s + 1, 3 * t + 2)
-    push(mesh, 3 * u)
-    push(mesh, 3 * s)
-    push(mesh, 3 * t)
+    for one in (u, s, t):
+        push(mesh, 3 * one)
 
 
 @kernel
@@ -157,8 +152,7 @@ def split_edge(mesh: Mesh, h: int, v: int) -> None:
     p, a, b, q = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)], mesh.corners[g]
     pa, bp = mesh.twins[before(h)], mesh.twins[after(h)]
     qb, aq = mesh.twins[before(g)], mesh.twins[after(g)]
-    s = _new_triangle(mesh)
-    r = _new_triangle(mesh)
+    s, r = _new_triangle(mesh), _new_triangle(mesh)
     _set_triangle(mesh, t, v, p, a)
     _set_triangle(mesh, s, v, a, q)
     _set_triangle(mesh, u, v, q, b)
@@ -171,10 +165,8 @@ def split_edge(mesh: Mesh, h: int, v: int) -> None:
     _join(mesh, 3 * s + 1, 3 * u + 2)
     _join(mesh, 3 * u + 1, 3 * r + 2)
     _join(mesh, 3 * r + 1, 3 * t + 2)
-    push(mesh, 3 * t)
-    push(mesh, 3 * s)
-    push(mesh, 3 * u)
-    push(mesh, 3 * r)
+    for one in (t, s, u, r):
+        push(mesh, 3 * one)
 
 
 @kernel
@@ -212,10 +204,8 @@ def _cut_ears(mesh: Mesh, h: int, degree: int) -> tuple[int, int]:
         e = after(h)
         g = mesh.twins[e]
         p, a, q = mesh.corners[e], mesh.corners[after(e)], mesh.corners[g]
-        if (
-            turn(mesh.points, mesh.scratch, p, a, q) > 0
-            and turn(mesh.points, mesh.scratch, v, p, q) > 0
-        ):
+        points, scratch = mesh.points, mesh.scratch
+        if turn(points, scratch, p, a, q) > 0 and turn(points, scratch, v, p, q) > 0:
             flip(mesh, e, g)
             push_triangle(mesh, e // 3)
             # Going round instead of staying gives each neighbour its turn: no fans.
@@ -248,11 +238,8 @@ def _merge_three(mesh: Mesh, h: int) -> int:
 @kernel
 def _merge_four(mesh: Mesh, h: int) -> int:
     """Remove a vertex of degree four that lies on a diagonal of its neighbours."""
-    v, here, opposite = (
-        mesh.corners[h],
-        mesh.corners[after(h)],
-        mesh.corners[before(around(mesh, h))],
-    )
+    v, here = mesh.corners[h], mesh.corners[after(h)]
+    opposite = mesh.corners[before(around(mesh, h))]
     if turn(mesh.points, mesh.scratch, here, v, opposite) != 0:
         h = around(mesh, h)
     g = around(mesh, h)

@@ -131,21 +131,12 @@ def _lifted(
     points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
 ) -> tuple[float, float, float]:
     """Return the determinant of the lifted a, b, c seen from v, its permanent, and the area."""
-    ax = points[a, 0] - points[v, 0]
-    ay = points[a, 1] - points[v, 1]
-    bx = points[b, 0] - points[v, 0]
-    by = points[b, 1] - points[v, 1]
-    cx = points[c, 0] - points[v, 0]
-    cy = points[c, 1] - points[v, 1]
-    a_gain = weights[a] - weights[v]
-    b_gain = weights[b] - weights[v]
-    c_gain = weights[c] - weights[v]
-    a_square = ax * ax + ay * ay
-    b_square = bx * bx + by * by
-    c_square = cx * cx + cy * cy
-    bc = bx * cy - by * cx
-    ca = cx * ay - cy * ax
-    ab = ax * by - ay * bx
+    x, y, weight = points[v, 0], points[v, 1], weights[v]
+    ax, ay, a_gain = points[a, 0] - x, points[a, 1] - y, weights[a] - weight
+    bx, by, b_gain = points[b, 0] - x, points[b, 1] - y, weights[b] - weight
+    cx, cy, c_gain = points[c, 0] - x, points[c, 1] - y, weights[c] - weight
+    a_square, b_square, c_square = ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy
+    bc, ca, ab = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
     height = (a_square - a_gain) * bc + (b_square - b_gain) * ca + (c_square - c_gain) * ab
     size = (
         (a_square + abs(a_gain)) * (abs(bx * cy) + abs(by * cx))
@@ -218,9 +209,7 @@ def precise_excess(
     ax, ay, a_lift = _relative(points, weights, a, v)
     bx, by, b_lift = _relative(points, weights, b, v)
     cx, cy, c_lift = _relative(points, weights, c, v)
-    bc = _cross(bx, by, cx, cy)
-    ca = _cross(cx, cy, ax, ay)
-    ab = _cross(ax, ay, bx, by)
+    bc, ca, ab = _cross(bx, by, cx, cy), _cross(cx, cy, ax, ay), _cross(ax, ay, bx, by)
     plane = _sum(_product(a_lift, bc), _sum(_product(b_lift, ca), _product(c_lift, ab)))
     area = _sum(bc, _sum(ca, ab))
     return -plane[0] / area[0] if area[0] > 0.0 else 0.0

@@ -33,21 +33,14 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Density:
-    """A piecewise-constant density with the prefix sums that integrals need.
+    """A piecewise-constant density with the prefix sums that integrals need."""
 
-    Kernels use corner coordinates: pixel (i, j) covers [i, i+1] × [j, j+1], half a
-    pixel more than the image's own coordinates, in which pixel centres are integers.
+    # Kernels use corner coordinates: pixel (i, j) covers [i, i+1] × [j, j+1], half a
+    # pixel more than the image's own coordinates, in which pixel centres are integers.
 
-    Attributes
-    ----------
-    image : ndarray, shape (H, W)
-        Intensity of each pixel.
-    sums : ndarray, shape (3, H, W + 1)
-        ∫ I, ∫ s I and ∫ s² I over each row, from 0 to the left edge of each pixel; the
-        last column holds the whole row's.
-    """
-
-    image: FloatArray
+    image: FloatArray  # (H, W)
+    # (3, H, W + 1): ∫ I, ∫ s I and ∫ s² I over each row, from 0 to the left edge of each pixel;
+    # the last column holds the whole row's.
     sums: FloatArray
 
     @classmethod
@@ -95,10 +88,8 @@ def split_pixels(image: FloatArray, factor: int) -> FloatArray:
 @njit(nogil=True, cache=True, inline="always")
 def _moments(f: Triple, g: float, k: Triple, y0: float, y1: float) -> Triple:
     """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy by Simpson's rule; g is the sum for G."""
-    f0, f_mid, f1 = f
-    k0, k_mid, k1 = k
-    y_mid = 0.5 * (y0 + y1)
-    sixth = (y1 - y0) / 6
+    (f0, f_mid, f1), (k0, k_mid, k1) = f, k
+    y_mid, sixth = 0.5 * (y0 + y1), (y1 - y0) / 6
     return (
         sixth * (y0 * f0 + 4 * y_mid * f_mid + y1 * f1),
         sixth * g,
@@ -148,33 +139,24 @@ def _walk_inside(
 ) -> tuple[float, float, float, float, float]:
     """Integrate along a segment inside the image, as `walk_edge` does."""
     height, width = image.shape
-    row = min(int(ya), height - 1)
-    column = min(int(xa), width - 1)
-    last_row = min(int(yb), height - 1)
-    last_column = min(int(xb), width - 1)
-    dy = yb - ya
-    dx = xb - xa
+    row, column = min(int(ya), height - 1), min(int(xa), width - 1)
+    last_row, last_column = min(int(yb), height - 1), min(int(xb), width - 1)
+    dy, dx = yb - ya, xb - xa
     length = math.sqrt(dy * dy + dx * dx)
-    down = 1 if last_row > row else 0
-    right = 1 if last_column > column else 0
+    down, right = 1 if last_row > row else 0, 1 if last_column > column else 0
     per_y = 1.0 / dy if last_row != row else 0.0
     per_x = 1.0 / dx if last_column != column else 0.0
     crossings = abs(last_row - row) + abs(last_column - column)
     flux = mass = moment_y = moment_x = inertia = 0.0
-    t = 0.0
-    y = ya
-    x = xa
+    t, y, x = 0.0, ya, xa
     for crossing in range(crossings + 1):
         # where the segment leaves this pixel, and whether by its upper or lower side
         t_y = (row + down - ya) * per_y if row != last_row else 2.0
         t_x = (column + right - xa) * per_x if column != last_column else 2.0
         t_next = min(t_y, t_x)
-        y_next = ya + t_next * dy
-        x_next = xa + t_next * dx
+        y_next, x_next = ya + t_next * dy, xa + t_next * dx
         if crossing == crossings:
-            t_next = 1.0
-            y_next = yb
-            x_next = xb
+            t_next, y_next, x_next = 1.0, yb, xb
         value = image[row, column]
         flux += value * (t_next - t)
         mass += (sums[0, row, column] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
@@ -187,9 +169,7 @@ def _walk_inside(
             column += 2 * right - 1
         else:
             row += 2 * down - 1
-        t = t_next
-        y = y_next
-        x = x_next
+        t, y, x = t_next, y_next, x_next
     return flux * length, mass, moment_y, moment_x, inertia
 
 
@@ -199,13 +179,11 @@ def _walk_right_of_image(
 ) -> tuple[float, float, float, float]:
     """Integrate from row position ya to yb beyond the right edge, where F is the row's sum."""
     height, width = image.shape
-    low = min(ya, yb)
-    high = max(ya, yb)
+    low, high = min(ya, yb), max(ya, yb)
     sign = 1.0 if yb > ya else -1.0
     mass = moment_y = moment_x = inertia = 0.0
     for row in range(min(int(low), height - 1), min(int(high), height - 1) + 1):
-        y0 = max(low, float(row))
-        y1 = min(high, row + 1.0)
+        y0, y1 = max(low, float(row)), min(high, row + 1.0)
         f, g, k = sums[0, row, width], sums[1, row, width], sums[2, row, width]
         of_y, of_x, of_both = _moments((f, f, f), 6 * g, (k, k, k), y0, y1)
         mass += sign * f * (y1 - y0)

@@ -11,7 +11,8 @@ reach beyond the outermost sites, those near the border can be mirrored across i
 References
 ----------
 R. W. Clough and J. L. Tocher, "Finite element stiffness matrices for analysis of plates
-in bending" (1965); P. Alfeld, Computer Aided Geometric Design 1, 169 (1984).
+in bending" (1965); P. Alfeld, Computer Aided Geometric Design 1, 169 (1984); for the
+gradients G. M. Nielson, Mathematics of Computation 40, 253 (1983).
 """
 
 from __future__ import annotations
@@ -25,32 +26,19 @@ from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
-__all__ = [
-    "BLOCK",
-    "CloughTocher",
-    "arrays_of",
-    "fit_gradients",
-    "locate",
-    "mirrored_across_border",
-]
+__all__ = ["BLOCK", "CloughTocher", "arrays_of", "fit_gradients", "locate", "with_mirror_images"]
 
 BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
 
 
-def mirrored_across_border(
+def with_mirror_images(
     sites: FloatArray, shape: tuple[int, int], band: float
 ) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
-    """Mirror the sites that are closer than `band` px to the image's border across it.
+    """Append to the sites the images of those closer than `band` px to the border, across it.
 
-    Returns
-    -------
-    mirrored : ndarray, shape (k, 2)
-        The mirror images; a site near a corner has three.
-    origin : ndarray of int, shape (k,)
-        The site that each comes from.
-    sense : ndarray, shape (k, 2)
-        -1 for the axes along which it was mirrored, else 1: what a mirrored gradient is
-        multiplied by.
+    A site near a corner has three. Returns the k points, the site that each comes from, and the
+    sense, shape (k, 2): -1 for the axes along which a point was mirrored, else 1, which is what a
+    mirrored gradient is multiplied by.
     """
     points, origin, sense = sites, np.arange(len(sites)), np.ones_like(sites)
     for axis in (0, 1):
@@ -62,11 +50,9 @@ def mirrored_across_border(
             images.append(image)
             origins.append(origin[near])
             senses.append(sense[near] * (1 - 2 * np.eye(2)[axis]))
-        points = np.concatenate(images)
-        origin = np.concatenate(origins)
+        points, origin = np.concatenate(images), np.concatenate(origins)
         sense = np.concatenate(senses)
-    n = len(sites)
-    return points[n:], origin[n:], sense[n:]
+    return points, origin, sense
 
 
 @njit(nogil=True, cache=True)
@@ -82,12 +68,10 @@ def _sweep(
     system = np.zeros((n, 5))
     for t in range(vertices.shape[0]):
         for k in range(3):
-            a = vertices[t, (k + 1) % 3]
-            b = vertices[t, (k + 2) % 3]
+            a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
             if neighbors[t, k] < t or a >= n or b >= n:
                 continue
-            ey = points[b, 0] - points[a, 0]
-            ex = points[b, 1] - points[a, 1]
+            ey, ex = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
             length2 = ey * ey + ex * ex
             stiffness = 1.0 / (length2 * np.sqrt(length2))
             rise = 3 * (values[b] - values[a])
@@ -112,12 +96,7 @@ def _sweep(
 def fit_gradients(
     triangulation: RegularTriangulation, values: FloatArray, gradients: FloatArray, sweeps: int = 1
 ) -> FloatArray:
-    """Improve gradients at the sites so that the surface bends least along the edges.
-
-    References
-    ----------
-    G. M. Nielson, Mathematics of Computation 40, 253 (1983).
-    """
+    """Improve gradients at the sites so that the surface bends least along the edges."""
     for _ in range(sweeps):
         gradients = _sweep(*arrays_of(triangulation), values, gradients, len(values))
     return gradients
@@ -133,22 +112,17 @@ def locate(
     vertices: Indices, neighbors: Indices, points: FloatArray, start: int, y: float, x: float
 ) -> int:
     """Walk to the triangle that holds (y, x)."""
-    t = start
-    came_from = -1
+    t, came_from = start, -1
     for _ in range(2 * vertices.shape[0] + 10):
         moved = False
         for k in range(3):
             other = neighbors[t, k]
             if other < 0 or other == came_from:
                 continue
-            a = vertices[t, (k + 1) % 3]
-            b = vertices[t, (k + 2) % 3]
-            side = (points[b, 0] - points[a, 0]) * (x - points[a, 1]) - (
-                points[b, 1] - points[a, 1]
-            ) * (y - points[a, 0])
-            if side < 0:
-                came_from = t
-                t = other
+            a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
+            ey, ex = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+            if ey * (x - points[a, 1]) - ex * (y - points[a, 0]) < 0:
+                came_from, t = t, other
                 moved = True
                 break
         if not moved:
@@ -161,13 +135,11 @@ def _edge_ordinates(
     p: FloatArray, f: FloatArray, g: FloatArray, i: int, j: int, cy: float, cx: float
 ) -> tuple[float, float, float]:
     """Return the Bézier ordinates on edge i-j, near i and near j, and inside its patch."""
-    ey = p[j, 0] - p[i, 0]
-    ex = p[j, 1] - p[i, 1]
+    ey, ex = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1]
     near_i = f[i] + (g[i, 0] * ey + g[i, 1] * ex) / 3
     near_j = f[j] - (g[j, 0] * ey + g[j, 1] * ex) / 3
     s = ((cy - p[i, 0]) * ey + (cx - p[i, 1]) * ex) / (ey * ey + ex * ex)
-    ny = cy - p[i, 0] - s * ey
-    nx = cx - p[i, 1] - s * ex
+    ny, nx = cy - p[i, 0] - s * ey, cx - p[i, 1] - s * ex
     across = ((g[i, 0] + g[j, 0]) * ny + (g[i, 1] + g[j, 1]) * nx) / 6
     return near_i, near_j, across + (1 - s) * near_i + s * near_j
 
@@ -185,8 +157,7 @@ def _patch(
     bary = np.empty(3)
     slope = np.empty((3, 2))  # gradient of each barycentric coordinate
     for k in range(3):
-        i = (k + 1) % 3
-        j = (k + 2) % 3
+        i, j = (k + 1) % 3, (k + 2) % 3
         bary[k] = ((p[i, 0] - y) * (p[j, 1] - x) - (p[i, 1] - x) * (p[j, 0] - y)) / double_area
         slope[k, 0] = (p[i, 1] - p[j, 1]) / double_area
         slope[k, 1] = (p[j, 0] - p[i, 0]) / double_area
@@ -204,11 +175,8 @@ def _patch(
     centre = (by_centre[0] + by_centre[1] + by_centre[2]) / 3
 
     k = int(np.argmin(bary))  # the patch that holds the point
-    i = (k + 1) % 3
-    j = (k + 2) % 3
-    u = bary[i] - bary[k]
-    v = bary[j] - bary[k]
-    w = 3 * bary[k]
+    i, j = (k + 1) % 3, (k + 2) % 3
+    u, v, w = bary[i] - bary[k], bary[j] - bary[k], 3 * bary[k]
     # de Casteljau: quadratics towards i, j and the centre, then their blend
     to_i = (
         f[i] * u * u
@@ -262,9 +230,7 @@ def _evaluate_blocks(
 ) -> None:
     """Evaluate blocks `start` to `stop` of the queries: value, ∂/∂y, ∂/∂x."""
     n = values.shape[0]
-    p = np.empty((3, 2))
-    f = np.empty(3)
-    g = np.empty((3, 2))
+    p, f, g = np.empty((3, 2)), np.empty(3), np.empty((3, 2))
     for block in range(start, stop):
         t = 0
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
@@ -276,9 +242,7 @@ def _evaluate_blocks(
                 if a >= n:
                     outside = k
                     continue
-                p[k] = points[a]
-                f[k] = values[a]
-                g[k] = gradients[a]
+                p[k], f[k], g[k] = points[a], values[a], gradients[a]
             if outside < 0:
                 out[q, 0], out[q, 1], out[q, 2] = _patch(p, f, g, y, x)
                 continue
@@ -296,34 +260,20 @@ def _evaluate_blocks(
 @njit(nogil=True, cache=True)
 def _nearest_corner(corners: Indices, points: FloatArray, n: int, y: float, x: float) -> int:
     """Return the corner nearest to (y, x) that is a site, or -1 between ghosts alone."""
-    nearest = -1
-    least = np.inf
+    nearest, least = -1, np.inf
     for a in corners:
         if a < n:
             distance = (points[a, 0] - y) ** 2 + (points[a, 1] - x) ** 2
             if distance < least:
-                least = distance
-                nearest = a
+                nearest, least = a, distance
     return nearest
 
 
 class CloughTocher:
-    """C¹ interpolant of values and gradients at scattered sites.
+    """C¹ interpolant of values, shape (n,), and gradients, shape (n, 2), at the sites of a mesh.
 
-    Parameters
-    ----------
-    triangulation : RegularTriangulation
-        Delaunay triangulation (zero weights) of the n sites.
-    values, gradients : ndarray, shapes (n,) and (n, 2)
-        At the sites; axis order (y, x).
-    threads : int, optional
-        Default: all cores. Results do not depend on it.
+    The mesh is a Delaunay triangulation. A plane is met exactly, also beyond the sites:
 
-    Examples
-    --------
-    A plane is met exactly, also beyond the sites:
-
-    >>> import numpy as np
     >>> sites = np.array([[0.0, 0.0], [0.0, 3.0], [3.0, 0.0], [3.0, 4.0]])
     >>> upwards = np.tile([1.0, 0.0], (4, 1))
     >>> surface = CloughTocher(RegularTriangulation(sites), sites[:, 0], upwards)

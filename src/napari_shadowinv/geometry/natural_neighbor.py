@@ -32,10 +32,7 @@ def _circumcentre(
     ay: float, ax: float, by: float, bx: float, cy: float, cx: float
 ) -> tuple[float, float]:
     """Return the circumcentre relative to a; far away where the points are in line."""
-    by -= ay
-    bx -= ax
-    cy -= ay
-    cx -= ax
+    by, bx, cy, cx = by - ay, bx - ax, cy - ay, cx - ax
     double_area = by * cx - bx * cy
     if double_area == 0.0:
         double_area = 1e-300
@@ -47,15 +44,11 @@ def _circumcentre(
 @njit(nogil=True, cache=True)
 def _circle_holds(points: FloatArray, corners: Indices, y: float, x: float) -> bool:
     """Tell whether (y, x) lies inside the circumcircle of a counter-clockwise triangle."""
-    ay = points[corners[0], 0] - y
-    ax = points[corners[0], 1] - x
-    by = points[corners[1], 0] - y
-    bx = points[corners[1], 1] - x
-    cy = points[corners[2], 0] - y
-    cx = points[corners[2], 1] - x
-    a2 = ay * ay + ax * ax
-    b2 = by * by + bx * bx
-    c2 = cy * cy + cx * cx
+    a, b, c = corners[0], corners[1], corners[2]
+    ay, ax = points[a, 0] - y, points[a, 1] - x
+    by, bx = points[b, 0] - y, points[b, 1] - x
+    cy, cx = points[c, 0] - y, points[c, 1] - x
+    a2, b2, c2 = ay * ay + ax * ax, by * by + bx * bx, cy * cy + cx * cx
     signed = a2 * (by * cx - bx * cy) + b2 * (cy * ax - cx * ay) + c2 * (ay * bx - ax * by)
     return bool(signed > 0)
 
@@ -72,8 +65,7 @@ def _cavity(
 ) -> int:
     """List the triangles whose circumcircles hold (y, x), from the one around it."""
     cavity[0] = start
-    count = 1
-    done = 0
+    count, done = 1, 0
     while done < count and count < cavity.shape[0]:
         t = cavity[done]
         done += 1
@@ -111,33 +103,23 @@ def _stolen_area(
     # The edge is the one opposite corner k of triangle t. Around b lie the centre of the new
     # triangle on this edge, those of the cavity's triangles at b, and the centre of the new
     # triangle on the next rim edge.
-    a = vertices[t, (k + 1) % 3]
-    b = vertices[t, (k + 2) % 3]
-    by = points[b, 0]
-    bx = points[b, 1]
+    a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
+    by, bx = points[b, 0], points[b, 1]
     first_y, first_x = _circumcentre(by, bx, y, x, points[a, 0], points[a, 1])
-    last_y = first_y
-    last_x = first_x
+    last_y, last_x = first_y, first_x
     double_area = 0.0
     pivot = (k + 2) % 3
     while True:
-        i = (pivot + 1) % 3
-        j = (pivot + 2) % 3
+        i, j = (pivot + 1) % 3, (pivot + 2) % 3
+        c, d = vertices[t, i], vertices[t, j]
         centre_y, centre_x = _circumcentre(
-            by,
-            bx,
-            points[vertices[t, i], 0],
-            points[vertices[t, i], 1],
-            points[vertices[t, j], 0],
-            points[vertices[t, j], 1],
+            by, bx, points[c, 0], points[c, 1], points[d, 0], points[d, 1]
         )
         double_area += last_y * centre_x - last_x * centre_y
-        last_y = centre_y
-        last_x = centre_x
+        last_y, last_x = centre_y, centre_x
         # cross the edge from b to corner i, towards the rest of b's cavity triangles
         other = neighbors[t, j]
         if other < 0 or _position(cavity, count, other) < 0:
-            c = vertices[t, i]
             break
         t = other
         pivot = 0
@@ -201,22 +183,10 @@ def natural_neighbor(
     *,
     threads: int | None = None,
 ) -> FloatArray:
-    """Interpolate values at the sites of a Delaunay triangulation (zero weights).
+    """Interpolate values, shape (n, ...), at the sites of a mesh, at points (y, x) in their hull.
 
-    Parameters
-    ----------
-    triangulation : RegularTriangulation
-        Of n sites.
-    values : array_like, shape (n, ...)
-        Values at the sites.
-    queries : array_like, shape (m, 2)
-        Points (y, x) inside the hull of the sites.
-    threads : int, optional
-        Default: all cores. Results do not depend on it.
+    The mesh is a Delaunay triangulation.
 
-    Examples
-    --------
-    >>> import numpy as np
     >>> corners = np.array([[0.0, 0.0], [0.0, 4.0], [4.0, 0.0], [4.0, 4.0]])
     >>> natural_neighbor(RegularTriangulation(corners), corners[:, 0], [[1.0, 2.5]])
     array([1.])
@@ -228,15 +198,7 @@ def natural_neighbor(
     for column in range(columns.shape[1]):
         result = np.empty(len(points))
         known = (*arrays_of(triangulation), np.ascontiguousarray(columns[:, column]))
-        blocks = -(-len(points) // BLOCK)
-        in_ranges(
-            _interpolate_blocks,
-            blocks,
-            available_threads(threads),
-            points,
-            *known,
-            result,
-            smallest=2,
-        )
+        work = -(-len(points) // BLOCK), available_threads(threads), points
+        in_ranges(_interpolate_blocks, *work, *known, result, smallest=2)
         out[:, column] = result
     return out.reshape(len(points), *at_sites.shape[1:])

@@ -19,7 +19,6 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
@@ -50,10 +49,8 @@ def _power_centres(
             a, b, c = b, c, a
         if a >= n:
             a, b, c = b, c, a
-        by = points[b, 0] - points[a, 0]
-        bx = points[b, 1] - points[a, 1]
-        cy = points[c, 0] - points[a, 0]
-        cx = points[c, 1] - points[a, 1]
+        by, bx = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+        cy, cx = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1]
         double_area = by * cx - bx * cy
         if double_area == 0.0:
             double_area = 1e-300
@@ -73,8 +70,7 @@ def _list_edges(vertices: Indices, neighbors: Indices, pairs: Indices, sides: In
             if other > t:
                 pairs[count, 0] = vertices[t, (k + 1) % 3]
                 pairs[count, 1] = vertices[t, (k + 2) % 3]
-                sides[count, 0] = t
-                sides[count, 1] = other
+                sides[count, 0], sides[count, 1] = t, other
                 count += 1
     return count
 
@@ -92,19 +88,13 @@ def _integrate_edges(
 ) -> None:
     """Walk each border; columns of `integrals`: flux, mass, moments y and x, inertia."""
     for e in range(start, stop):
-        left = sides[e, 0]
-        right = sides[e, 1]
+        left, right = sides[e, 0], sides[e, 1]
         ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
         yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
-        flux, mass, moment_y, moment_x, inertia = walk_edge(
-            image, sums, ya, xa, yb, xb, with_moments
-        )
-        integrals[e, 0] = flux
-        integrals[e, 1] = mass
+        found = walk_edge(image, sums, ya, xa, yb, xb, with_moments)
+        integrals[e, 0], integrals[e, 1] = found[0], found[1]
         if with_moments:
-            integrals[e, 2] = moment_y
-            integrals[e, 3] = moment_x
-            integrals[e, 4] = inertia
+            integrals[e, 2], integrals[e, 3], integrals[e, 4] = found[2], found[3], found[4]
 
 
 @njit(nogil=True, cache=True)
@@ -112,8 +102,7 @@ def _sum_over_cells(edges: Indices, integrals: FloatArray, column: int, sums: Fl
     """Add one column of the edges' integrals to the two cells of each edge."""
     n = sums.shape[0]
     for e in range(edges.shape[0]):
-        a = edges[e, 0]
-        b = edges[e, 1]
+        a, b = edges[e, 0], edges[e, 1]
         value = integrals[e, column]
         if a < n:
             sums[a] += value
@@ -126,12 +115,10 @@ def _laplacian(
     points: FloatArray, n: int, edges: Indices, integrals: FloatArray
 ) -> tuple[FloatArray, Indices, Indices]:
     """Assemble the graph Laplacian with conductance flux / (2 |r_i - r_j|) as CSR."""
-    starts = np.zeros(n + 1, np.int32)
-    for i in range(n):
-        starts[i + 1] = 1
+    starts = np.ones(n + 1, np.int32)
+    starts[0] = 0
     for e in range(edges.shape[0]):
-        a = edges[e, 0]
-        b = edges[e, 1]
+        a, b = edges[e, 0], edges[e, 1]
         if a < n and b < n and integrals[e, 0] > 0:
             starts[a + 1] += 1
             starts[b + 1] += 1
@@ -139,47 +126,29 @@ def _laplacian(
         starts[i + 1] += starts[i]
     filled = starts[:-1] + 1
     columns = np.empty(starts[n], np.int32)
-    values = np.empty(starts[n])
+    values = np.zeros(starts[n])
     for i in range(n):
         columns[starts[i]] = i
-        values[starts[i]] = 0.0
     for e in range(edges.shape[0]):
-        a = edges[e, 0]
-        b = edges[e, 1]
+        a, b = edges[e, 0], edges[e, 1]
         if a < n and b < n and integrals[e, 0] > 0:
-            dy = points[a, 0] - points[b, 0]
-            dx = points[a, 1] - points[b, 1]
+            dy, dx = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
             conductance = integrals[e, 0] / (2 * np.sqrt(dy * dy + dx * dx))
-            columns[filled[a]] = b
-            values[filled[a]] = -conductance
-            columns[filled[b]] = a
-            values[filled[b]] = -conductance
-            filled[a] += 1
-            filled[b] += 1
-            values[starts[a]] += conductance
-            values[starts[b]] += conductance
+            for i, j in ((a, b), (b, a)):
+                columns[filled[i]] = j
+                values[filled[i]] = -conductance
+                filled[i] += 1
+                values[starts[i]] += conductance
     return values, columns, starts
 
 
 class PowerDiagram:
-    """The power diagram that is dual to a regular triangulation, over a density.
+    """The power diagram that is dual to a regular triangulation of n sites, over a density.
 
-    Parameters
-    ----------
-    triangulation : RegularTriangulation
-        Triangulation of the n sites with their weights, in the image's coordinates
-        (y, x). The diagram holds for the weights it has now. Where the sites cover only a
-        part of the image, the triangulation must know of it as its `region`.
-    density : Density
-        The image.
-    with_moments : bool
-        Whether centroids and moments of inertia will be asked for.
-    threads : int, optional
-        Default: all cores. Results do not depend on it.
+    It holds for the weights that the triangulation has now. Where the sites cover only a part
+    of the image, the triangulation must know of it as its `region`. Centroids and moments of
+    inertia need `with_moments`. Results do not depend on the number of threads.
 
-    Examples
-    --------
-    >>> import numpy as np
     >>> image = Density.from_image(np.ones((4, 4)))
     >>> sites = np.array([[0.5, 0.5], [0.5, 2.5], [2.5, 0.5], [2.5, 2.5]])
     >>> diagram = PowerDiagram(RegularTriangulation(sites), image)
@@ -221,7 +190,8 @@ class PowerDiagram:
 
     @cached_property
     def _first_moments(self) -> FloatArray:
-        self._need_moments()
+        if not self._with_moments:
+            raise ValueError("this diagram was made without moments: pass with_moments=True")
         corner = np.stack([self._cell_sums(2), self._cell_sums(3)], axis=1)
         return corner - 0.5 * self.masses[:, None]
 
@@ -236,22 +206,12 @@ class PowerDiagram:
     @cached_property
     def inertia(self) -> FloatArray:
         """∫ |r - r_i|² I dr over each cell about its site, shape (n,)."""
-        self._need_moments()
         # the walk's moments are about the image's corner, (-0.5, -0.5)
         site = self.sites + 0.5
         corner = self._first_moments + 0.5 * self.masses[:, None]
         shifted = (site**2).sum(axis=1) * self.masses - 2 * (site * corner).sum(axis=1)
         inertia: FloatArray = self._cell_sums(4) + shifted
         return inertia
-
-    def _need_moments(self) -> None:
-        if not self._with_moments:
-            raise ValueError("this diagram was made without moments: pass with_moments=True")
-
-    @property
-    def edge_fluxes(self) -> FloatArray:
-        """∫ I ds along the border of each pair in `edges`, shape (e,)."""
-        return self._integrals[:, 0]
 
     def laplacian(self) -> csr_array:
         """Return ∂T_i/∂w_j, shape (n, n): the Hessian of the paper's Eq. 6.
@@ -292,11 +252,3 @@ def _edges_of(triangulation: RegularTriangulation) -> tuple[Indices, Indices]:
     pairs, sides = np.empty((most, 2), np.int32), np.empty((most, 2), np.int32)
     count = _list_edges(triangulation.vertices, triangulation.neighbors, pairs, sides)
     return pairs[:count], sides[:count]
-
-
-def power_diagram(
-    sites: ArrayLike, density: Density, weights: ArrayLike | None = None
-) -> PowerDiagram:
-    """Build the triangulation of `sites` and its power diagram with moments in one go."""
-    triangulation = RegularTriangulation(sites, weights, region=density.region)
-    return PowerDiagram(triangulation, density, with_moments=True)

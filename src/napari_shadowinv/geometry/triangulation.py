@@ -51,15 +51,6 @@ T = TypeVar("T", bound=np.generic)
 def hilbert_order(points: ArrayLike) -> Indices:
     """Return the permutation that sorts points along a Hilbert curve, so that neighbours stay near.
 
-    Points in the same cell of a 2¹⁶ × 2¹⁶ grid keep their order.
-
-    Raises
-    ------
-    InputError
-        If the points are not finite or not of shape (n, 2).
-
-    Examples
-    --------
     >>> hilbert_order([[0.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
     array([0, 2, 1, 3], dtype=int32)
     """
@@ -105,36 +96,20 @@ def _read_only(array: NDArray[T]) -> NDArray[T]:
 class RegularTriangulation:
     """Regular (weighted Delaunay) triangulation of sites in the plane.
 
-    Four ghost sites, the corners of a square far outside, close the plane: their cells stay
-    outside three times the bounding box of sites and `region`. Cells of sites may end at them
-    out there.
+    Sites, shape (n, 2), are (y, x) in any unit, fastest in `hilbert_order`; weights, shape (n,),
+    are in its square. The region, two opposite corners of a box that matters such as an image, is
+    only needed where it reaches much further than the sites. Four ghost sites, the corners of a
+    square far outside, close the plane: their cells stay outside three times the bounding box of
+    sites and region. Cells of sites may end at them out there.
 
-    Parameters
-    ----------
-    sites : array_like, shape (n, 2)
-        Positions (y, x), in any unit; fastest if they come in `hilbert_order`.
-    weights : array_like, shape (n,), optional
-        Weights of the power diagram, in squared units of the sites; 0 by default.
-    region : array_like, shape (2, 2), optional
-        Two opposite corners of a box that matters, such as an image. Only needed where it
-        reaches much further than the sites.
+    Shapes that do not match and values that are not finite raise an `InputError`, here and in the
+    methods; reaching the limit of flips raises a RuntimeError.
 
-    Raises
-    ------
-    InputError
-        Here and in the methods, if shapes do not match or a value is not finite.
-    RuntimeError
-        Likewise, if the limit of flips was reached.
-
-    Notes
-    -----
     Of sites at the same place the heaviest is a vertex, the first one if they weigh the same; the
     others are hidden. A cell whose area is zero within rounding may count as empty or not.
 
     The arrays are read-only and valid until the next `update` or `lower_hidden`.
 
-    Examples
-    --------
     >>> triangulation = RegularTriangulation([[0, 0], [0, 4], [4, 0], [4, 4], [1, 2]])
     >>> triangulation.vertices.shape
     (12, 3)
@@ -211,15 +186,9 @@ class RegularTriangulation:
     ) -> bool:
         """Repair the triangulation for new weights; return False if it was stopped.
 
-        Parameters
-        ----------
-        weights : array_like, shape (n,)
-            New weights of the sites.
-        stop_when_hidden : bool
-            Whether to stop as soon as a site that is in the triangulation is proven hidden.
-            What is left is valid and has all those sites, but is irregular until the next update.
-        threads : int
-            Threads that look for irregular edges; the flips themselves take one.
+        That is, on demand, as soon as a site that is in the triangulation is proven hidden: what
+        is left is valid and has all those sites, but is irregular until the next update. The
+        threads look for irregular edges; the flips themselves take one.
         """
         self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
         self._forget()
@@ -285,9 +254,8 @@ class RegularTriangulation:
     def copy(self) -> RegularTriangulation:
         """Return an independent copy."""
         twin = object.__new__(RegularTriangulation)
-        twin._order = self._order
+        twin._order, twin._region = self._order, self._region
         twin._ghost_distance = self._ghost_distance
-        twin._region = self._region
         # `move` copies the points before it changes them
         twin._mesh = Mesh._make([self._mesh.points, *(array.copy() for array in self._mesh[1:])])
         return twin

@@ -12,10 +12,6 @@ import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 
-__all__ = ["code_folder", "ensure_compiled", "is_compiled"]
-
-_SIDE = 64  # enough sites for every kernel to be used
-
 
 def ensure_compiled(
     on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
@@ -32,7 +28,7 @@ def ensure_compiled(
         else "every time: set NUMBA_CACHE_DIR to a writable folder"
     )
     Reporter(on_progress, should_stop)("compile", 0, None, how_often)
-    y, x = np.indices((_SIDE, _SIDE)) / _SIDE
+    y, x = np.indices((64, 64)) / 64  # enough sites for every kernel to be used
     uneven = np.exp(-4 * (y + x))
     invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)
 

@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -101,9 +101,17 @@ class Uncertainty:
     ) -> xarray.Dataset:
         """Return the inversion and the scatter of its noisy samples as one dataset.
 
-        It is that of `Inversion.to_dataset` with ``potential_mean``, ``displacement_mean`` and
-        a ``…_std`` beside each potential, displacement and field. How the samples were made is a
-        JSON text in the attribute ``uncertainty``.
+        Parameters
+        ----------
+        setup, attributes
+            As of `Inversion.to_dataset`.
+
+        Returns
+        -------
+        xarray.Dataset
+            As of `Inversion.to_dataset`, with ``potential_mean``, ``displacement_mean`` and a
+            ``…_std`` beside each potential, displacement and field. How the samples were made is
+            a JSON text in the attribute ``uncertainty``.
         """
         samples = ("n", "noise", "tolerance", "iterations", "residuals", "converged", "warnings")
         history = json.dumps({name: getattr(self, name) for name in samples})
@@ -222,6 +230,13 @@ def uncertainty(
         solutions.append(sample.solution)
 
     _in_order(sampling.sample, seeds, workers, keep, Reporter(on_progress, should_stop))
+    warnings = inversion.report.warnings
+    if failed := sum(not solution.converged for solution in solutions):
+        warnings = (
+            f"{failed} of {len(solutions)} samples did not converge: the deviations are "
+            "unreliable where the samples scatter most",
+            *warnings,
+        )
     return Uncertainty(
         inversion=inversion,
         potential_mean=potential.mean,
@@ -234,12 +249,11 @@ def uncertainty(
         iterations=tuple(solution.iterations for solution in solutions),
         residuals=tuple(solution.residual for solution in solutions),
         converged=tuple(solution.converged for solution in solutions),
-        warnings=_warnings(inversion, solutions),
+        warnings=warnings,
     )
 
 
-@dataclass(frozen=True)
-class _Sample:
+class _Sample(NamedTuple):
     """One noisy image, inverted."""
 
     potential: FloatArray
@@ -413,14 +427,3 @@ def _in_order(
                 keep_first()
         finally:
             abandoned.set()
-
-
-def _warnings(inversion: Inversion, solutions: list[LevelSolution]) -> tuple[str, ...]:
-    failed = sum(not solution.converged for solution in solutions)
-    if not failed:
-        return inversion.report.warnings
-    return (
-        f"{failed} of {len(solutions)} samples did not converge: the deviations are unreliable "
-        "where the samples scatter most",
-        *inversion.report.warnings,
-    )

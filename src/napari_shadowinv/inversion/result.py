@@ -149,7 +149,13 @@ class Inversion:
         return None if self.provenance is None else self.provenance.setup
 
     def with_warnings(self, texts: Iterable[str]) -> Inversion:
-        """Return the same inversion with these texts after the warnings of its report."""
+        """Return the same inversion with more warnings in its report.
+
+        Parameters
+        ----------
+        texts : iterable of str
+            To be appended.
+        """
         warnings = (*self.report.warnings, *texts)
         return replace(self, report=replace(self.report, warnings=warnings))
 

@@ -74,13 +74,10 @@ def _put_lower_first(
     middle = begin
     degree = 0.0
     for k in range(begin, end):
-        neighbor = neighbors[k]
-        conductance = conductances[k]
+        neighbor, conductance = neighbors[k], conductances[k]
         degree += conductance
-        neighbors[k] = neighbors[middle]
-        conductances[k] = conductances[middle]
-        neighbors[middle] = neighbor
-        conductances[middle] = conductance
+        neighbors[k], conductances[k] = neighbors[middle], conductances[middle]
+        neighbors[middle], conductances[middle] = neighbor, conductance
         middle += 1 if neighbor < node else 0
     return middle, degree
 
@@ -90,8 +87,7 @@ def _read_laplacian(
     starts: Indices, columns: Indices, values: FloatArray, network: Network
 ) -> None:
     """Take the conductors out of a sparse matrix, in any order of columns."""
-    neighbors = network.neighbors
-    conductances = network.conductances
+    neighbors, conductances = network.neighbors, network.conductances
     end = 0
     for i in range(starts.shape[0] - 1):
         begin = end
@@ -141,13 +137,11 @@ def _pair(
             if group < 0:
                 tie = conductances[k] * (inverses[i] + inverses[other])
                 if tie > free_tie:
-                    free_tie = tie
-                    free = other
+                    free, free_tie = other, tie
             else:
                 tie = conductances[k] * (inverses[i] + group_inverses[group - first])
                 if tie > taken_tie:
-                    taken_tie = tie
-                    taken = group
+                    taken, taken_tie = group, tie
         if free >= 0:
             groups[i] = groups[free] = count
             group_inverses[count - first] = _of_sum(inverses[i], inverses[free])
@@ -194,8 +188,7 @@ def _contract(
     """Make each group one node, with the sums of the conductances between groups."""
     begins, members = _list_members(start, stop, groups, first, last)
     starts, _, neighbors, conductances, _, _ = fine
-    coarse_neighbors = coarse.neighbors
-    coarse_conductances = coarse.conductances
+    coarse_neighbors, coarse_conductances = coarse.neighbors, coarse.conductances
     place = np.full(last - first, -1, np.int32)
     end = int(coarse.starts[first])
     for g in range(first, last):
@@ -209,8 +202,7 @@ def _contract(
                 at = place[other - first]
                 if at < begin:
                     place[other - first] = end
-                    coarse_neighbors[end] = other
-                    coarse_conductances[end] = conductances[k]
+                    coarse_neighbors[end], coarse_conductances[end] = other, conductances[k]
                     end += 1
                 else:
                     coarse_conductances[at] += conductances[k]

@@ -22,7 +22,7 @@ from scipy.fft import dctn, idctn
 
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.transport.newton import newton, with_full_cells
+from napari_shadowinv.transport.minimise import newton, with_full_cells
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 from napari_shadowinv.transport.sites import Level
 
@@ -47,12 +47,8 @@ _LEAST_OF_PREDICTION = 1e-2  # of the smallest flux to reach
 def blurred(image: FloatArray, width: float) -> FloatArray:
     """Let a positive image's flux diffuse to a standard deviation in px, mirrored at the border.
 
-    The kernel is the discrete Gaussian, which solves the diffusion equation on the pixels: the
-    sum stays, and there are no negative lobes at any width.
-
-    References
-    ----------
-    T. Lindeberg, IEEE Trans. Pattern Anal. Mach. Intell. 12, 234 (1990).
+    The kernel is the discrete Gaussian (T. Lindeberg, IEEE Trans. Pattern Anal. Mach. Intell. 12,
+    234, 1990), which has no negative lobes at any width; the sum stays.
     """
     spectrum = dctn(image)
     for axis in (0, 1):

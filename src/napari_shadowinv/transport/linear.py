@@ -64,8 +64,7 @@ def _descend(
     """Sweep forward from zero and hand what is left to the next level, up to `end`."""
     # After such a sweep only the conductors to higher nodes leave a residual, and each is
     # also an entry of the higher node's row: both are done in one walk over half the entries.
-    residual = vectors.residual
-    x = vectors.correction
+    residual, x = vectors.residual, vectors.correction
     for i in range(stop, end):
         residual[i] = 0.0
     for i in range(start, stop):
@@ -113,8 +112,7 @@ def _dot(start: int, stop: int, a: FloatArray, b: FloatArray) -> float:
 @njit(nogil=True, cache=True)
 def _first_step(start: int, stop: int, network: Network, vectors: _Vectors) -> tuple[float, float]:
     """Minimise along the level's first correction; return its energy and the step's length."""
-    residual = vectors.residual
-    x = vectors.correction
+    residual, x = vectors.residual, vectors.correction
     _multiply(start, stop, network, x, vectors.direction_product)
     energy = _dot(start, stop, x, vectors.direction_product)
     if not energy > 0.0:
@@ -150,8 +148,7 @@ def _cycle(hierarchy: Hierarchy, vectors: _Vectors) -> None:
     # must not call itself.
     bounds, twice, network, parents, inverse = hierarchy
     deepest = bounds.shape[0] - 2
-    energies = np.zeros(deepest + 1)
-    lengths = np.zeros(deepest + 1)
+    energies, lengths = np.zeros(deepest + 1), np.zeros(deepest + 1)
     halfway = np.zeros(deepest + 1, np.bool_)
     level = 0
     while True:
@@ -198,23 +195,11 @@ def _advance(n: int, length: float, solution: FloatArray, vectors: _Vectors) -> 
 class LaplacianSolver:
     """Conjugate gradients for a connected graph Laplacian, with a multigrid set up once.
 
-    One object must not be used by several threads at the same time.
-
-    Parameters
-    ----------
-    laplacian : csr_array, shape (n, n)
-        Symmetric, nothing positive off the diagonal, rows sum to zero. Columns may come in
-        any order; neighbours should be near in the numbering for speed.
-    ground : ndarray, shape (n,), optional
-        Conductance from each node to a ground at potential 0, added to the diagonal; not zero
-        everywhere.
-    threads : int
-        Most threads to use. Results do not depend on it.
-
-    Raises
-    ------
-    RuntimeError
-        The graph is not connected.
+    One object must not be used by several threads at the same time. The Laplacian is symmetric,
+    with nothing positive off the diagonal and rows that sum to zero; its columns may come in any
+    order, but neighbours should be near in the numbering for speed. A ground at potential 0, if
+    any, is tied to each node by a conductance, added to the diagonal. A graph that is not
+    connected raises a RuntimeError.
     """
 
     def __init__(
@@ -265,8 +250,7 @@ class LaplacianSolver:
 
     def _iterate(self, solution: FloatArray, energy: float) -> float:
         """Do one step of flexible conjugate gradients; return its direction's energy."""
-        n = self._n
-        vectors = self._vectors
+        n, vectors = self._n, self._vectors
         _cycle(self._hierarchy, vectors)
         share = _dot(0, n, vectors.correction, vectors.direction_product) / energy
         _turn(n, share, self._grounded, vectors)
@@ -293,15 +277,7 @@ def solve_laplacian(
     *,
     ground: FloatArray | None = None,
 ) -> FloatArray:
-    """Solve L x = b as `LaplacianSolver` does, or by factorisation if small or too hard for it.
-
-    Examples
-    --------
-    >>> chain = csr_array(np.array([[1.0, -1, 0], [-1, 3, -2], [0, -2, 2]]))
-    >>> solution = solve_laplacian(chain, np.array([1.0, 0, -1]), 1e-2)
-    >>> solution - solution[2]
-    array([1.5, 0.5, 0. ])
-    """
+    """Solve L x = b as `LaplacianSolver` does, or by factorisation if small or too hard for it."""
     if len(right) < _DIRECT_BELOW:
         require_connected(laplacian)
     else:
@@ -309,16 +285,10 @@ def solve_laplacian(
         solution, _, residual = solver.solve(right, tolerance)
         if residual <= tolerance:
             return solution
-    return _solve_directly(laplacian, right, ground)
-
-
-def _solve_directly(
-    laplacian: csr_array, right: FloatArray, ground: FloatArray | None
-) -> FloatArray:
-    """Factorise the system, without a ground all but its first unknown."""
     if ground is not None:
         return _factorised(laplacian + diags_array(ground), right)
-    solution: FloatArray = np.zeros(len(right))
+    # Without a ground one unknown is free: all but the first are factorised.
+    solution = np.zeros(len(right))
     if len(right) > 1:
         solution[1:] = _factorised(laplacian[1:, 1:], right[1:] - right.mean())
     solution -= solution.mean()
@@ -326,11 +296,6 @@ def _solve_directly(
 
 
 def _factorised(matrix: csr_array, right: FloatArray) -> FloatArray:
-    factors = splu(
-        matrix.tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
-    solution: FloatArray = factors.solve(right)
+    symmetric = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}}
+    solution: FloatArray = splu(matrix.tocsc(), diag_pivot_thresh=0.0, **symmetric).solve(right)
     return solution

@@ -26,23 +26,13 @@ from napari_shadowinv.geometry.density import split_pixels
 
 __all__ = ["Margin", "edge_flux"]
 
-_SIDES = ("top", "bottom", "left", "right")
-
 
 @dataclass(frozen=True)
 class Margin:
-    """The beam in an image and in a margin around it.
+    """The beam in an image and in a margin around it."""
 
-    Attributes
-    ----------
-    beam : ndarray, shape (H + 2 m, W + 2 m)
-        The source with its margin.
-    width : int
-        Pixels m on each side.
-    """
-
-    beam: FloatArray
-    width: int
+    beam: FloatArray  # (H + 2 m, W + 2 m): the source with its margin
+    width: int  # pixels m on each side
 
     @classmethod
     def around(cls, source: FloatArray, width: int, mask: BoolArray | None = None) -> Margin:
@@ -81,10 +71,7 @@ class Margin:
         return beyond
 
     def edge_distance(self, points: AnyArray) -> FloatArray:
-        """Return how far inside each side points (y, x) of the whole lie, px; negative beyond.
-
-        The last axis counts top, bottom, left and right, shape (..., 4).
-        """
+        """Return how far inside top, bottom, left, right points (y, x) lie, px, shape (..., 4)."""
         first = self.width - 0.5
         last = np.array(self.beam.shape) - 1 - first
         both = np.stack([points - first, last - points], axis=-1)
@@ -94,10 +81,9 @@ class Margin:
 def edge_flux(
     left_behind: FloatArray, arrived: FloatArray, margin: Margin
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Sort the flux that has crossed the image's edge by the nearest side.
+    """Return what left and what entered the image at each side, as shares of its source's flux.
 
-    The image's share of the source has landed as `left_behind`, the margin's as `arrived`.
-    Returns what left and what entered at each side, as a share of the source's flux in the image.
+    The image's part of the source has landed as `left_behind`, the margin's as `arrived`.
     """
     pixels = np.moveaxis(np.indices(margin.beam.shape), 0, -1)
     nearest = margin.edge_distance(pixels).argmin(axis=-1)
@@ -105,7 +91,7 @@ def edge_flux(
 
     def by_side(flux: FloatArray) -> dict[str, float]:
         shares = np.bincount(nearest.ravel(), flux.ravel(), minlength=4) / total
-        return dict(zip(_SIDES, shares.tolist(), strict=True))
+        return dict(zip(("top", "bottom", "left", "right"), shares.tolist(), strict=True))
 
     return by_side(np.where(margin.beyond, left_behind, 0)), by_side(
         np.where(margin.beyond, 0, arrived)

@@ -44,18 +44,9 @@ class Solution:
 
 
 class TransportObjective:
-    """The function f(w) for given sites, their source flux, and an image.
+    """The function f(w) for given sites, their source flux S_i, and an image of the same flux.
 
-    Parameters
-    ----------
-    triangulation : RegularTriangulation
-        Triangulation of the sites; it follows the weights that are asked for.
-    mass : ndarray, shape (n,)
-        Source flux S_i of each site; its sum must equal the image's flux.
-    image : Density
-        The image.
-    threads : int, optional
-        Default: all cores. Results do not depend on it.
+    The triangulation of the sites follows the weights that are asked for.
     """
 
     def __init__(
@@ -74,11 +65,9 @@ class TransportObjective:
     def diagram(self, weights: FloatArray, *, with_moments: bool = False) -> PowerDiagram:
         """Return the power diagram for `weights`; empty cells are allowed."""
         self.triangulation.update(weights, threads=available_threads(self.threads))
+        image = self.image_for(weights)
         return PowerDiagram(
-            self.triangulation,
-            self.image_for(weights),
-            with_moments=with_moments,
-            threads=self.threads,
+            self.triangulation, image, with_moments=with_moments, threads=self.threads
         )
 
     def diagram_if_full(self, weights: FloatArray) -> PowerDiagram | None:
@@ -135,12 +124,8 @@ class OpenObjective(TransportObjective):
     ) -> None:
         self._pixels = margin.beam.copy()
         margin.within(self._pixels)[:] = image
-        super().__init__(
-            level.triangulation.copy(),
-            level.mass,
-            Density.from_image(self._pixels),
-            threads=threads,
-        )
+        density = Density.from_image(self._pixels)
+        super().__init__(level.triangulation.copy(), level.mass, density, threads=threads)
         self._beyond = np.nonzero(margin.beyond)
         self._beam = margin.beam[self._beyond]
         self._site = KDTree(level.sites).query(

@@ -6,7 +6,9 @@
 
 References
 ----------
-Paper, sections II.C and III: rejection, then weighted Lloyd relaxation.
+Paper, sections II.C and III: rejection, then weighted Lloyd relaxation (lines 6–10 of its
+algorithm); for the sequence of positions H. Niederreiter, *Random Number Generation and
+Quasi-Monte Carlo Methods* (SIAM, 1992), chapter 3.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.interpolation import mirrored_across_border
+from napari_shadowinv.geometry.interpolation import with_mirror_images
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 from napari_shadowinv.transport.margin import Margin
@@ -50,46 +52,17 @@ class Mirrored:
     origin: Indices  # the site that each point is, or is the mirror image of
     sense: NDArray[np.int8]  # (y, x): -1 for the axes along which a point was mirrored, else 1
 
-    @classmethod
-    def from_sites(cls, sites: FloatArray, shape: tuple[int, int]) -> Mirrored:
-        """Mirror the sites of an image of shape (H, W)."""
-        band = _MIRROR_BAND * _spacing(shape, len(sites))
-        images, origin, sense = mirrored_across_border(sites, shape, band)
-        points = np.concatenate([sites, images])
-        order = hilbert_order(points)
-        origins = np.concatenate([np.arange(len(sites)), origin])[order]
-        senses = np.concatenate([np.ones_like(sites), sense])[order]
-        return cls(
-            RegularTriangulation(points[order]), origins.astype(np.int32), senses.astype(np.int8)
-        )
-
 
 @dataclass(frozen=True)
 class Level:
-    """The sites of one level of the multilevel solution.
+    """The n sites of one level of the multilevel solution."""
 
-    Attributes
-    ----------
-    sites : ndarray, shape (n, 2)
-        Positions; neighbours in the plane are near in the order, mostly.
-    mass : ndarray, shape (n,)
-        Flux of the source in each site's Voronoi cell, S(V_i) of the paper.
-    centroids : ndarray, shape (n, 2)
-        Centres of flux of the Voronoi cells; the sites themselves after many Lloyd steps.
-    triangulation : RegularTriangulation
-        Their Delaunay triangulation; copy it before changing weights.
-    shape : tuple of int
-        Shape (H, W) of the source.
-    lloyd_iterations : int
-        Lloyd steps that were made.
-    """
-
-    sites: FloatArray
-    mass: FloatArray
-    centroids: FloatArray
-    triangulation: RegularTriangulation
-    shape: tuple[int, int]
-    lloyd_iterations: int
+    sites: FloatArray  # (n, 2); neighbours in the plane are near in the order, mostly
+    mass: FloatArray  # (n,): flux of the source in each Voronoi cell, S(V_i) of the paper
+    centroids: FloatArray  # (n, 2): centres of that flux; the sites after many Lloyd steps
+    triangulation: RegularTriangulation  # Delaunay's; copy it before changing weights
+    shape: tuple[int, int]  # (H, W) of the source
+    lloyd_iterations: int  # made
 
     @property
     def spacing(self) -> float:
@@ -99,7 +72,15 @@ class Level:
     @cached_property
     def mirrored(self) -> Mirrored:
         """The sites with those near the border mirrored across it; made when first asked for."""
-        return Mirrored.from_sites(self.sites, self.shape)
+        points, origin, sense = with_mirror_images(
+            self.sites, self.shape, _MIRROR_BAND * self.spacing
+        )
+        order = hilbert_order(points)
+        return Mirrored(
+            RegularTriangulation(points[order]),
+            origin[order].astype(np.int32),
+            sense[order].astype(np.int8),
+        )
 
     def split(self, factor: int) -> Level:
         """Return the same sites, in px of an image whose pixels are split into factor × factor."""
@@ -119,28 +100,14 @@ class Level:
 
 @dataclass(frozen=True)
 class SitePlan:
-    """Everything about the sites that depends on the source alone.
+    """Everything about the sites that depends on the source alone."""
 
-    Attributes
-    ----------
-    source : ndarray, shape (H, W)
-        The source that the sites stand for.
-    levels : tuple of Level
-        Coarse to fine.
-    mask : ndarray of bool, shape (H, W), or None
-        Where the source is known; elsewhere it only keeps the cells together.
-    margin : Margin or None
-        The margin around the image that the sites cover too, where the boundary is free; the
-        levels' coordinates are then those of image and margin.
-    unit : float
-        Flux of the source that the levels' masses count as 1.
-    """
-
-    source: FloatArray
-    levels: tuple[Level, ...]
-    mask: BoolArray | None = None
+    source: FloatArray  # (H, W)
+    levels: tuple[Level, ...]  # coarse to fine
+    mask: BoolArray | None = None  # where the source is known; elsewhere it keeps cells together
+    # Where the boundary is free, the sites cover it too, and the levels' coordinates are its.
     margin: Margin | None = None
-    unit: float = 1.0
+    unit: float = 1.0  # flux of the source that the levels' masses count as 1
 
     @property
     def margin_width(self) -> int:
@@ -177,15 +144,7 @@ def _accepted(source: FloatArray, shift: FloatArray, sites: FloatArray) -> None:
 
 
 def sample_sites(source: FloatArray, n_sites: int, seed: int = 0) -> FloatArray:
-    """Deploy sites on the source by rejection: bright places keep more of them.
-
-    The seed shifts the sequence of positions. They come in the order of a Hilbert curve.
-
-    References
-    ----------
-    Paper, section II.C; for the sequence H. Niederreiter, *Random Number Generation and
-    Quasi-Monte Carlo Methods* (SIAM, 1992), chapter 3.
-    """
+    """Deploy sites by rejection, in Hilbert order; the seed shifts the sequence of positions."""
     sites = np.empty((n_sites, 2))
     shift = np.random.default_rng(seed).random(3)
     _accepted(np.ascontiguousarray(source, dtype=np.float64), shift, sites)
@@ -203,14 +162,9 @@ def lloyd(
 ) -> tuple[PowerDiagram, int]:
     """Move each site to the centroid of its Voronoi cell, again and again.
 
-    The triangulation, without weights, is moved along with the sites. The steps end when the
-    root mean square distance of sites from centroids is below the tolerance, in units of the
-    mean spacing of the sites. The report is told before each step how many were made, and the
-    number of sites. Returns the diagram with moments, and the steps that were made.
-
-    References
-    ----------
-    Paper, section II.C, and lines 6–10 of its algorithm.
+    The triangulation, without weights, moves with the sites, until their r.m.s. distance from the
+    centroids is below the tolerance, in units of their mean spacing. The report is told the steps
+    made and the number of sites. Returns the diagram with moments, and the steps.
     """
     near = tolerance * _spacing(source.shape, len(triangulation.sites))
     step = 0
@@ -241,19 +195,15 @@ def plan_levels(
     threads: int | None = None,
     report: Reporter | None = None,
 ) -> SitePlan:
-    """Spread the sites of all levels over a source; the finest has `n_sites`, each other a quarter.
-
-    The report is told of each step of the finest level, with one thread of all levels.
-    """
+    """Spread the sites of all levels over a source; the finest has `n_sites`, others a quarter."""
     density = Density.from_image(source)
     counts = [n_sites]
     while counts[-1] > COARSEST:
         counts.append(max(4, counts[-1] // RATIO))
 
     def level(count: int, tell: Callable[[int, int], None]) -> Level:
-        triangulation = RegularTriangulation(
-            sample_sites(source, count, seed), region=density.region
-        )
+        sites = sample_sites(source, count, seed)
+        triangulation = RegularTriangulation(sites, region=density.region)
         diagram, steps = lloyd(
             triangulation,
             density,

@@ -22,9 +22,8 @@ from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.transport.continuation import blurred, sharpen
-from napari_shadowinv.transport.descent import descend
 from napari_shadowinv.transport.margin import Margin
-from napari_shadowinv.transport.newton import newton, with_full_cells
+from napari_shadowinv.transport.minimise import descend, newton, with_full_cells
 from napari_shadowinv.transport.objective import OpenObjective, Solution, TransportObjective
 from napari_shadowinv.transport.sites import Level
 
@@ -42,20 +41,12 @@ _SHORTEST_WARM_STEP = 0.1  # where steps must be shorter, starting afresh is fas
 
 @dataclass(frozen=True, kw_only=True)
 class LevelSolution(Solution):
-    """A solution and where it moves the sites of its level.
+    """A solution and where it moves the n sites of its level."""
 
-    Attributes
-    ----------
-    flux : ndarray, shape (n,)
-        What each cell holds of the image.
-    displacement : ndarray, shape (n, 2)
-        Centroid of each cell in the image minus that of the same site's cell in the
-        source, px. (The paper, in lines 21–23 of its algorithm, subtracts the site, which is the
-        same after enough Lloyd steps; with the centroid an image that equals its source gives
-        exactly zero.)
-    """
-
-    flux: FloatArray
+    flux: FloatArray  # (n,): what each cell holds of the image
+    # (n, 2), px: centroid of each cell in the image minus that of the same site's cell in the
+    # source. (The paper, in lines 21–23 of its algorithm, subtracts the site, which is the same
+    # after enough Lloyd steps; with the centroid an image that equals its source gives zero.)
     displacement: FloatArray
 
     @classmethod
@@ -79,27 +70,10 @@ def solve(
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
-    With a `start` it solves on the finest level alone, if that converges.
-
-    Parameters
-    ----------
-    levels : tuple of Level
-        Coarse to fine.
-    image : ndarray, shape (H, W)
-        Positive everywhere; without a `margin` with the flux of the source.
-    options : InversionOptions
-        Solver, stages, tolerance, most iterations, threads, decay length.
-    start : ndarray, shape (n,), optional
-        Weights of the finest level that solve a similar image, px². Where they lead nowhere
-        they have no influence on the answer.
-    margin : Margin, optional
-        The margin that the levels cover too; without one no flux crosses the image's edge.
-
-    Returns
-    -------
-    list of LevelSolution
-        One for each level that was tried, and for the finest one tried afresh where a level
-        led nowhere; the last is the answer.
+    The image, shape (H, W), is positive everywhere, and has the flux of the source unless there
+    is a margin. With a `start` (weights of the finest level that solve a similar image) it solves
+    on the finest level alone, if that converges. Returns one solution for each level that was
+    tried, and for the finest one tried afresh where a level led nowhere; the last is the answer.
     """
     if options.stages == "single":
         levels = levels[-1:]
@@ -119,7 +93,13 @@ def solve(
         else:
             weights = np.zeros(len(level.sites))
             if number > 0:
-                weights = _prolong(levels[number - 1], solutions[-1], level, options.threads)
+                last, coarse = solutions[-1], levels[number - 1]
+                weights = (
+                    2
+                    * potential_surface(
+                        coarse, last.weights, last.displacement, threads=options.threads
+                    )(level.sites)[0]
+                )
             solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > _STALLED and len(levels) > 1:
@@ -151,24 +131,20 @@ def fitted_flux(
     The image comes with the flux of the source.
     """
     few = tuple(level for level in levels if len(level.sites) <= _SITES_OF_FIT) or levels[:1]
+    at_edge = np.abs(margin.edge_distance(few[-1].sites).min(axis=-1)) < few[-1].spacing
+
+    def move_at_edge(trial: FloatArray) -> float:
+        solution = solve(few, trial, options, report, margin=margin)[-1]
+        return float((solution.displacement[at_edge] ** 2).sum(axis=1).mean())
+
     factor = 1.0
     for step in _STEPS_OF_FIT:
-        moves = [
-            _move_at_edge(
-                few[-1], solve(few, trial * image, options, report, margin=margin)[-1], margin
-            )
-            for trial in (factor * (1 - step), factor, factor * (1 + step))
-        ]
+        trials = factor * (1 - step), factor, factor * (1 + step)
+        moves = [move_at_edge(trial * image) for trial in trials]
         curvature = moves[0] - 2 * moves[1] + moves[2]
         lowest = 0.5 * (moves[0] - moves[2]) / curvature if curvature > 0 else 0.0
         factor *= 1 + step * float(np.clip(lowest, -_REACH_OF_FIT, _REACH_OF_FIT))
     return factor
-
-
-def _move_at_edge(level: Level, solution: LevelSolution, margin: Margin) -> float:
-    """Return the mean square displacement of the sites along the image's edge."""
-    at_edge = np.abs(margin.edge_distance(level.sites).min(axis=-1)) < level.spacing
-    return float((solution.displacement[at_edge] ** 2).sum(axis=1).mean())
 
 
 def _solve_from(
@@ -244,14 +220,6 @@ def _solve_level(
     return descend(
         objective, weights, options.solver, tolerance=tolerance, max_iterations=most, report=report
     )
-
-
-def _prolong(
-    coarse: Level, solution: LevelSolution, fine: Level, threads: int | None
-) -> FloatArray:
-    """Evaluate the coarse potential at the fine sites."""
-    surface = potential_surface(coarse, solution.weights, solution.displacement, threads=threads)
-    return 2 * surface(fine.sites)[0]
 
 
 def potential_surface(

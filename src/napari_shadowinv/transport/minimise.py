@@ -1,11 +1,16 @@
-"""Damped Newton steps for the weights of one level.
+"""Minimising the convex function of one level.
 
-- solve from a start whose cells all hold flux: `newton`
-- make such a start of any weights: `with_full_cells`
+- by damped Newton steps, from weights whose cells all hold flux: `newton`
+- make such weights of any others: `with_full_cells`
+- by descent along gradients, as in the paper; slower, for comparison: `descend`
+
+The tolerance is the largest relative flux error of a cell.
 
 References
 ----------
-J. Kitagawa, Q. Mérigot and B. Thibert, J. Eur. Math. Soc. 21, 2603 (2019).
+J. Kitagawa, Q. Mérigot and B. Thibert, J. Eur. Math. Soc. 21, 2603 (2019); paper, section
+III.A; D. C. Liu and J. Nocedal, Math. Prog. 45, 503 (1989); A. G. Buckley, Math. Prog. 15,
+200 (1978).
 """
 
 from __future__ import annotations
@@ -14,14 +19,16 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+from scipy.optimize import minimize
 
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 
-__all__ = ["SHORTEST_STEP", "newton", "with_full_cells"]
-
+__all__ = ["SHORTEST_STEP", "descend", "newton", "with_full_cells"]
 
 SHORTEST_STEP = 1e-7
 
@@ -29,6 +36,13 @@ _PATIENCE = 15  # steps within which the error must halve, or the start was a ba
 _LINEAR_TOLERANCE = 1e-2
 _SHARES_OF_START = (0.999, 0.99, 0.9, 0.5)
 _LEAST_START = 1e-12  # of a mean cell's flux
+
+_MATRICES = 4  # n × n matrices that scipy's BFGS holds at once
+_METHODS: dict[str, tuple[str, dict[str, float]]] = {
+    # maxcor: pairs of steps and gradients that it keeps
+    "lbfgs": ("L-BFGS-B", {"maxcor": 20, "ftol": 0.0, "gtol": 0.0, "maxfun": 10**9}),
+    "quasi-newton": ("BFGS", {"gtol": 0.0}),
+}
 
 
 def newton(
@@ -42,9 +56,8 @@ def newton(
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
 
-    Every cell must hold flux at the start. It gives up where the error has not halved in many
-    steps (the start was a bad one), and where less than `shortest_step` of Newton's step would
-    be possible. The tolerance is the largest relative flux error of a cell.
+    It gives up where the error has not halved in many steps (the start was a bad one), and where
+    less than `shortest_step` of Newton's step would be possible.
     """
     mass = objective.mass
     diagram = objective.diagram(weights)
@@ -125,3 +138,58 @@ def with_full_cells(objective: TransportObjective, weights: FloatArray) -> Float
         if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
             return share * shown
     return np.zeros(len(weights))
+
+
+def descend(
+    objective: TransportObjective,
+    start: FloatArray,
+    solver: str,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    report: Reporter | None = None,
+) -> Solution:
+    """Minimise by one of scipy's methods; cells may be empty at the start."""
+    memory, needed = physical_memory(), 8 * _MATRICES * len(start) ** 2
+    if solver == "quasi-newton" and memory is not None and needed > memory:
+        most = int((memory / (8 * _MATRICES)) ** 0.5)
+        raise InputError(
+            f"quasi-newton keeps n × n matrices: {len(start):,} sites need {needed / 1e9:.3g} GB, "
+            f"this machine has {memory / 1e9:.3g} GB: use lbfgs, or at most {most:,} sites"
+        )
+    method, options = _METHODS[solver]
+    mass = objective.mass
+    flux = float(mass.mean())
+    # weights in units of the cells' area and flux in units of a cell's make a well-scaled problem
+    height, width = objective.image.shape
+    area = height * width / len(mass)
+    residual = np.inf
+    steps = 0
+
+    def scaled(weights: FloatArray) -> tuple[float, FloatArray]:
+        nonlocal residual
+        value, gradient = objective.value_and_gradient(area * weights)
+        residual = float(np.max(np.abs(gradient) / mass))
+        return value / (area * flux), gradient / flux
+
+    def after_step(_: FloatArray) -> None:
+        nonlocal steps
+        steps += 1
+        if report is not None:
+            report("transport", steps, None, f"{len(mass):,} sites, residual {residual:.2g}")
+        if residual <= tolerance:
+            raise StopIteration
+
+    result = minimize(
+        scaled,
+        start / area,
+        jac=True,
+        method=method,
+        callback=after_step,
+        options={"maxiter": max_iterations, **options},
+    )
+    weights = area * result.x
+    residual = objective.residual(objective.diagram(weights))
+    converged = residual <= tolerance
+    reason = "" if converged else f"{method} ended after {steps} iterations: {result.message}"
+    return Solution(weights - weights.mean(), residual, steps, converged, reason)
