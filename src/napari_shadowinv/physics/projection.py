@@ -4,8 +4,8 @@
 - the image there, from a displacement: `project`; from a potential in SI: `project_potential`
 - what bends the beam, and so what both experiments have in common: `Deflector`
 
-A deflection angle a, and with it the potential Φ in m, belongs to a beam: other energies bend by
-other angles. What belongs to the object, and is the same for all beams, is a line integral:
+A deflection angle, and with it the potential in m, belongs to a beam. What belongs to the object,
+and is the same for all beams, is a line integral:
 
 =================  ===========================  ==========================================
 deflector          of the object                angle of a beam

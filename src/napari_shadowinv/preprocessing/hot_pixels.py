@@ -72,8 +72,7 @@ def remove_hot_pixels(
     image : array_like, shape (H, W)
         An image or a potential, any unit.
     threshold : float, default 6
-        How many standard deviations of the noise a pixel may differ from the median of its
-        neighbours.
+        Standard deviations of the noise from the median of the neighbours.
     size : int, default 3
         Side of the neighbourhood in px, odd. Clusters of up to an eighth of its area plus one
         are found: pairs with 3, four pixels with 5.

@@ -33,7 +33,7 @@ class SIField:
 
 @dataclass(frozen=True)
 class MainField:
-    """The vector among a setup's `SIField`s that figures and layers show, and how.
+    """The vector among a setup's SI fields that figures and layers show, and how.
 
     `components` are the symbols along y and x; `arrows` is the title of the field's own arrows,
     empty where they would point along the displacement.
