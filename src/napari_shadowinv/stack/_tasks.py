@@ -1,8 +1,4 @@
-"""What a worker of a run is asked to do: invert some shots, and write each.
-
-- the task: `run_shots`, with its `Settings`
-- what it tells of a shot: `ShotOutcome`
-"""
+"""What a worker of a run is asked to do, `run_shots`: invert some shots, and write each."""
 
 from __future__ import annotations
 
@@ -23,27 +19,13 @@ from napari_shadowinv.stack._worker import Beam, Work
 
 @dataclass(frozen=True)
 class ShotOutcome:
-    """What became of one shot.
-
-    Attributes
-    ----------
-    index : int
-        Which.
-    status : int
-        DONE or FAILED of `napari_shadowinv.io.store`.
-    seconds : float
-        Time that its worker spent on it, reading and writing included.
-    reason : str
-        Why it failed.
-    converged : bool
-        Whether the solver reached its tolerance.
-    """
+    """What became of one shot."""
 
     index: int
-    status: int
-    seconds: float
-    reason: str = ""
-    converged: bool = True
+    status: int  # DONE or FAILED of `napari_shadowinv.io.store`
+    seconds: float  # that its worker spent on it, reading and writing included
+    reason: str = ""  # why it failed
+    converged: bool = True  # whether the solver reached its tolerance
 
 
 @dataclass(frozen=True)
@@ -89,7 +71,14 @@ def run_shots(
             settings.writer.fail(index, {"reason": failure, "seconds": seconds})
             outcomes.append(ShotOutcome(index, FAILED, seconds, failure))
         else:
-            _write(settings, index, previous, origin, seconds)
+            report = {
+                **dataclasses.asdict(previous.report),
+                "stages": previous.report.seconds,
+                "seconds": seconds,
+                **origin,
+                "warnings": [*previous.report.warnings, *origin.get("warnings", ())],
+            }
+            settings.writer.write(index, settings.work.arrays(previous), report)
             spent = time.perf_counter() - start
             outcomes.append(ShotOutcome(index, DONE, spent, converged=previous.report.converged))
     return outcomes
@@ -108,18 +97,5 @@ def _loaded(shot: Any) -> tuple[AnyArray, dict[str, Any]]:
     """Image of a shot; a block of a dask array on a cluster has been computed already."""
     if isinstance(shot, np.ndarray):
         return shot[0], {"sha256": checksum(shot[0])}
-    image, origin = shot.load()
-    return image, origin
-
-
-def _write(
-    settings: Settings, index: int, inversion: Inversion, origin: dict[str, Any], seconds: float
-) -> None:
-    report = {
-        **dataclasses.asdict(inversion.report),
-        "stages": inversion.report.seconds,
-        "seconds": seconds,
-        **origin,
-        "warnings": [*inversion.report.warnings, *origin.get("warnings", ())],
-    }
-    settings.writer.write(index, settings.work.arrays(inversion), report)
+    loaded: tuple[AnyArray, dict[str, Any]] = shot.load()
+    return loaded

@@ -1,9 +1,4 @@
-"""What a worker does with one shot; sites are made once in each process.
-
-- an undisturbed beam that can be sent around: `Beam`; the sites that threads share: `shared_plan`
-- a shot as it was recorded to an inversion: `Work`
-- an inversion to arrays for a dataset: `arrays_of`; threads for a shot: `threads_here`
-"""
+"""What a worker does with one shot, `Work`; sites are made once in each process."""
 
 from __future__ import annotations
 
@@ -14,9 +9,8 @@ import sys
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -30,9 +24,6 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.pipeline import Cache, Inputs, run_prepared
 from napari_shadowinv.stack._references import checksum
 from napari_shadowinv.transport.sites import SitePlan
-
-if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import Setup
 
 _ASKED_AGAIN_AFTER = 10.0  # seconds: workers come and go, but asking takes milliseconds
 _PLANS_KEPT = 2  # a worker that changes between two sources makes each once
@@ -126,11 +117,7 @@ class Work:
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
-        """Apply the recipe to a shot as it was recorded.
-
-        Without a beam that all shots share, it has the given source, also as it was recorded, or
-        one that is estimated from the image.
-        """
+        """Apply the recipe to a shot as recorded, and to its source if it has its own."""
         if np.shape(image) != self.shape:
             others = "the others" if beam is None or beam.source is None else "the source"
             raise InputError(
@@ -155,8 +142,15 @@ class Work:
         return run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
 
     def arrays(self, inversion: Inversion) -> dict[str, AnyArray]:
-        """Return the variables by name."""
-        return arrays_of(inversion, dict.fromkeys(self.variables), inversion.setup)
+        """Return the variables by name, fields in SI units among them."""
+        own = variable_labels()
+        arrays = {name: getattr(inversion, name) for name in self.variables if name in own}
+        if len(arrays) < len(self.variables):
+            fields = dataset_from_field(
+                inversion.displacement, inversion.potential, inversion.setup
+            )
+            arrays |= {name: fields[name].values for name in self.variables if name not in own}
+        return arrays
 
 
 def _relative(image: AnyArray, mask: BoolArray | None) -> AnyArray:
@@ -168,18 +162,6 @@ def _relative(image: AnyArray, mask: BoolArray | None) -> AnyArray:
         return values
     mean = float(np.maximum(used, 0).mean())
     return values / mean if mean > 0 else values
-
-
-def arrays_of(
-    inversion: Inversion, names: Mapping[str, Any], setup: Setup | None
-) -> dict[str, AnyArray]:
-    """Return variables of an inversion by name, fields in SI units among them."""
-    own = variable_labels()
-    arrays = {name: getattr(inversion, name) for name in names if name in own}
-    if len(arrays) < len(names):
-        fields = dataset_from_field(inversion.displacement, inversion.potential, setup)
-        arrays |= {name: fields[name].values for name in names if name not in own}
-    return arrays
 
 
 def threads_here(workers: int | None = None) -> int:
