@@ -25,7 +25,7 @@ from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_h
 from napari_shadowinv.stack._references import Reader, read_shot
 from napari_shadowinv.stack._resuming import append_shots, contents_of, resume
 from napari_shadowinv.stack._spec import Stack, describe_stack
-from napari_shadowinv.stack._tasks import Settings, ShotOutcome, run_shots
+from napari_shadowinv.stack._worker import Settings, ShotOutcome, run_shots
 
 if TYPE_CHECKING:
     import xarray
@@ -39,15 +39,27 @@ _POLL = 0.25  # seconds between two looks at the engine and at `should_stop`
 
 @dataclass(frozen=True)
 class RunProgress:
-    """A sign of life from a run."""
+    """A sign of life from a run.
 
-    total: int  # shots of the stack
-    done: int  # of them, with those of earlier runs
+    Attributes
+    ----------
+    total, done, failed : int
+        Shots of the stack, with those of earlier runs.
+    engine : str
+        Where the work is done.
+    name, outcome : str, ShotOutcome or None
+        The shot that has just ended, if one has, and what became of it.
+    compiling : str
+        Before all shots, after an installation: that the compiler is at work.
+    """
+
+    total: int
+    done: int
     failed: int
-    engine: str  # where the work is done
-    name: str = ""  # of the shot that has just ended, if one has
-    outcome: ShotOutcome | None = None  # what became of it
-    compiling: str = ""  # before all shots, after an installation: that the compiler is at work
+    engine: str
+    name: str = ""
+    outcome: ShotOutcome | None = None
+    compiling: str = ""
 
 
 OnRunProgress = Callable[[RunProgress], None]
