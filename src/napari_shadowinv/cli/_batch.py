@@ -81,7 +81,7 @@ def run_batch(
     quiet: bool,
     **choices: Any,
 ) -> None:
-    """Invert all shots into a store, with `choices` of `run_stack`; tell what became of them."""
+    """Invert all shots into a store, with `choices` of `run_stack`, and tell how it went."""
     from napari_shadowinv.stack import STORED, read_shot, run_stack
 
     _check(out, resume or choices["redo_failed"], choices["overwrite"])

@@ -1,11 +1,5 @@
 """Figures of an inversion for a logbook or a talk.
 
-- all of one shot on a page: `report_figure`
-- fields side by side on one scale: `comparison_figure`
-- frames of a film of many shots: `stack_frames`, for a GIF also `in_few_colours`; the film:
-  `write_film`
-- write a figure, whole or not at all: `save_figure`
-
 The figures use matplotlib's objects and no pyplot, so they neither need a window nor
 disturb the figures of a notebook.
 """

@@ -14,14 +14,8 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.physics.units import ShownField, shown_fields, shown_potential
-from napari_shadowinv.plotting._panels import (
-    STYLE,
-    Panel,
-    choose_grid,
-    image_scale,
-    new_page,
-    write_footer,
-)
+from napari_shadowinv.plotting import _panels
+from napari_shadowinv.plotting._panels import Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,16 +24,10 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 DOTS_PER_INCH = 160  # of a figure's file
-_ALARM_COLOUR = "#b00020"
-_QUIET_COLOUR = "0.3"
-_INTENSITY_MAP = "gray"
-_POTENTIAL_MAP = "viridis"
-_FIELD_MAP = "inferno"
-_RESIDUAL_MAP = "RdBu_r"
+_ALARM_COLOUR, _QUIET_COLOUR = "#b00020", "0.3"
 _CUT_COLOURS = ("#1f9bff", "#18b368")
 _REFERENCE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.4, "alpha": 0.45}
-_CAUSTIC_COLOUR = "white"
-_CAUSTIC_DENSITY = 0.15
+_CAUSTIC_DENSITY = 0.15  # where a caustic is outlined
 _LARGEST_INTENSITY = 3.5
 _LARGEST_RESIDUAL = 50.0
 
@@ -49,9 +37,8 @@ def report_figure(
 ) -> Figure:
     """Show all of one shot on a page.
 
-    Six panels: image, potential with contours, field with arrows, re-projection, residual
-    and profiles. The profiles are cuts along the dashed lines on the field. White outlines
-    on potential and field are caustics.
+    Six panels: image, potential with contours, field with arrows, re-projection, residual and
+    profiles along the dashed lines on the field. White outlines are caustics.
 
     Parameters
     ----------
@@ -71,18 +58,18 @@ def report_figure(
 
     shape = inversion.potential.shape
     (field,) = shown_fields([inversion.displacement], setup)
-    width = choose_grid(shape, panels=6).figure_size[0]
+    width = _panels.choose_grid(shape, panels=6).figure_size[0]
     footer = _footer(inversion, field, columns=int(width * 14))
-    grid = choose_grid(shape, panels=6, foot=0.12 + 0.18 * len(footer), title=bool(title))
-    with mpl.rc_context(STYLE):
-        figure, panels = new_page(grid, image_scale(shape, setup), title)
+    grid = _panels.choose_grid(shape, panels=6, foot=0.12 + 0.18 * len(footer), title=bool(title))
+    with mpl.rc_context(_panels.STYLE):
+        figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), title)
         _draw_intensity(panels[0], inversion.image, "Image", inversion)
         _draw_potential(panels[1], inversion, setup)
         _draw_field(panels[2], field, inversion.caustic)
         _draw_intensity(panels[3], inversion.reprojection, "Re-projection", inversion)
         _draw_residual(panels[4], inversion)
         _draw_cuts(panels[5], field)
-        write_footer(figure, footer, grid)
+        _panels.write_footer(figure, footer, grid)
     return figure
 
 
@@ -99,10 +86,8 @@ def comparison_figure(
     ----------
     fields : mapping of str to array_like, shape (2, H, W)
         Displacements in px by name; the first is the reference.
-    setup : Setup, optional
-        Gives axes in metres and the field in SI units; pixels without.
-    title : str, optional
-        A heading.
+    setup, title
+        As for `report_figure`.
     caption : str
         A line below.
 
@@ -124,11 +109,11 @@ def comparison_figure(
         raise InputError(f"fields have shapes {shapes}: expected one or more of the same shape")
     shown = dict(zip(fields, shown_fields(arrays, setup), strict=True))
     shape = shapes[0][1], shapes[0][2]
-    grid = choose_grid(shape, panels=len(shown) + 1, foot=0.35, title=bool(title))
-    with mpl.rc_context(STYLE):
-        figure, panels = new_page(grid, image_scale(shape, setup), title)
+    grid = _panels.choose_grid(shape, panels=len(shown) + 1, foot=0.35, title=bool(title))
+    with mpl.rc_context(_panels.STYLE):
+        figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), title)
         _draw_side_by_side(panels, shown)
-        write_footer(figure, [(caption, _QUIET_COLOUR)], grid)
+        _panels.write_footer(figure, [(caption, _QUIET_COLOUR)], grid)
     return figure
 
 
@@ -184,7 +169,7 @@ def _draw_intensity(panel: Panel, plane: FloatArray, title: str, inversion: Inve
     """Show the image, or what the answer predicts of it, on the image's scale."""
     shown = plane / inversion.source.mean()
     limits = _intensity_limits(inversion)
-    panel.show(shown, title, "Intensity / mean source", _INTENSITY_MAP, limits)
+    panel.show(shown, title, "Intensity / mean source", "gray", limits)
 
 
 def _intensity_limits(inversion: Inversion) -> tuple[float, float]:
@@ -201,7 +186,7 @@ def _draw_potential(panel: Panel, inversion: Inversion, setup: Setup | None) -> 
     """Show the potential with contours, and where the caustics are."""
     plane, unit = shown_potential(inversion.potential, setup)
     limits = (float(plane.min()), float(plane.max()))
-    panel.show(plane, "Deflection potential", f"Potential ({unit})", _POTENTIAL_MAP, limits)
+    panel.show(plane, "Deflection potential", f"Potential ({unit})", "viridis", limits)
     if limits[1] > limits[0]:
         levels = np.linspace(*limits, 9)[1:-1]
         panel.contour(plane, levels, "black", linewidths=0.5, alpha=0.45)
@@ -218,11 +203,6 @@ def _draw_field(panel: Panel, field: ShownField, caustic: BoolArray) -> None:
     _outline_caustics(panel, caustic)
 
 
-def _draw_vectors(panel: Panel, field: ShownField, title: str, largest: float) -> None:
-    panel.show(field.magnitude, title, _label(field), _FIELD_MAP, (0.0, largest))
-    _draw_arrows(panel, field)
-
-
 def _strongest(field: ShownField) -> float:
     """Upper end of a colour scale, which must not be empty even if the field is."""
     return float(field.magnitude.max()) or 1.0
@@ -232,11 +212,12 @@ def _label(field: ShownField) -> str:
     return f"{field.symbol} ({field.unit})"
 
 
-def _draw_arrows(panel: Panel, field: ShownField, across: int = 14) -> None:
-    """Show the direction where the field is strong enough to have one."""
+def _draw_vectors(panel: Panel, field: ShownField, title: str, largest: float) -> None:
+    """Show a field, with arrows where it is strong enough to have a direction."""
     everywhere = field.magnitude
+    panel.show(everywhere, title, _label(field), "inferno", (0.0, largest))
     height, width = everywhere.shape
-    step = max(1, round(np.sqrt(height * width) / across))
+    step = max(1, round(np.sqrt(height * width) / 14))
     rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
     strong = everywhere[rows, columns] > 0.15 * everywhere.max()
     if not strong.any():
@@ -272,7 +253,7 @@ def _outline_caustics(panel: Panel, caustic: BoolArray) -> None:
     # Noise breaks a caustic into specks; one line around them is what can be read.
     density = gaussian_filter(caustic.astype(np.float64), 1 + min(caustic.shape) / 200)
     if density.min() < _CAUSTIC_DENSITY < density.max():
-        panel.contour(density, [_CAUSTIC_DENSITY], _CAUSTIC_COLOUR, linewidths=1.1)
+        panel.contour(density, [_CAUSTIC_DENSITY], "white", linewidths=1.1)
 
 
 def _draw_residual(panel: Panel, inversion: Inversion) -> None:
@@ -281,7 +262,7 @@ def _draw_residual(panel: Panel, inversion: Inversion) -> None:
     # Limits that a handful of pixels at a caustic cannot blow up.
     limit = min(float(np.percentile(np.abs(percent), 99.5)) or 1.0, _LARGEST_RESIDUAL)
     title = f"Residual: {100 * inversion.report.image_residual:.3g} % rms"
-    panel.show(percent, title, "Difference (% of mean)", _RESIDUAL_MAP, (-limit, limit))
+    panel.show(percent, title, "Difference (% of mean)", "RdBu_r", (-limit, limit))
 
 
 def _draw_cuts(panel: Panel, field: ShownField) -> None:

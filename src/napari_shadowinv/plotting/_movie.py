@@ -91,12 +91,8 @@ def _plane(field: xarray.DataArray, index: int) -> FloatArray:
 
 
 def _limits(field: xarray.DataArray) -> tuple[float, float]:
-    extremes = np.array(
-        [
-            (plane.min(), plane.max())
-            for plane in (_plane(field, index) for index in range(field.sizes["shot"]))
-        ]
-    )
+    planes = (_plane(field, index) for index in range(field.sizes["shot"]))
+    extremes = np.array([(plane.min(), plane.max()) for plane in planes])
     low = float(np.quantile(extremes[:, 0], _OUTLIERS, method="lower"))
     high = float(np.quantile(extremes[:, 1], 1 - _OUTLIERS, method="higher"))
     if "component" in field.dims:
@@ -141,15 +137,8 @@ def in_few_colours(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
     A program that chooses 256 colours by how often they occur leaves few for the bright parts.
 
-    Parameters
-    ----------
-    frame : ndarray of uint8, shape (rows, columns, 3)
-        From `stack_frames`.
-
-    Returns
-    -------
-    ndarray of uint8, shape (rows, columns, 3)
-        The nearest colours of the colour scale, and greys.
+    Takes and returns an ndarray of uint8, shape (rows, columns, 3); the colours are the nearest of
+    the colour scale, and greys.
     """
     tree, palette = _palette()
     rows = frame.reshape(-1, 3)
@@ -162,7 +151,7 @@ def in_few_colours(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=1)
 def _palette() -> tuple[Any, NDArray[np.uint8]]:
-    """The colours of a GIF, and what finds the nearest."""
+    """What finds the nearest of a GIF's colours, and these."""
     from matplotlib import colormaps
     from scipy.spatial import cKDTree
 

@@ -10,7 +10,7 @@ from napari_shadowinv.stack._lazy import invert_stack
 from napari_shadowinv.stack._references import read_shot
 from napari_shadowinv.stack._run import STORED, RunProgress, run_stack
 from napari_shadowinv.stack._statistics import stack_statistics
-from napari_shadowinv.stack._tasks import ShotOutcome
+from napari_shadowinv.stack._worker import ShotOutcome
 
 __all__ = [
     "STORED",

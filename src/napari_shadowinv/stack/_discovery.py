@@ -1,8 +1,4 @@
-"""Where shots come from: globs, lists of files, pages, arrays.
-
-- any input as references to single shots: `find_shots`, which gives `Shots`
-- sources in the same ways: `find_source`
-"""
+"""Where shots, and sources, come from: globs, lists of files, pages, arrays."""
 
 from __future__ import annotations
 
@@ -23,15 +19,8 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, text_of
 from napari_shadowinv.io.formats import kind_of
 from napari_shadowinv.io.images import tiff_pages
-from napari_shadowinv.stack._references import (
-    ArrayShot,
-    BlockShot,
-    FileShot,
-    PageShot,
-    Reader,
-    Shot,
-    read_shot,
-)
+from napari_shadowinv.stack import _references
+from napari_shadowinv.stack._references import Reader, Shot, read_shot
 
 if TYPE_CHECKING:
     import xarray
@@ -113,7 +102,7 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
     pages = _page_count(path, reader)
     if pages == 1:
         return _from_files([path], reader, shape)
-    items = [PageShot(path.absolute(), page, reader) for page in range(pages)]
+    items = [_references.PageShot(path.absolute(), page, reader) for page in range(pages)]
     names = tuple(f"{text_of(path.name)}[{page}]" for page in range(pages))
     return Shots(items, names, shape or _usual_shape(items))
 
@@ -133,7 +122,7 @@ def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | 
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise InputError(f"shots contain {twice} twice: expected each file once")
-    items = [FileShot(path.absolute(), reader) for path in paths]
+    items = [_references.FileShot(path.absolute(), reader) for path in paths]
     return Shots(items, names, shape or _usual_shape(items))
 
 
@@ -189,7 +178,7 @@ def _from_array(shots: Any, coordinate: Any = None) -> Shots:
         items = _Blocks(array)
     else:
         array = da.from_array(np.asarray(shots), chunks=(1, -1, -1))
-        items = [ArrayShot(plane) for plane in np.asarray(shots)]
+        items = [_references.ArrayShot(plane) for plane in np.asarray(shots)]
     names = tuple(str(value) for value in (range(count) if coordinate is None else coordinate))
     return Shots(items, names, (shots.shape[1], shots.shape[2]), coordinate, array)
 
@@ -206,7 +195,7 @@ class _Blocks(Sequence[Shot]):
     def __getitem__(self, index: Any) -> Any:
         dask: Any = import_module("dask")
         # Without the tasks of other shots, which would travel with it.
-        return BlockShot(dask.optimize(self._array.blocks[index])[0])
+        return _references.BlockShot(dask.optimize(self._array.blocks[index])[0])
 
 
 def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots | None:
@@ -215,7 +204,7 @@ def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots 
         return None
     single = isinstance(source, (str, Path)) and not _MAGIC.search(str(source))
     if single and _page_count(Path(source), reader) == 1:
-        return FileShot(Path(source).absolute(), reader).load()[0]
+        return _references.FileShot(Path(source).absolute(), reader).load()[0]
     if getattr(source, "ndim", None) == 2:
         return np.asarray(source)
     sources = find_shots(source, reader=reader)

@@ -1,7 +1,4 @@
-"""Where shots are inverted: in this process, in others, on a cluster.
-
-- an engine for what the user names: `engine_for`; whether it is on this machine: `is_here`
-"""
+"""Where shots are inverted: in this process, in others, on a cluster; see `engine_for`."""
 
 from __future__ import annotations
 
@@ -24,7 +21,6 @@ _CONNECT_SECONDS = 10.0
 _POLL = 0.1  # seconds between two looks at `should_stop` while connecting
 _ASKED_AGAIN_AFTER = 2.0  # seconds: clusters grow and shrink
 _AHEAD = 2  # tasks for each slot: one that runs, one that waits for it to end
-_HERE = ("threads", "synchronous", "processes")
 _AHEAD_OF_FILES = 64  # references to files are small; a cluster that grows wants to see work
 
 
@@ -113,11 +109,13 @@ class _Cluster:
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
         # A dask array may live on the cluster already, so its blocks are the cluster's tasks.
         with self._connected_or_lost():
-            handed = [self._block(shot) if isinstance(shot, BlockShot) else shot for shot in shots]
+            handed = [
+                self._client.compute(shot.block.to_delayed().ravel()[0])
+                if isinstance(shot, BlockShot)
+                else shot
+                for shot in shots
+            ]
             return self._client.submit(task, handed, *args, pure=False)
-
-    def _block(self, shot: BlockShot) -> Any:
-        return self._client.compute(shot.block.to_delayed().ravel()[0])
 
     def result(self, future: Any) -> Any:
         from distributed.scheduler import KilledWorker
@@ -182,14 +180,17 @@ def engine_for(
             f"scheduler is {scheduler!r}: expected 'threads', 'processes', 'synchronous', an "
             "address such as tcp://host:8786, a Client or a cluster"
         )
+    elif isinstance(scheduler, import_module("distributed").Client):
+        yield _Cluster(scheduler)
     else:
-        yield from _given(scheduler, should_stop)
+        with _connected(scheduler, should_stop) as client:
+            yield _Cluster(client)
 
 
 def is_here(scheduler: Any) -> bool:
     """Whether `engine_for` makes an engine on this machine of this."""
     chosen = _chosen(scheduler)
-    return isinstance(chosen, str) and chosen in _HERE
+    return isinstance(chosen, str) and chosen in ("threads", "synchronous", "processes")
 
 
 def _chosen(scheduler: Any) -> Any:
@@ -232,15 +233,6 @@ def _last_cause(error: BaseException) -> str:
     while error.__cause__ is not None:
         error = error.__cause__
     return str(error).rstrip(".") or type(error).__name__
-
-
-def _given(scheduler: Any, should_stop: ShouldStop | None) -> Iterator[Engine]:
-    distributed: Any = import_module("distributed")
-    if isinstance(scheduler, distributed.Client):
-        yield _Cluster(scheduler)
-    else:
-        with _connected(scheduler, should_stop) as client:
-            yield _Cluster(client)
 
 
 def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:

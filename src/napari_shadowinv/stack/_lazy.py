@@ -14,15 +14,8 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import variable_labels
 from napari_shadowinv.io.store import SUMMARY
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.stack import _spec
 from napari_shadowinv.stack._references import Reader, Shot, read_shot
-from napari_shadowinv.stack._spec import (
-    Stack,
-    attributes_of,
-    coordinates_of,
-    describe_stack,
-    dtype_of,
-    values_of_beam,
-)
 from napari_shadowinv.stack._worker import Beam, Work
 
 if TYPE_CHECKING:
@@ -59,40 +52,36 @@ def invert_stack(
         page for each shot. Files are read by the tasks that invert them.
     source : array (y, x), path, Estimate, or as `shots`, optional
         The undisturbed beam, one for all shots or one for each, or an estimate of
-        `napari_shadowinv.preprocessing` by which it is guessed from each shot. Default:
-        uniform, and then intensities in the result are relative to each shot's mean.
+        `napari_shadowinv.preprocessing` by which it is guessed from each shot. Default: uniform,
+        and then intensities in the result are relative to each shot's mean.
     mask : array_like of bool, shape (H, W), optional
-        The pixels that can be used, the same in all shots; see `napari_shadowinv.invert`.
+        The pixels that can be used in all shots; see `napari_shadowinv.invert`.
     options : InversionOptions, optional
-        Choices. If `threads` is None, all shots that are inverted at once share the cores.
+        Choices. Without `threads`, all shots that are inverted at once share the cores.
     setup : Setup, optional
         Adds fields in SI units.
     recipe : Recipe, optional
         Everything that is done to each shot, in place of `options`, `setup` and `filters`.
     filters : sequence of Step, optional
-        Steps of `napari_shadowinv.preprocessing` for each shot, in their order. They are applied
-        to a measured source, too; what flattens the image needs a source that is not measured.
+        Steps for each shot and a measured source; what flattens the image takes no such source.
     source_mask : array_like of bool, shape (H, W), optional
         Pixels where the object never is; an estimate of the source looks at no others.
     variables : collection of str, optional
-        Make only these of a result's variables. Default: all.
+        Which of a result's variables to make. Default: all.
     reader : callable, optional
         Makes an image of a path; one with a keyword ``page`` reads TIFFs with many pages, too.
         `functools.partial(read_shot, channel="red")` reads one channel of colour images.
     warm_start : int, optional
-        The solver starts from the answer to the shot before, in runs of so many shots: for
-        series in which shots are alike and share their source. The answers are the same within
-        the tolerance. Shots of one run are inverted one after the other. Default: each shot on
-        its own.
+        Start from the answer to the shot before, in runs of so many shots, one after the other:
+        for alike shots that share their source. The answers agree within the tolerance.
 
     Returns
     -------
     xarray.Dataset
         The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
-        chunk, and ``converged``, ``flux_residual``, ``image_residual`` and ``iterations``. Sites
-        have no dimension ``shot`` where all shots share a source. With a free boundary and a
-        source for each shot, shots differ in their number of sites, and there are no variables
-        of sites. Nothing is computed yet.
+        chunk, and ``converged``, ``flux_residual``, ``image_residual`` and ``iterations``; nothing
+        is computed yet. Sites have no dimension ``shot`` where all shots share a source, and are
+        left out with a free boundary and a source for each shot, as their number then differs.
 
     Raises
     ------
@@ -104,8 +93,7 @@ def invert_stack(
 
     Notes
     -----
-    The values do not depend on scheduler, chunks, order or number of workers. Sites are made
-    once in each process. To write many shots, `run_stack` is safer: it can be resumed.
+    The values do not depend on scheduler, chunks, order or number of workers.
 
     Examples
     --------
@@ -116,7 +104,7 @@ def invert_stack(
     >>> float(abs(stack.displacement.isel(shot=1)).max())
     0.0
     """
-    stack = describe_stack(
+    stack = _spec.describe_stack(
         shots,
         source=source,
         mask=mask,
@@ -169,7 +157,7 @@ def _pick(record: dict[str, Any], name: str, with_shot: bool) -> AnyArray:
 class _Graph:
     """The tasks of a stack: one for each shot, one that takes each variable out of it."""
 
-    def __init__(self, stack: Stack) -> None:
+    def __init__(self, stack: _spec.Stack) -> None:
         from dask.base import tokenize
         from dask.delayed import delayed
         from dask.highlevelgraph import HighLevelGraph
@@ -226,7 +214,9 @@ class _Graph:
         for name in _NUMBERS:
             dtype, labels = SUMMARY[name]
             variables[name] = (("shot",), self._of_each(name, (), dtype), labels)
-        return xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes_of(stack))
+        return xr.Dataset(
+            variables, coords=_spec.coordinates_of(stack), attrs=_spec.attributes_of(stack)
+        )
 
     def _of_each(self, name: str, dims: tuple[str, ...], dtype: Any = None) -> Any:
         from dask.highlevelgraph import HighLevelGraph
@@ -244,13 +234,13 @@ class _Graph:
         )
         da: Any = import_module("dask.array")
         chunks = ((1,) * sizes["shot"], *((sizes[dim],) for dim in dims))
-        return da.Array(graph, layer, chunks, dtype=dtype or dtype_of(name))
+        return da.Array(graph, layer, chunks, dtype=dtype or _spec.dtype_of(name))
 
     def _shared(self, name: str, dims: tuple[str, ...]) -> Any:
         from dask.delayed import delayed
 
-        beam = delayed(values_of_beam, pure=True)(self._beam, self._stack.recipe.options)
+        beam = delayed(_spec.values_of_beam, pure=True)(self._beam, self._stack.recipe.options)
         value = delayed(_pick, pure=True)(beam, name, False)
         da: Any = import_module("dask.array")
         shape = tuple(self._stack.sizes[dim] for dim in dims)
-        return da.from_delayed(value, shape, dtype=dtype_of(name))
+        return da.from_delayed(value, shape, dtype=_spec.dtype_of(name))

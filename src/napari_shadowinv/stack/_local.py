@@ -1,6 +1,4 @@
-"""Worker processes on this machine, as runs of shots need them.
-
-- start some, connected: `local_client`; what each of them runs first: `dask_setup`
+"""Worker processes on this machine: `local_client` starts some, connected.
 
 Whoever may talk to a scheduler or a worker of dask can have it run any code. So these talk among
 themselves only: encrypted, with a key that is made for the run and exists nowhere but in them.
@@ -57,7 +55,7 @@ def local_client(count: int) -> Iterator[Any]:
 
 
 def _settings(environment: dict[str, Any]) -> dict[str, Any]:
-    """Return what differs from dask's own settings."""
+    """What differs from dask's own settings."""
     return {
         # They tell all the machine what is at work, to nobody's use.
         "distributed.scheduler.http.routes": [],

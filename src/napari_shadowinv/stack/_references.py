@@ -1,10 +1,4 @@
-"""One shot of a stack: a reference that is read when it is needed.
-
-- what every reference can do: `Shot`; a file: `FileShot`; a page: `PageShot`; an array:
-  `ArrayShot`, `BlockShot`
-- a file with a colour channel chosen, or binned: `read_shot`
-- tell arrays and readers from others: `checksum`, `described_reader`
-"""
+"""One shot of a stack: a reference, `Shot`, that is read when it is needed."""
 
 from __future__ import annotations
 
@@ -55,11 +49,9 @@ def read_shot(
     path : Path
         The file.
     page : int, optional
-        Of a TIFF with many pages.
-    channel : {"red", "green", "blue", "mean"} or int, optional
-        What to take of a colour image.
-    variable : str, optional
-        Name of the array in a MATLAB or HDF5 file.
+        Of a TIFF with many pages, from 0.
+    channel, variable
+        As for `napari_shadowinv.io.read_radiograph`.
     warnings : list of str, optional
         What the user should know before trusting the image is put in here.
 

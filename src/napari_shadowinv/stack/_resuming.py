@@ -1,9 +1,4 @@
-"""The store of a run: what a new one holds, what may go on in one that is there.
-
-- a new store: `contents_of`
-- one of an earlier run: `resume` refuses what does not belong into it
-- room in it for shots that arrived since: `append_shots`
-"""
+"""The store of a run: what a new one holds, what may go on in one that is there."""
 
 from __future__ import annotations
 
@@ -20,28 +15,24 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import variable_labels
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.io.store_layout import Contents, Variable, grow_store
+from napari_shadowinv.stack import _spec
 from napari_shadowinv.stack._references import checksum
-from napari_shadowinv.stack._spec import (
-    Stack,
-    attributes_of,
-    coordinates_of,
-    dtype_of,
-    values_of_beam,
-)
+from napari_shadowinv.stack._spec import Stack, dtype_of
 
 _APPENDED = "appended_at"  # attribute: where later runs began to append shots
 _INSTEAD = "use the same, overwrite the store, or choose another name"
 
 
 def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
-    """Say what the store of a stack holds."""
     identity = {name: value for name, value in _identity(stack, dtype).items() if value}
-    attributes = {**attributes_of(stack), **identity}
+    attributes = {**_spec.attributes_of(stack), **identity}
     return Contents(stack.sizes, _variables(stack, dtype), _coordinates(stack), attributes)
 
 
 def _coordinates(stack: Stack) -> dict[str, Variable]:
-    return {name: _stored_coordinate(values) for name, values in coordinates_of(stack).items()}
+    return {
+        name: _stored_coordinate(values) for name, values in _spec.coordinates_of(stack).items()
+    }
 
 
 def _stored_coordinate(coordinate: Any) -> Variable:
@@ -69,7 +60,7 @@ def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
         exact = dtype_of(name).kind != "f" or "site" in dims
         kept = dtype_of(name) if exact else dtype
         if stack.beam is not None and stack.is_shared(name):
-            values = np.asarray(values_of_beam(stack.beam, stack.recipe.options)[name])
+            values = np.asarray(_spec.values_of_beam(stack.beam, stack.recipe.options)[name])
             found[name] = Variable(dims, kept, labels, values)
         else:
             found[name] = Variable(("shot", *dims), kept, labels, None)
@@ -169,12 +160,7 @@ def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack
         for name, coordinate in _coordinates(stack).items()
         if coordinate.along_shots
     }
-    return grow_store(
-        store.path,
-        len(stack.shots),
-        coordinates,
-        {
-            "source_image": _identity(stack, dtype)["source_image"],
-            _APPENDED: [*store.attributes.get(_APPENDED, []), len(store.names)],
-        },
-    )
+    begins = [*store.attributes.get(_APPENDED, []), len(store.names)]
+    source = _identity(stack, dtype)["source_image"]
+    told = {"source_image": source, _APPENDED: begins}
+    return grow_store(store.path, len(stack.shots), coordinates, told)

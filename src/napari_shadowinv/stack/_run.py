@@ -17,21 +17,15 @@ from napari_shadowinv._system.locking import locked
 from napari_shadowinv._system.progress import Progress, ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
-from napari_shadowinv.io.store import (
-    DONE,
-    FAILED,
-    PENDING,
-    StackStore,
-    check_store_path,
-    read_stack,
-)
+from napari_shadowinv.io import read_stack
+from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
 from napari_shadowinv.io.store_layout import create_store
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
 from napari_shadowinv.stack._references import Reader, read_shot
 from napari_shadowinv.stack._resuming import append_shots, contents_of, resume
 from napari_shadowinv.stack._spec import Stack, describe_stack
-from napari_shadowinv.stack._tasks import Settings, ShotOutcome, run_shots
+from napari_shadowinv.stack._worker import Settings, ShotOutcome, run_shots
 
 if TYPE_CHECKING:
     import xarray
@@ -40,7 +34,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.preprocessing import Recipe, Step
 
 STORED = ("potential", "displacement", "caustic")
-
 _POLL = 0.25  # seconds between two looks at the engine and at `should_stop`
 
 
@@ -54,10 +47,8 @@ class RunProgress:
         Shots of the stack, with those of earlier runs.
     engine : str
         Where the work is done.
-    name : str
-        The shot that has just ended; empty at the start and while nothing has ended.
-    outcome : ShotOutcome or None
-        What became of it.
+    name, outcome : str, ShotOutcome or None
+        The shot that has just ended, if one has, and what became of it.
     compiling : str
         Before all shots, after an installation: that the compiler is at work.
     """
@@ -104,26 +95,22 @@ def run_stack(
 
     Parameters
     ----------
-    shots, source, mask, options, setup, filters, source_mask, reader, warm_start
-        See `invert_stack`. All of them, and earlier shots, must be those of the store where it is
-        resumed.
+    shots, source, mask, options, setup, recipe, filters, source_mask, reader, warm_start
+        See `invert_stack`. They and earlier shots must be those of a store that is resumed.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
     variables : collection of str, optional
-        What to store. Default: potential, displacement and caustic; at a million pixels these
-        are 13 MB a shot before compression, and the rest can be computed from them and the image.
+        What to store. Default: potential, displacement and caustic, at a million pixels 13 MB a
+        shot before compression; the rest can be computed from them and the image.
     dtype : {"float32", "float64"}, optional
-        Type of stored images. Seven digits are more than the inversion has. Sites, weights and
-        numbers of a shot keep 64 bits.
+        Type of stored images; sites, weights and numbers of a shot keep 64 bits.
     scheduler : str, distributed.Client, cluster or None, optional
         ``"threads"``, ``"processes"``, ``"synchronous"``, the address of a scheduler, a client or
         a cluster. Default: dask's current client, else threads. The values do not depend on it.
     workers : int, optional
         Shots that are inverted at once, on this machine. Default: as many as cores.
-    overwrite : bool, optional
-        Throw away what the store holds and begin anew.
-    redo_failed : bool, optional
-        Try shots again that failed before.
+    overwrite, redo_failed : bool, optional
+        Throw away what the store holds; try shots again that failed before.
     on_progress : callable, optional
         Receives a `RunProgress` at the start and when a shot has ended.
     should_stop : callable, optional
@@ -164,8 +151,13 @@ def run_stack(
     )
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
     if is_here(scheduler):
+
+        def tell(news: Progress) -> None:
+            if on_progress is not None:
+                on_progress(RunProgress(len(stack.shots), 0, 0, "", compiling=news.message))
+
         # Once for all workers, which would each be at it during their first shot.
-        _compile(len(stack.shots), on_progress, should_stop)
+        ensure_compiled(tell, should_stop)
     with locked(path):
         store = StackStore(path) if path.exists() and not overwrite else None
         arrived = False
@@ -183,14 +175,6 @@ def run_stack(
                 store = append_shots(store, stack, kept)
             _Run(stack, store, again, on_progress, should_stop).on(engine)
     return read_stack(path)
-
-
-def _compile(shots: int, on_progress: OnRunProgress | None, should_stop: ShouldStop | None) -> None:
-    def tell(news: Progress) -> None:
-        if on_progress is not None:
-            on_progress(RunProgress(shots, 0, 0, "", compiling=news.message))
-
-    ensure_compiled(tell, should_stop)
 
 
 class _Run:
@@ -216,7 +200,6 @@ class _Run:
         }
 
     def tell(self, engine: str, outcome: ShotOutcome | None = None) -> None:
-        """Count an outcome and tell of it."""
         if outcome is not None:
             self._counts[outcome.status] += 1
         if self._on_progress is not None:
@@ -261,7 +244,6 @@ class _Run:
             raise
 
     def _shared(self, engine: Engine) -> tuple[Any, Any]:
-        """Bring what all shots need to where they are inverted."""
         stack = self._stack
         own = tuple(name for name in stack.variables if not stack.is_shared(name))
         settings = Settings(self._store.writer, stack.work(own), engine.workers)

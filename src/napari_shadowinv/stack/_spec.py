@@ -1,9 +1,4 @@
-"""What is known about a stack before any shot is inverted.
-
-- check everything that can be checked: `describe_stack`, which gives a `Stack`
-- the labels of its dataset: `coordinates_of`, `attributes_of`, `dtype_of`
-- what its shots have together: `values_of_beam`
-"""
+"""What is known about a stack before any shot is inverted: `describe_stack` gives a `Stack`."""
 
 from __future__ import annotations
 
@@ -55,7 +50,6 @@ class Stack:
 
     @property
     def recipe(self) -> Recipe:
-        """What is done to each shot."""
         return self.inputs.recipe
 
     @cached_property
@@ -70,12 +64,10 @@ class Stack:
 
     @property
     def setup(self) -> Setup | None:
-        """Setup of the results."""
         return self.moved.setup
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """Length of each dimension."""
         height, width = self.shape
         # Where each shot has its own, there are sites only if they do not depend on it.
         beam = self.beam or Beam.of(self.shape, None, self.moved.mask)
@@ -146,12 +138,9 @@ def describe_stack(
             "the recipe asks for a measured source, but names no file: name one, or give a source"
         )
     # Where the source tells it, no shot needs to be read for its shape.
-    shape: tuple[int, ...] = () if mask is None else np.shape(mask)
-    if sources is not None:
-        shape = sources.shape
-    found = find_shots(
-        shots, reader=reader, shape=(shape[0], shape[1]) if len(shape) == 2 else None
-    )
+    shape = (() if mask is None else np.shape(mask)) if sources is None else sources.shape
+    known = (shape[0], shape[1]) if len(shape) == 2 else None
+    found = find_shots(shots, reader=reader, shape=known)
     if sources is not None and sources.shape != found.shape:
         raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
     usable = None if mask is None else checked_mask(mask, found.shape)
@@ -236,7 +225,6 @@ def _checked_variables(
 
 
 def coordinates_of(stack: Stack) -> dict[str, Any]:
-    """Return the coordinates of a stack's dataset."""
     plane = dataset_from_field(np.zeros((2, *stack.shape)), None, stack.setup)
     shots = stack.shots
     numbers = np.arange(len(shots)) if shots.coordinate is None else shots.coordinate
@@ -247,7 +235,6 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
 
 
 def attributes_of(stack: Stack) -> dict[str, str]:
-    """Return the attributes of a stack's dataset."""
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.setup).attrs
     provenance = stack.inputs.provenance.model_copy(update={"setup": stack.setup})
     return {

@@ -12,16 +12,10 @@ from napari_shadowinv.io.store import DONE
 if TYPE_CHECKING:
     import xarray
 
-_AVERAGED = (
-    "potential",
-    "displacement",
-    "potential_si",
-    "deflection_angle",
-    "path_integrated_b",
-    "path_integrated_e",
-    "line_integrated_log_index",
-    "line_integrated_density",
-)
+_AVERAGED = """
+    potential displacement potential_si deflection_angle path_integrated_b path_integrated_e
+    line_integrated_log_index line_integrated_density
+"""
 
 
 def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
@@ -36,10 +30,9 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
     Returns
     -------
     xarray.Dataset
-        Lazy. For each field ``name``: ``name_mean`` and ``name_std`` (y, x), the standard
-        deviation of one shot from the mean (divided by shots - 1; NaN for a single shot), and
-        ``name_peak`` (shot), the largest magnitude of each shot. For vectors the mean and
-        spread are those of each component.
+        Lazy. For each field ``name``, by component: ``name_mean`` and ``name_std`` (y, x), the
+        standard deviation of one shot (divided by shots - 1; NaN for a single shot), and
+        ``name_peak`` (shot), the largest magnitude of each shot.
 
     Raises
     ------
@@ -56,7 +49,7 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
     """
     import xarray as xr
 
-    names = [name for name in _AVERAGED if name in stack and "shot" in stack[name].dims]
+    names = [name for name in _AVERAGED.split() if name in stack and "shot" in stack[name].dims]
     if not names:
         raise InputError(
             "the dataset has no fields of a series of shots: expected one from invert_stack, "

@@ -1,12 +1,8 @@
-"""What a worker does with one shot; sites are made once in each process.
-
-- an undisturbed beam that can be sent around: `Beam`; the sites that threads share: `shared_plan`
-- a shot as it was recorded to an inversion: `Work`
-- an inversion to arrays for a dataset: `arrays_of`; threads for a shot: `threads_here`
-"""
+"""What a worker does: `Work` inverts one shot, `run_shots` some and writes each."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import multiprocessing
@@ -14,25 +10,22 @@ import sys
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
+from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.pipeline import Cache, Inputs, run_prepared
-from napari_shadowinv.stack._references import checksum
+from napari_shadowinv.stack._references import Shot, checksum
 from napari_shadowinv.transport.sites import SitePlan
-
-if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import Setup
 
 _ASKED_AGAIN_AFTER = 10.0  # seconds: workers come and go, but asking takes milliseconds
 _PLANS_KEPT = 2  # a worker that changes between two sources makes each once
@@ -126,11 +119,7 @@ class Work:
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
-        """Apply the recipe to a shot as it was recorded.
-
-        Without a beam that all shots share, it has the given source, also as it was recorded, or
-        one that is estimated from the image.
-        """
+        """Apply the recipe to a shot as recorded, and to its source if it has its own."""
         if np.shape(image) != self.shape:
             others = "the others" if beam is None or beam.source is None else "the source"
             raise InputError(
@@ -155,8 +144,15 @@ class Work:
         return run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
 
     def arrays(self, inversion: Inversion) -> dict[str, AnyArray]:
-        """Return the variables by name."""
-        return arrays_of(inversion, dict.fromkeys(self.variables), inversion.setup)
+        """Return the variables by name, fields in SI units among them."""
+        own = variable_labels()
+        arrays = {name: getattr(inversion, name) for name in self.variables if name in own}
+        if len(arrays) < len(self.variables):
+            fields = dataset_from_field(
+                inversion.displacement, inversion.potential, inversion.setup
+            )
+            arrays |= {name: fields[name].values for name in self.variables if name not in own}
+        return arrays
 
 
 def _relative(image: AnyArray, mask: BoolArray | None) -> AnyArray:
@@ -168,18 +164,6 @@ def _relative(image: AnyArray, mask: BoolArray | None) -> AnyArray:
         return values
     mean = float(np.maximum(used, 0).mean())
     return values / mean if mean > 0 else values
-
-
-def arrays_of(
-    inversion: Inversion, names: Mapping[str, Any], setup: Setup | None
-) -> dict[str, AnyArray]:
-    """Return variables of an inversion by name, fields in SI units among them."""
-    own = variable_labels()
-    arrays = {name: getattr(inversion, name) for name in names if name in own}
-    if len(arrays) < len(names):
-        fields = dataset_from_field(inversion.displacement, inversion.potential, setup)
-        arrays |= {name: fields[name].values for name in names if name not in own}
-    return arrays
 
 
 def threads_here(workers: int | None = None) -> int:
@@ -223,3 +207,99 @@ def _threads_of_pool(cores: int) -> int:
     import dask
 
     return int(dask.config.get("num_workers", None) or cores)
+
+
+@dataclass(frozen=True)
+class ShotOutcome:
+    """What became of one shot.
+
+    Attributes
+    ----------
+    index, status : int
+        Its number, and DONE or FAILED of `napari_shadowinv.io.store`.
+    seconds : float
+        Time that its worker spent on it, reading and writing included.
+    reason : str
+        Why it failed.
+    converged : bool
+        Whether the solver reached its tolerance.
+    """
+
+    index: int
+    status: int
+    seconds: float
+    reason: str = ""
+    converged: bool = True
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the task of every shot needs to know."""
+
+    writer: ShotWriter
+    work: Work
+    workers: int | None
+
+
+def run_shots(
+    shots: list[Any],
+    labels: list[tuple[int, bool, Shot | None]],
+    beam: Beam | None,
+    settings: Settings,
+    stop: Any = None,
+) -> list[ShotOutcome]:
+    """Task: invert some shots one after the other and write each."""
+    should_stop = None if stop is None else stop.is_set
+    previous: Inversion | None = None
+    outcomes = []
+    for shot, (index, wanted, source) in zip(shots, labels, strict=True):
+        start = time.perf_counter()
+        failure = ""
+        try:
+            image, origin = _loaded(shot)
+            own = None
+            if source is not None:
+                own, origin["source"] = source.load()
+            previous = settings.work.invert(
+                image, beam, own, start=previous, workers=settings.workers, should_stop=should_stop
+            )
+        except InversionCancelled:
+            raise
+        except Exception as error:
+            # Whatever a reader or a solver stumbles over, the other shots shall go on.
+            previous, failure = None, _reason(error)
+        if not wanted:
+            continue
+        seconds = time.perf_counter() - start
+        if previous is None:
+            settings.writer.fail(index, {"reason": failure, "seconds": seconds})
+            outcomes.append(ShotOutcome(index, FAILED, seconds, failure))
+        else:
+            report = {
+                **dataclasses.asdict(previous.report),
+                "stages": previous.report.seconds,
+                "seconds": seconds,
+                **origin,
+                "warnings": [*previous.report.warnings, *origin.get("warnings", ())],
+            }
+            settings.writer.write(index, settings.work.arrays(previous), report)
+            spent = time.perf_counter() - start
+            outcomes.append(ShotOutcome(index, DONE, spent, converged=previous.report.converged))
+    return outcomes
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        return "there is not enough memory for this shot on its worker"
+    kind = type(error).__name__
+    if isinstance(error, InputError | OSError):
+        return str(error) or kind
+    return f"{kind}: {error}"
+
+
+def _loaded(shot: Any) -> tuple[AnyArray, dict[str, Any]]:
+    """Image of a shot; a block of a dask array on a cluster has been computed already."""
+    if isinstance(shot, np.ndarray):
+        return shot[0], {"sha256": checksum(shot[0])}
+    loaded: tuple[AnyArray, dict[str, Any]] = shot.load()
+    return loaded

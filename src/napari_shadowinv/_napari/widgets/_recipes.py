@@ -21,7 +21,7 @@ from napari_shadowinv.preprocessing import Crop, MeasuredSource, Recipe
 
 
 class RecipeButton(QPushButton):
-    """A menu to load what a tool with `InversionInputs` is to do from a TOML file, or to save it."""
+    """A menu to load what a tool with `InversionInputs` is to do, or to save it, as TOML."""
 
     def __init__(self, tool: Any) -> None:
         super().__init__("Recipe")
