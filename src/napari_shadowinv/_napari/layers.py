@@ -129,7 +129,7 @@ def add_inversion(
         Where to add them; a `ViewerModel` needs neither a window nor a display.
     inversion : Inversion
         The result.
-    setup : ProtonSetup or OpticalSetup, optional
+    setup : Setup, optional
         Gives the pixel size and the field in SI units; pixels without. Default: that of the
         inversion's provenance.
     name : str

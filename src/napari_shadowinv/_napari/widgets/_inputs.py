@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pydantic import BaseModel
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QWidget
 
@@ -54,6 +53,7 @@ from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.setup import SETUPS, Setup
 from napari_shadowinv.pipeline._run import PREVIEW_SITES
 from napari_shadowinv.preprocessing import (
     ESTIMATES,
@@ -66,25 +66,10 @@ from napari_shadowinv.preprocessing import (
     check_masks,
 )
 
-if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import Setup
-
 _NONE = "none"
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
 _OWN, _LAYER, _FILE = "own", "layer", "file"
-
-
-def _proton() -> type[BaseModel]:
-    from napari_shadowinv.physics.setup import ProtonSetup
-
-    return ProtonSetup
-
-
-def _optical() -> type[BaseModel]:
-    from napari_shadowinv.physics.setup import OpticalSetup
-
-    return OpticalSetup
 
 
 @dataclass(frozen=True)
@@ -94,11 +79,11 @@ class _Given:
 
 
 class SetupPicker(QWidget):
-    """No setup, particles or light, with buttons for TOML files.
+    """No setup or one of a kind, with buttons for TOML files.
 
     A setup belongs to an image: it is kept with the image's layer, and another image without
     one starts with none. What the user has typed or loaded for one image is in the form when
-    he chooses particles or light for the next, in the next session too; a line tells where
+    he chooses its kind for the next, in the next session too; a line tells where
     it comes from. What came with a file is never handed on.
     """
 
@@ -111,12 +96,7 @@ class SetupPicker(QWidget):
         self._own: dict[str, _Given] = {}
         self._shown: dict[str, _Given] = {}
         self.picker = ModelPicker(
-            "Setup",
-            {
-                _NONE: ("none: results in pixels", None),
-                "proton": ("particles (protons, …)", _proton),
-                "optical": ("light", _optical),
-            },
+            "Setup", {_NONE: ("none: results in pixels", None), **kinds_of(SETUPS)}
         )
         self.picker.choice.setToolTip(
             "<qt>With a setup the results are in SI units; lengths can be entered as 1.3 mm or "

@@ -38,7 +38,7 @@ from napari_shadowinv._napari.widgets._qt import beside, error_text
 from napari_shadowinv._napari.widgets._results import LastResults
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup import Deflector
+from napari_shadowinv.physics.setup import SETUPS, Deflector
 
 if TYPE_CHECKING:
     import napari
@@ -247,9 +247,7 @@ class ForwardModel(ToolPanel):
         self.setup.picker.set_kind(kind)
         form = self.setup.picker.form
         if form is not None and form.is_empty:
-            from napari_shadowinv.physics.phantoms import paper_setup, wakefield_setup
-
-            usual = paper_setup() if kind == "proton" else wakefield_setup()
+            usual = SETUPS[kind].example()
             self.setup.suggest(usual, "the paper's beam")
 
     def _follow_potential(self) -> None:
