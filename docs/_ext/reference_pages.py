@@ -70,7 +70,7 @@ def parameters_page() -> str:
         "The same parameters appear in napari's forms, in TOML files and in Python. "
         "Lengths in px are pixels of the image that is inverted, after any binning.",
         "## Filters",
-        "Chosen under *Filter first* in napari; see [](../filters.md).",
+        "Chosen under *Steps first* in napari; see [](../filters.md).",
         *(model_section(model, name) for name, model in FILTERS.items()),
         "## Source estimates",
         "Chosen under *Source* in napari; see [](../sources.md).",
