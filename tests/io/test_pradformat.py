@@ -143,6 +143,9 @@ def test_inversion_comes_back(
     tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup
 ) -> None:
     dataset = read(written(tmp_path / "shot.h5", inversion, proton_setup))
+    made = Provenance.of(dataset.attrs)
+    assert made is not None
+    assert made.image.file == "shot.tif"
     assert isinstance(dataset, xr.Dataset)
     np.testing.assert_allclose(dataset["displacement"], inversion.displacement, rtol=1e-12)
     np.testing.assert_allclose(dataset["potential"], inversion.potential, rtol=1e-12)

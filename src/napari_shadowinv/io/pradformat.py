@@ -174,7 +174,9 @@ def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
         displacement = setup.displacement(np.stack([arrays["defl_ax1"], arrays["defl_ax2"]]))
     else:
         displacement = displacement_from_potential(-setup.normalized_potential(arrays["phi"]))
-    return dataset_from_field(displacement, potential, setup, attributes={"format": "pradformat"})
+    told = {name: attributes[name] for name in ("provenance",) if name in attributes}
+    told["format"] = "pradformat"
+    return dataset_from_field(displacement, potential, setup, attributes=told)
 
 
 def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:

@@ -1,4 +1,4 @@
-"""The plugin's dock widgets, each a thin face of what `_jobs` and `_stacking` compute.
+"""The dock widgets, thin faces of the pipeline and of stacks.
 
 - invert an image: `invert_shot`; a run of shots into a store: `invert_stack`
 - guess the undisturbed beam: `estimate_source`
