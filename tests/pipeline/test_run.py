@@ -273,6 +273,8 @@ def test_a_cache_spares_sites_and_estimates_without_changing_results(image: Floa
     assert_same(second, run(sharper, image))
     preview = run(sharper, image, cache=cache, preview=True)
     np.testing.assert_allclose(preview.displacement, second.displacement, atol=1e-3)
+    assert preview.provenance is not None
+    assert preview.provenance.notes == ("previewed",)
     assert_same(run(recipe, image, cache=cache), first)
 
 

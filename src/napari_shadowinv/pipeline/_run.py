@@ -175,11 +175,11 @@ def run_prepared(
     clock = time.perf_counter() if began is None else began
     report("prepare", 0, None)
     doubts: list[str] = []
+    # Before an estimate is made, and before sites are spread: a mistake is told at once.
     if shot.source is None:
-        prepare(shot.image, None, options, shot.mask)  # likewise, and before the estimate
+        prepare(shot.image, None, options, shot.mask)
     source = _source(inputs, shot, report, should_stop, cache, doubts, preview=preview)
     report("prepare", 0, None)
-    # Before the sites are spread: a mistake is told at once.
     prepare(shot.image, source, options, shot.mask)
     seconds["source"] = time.perf_counter() - clock
     ensure_compiled(on_progress, should_stop)
@@ -200,7 +200,11 @@ def run_prepared(
         cache.keep(plan, inversion)
     spent = inversion.report.seconds
     seconds |= {stage: spent[stage] + seconds.get(stage, 0.0) for stage in spent}
-    provenance = inputs.provenance.model_copy(update={"setup": shot.setup, "notes": shot.notes})
+    notes = (*shot.notes, "previewed") if preview else shot.notes
+    recipe = inputs.provenance.recipe.model_copy(update={"options": options})
+    provenance = inputs.provenance.model_copy(
+        update={"setup": shot.setup, "notes": notes, "recipe": recipe}
+    )
     inversion = replace(
         inversion, report=replace(inversion.report, seconds=seconds), provenance=provenance
     )
