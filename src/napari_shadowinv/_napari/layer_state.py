@@ -1,8 +1,4 @@
-"""How layers looked, kept with a result, so that they come back as they were.
-
-- a result's layers from its dataset: `layers_of_dataset`
-- a result's dataset from its layers: `dataset_of_layers`
-"""
+"""How layers looked, kept with a result, so that they come back as they were."""
 
 from __future__ import annotations
 
@@ -20,8 +16,6 @@ from napari_shadowinv.inversion.labels import setup_from_dataset
 
 if TYPE_CHECKING:
     import xarray
-
-__all__ = ["dataset_of_layers", "layers_of_dataset"]
 
 _LOOKS = "napari_layers"
 

@@ -1,12 +1,4 @@
-"""Results as napari layers, of one shot or of a stack of shots.
-
-- the kinds of layers: `KINDS`; a labelled dataset as layers: `dataset_layers`
-- a result as layers: `inversion_layers`, `result_layers`
-- put layers into a viewer, with or without a window: `add_inversion`, `add_layers`
-
-The lowest layer comes first. What each layer shows, in which unit, and the whole result behind
-it are in its metadata; see `napari_shadowinv._napari.layer_metadata`.
-"""
+"""Results as napari layers, of one shot or of a stack of shots; the lowest layer comes first."""
 
 from __future__ import annotations
 
@@ -30,19 +22,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
-
-__all__ = [
-    "KINDS",
-    "FullLayerData",
-    "add_inversion",
-    "add_layers",
-    "at_shot",
-    "dataset_layers",
-    "intensity_limits",
-    "inversion_layers",
-    "result_layers",
-    "thinned_arrows",
-]
 
 FullLayerData = tuple[Any, dict[str, Any], str]
 Limits = tuple[float, float]
@@ -365,10 +344,7 @@ def _arrows(shown: _Shown, kind: Kind) -> Content:
 
 
 def thinned_arrows(field: FloatArray) -> tuple[FloatArray, float]:
-    """Pick vectors (y, x) of a field on a grid: starts and vectors (n, 2, 2), and the spacing.
-
-    Those of nearly no length are left out.
-    """
+    """Pick long enough vectors (y, x) on a grid: starts and vectors (n, 2, 2), and the spacing."""
     height, width = field.shape[1:]
     step = max(1, -(-max(height, width) // _ARROWS_ALONG))
     rows, columns = (

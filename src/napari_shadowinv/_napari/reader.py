@@ -1,9 +1,4 @@
-"""What napari opens with this plugin: `get_reader`.
-
-Results, stores of many shots, pradformat, and the radiographs that napari itself cannot read;
-folders and lists of shots become one lazy stack. Asking whether a file can be read imports neither
-napari nor a compiler and reads a header at most.
-"""
+"""What napari opens with this plugin; to ask imports no napari and reads a header at most."""
 
 from __future__ import annotations
 
@@ -19,8 +14,6 @@ from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT,
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
-
-__all__ = ["get_reader", "read_paths"]
 
 ReaderFunction = Callable[[str | Sequence[str]], "list[Any]"]
 

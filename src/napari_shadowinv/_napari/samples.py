@@ -1,11 +1,4 @@
-"""Sample data: shots of known objects, made when they are asked for.
-
-- one object: `toroid`, `toroid_with_caustics`, `four_toroids`; with the shadow of what stands
-  in the beam: `coaxial_line`
-- a run of shots that change with time: `wakefield_run`
-
-Each shot carries its setup, and its undisturbed beam where that is not uniform.
-"""
+"""Sample data: shots of known objects with setup and source, made when they are asked for."""
 
 from __future__ import annotations
 
@@ -18,8 +11,6 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.io import Radiograph
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
-
-__all__ = ["coaxial_line", "four_toroids", "toroid", "toroid_with_caustics", "wakefield_run"]
 
 _SHAPE = (200, 200)
 _COUNTS = 400.0

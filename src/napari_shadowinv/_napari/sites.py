@@ -1,8 +1,4 @@
-"""What can be told about each site, and the shape of its cell.
-
-- numbers by site: `site_features`
-- the cells as polygons inside the image: `power_cells`
-"""
+"""What can be told about each site, and the shape of its cell."""
 
 from __future__ import annotations
 
@@ -19,8 +15,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.inversion import Inversion
-
-__all__ = ["Cells", "power_cells", "site_features"]
 
 Cells = tuple[list[FloatArray], NDArray[np.intp]]
 
@@ -40,10 +34,7 @@ def site_features(dataset: xarray.Dataset) -> dict[str, FloatArray]:
 
 
 def power_cells(inversion: Inversion) -> Cells:
-    """Corners (y, x) of the cells that the solver ended with, and the site of each.
-
-    They are cut off at the image's border; an empty cell has no polygon.
-    """
+    """Corners (y, x) of the last cells that are not empty, cut off at the border; their sites."""
     count = len(inversion.sites)
     if count > _MOST_CELLS:
         raise InputError(

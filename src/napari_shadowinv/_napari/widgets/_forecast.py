@@ -1,8 +1,4 @@
-"""The image that an object would make, as plain arrays: no napari, no Qt.
-
-- objects to put into a beam, with their parameters, for a form: `PHANTOMS`
-- predict an image: `ForwardJob`, with a `Forecast` as the answer
-"""
+"""The image that an object would make, as plain arrays: no napari, no Qt."""
 
 from __future__ import annotations
 

@@ -1,10 +1,4 @@
-"""Forms made from pydantic models: there is no second list of fields and defaults.
-
-- edit a model: `ModelForm`; one of several kinds of models: `ModelPicker`
-- choose one of several kinds of things, with other controls: `RowPicker`
-- their values as TOML files, as the command line reads them: `dump_toml`, `TomlButtons`
-- smaller parts: `labelled`, `with_button`, `section`, `wrapping_label`, `PathEdit`
-"""
+"""Forms made from pydantic models: there is no second list of fields and defaults."""
 
 from __future__ import annotations
 
@@ -13,17 +7,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
+from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
-from qtpy.QtWidgets import (
-    QFileDialog,
-    QFormLayout,
-    QLabel,
-    QLineEdit,
-    QPushButton,
-    QSizePolicy,
-    QToolButton,
-    QWidget,
-)
 from superqt import QCollapsible
 
 from napari_shadowinv._napari.widgets._fields import (
@@ -48,23 +33,25 @@ TOML = "TOML (*.toml)"
 _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
 
 
-def labelled(text: str, widget: QWidget) -> QWidget:
+def labelled(text: str, widget: QtWidgets.QWidget) -> QtWidgets.QWidget:
     """A widget with a label before it; all of them line up."""
-    label = QLabel(text)
+    label = QtWidgets.QLabel(text)
     label.setMinimumWidth(_LABEL_WIDTH)
     return beside((label, 0), (widget, 1))
 
 
-def with_button(widget: QWidget, text: str, tip: str, action: Callable[[], Any]) -> QWidget:
+def with_button(
+    widget: QtWidgets.QWidget, text: str, tip: str, action: Callable[[], Any]
+) -> QtWidgets.QWidget:
     """A widget with a small button on its right."""
-    button = QToolButton()
+    button = QtWidgets.QToolButton()
     button.setText(text)
     button.setToolTip(tip)
     button.clicked.connect(lambda: action())
     return beside((widget, 1), (button, 0))
 
 
-def section(title: str, *widgets: QWidget) -> QCollapsible:
+def section(title: str, *widgets: QtWidgets.QWidget) -> QCollapsible:
     """Widgets under a title that folds them away; folded to begin with."""
     folded = QCollapsible(title, expandedIcon="▾", collapsedIcon="▸")
     folded.setDuration(0)
@@ -76,25 +63,25 @@ def section(title: str, *widgets: QWidget) -> QCollapsible:
     return folded
 
 
-def wrapping_label(text: str = "", style: str = "") -> QLabel:
+def wrapping_label(text: str = "", style: str = "") -> QtWidgets.QLabel:
     """Text that wraps at the width there is, instead of asking for more."""
-    label = QLabel(text)
+    label = QtWidgets.QLabel(text)
     label.setWordWrap(True)
     label.setMinimumWidth(0)
-    label.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Minimum)
+    label.setSizePolicy(QtWidgets.QSizePolicy.Policy.Ignored, QtWidgets.QSizePolicy.Policy.Minimum)
     label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
     label.setStyleSheet(style)
     label.setVisible(bool(text))
     return label
 
 
-class PathEdit(QWidget):
+class PathEdit(QtWidgets.QWidget):
     changed = Signal()
 
     def __init__(self, title: str, example: str = "path of a file") -> None:
         super().__init__()
         self._title = title
-        self.edit = QLineEdit()
+        self.edit = QtWidgets.QLineEdit()
         self.edit.setPlaceholderText(example)
         self.edit.setMinimumWidth(60)
         beside((with_button(self.edit, "…", title, self._choose), 0), holder=self)
@@ -106,7 +93,7 @@ class PathEdit(QWidget):
 
     def ask(self) -> str:
         """Let the user choose in a dialog; empty if he does not."""
-        path, _ = QFileDialog.getOpenFileName(self, self._title)
+        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, self._title)
         return str(path)
 
     def _choose(self) -> None:
@@ -116,12 +103,8 @@ class PathEdit(QWidget):
             self.changed.emit()
 
 
-class ModelForm(QWidget):
-    """Editors for all fields of a model, with titles, units and descriptions from it.
-
-    Fields that leave no choice (a Literal of one value) are not shown; optional ones start with
-    what `first` holds when they are first checked.
-    """
+class ModelForm(QtWidgets.QWidget):
+    """Editors for a model's fields; optional ones start with what `first` holds."""
 
     changed = Signal()
 
@@ -132,9 +115,9 @@ class ModelForm(QWidget):
         self._model_class = model_class
         self._fixed: dict[str, Any] = {}
         self.editors: dict[str, Editor] = {}
-        rows = QFormLayout()
+        rows = QtWidgets.QFormLayout()
         rows.setContentsMargins(0, 0, 0, 0)
-        rows.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
+        rows.setFieldGrowthPolicy(QtWidgets.QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
         whole = column(self)
         whole.addLayout(rows)
@@ -144,7 +127,7 @@ class ModelForm(QWidget):
                 continue
             editor = editor_for(field, (first or {}).get(name))
             title = field.title or name
-            label = QLabel(unit_of_title(title)[0] if editor.shows_unit else title)
+            label = QtWidgets.QLabel(unit_of_title(title)[0] if editor.shows_unit else title)
             for widget in (label, editor):
                 # As rich text, so that Qt breaks it into lines.
                 widget.setToolTip(f"<qt>{field.description}</qt>" if field.description else "")
@@ -220,7 +203,7 @@ def kinds_of(models: Mapping[str, Any], prefix: str = "") -> Kinds:
     return {name: (f"{prefix}{model.title}", returning(model)) for name, model in models.items()}
 
 
-class ModelPicker(QWidget):
+class ModelPicker(QtWidgets.QWidget):
     """A choice between kinds of things, each with a form of its own or with none."""
 
     changed = Signal()
@@ -285,15 +268,14 @@ class ModelPicker(QWidget):
         return self._forms.get(kind)
 
 
-class RowPicker(QWidget):
-    """A choice between kinds of things, some with a control of their own in a row below.
-
-    Their owner connects the signals of these controls.
-    """
+class RowPicker(QtWidgets.QWidget):
+    """A choice between kinds of things, some with a control of the owner's in a row below."""
 
     changed = Signal()
 
-    def __init__(self, label: str, kinds: Kinds, tip: str, rows: Mapping[str, QWidget]) -> None:
+    def __init__(
+        self, label: str, kinds: Kinds, tip: str, rows: Mapping[str, QtWidgets.QWidget]
+    ) -> None:
         super().__init__()
         self.picker = ModelPicker(label, kinds)
         self.picker.choice.setToolTip(f"<qt>{tip}</qt>")
@@ -309,11 +291,7 @@ class RowPicker(QWidget):
 
 
 def dump_toml(values: dict[str, object], path: str | Path) -> Path:
-    """Write values as a TOML file, whole or not at all, and return its path.
-
-    A file that exists is replaced, for the dialog has asked. A name without a suffix gets
-    ``.toml``, which the dialog has not asked about: then an existing file is refused.
-    """
+    """Write a TOML file; a name without suffix gets one, which no dialog asked to replace."""
     import tomli_w
 
     from napari_shadowinv.io import replacing
@@ -325,12 +303,8 @@ def dump_toml(values: dict[str, object], path: str | Path) -> Path:
     return path
 
 
-class TomlButtons(QWidget):
-    """Load… and Save… beside each other.
-
-    `values` returns what is to be saved, `take` receives what was loaded and its path; both raise
-    an `InputError` for what cannot be used.
-    """
+class TomlButtons(QtWidgets.QWidget):
+    """Load… and Save…: `take` gets values and path; it and `values` raise `InputError`."""
 
     def __init__(
         self,
@@ -340,8 +314,8 @@ class TomlButtons(QWidget):
     ) -> None:
         super().__init__()
         self._what, self._values, self._take = what, values, take
-        self.load_button = QPushButton("Load…")
-        self.save_button = QPushButton("Save…")
+        self.load_button = QtWidgets.QPushButton("Load…")
+        self.save_button = QtWidgets.QPushButton("Save…")
         self.load_button.setToolTip(f"Read {what} from a TOML file.")
         self.save_button.setToolTip(
             f"Write {what} to a TOML file, to reuse here or on the command line."
@@ -354,7 +328,7 @@ class TomlButtons(QWidget):
     def _load(self) -> None:
         from napari_shadowinv.io import read_toml
 
-        path, _ = QFileDialog.getOpenFileName(self, f"Load {self._what}", "", TOML)
+        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, f"Load {self._what}", "", TOML)
         if path:
             self._take(read_toml(path), path)
 
@@ -363,7 +337,7 @@ class TomlButtons(QWidget):
         values = self._values()
         if not values:
             raise InputError(f"there is no {self._what} to save: choose one first")
-        path, _ = QFileDialog.getSaveFileName(
+        path, _ = QtWidgets.QFileDialog.getSaveFileName(
             self, f"Save {self._what}", f"{self._what}.toml", TOML
         )
         if path:

@@ -1,10 +1,4 @@
-"""What all widgets need of Qt and napari.
-
-- lay out: `column`, `beside`; do something later, or again and again: `timer`
-- until a Qt object is gone: `when_destroyed`, `while_alive`
-- one sentence in napari's notifications, no traceback: `tell_error`, `notify_errors`
-- share the place of other docks: `Docked`; remember between sessions: `StateKeeper`
-"""
+"""What all widgets need of Qt and napari."""
 
 from __future__ import annotations
 
@@ -102,10 +96,7 @@ def tell_error(error: BaseException | str) -> None:
 
 
 def notify_errors(method: Method) -> Method:
-    """Turn a user's mistake in a widget's method into one notification.
-
-    The widget, or the first around it that can, also shows it: with a method `show_problem`.
-    """
+    """Turn a user's mistake into one notification, and `show_problem` of the nearest widget."""
 
     @functools.wraps(method)
     def told(*args: Any, **kwargs: Any) -> Any:
@@ -124,10 +115,7 @@ def notify_errors(method: Method) -> Method:
 
 
 class Docked(QWidget):
-    """A widget that joins the docks on its side of the window as a tab when it opens.
-
-    napari puts a second dock below the first, where neither of them has room.
-    """
+    """Joins the docks on its side as a tab; napari puts it below them, where neither has room."""
 
     _has_place = False
 

@@ -1,8 +1,4 @@
-"""A run over many shots.
-
-- what to do: `StackJob`; what has come of it so far, for the window to look at: `RunBooks`
-- a run and the layers over its store: `StackRequest`; where they lie: `place_on`
-"""
+"""A run over many shots, and the layers over its store."""
 
 from __future__ import annotations
 
@@ -73,11 +69,7 @@ class StackJob:
         should_stop: ShouldStop,
         on_done: Callable[[int | None], None] = lambda _: None,
     ) -> RunBooks:
-        """Invert all shots that are not done yet.
-
-        `on_done` is called before it is told that there are finished shots, with the one that has
-        just ended well, if any.
-        """
+        """Invert what is not done; `on_done` gets what ended well before it is told of."""
         from napari_shadowinv.stack import run_stack
 
         def tell(news: RunProgress) -> None:
@@ -144,10 +136,7 @@ class StackRequest:
         return self.job.run(on_progress, should_stop, self._look)
 
     def follow(self, layers: Sequence[Any]) -> None:
-        """Let the colours of layers reach to the strongest shot so far.
-
-        Where the user has chosen other contrast limits, they stay.
-        """
+        """Let layers whose limits the user left alone reach to the strongest shot so far."""
         for layer in filter(_is_image, layers):
             role = str(role_of(layer))
             if role not in self._limits:

@@ -6,13 +6,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.layer_metadata import (
-    SOURCE,
-    mark,
-    setup_of,
-    setup_origin_of,
-)
 from napari_shadowinv._napari.shots import loaded
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._layers import LayerWatch, MaskPicker, image_of, shot_picker
@@ -90,7 +85,7 @@ class EstimateSource(LivePanel):
         image = image_of(layer)
         mask = self.masks.usable(layer)
         model: Any = self.method.model()
-        estimate = model.placed(setup_of(layer), image.shape)
+        estimate = model.placed(about.setup_of(layer), image.shape)
         made_from = {"image": layer.name, "estimate": estimate.described}
         if mask is not None:
             made_from["source_mask"] = self.masks.described(layer)
@@ -104,11 +99,11 @@ class EstimateSource(LivePanel):
             value,
             {
                 "name": f"{layer.name} source{' preview' if preview else ''}",
-                "metadata": mark(
-                    SOURCE,
+                "metadata": about.mark(
+                    about.SOURCE,
                     "",
-                    setup_of(layer),
-                    setup_origin=setup_origin_of(layer),
+                    about.setup_of(layer),
+                    setup_origin=about.setup_origin_of(layer),
                     made_from=request.made_from,
                     source_mask=request.shot.source_mask,
                 ),
