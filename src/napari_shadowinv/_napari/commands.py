@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Radiograph
 
-_HIGH_PASS_SHARE = 0.15
-
 
 @dataclass(frozen=True)
 class _Picked:
@@ -163,7 +161,7 @@ def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
 def _high_passed(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     from napari_shadowinv.preprocessing import high_pass as remove_large
 
-    width = _HIGH_PASS_SHARE * min(picked.image.shape)
+    width = 0.15 * min(picked.image.shape)
     return [_filtered(picked, remove_large(picked.image, width), f"high-pass σ={width:.3g} px")]
 
 

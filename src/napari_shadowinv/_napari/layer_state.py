@@ -20,17 +20,8 @@ if TYPE_CHECKING:
 _LOOKS = "napari_layers"
 
 # Attributes that the dataset of a result makes anew.
-_OWN_ATTRIBUTES = {
-    "format",
-    "options",
-    "report",
-    "image_residual",
-    "setup",
-    "provenance",
-    "package_version",
-    "created",
-    _LOOKS,
-}
+_OWN_ATTRIBUTES = {_LOOKS, "format", "options", "report", "image_residual"}
+_OWN_ATTRIBUTES |= {"setup", "provenance", "package_version", "created"}
 
 _PLACE = ("scale", "translate", "units")
 _TURN = ("rotate", "shear", "affine")

@@ -35,22 +35,18 @@ def _can_read(path: Path) -> bool:
     if path.is_dir():
         return bool(images_in(path))
     if path.suffix.lower() in PRADFORMAT.suffixes:
-        return _is_ours(path)
+        from napari_shadowinv.io.pradformat import is_ours
+
+        # Pradformat or a result; much else has the ending of HDF5.
+        try:
+            return is_ours(path)
+        except FileFormatError:
+            return False
     return _is_image_name(path)
 
 
 def _is_image_name(path: Path) -> bool:
     return path.suffix.lower() in RADIOGRAPH_SUFFIXES
-
-
-def _is_ours(path: Path) -> bool:
-    """Whether HDF5 is pradformat or a result; much else has that ending."""
-    from napari_shadowinv.io.pradformat import is_ours
-
-    try:
-        return is_ours(path)
-    except FileFormatError:
-        return False
 
 
 @notify_errors(otherwise=lambda: [(None,)])  # napari's sign for: dealt with, and nothing to add

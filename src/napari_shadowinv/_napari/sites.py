@@ -13,7 +13,6 @@ from napari_shadowinv.errors import InputError
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.inversion import Inversion
 
 Cells = tuple[list[FloatArray], NDArray[np.intp]]
@@ -41,15 +40,6 @@ def power_cells(inversion: Inversion) -> Cells:
             f"the result has {count:,} sites: power cells can be shown for up to {_MOST_CELLS:,} "
             "sites; invert with fewer sites to show the cells"
         )
-    diagram, margin = _diagram(inversion)
-    height, width = inversion.potential.shape
-    polygons = [_clipped(diagram.cell(site) - margin, height, width) for site in range(count)]
-    kept = np.flatnonzero([len(polygon) > 2 for polygon in polygons])
-    return [polygons[site] for site in kept], kept
-
-
-def _diagram(inversion: Inversion) -> tuple[PowerDiagram, int]:
-    """Return the power diagram that the solver ended with, and the margin that it has in px."""
     from napari_shadowinv.geometry.density import Density
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.geometry.triangulation import RegularTriangulation
@@ -62,7 +52,10 @@ def _diagram(inversion: Inversion) -> tuple[PowerDiagram, int]:
     triangulation = RegularTriangulation(
         inversion.sites + margin, inversion.weights, region=anything.region
     )
-    return PowerDiagram(triangulation, anything, threads=options.threads), margin
+    diagram = PowerDiagram(triangulation, anything, threads=options.threads)
+    polygons = [_clipped(diagram.cell(site) - margin, *shape) for site in range(count)]
+    kept = np.flatnonzero([len(polygon) > 2 for polygon in polygons])
+    return [polygons[site] for site in kept], kept
 
 
 def _clipped(corners: FloatArray, height: int, width: int) -> FloatArray:

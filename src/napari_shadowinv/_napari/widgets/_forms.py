@@ -21,13 +21,12 @@ from napari_shadowinv._napari.widgets._qt import beside, column, notify_errors
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 
-# For each key the title to show, and what returns the model's class, if there is one: called
-# only when the kind is chosen, because some classes take a second to import.
-Kinds = dict[str, tuple[str, Callable[[], type[BaseModel]] | None]]
+# For each key the title to show, and the model's class, if there is one.
+Kinds = dict[str, tuple[str, type[BaseModel] | None]]
 
 PROBLEM_STYLE = "color: #d9822b;"
 _LABEL_WIDTH = 54
-_INDENT = 12
+INDENT = 12
 TOML = "TOML (*.toml)"
 # Of these optional fields only one may be given: checking one unchecks the other.
 _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
@@ -44,11 +43,15 @@ def with_button(
     widget: QtWidgets.QWidget, text: str, tip: str, action: Callable[[], Any]
 ) -> QtWidgets.QWidget:
     """A widget with a small button on its right."""
+    return beside((widget, 1), (small_button(text, tip, action), 0))
+
+
+def small_button(text: str, tip: str, action: Callable[[], Any]) -> QtWidgets.QToolButton:
     button = QtWidgets.QToolButton()
     button.setText(text)
     button.setToolTip(tip)
     button.clicked.connect(lambda: action())
-    return beside((widget, 1), (button, 0))
+    return button
 
 
 def section(title: str, *widgets: QtWidgets.QWidget) -> QCollapsible:
@@ -196,11 +199,7 @@ class ModelForm(QtWidgets.QWidget):
 
 def kinds_of(models: Mapping[str, Any], prefix: str = "") -> Kinds:
     """Kinds for a `ModelPicker`, from model classes that have a title."""
-
-    def returning(model: type[BaseModel]) -> Callable[[], type[BaseModel]]:
-        return lambda: model
-
-    return {name: (f"{prefix}{model.title}", returning(model)) for name, model in models.items()}
+    return {name: (f"{prefix}{model.title}", model) for name, model in models.items()}
 
 
 class ModelPicker(QtWidgets.QWidget):
@@ -259,8 +258,8 @@ class ModelPicker(QtWidgets.QWidget):
     def _form_of(self, kind: str) -> ModelForm | None:
         _, model_class = self._kinds[kind]
         if model_class is not None and kind not in self._forms:
-            form = ModelForm(model_class())
-            form.layout().setContentsMargins(_INDENT, 0, 0, 0)
+            form = ModelForm(model_class)
+            form.layout().setContentsMargins(INDENT, 0, 0, 0)
             form.setVisible(False)
             form.changed.connect(self.changed)
             self._forms[kind] = form

@@ -10,6 +10,7 @@ from typing import Any
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QWidget
 
+from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
@@ -24,16 +25,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
 from napari_shadowinv.pipeline._run import PREVIEW_SITES
-from napari_shadowinv.preprocessing import (
-    ESTIMATES,
-    Crop,
-    Estimate,
-    MeasuredSource,
-    Radiograph,
-    Recipe,
-    Step,
-    check_masks,
-)
 
 _NONE = "none"
 _CHANGED = ", changed by hand"
@@ -200,11 +191,11 @@ class SourcePicker(forms.RowPicker):
     def __init__(self, viewer: Any) -> None:
         self._image: Any = None
         self._before_own = "uniform"
-        self._loaded = MeasuredSource()
+        self._loaded = preprocessing.MeasuredSource()
         tip = "Image layer of the undisturbed beam."
         self.layers = layers.LayerPicker(viewer, ("image",), tip, "choose a layer", self._offers)
         self.file = forms.PathEdit("Image of the undisturbed beam")
-        kinds = forms.kinds_of(ESTIMATES, "estimate: ")
+        kinds = forms.kinds_of(preprocessing.ESTIMATES, "estimate: ")
         _, uniform = kinds.pop("uniform")
         super().__init__(
             "Source",
@@ -225,7 +216,8 @@ class SourcePicker(forms.RowPicker):
     @property
     def is_guessed(self) -> bool:
         """Whether it is an estimate from the shot, which a mask can keep from the object."""
-        return self.picker.kind in ESTIMATES and ESTIMATES[self.picker.kind].uses_mask
+        estimate = preprocessing.ESTIMATES.get(self.picker.kind)
+        return estimate is not None and estimate.uses_mask
 
     @property
     def is_own(self) -> bool:
@@ -242,25 +234,25 @@ class SourcePicker(forms.RowPicker):
         if kind == _OWN:
             return "came with the shot"
         model = self.picker.model()
-        assert isinstance(model, Estimate)
+        assert isinstance(model, preprocessing.Estimate)
         return f"estimate: {model.described}" if self.is_guessed else model.described
 
-    def chosen(self) -> Estimate | MeasuredSource:
+    def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource:
         """What a recipe says of the source, or an `InputError`."""
         model = self.picker.model()
-        if isinstance(model, Estimate):
+        if isinstance(model, preprocessing.Estimate):
             return model
         if self.picker.kind != _FILE:
-            return MeasuredSource()
+            return preprocessing.MeasuredSource()
         if not self.file.path:
             raise InputError("no source file is selected: choose one, or choose another source")
         if self._loaded.file is not None and str(self._loaded.file) == self.file.path:
             return self._loaded  # the form has no name for what is in the file
-        return MeasuredSource(file=Path(self.file.path))
+        return preprocessing.MeasuredSource(file=Path(self.file.path))
 
     def show(self, source: Any) -> None:
         """Show the source of a recipe; None for uniform."""
-        if isinstance(source, Estimate):
+        if isinstance(source, preprocessing.Estimate):
             name = source.name()
             self.restore({"kind": name, "values": {name: source.values()}})
         elif source is None:
@@ -273,7 +265,7 @@ class SourcePicker(forms.RowPicker):
             self.picker.set_kind(_FILE)
             self.changed.emit()
 
-    def measured(self, image_layer: Any) -> Radiograph | None:
+    def measured(self, image_layer: Any) -> preprocessing.Radiograph | None:
         """The measured source of an image layer unless it is a file, or an `InputError`."""
         kind = self.picker.kind
         if kind == _LAYER:
@@ -300,7 +292,7 @@ class SourcePicker(forms.RowPicker):
         layer = self.layers.layer if self.picker.kind == _LAYER else None
         bare = None if layer is None else about.mark_of(layer).get("source_mask")
         if bare is not None and mask is not None and bare.shape == mask.shape:
-            check_masks(mask, bare)
+            preprocessing.check_masks(mask, bare)
 
     def state(self) -> dict[str, Any]:
         """What is kept: layers and files belong to a session."""
@@ -337,11 +329,10 @@ class SourcePicker(forms.RowPicker):
         known = [
             layer
             for layer in self.layers.offered
-            if about.role_of(layer) == about.SOURCE
-            and about.result_of(layer) is None
-            and tuple(layer.data.shape[-2:]) == shape
+            if about.role_of(layer) == about.SOURCE and about.result_of(layer) is None
         ]
-        return known[0] if len(known) == 1 else None
+        fitting = [layer for layer in known if tuple(layer.data.shape[-2:]) == shape]
+        return fitting[0] if len(fitting) == 1 else None
 
 
 class OptionsForm(forms.ModelForm):
@@ -366,25 +357,23 @@ class InversionInputs:
     crop: Any = None  # a picker, where a rectangle can be drawn
 
     def make_inputs(
-        self, viewer: Any, image: Callable[[], Any], kinds: tuple[str, ...], tips: tuple[str, str]
+        self, image: Callable[[], Any], kinds: tuple[str, ...], mask_tip: str, source_mask_tip: str
     ) -> None:
-        """Make them; masks are layers of these kinds for the image, with a tooltip each."""
-        self.source = SourcePicker(viewer)
-        self.masks = layers.MaskPicker(viewer, image, kinds, tips[0])
-        self.source_masks = layers.MaskPicker(viewer, image, kinds, tips[1], "Source mask")
+        """Make them, in rows `beam` and `how`; masks are layers of these kinds for the image."""
+        self.source = SourcePicker(self.viewer)
+        self.masks = layers.MaskPicker(self.viewer, image, kinds, mask_tip)
+        self.source_masks = layers.MaskPicker(
+            self.viewer, image, kinds, source_mask_tip, "Source mask"
+        )
         self.setup = SetupPicker()
         self.steps = StepsSection()
         self.options = OptionsForm()
         self.recipes = RecipeButton(self)
         self.chosen_image = image
-        self.inputs = (
-            self.source,
-            self.source_masks,
-            self.masks,
-            self.setup,
-            self.steps,
-            self.options,
-        )
+        self.beam = (self.source, self.source_masks, self.masks)
+        options = forms.section("Options", self.options)
+        self.how = (self.setup, self.steps, options, self.recipes)
+        self.inputs = (*self.beam, self.setup, self.steps, self.options)
         self.source.changed.connect(self._show_source_mask)
         self._show_source_mask()
 
@@ -401,22 +390,22 @@ class InversionInputs:
             "painted_is_object": self.source_masks,
         }
 
-    def all_steps(self) -> tuple[Step, ...]:
+    def all_steps(self) -> tuple[preprocessing.Step, ...]:
         """What is done to an image first; or an `InputError`."""
         part = None if self.crop is None else layers.crop_of(self.crop.layer, self.chosen_image())
         if part is None:
             return self.steps.steps()
         rows, columns = part
-        crop = Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
+        crop = preprocessing.Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
         return (crop, *self.steps.steps())
 
     def hidden_from_source(self, image: Any) -> BoolArray | None:
         """False where the object is, as far as the source is estimated without it."""
         return self.source_masks.usable(image) if self.source.is_guessed else None
 
-    def recipe(self) -> Recipe:
+    def recipe(self) -> preprocessing.Recipe:
         """What the controls ask for, but for masks and layers; or an `InputError`."""
-        return Recipe(
+        return preprocessing.Recipe(
             steps=self.all_steps(),
             source=self.source.chosen(),
             setup=self.setup.setup(),
@@ -425,8 +414,8 @@ class InversionInputs:
 
     def companions(self, image: Any, *others: Any) -> tuple[Any, ...]:
         """Layers that lie on an image: masks and source, and others if there are any."""
-        layers = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
-        return tuple(one for one in layers if one is not None and one is not image)
+        chosen = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
+        return tuple(one for one in chosen if one is not None and one is not image)
 
     def origins(self, layer: Any, name: str) -> Origins:
         """Where all of it comes from, for an image or the images of that name."""

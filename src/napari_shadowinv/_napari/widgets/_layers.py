@@ -206,7 +206,7 @@ class LayerPicker(SteadyComboBox):
     ) -> None:
         super().__init__()
         self._viewer, self._kinds, self._none, self._suits = viewer, kinds, none, suits
-        self._offered: list[Any] = []
+        self.offered: list[Any] = []
         self.setToolTip(tip)
         self.fill()
         self.currentIndexChanged.connect(lambda _: self.picked.emit())
@@ -219,21 +219,17 @@ class LayerPicker(SteadyComboBox):
     @property
     def layer(self) -> Any | None:
         index = self.currentIndex() - bool(self._none)
-        return self._offered[index] if 0 <= index < len(self._offered) else None
+        return self.offered[index] if 0 <= index < len(self.offered) else None
 
     @layer.setter
     def layer(self, layer: Any | None) -> None:
         if layer is None:
             self.setCurrentIndex(0 if self._none else -1)
-        elif layer in self._offered:
-            self.setCurrentIndex(self._offered.index(layer) + bool(self._none))
+        elif layer in self.offered:
+            self.setCurrentIndex(self.offered.index(layer) + bool(self._none))
 
     def _on_insertion(self, event: Any) -> None:
         while_alive(self, event.value.events.name, self.fill)
-
-    @property
-    def offered(self) -> list[Any]:
-        return list(self._offered)
 
     def fill(self, event: Any = None) -> None:
         """Offer what the viewer has now; what is chosen stays while it is there."""
@@ -245,7 +241,7 @@ class LayerPicker(SteadyComboBox):
         ]
         with QSignalBlocker(self):
             self.clear()
-            self._offered = offered
+            self.offered = offered
             if self._none:
                 self.addItem(self._none)
             for layer in offered:

@@ -10,6 +10,7 @@ from napari.utils import progress as activity
 from qtpy import QtWidgets
 from qtpy.QtCore import QSize, Qt
 
+from napari_shadowinv._napari.notifications import MISTAKES
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, wrapping_label
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
@@ -263,6 +264,10 @@ class ToolPanel(qt.Docked):
         """Show what is wrong, where it can be read until the next run."""
         self.panel.say(text, problem=True)
 
+    def add(self, *rows: QtWidgets.QWidget) -> None:
+        for row in rows:
+            self.column.addWidget(row)
+
     # What is kept between sessions, made of what JSON knows
 
     def parts(self) -> dict[str, Any]:
@@ -309,7 +314,7 @@ class ToolPanel(qt.Docked):
         self.forget()
         try:
             request = self.request()
-        except qt.MISTAKES as error:
+        except MISTAKES as error:
             self.panel.refuse(error)
             return
         self._running_preview = False
@@ -362,7 +367,7 @@ class LivePanel(ToolPanel):
             return
         try:
             request = self.request(preview=True)
-        except qt.MISTAKES as error:
+        except MISTAKES as error:
             # Half a rectangle, half a number: no reason for a notification.
             self.panel.say(str(error), problem=True)
             return

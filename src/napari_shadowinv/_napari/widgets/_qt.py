@@ -12,13 +12,9 @@ from napari.utils.notifications import show_error
 from qtpy.QtCore import QObject, QSettings, Qt, QTimer
 from qtpy.QtWidgets import QDockWidget, QHBoxLayout, QMainWindow, QVBoxLayout, QWidget
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv._napari.notifications import MISTAKES
 
 Method = TypeVar("Method", bound=Callable[..., Any])
-
-# A user's mistake, a file system that refuses, or no memory; all else is a fault of the
-# program's, whose traceback somebody needs.
-MISTAKES = (InputError, OSError, MemoryError)
 
 _WRITE_AFTER = 300  # ms; a slider on the move is not worth writing
 # napari's own docks, which users expect to see beside a plugin's.

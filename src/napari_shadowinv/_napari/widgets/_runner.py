@@ -16,7 +16,8 @@ from typing import Any
 
 from qtpy.QtCore import QObject, Signal
 
-from napari_shadowinv._napari.widgets._qt import MISTAKES, timer, when_destroyed
+from napari_shadowinv._napari.notifications import MISTAKES
+from napari_shadowinv._napari.widgets._qt import timer, when_destroyed
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InversionCancelled
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,7 +49,7 @@ class RunBooks:
 
 @dataclass(frozen=True, eq=False)
 class StackJob:
-    """Many shots to invert into a store; what is not told here, see `stack.run_stack`."""
+    """Many shots to invert into a store: the arguments of `stack.run_stack`, and its books."""
 
     shots: Any  # an array (shot, y, x), also a lazy one, or files
     out: Path
@@ -87,20 +87,8 @@ class StackJob:
             on_progress(Progress("shots", step, news.total, self.books.text))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
-        run_stack(
-            self.shots,
-            self.out,
-            recipe=self.recipe,
-            source=self.source,
-            mask=self.mask,
-            source_mask=self.source_mask,
-            scheduler=self.scheduler,
-            workers=self.workers,
-            overwrite=self.overwrite,
-            redo_failed=self.redo_failed,
-            on_progress=tell,
-            should_stop=should_stop,
-        )
+        told = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "books"}
+        run_stack(**told, on_progress=tell, should_stop=should_stop)
         return self.books
 
     def _recall(self) -> None:

@@ -45,32 +45,16 @@ class EstimateSource(LivePanel):
     """Choose a shot and a method; the estimate becomes an image layer."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(
-            viewer,
-            "estimate-source",
-            RunPanel(
-                "Estimate source", "Estimate", "Create an image layer with the estimated beam."
-            ),
-        )
+        tip = "Create an image layer with the estimated beam."
+        super().__init__(viewer, "estimate-source", RunPanel("Estimate source", "Estimate", tip))
         self.image = shot_picker(viewer)
-        self.masks = MaskPicker(
-            viewer,
-            lambda: self.image.layer,
-            ("labels", "shapes"),
-            "Labels or shapes marking pixels that the estimate ignores.",
-        )
+        tip = "Labels or shapes marking pixels that the estimate ignores."
+        self.masks = MaskPicker(viewer, lambda: self.image.layer, ("labels", "shapes"), tip)
         self.method = ModelPicker("Method", kinds_of(ESTIMATES))
         self.method.set_kind("total-variation")
         self.live.setToolTip("Update the estimate after every change.")
-        for row in (
-            labelled("Image", self.image),
-            self.masks,
-            self.method,
-            self.live,
-            self.keep_earlier,
-            self.panel,
-        ):
-            self.column.addWidget(row)
+        self.add(labelled("Image", self.image), self.masks, self.method)
+        self.add(self.live, self.keep_earlier, self.panel)
         edits = LayerWatch(self, (self.image, self.masks))
         for signal in (self.image.picked, self.masks.changed, self.method.changed, edits.edited):
             signal.connect(self.on_change)

@@ -108,11 +108,8 @@ class ForwardModel(ToolPanel):
     """Choose an object or a potential; see the image that it would make."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(
-            viewer,
-            "forward-model",
-            RunPanel("Forward model", "Simulate", "Trace the beam through the object."),
-        )
+        panel = RunPanel("Forward model", "Simulate", "Trace the beam through the object.")
+        super().__init__(viewer, "forward-model", panel)
         self.object = forms.ModelPicker(
             "Object", {**forms.kinds_of(PHANTOMS), _LAYER: ("a result or potential", None)}
         )
@@ -146,17 +143,9 @@ class ForwardModel(ToolPanel):
         self._last = LastResults(viewer, self)
         size = beside((self.width_px, 1), (QLabel("×"), 0), (self.height_px, 1))
         self._size_row = forms.labelled("Size", size)
-        for row in (
-            self.object,
-            *self._potential_rows,
-            self._size_row,
-            self.setup,
-            forms.labelled("Source", self.source),
-            self._last.keep_earlier,
-            self.panel,
-            self.warning,
-        ):
-            self.column.addWidget(row)
+        self.add(self.object, *self._potential_rows, self._size_row, self.setup)
+        self.add(forms.labelled("Source", self.source), self._last.keep_earlier)
+        self.add(self.panel, self.warning)
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
         self.object.changed.connect(self._on_change)
         self.potential.picked.connect(self._follow_potential)

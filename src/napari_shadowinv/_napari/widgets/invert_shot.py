@@ -143,11 +143,8 @@ class InvertShot(InversionInputs, LivePanel):
     """Choose an image, press Run; all else has a default."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(
-            viewer,
-            "invert-shot",
-            RunPanel("Invert shot", "Run", "Invert the image and show the result as layers."),
-        )
+        panel = RunPanel("Invert shot", "Run", "Invert the image and show the result as layers.")
+        super().__init__(viewer, "invert-shot", panel)
         self._cache = Cache()
         self._build()
         self._connect()
@@ -156,49 +153,25 @@ class InvertShot(InversionInputs, LivePanel):
         self._ready = True
 
     def _build(self) -> None:
-        viewer = self.viewer
-        self.image = layers.shot_picker(viewer)
+        self.image = layers.shot_picker(self.viewer)
         self.make_inputs(
-            viewer,
             lambda: self.image.layer,
             ("labels", "shapes"),
-            (
-                "Labels or shapes marking detector pixels. The inversion ignores masked pixels, so "
-                "do not mask the object.",
-                "Labels or shapes that hide the object from the source estimate only; the "
-                "inversion still uses it.",
-            ),
+            "Labels or shapes marking detector pixels. The inversion ignores masked pixels, so "
+            "do not mask the object.",
+            "Labels or shapes that hide the object from the source estimate only; the "
+            "inversion still uses it.",
         )
-        self.crop = layers.LayerPicker(
-            viewer,
-            ("shapes",),
-            "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>",
-            none="none",
-        )
+        tip = "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>"
+        self.crop = layers.LayerPicker(self.viewer, ("shapes",), tip, none="none")
         self.live.setToolTip(
             f"<qt>Update the field after every change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
         self.cost, self._pace = forms.wrapping_label(), 1.0
         self.report = ReportTable()
-        for row in (
-            forms.labelled("Image", self.image),
-            self.source,
-            self.source_masks,
-            self.masks,
-            forms.labelled(
-                "Crop", forms.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
-            ),
-            self.setup,
-            self.steps,
-            forms.section("Options", self.options),
-            self.recipes,
-            self.live,
-            self.keep_earlier,
-            self.cost,
-            self.panel,
-            self.report,
-        ):
-            self.column.addWidget(row)
+        crop = forms.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
+        self.add(forms.labelled("Image", self.image), *self.beam, forms.labelled("Crop", crop))
+        self.add(*self.how, self.live, self.keep_earlier, self.cost, self.panel, self.report)
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)

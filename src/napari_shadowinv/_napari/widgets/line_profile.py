@@ -145,8 +145,9 @@ class ProfilePlot(QtWidgets.QWidget):
             axis.set_ylabel(of_unit or "value", color=ink)
             for number, profile in enumerate(profiles):
                 if profile.unit == of_unit:
-                    colour = _COLOURS[number % len(_COLOURS)]
-                    axis.plot(distance, profile.values, color=colour, label=_short(profile.name))
+                    colour, name = _COLOURS[number % len(_COLOURS)], profile.name
+                    name = name if len(name) <= _LONGEST_NAME else f"…{name[1 - _LONGEST_NAME :]}"
+                    axis.plot(distance, profile.values, color=colour, label=name)
             if profiles:
                 axis.legend(fontsize=8, labelcolor=ink, facecolor=paper, edgecolor=ink)
         averaged = f", {profiles[0].averaged}" if profiles and profiles[0].averaged else ""
@@ -183,12 +184,6 @@ def _dress(axis: Any, ink: str, paper: str) -> None:
     for spine in axis.spines.values():
         spine.set_color(ink)
     axis.grid(color=ink, alpha=0.15)
-
-
-def _short(name: str) -> str:
-    if len(name) <= _LONGEST_NAME:
-        return name
-    return f"…{name[-_LONGEST_NAME + 1 :]}"
 
 
 class LineProfile(qt.Docked):
@@ -261,16 +256,18 @@ class LineProfile(qt.Docked):
             signal.connect(lambda _: self._soon())
         self.export.clicked.connect(lambda: self._export())
 
-    def checked(self) -> list[Any]:
+    def _items(self) -> list[tuple[Any, Any]]:
+        """The rows of the list, each with its layer."""
         items = [self.layers.item(row) for row in range(self.layers.count())]
-        return [
-            item.data(_LAYER_ROLE) for item in items if item.checkState() == Qt.CheckState.Checked
-        ]
+        return [(item, item.data(_LAYER_ROLE)) for item in items]
+
+    def checked(self) -> list[Any]:
+        on = Qt.CheckState.Checked
+        return [layer for item, layer in self._items() if item.checkState() == on]
 
     def check(self, layer: Any, on: bool = True) -> None:
-        for row in range(self.layers.count()):
-            item = self.layers.item(row)
-            if item.data(_LAYER_ROLE) is layer:
+        for item, known in self._items():
+            if known is layer:
                 item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
 
     def update_plot(self) -> None:
@@ -357,8 +354,7 @@ class LineProfile(qt.Docked):
 
     def _fill(self, event: Any = None) -> None:
         """Offer all plane images, the ones that can be seen checked when they are new."""
-        known = [self.layers.item(row).data(_LAYER_ROLE) for row in range(self.layers.count())]
-        checked = self.checked()
+        known, checked = [layer for _, layer in self._items()], self.checked()
         self.layers.blockSignals(True)
         self.layers.clear()
         for layer in reversed(self.viewer.layers):
