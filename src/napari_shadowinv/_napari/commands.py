@@ -9,14 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import notifications
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layers import (
-    FullLayerData,
-    add_layers,
-    intensity_limits,
-    result_layers,
-)
 from napari_shadowinv._napari.shots import loaded, radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -60,9 +55,8 @@ def remove_hot_pixels(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
     """Replace pixels that stand out of the noise by the median of their neighbours."""
-    return _begin(
-        _picked(layer, viewer, about.may_be_source), _repaired, "Removing hot pixels from", viewer
-    )
+    picked = _picked(layer, viewer, about.may_be_source)
+    return _begin(picked, _repaired, "Removing hot pixels from", viewer)
 
 
 @notifications.notify_errors(otherwise=list)
@@ -103,7 +97,7 @@ def _picked(layer: Any, viewer: Any, usable: Callable[[Any], bool] = about.may_b
     return _Picked(radiograph_of(layer, np.asarray(data)), name, frame_of(layer), *known)
 
 
-Work = Callable[[_Picked, ShouldStop], "list[FullLayerData]"]
+Work = Callable[[_Picked, ShouldStop], list[results.FullLayerData]]
 
 
 def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
@@ -115,18 +109,18 @@ def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
 
     bar = cancelable_progress(total=0, desc=f"{doing} {picked.name}")
 
-    def finish(outcome: tuple[list[FullLayerData], Exception | None]) -> None:
+    def finish(outcome: tuple[list[results.FullLayerData], Exception | None]) -> None:
         layers, error = outcome
         bar.close()
         if error is None:
-            add_layers(viewer, layers)
+            results.add_layers(viewer, layers)
         elif isinstance(error, notifications.MISTAKES):
             notifications.show_mistake(error)
         elif not isinstance(error, InversionCancelled):
             raise error
 
     # An error must not leave the worker: what napari then does differs between its versions.
-    def run() -> tuple[list[FullLayerData], Exception | None]:
+    def run() -> tuple[list[results.FullLayerData], Exception | None]:
         # A closing window asks its workers to stop; the cross only leaves a mark on the bar.
         try:
             return work(picked, lambda: bar.is_canceled or worker.abort_requested), None
@@ -139,7 +133,7 @@ def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
     return []
 
 
-def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:
     from napari_shadowinv.pipeline._run import run
     from napari_shadowinv.preprocessing import Recipe, UniformEstimate
 
@@ -148,36 +142,38 @@ def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     told = {"source_origin": "uniform"}
     if picked.setup_origin:
         told["setup_origin"] = picked.setup_origin
-    return result_layers(about.Result(inversion, picked.setup, told), picked.frame, picked.name)
+    return results.result_layers(
+        about.Result(inversion, picked.setup, told), picked.frame, picked.name
+    )
 
 
-def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:
     from napari_shadowinv.preprocessing import remove_hot_pixels as remove
 
     image, hot, dead = remove(picked.image, should_stop=should_stop)
     return [_filtered(picked, image, f"without {int((hot | dead).sum())} hot or dead pixels")]
 
 
-def _high_passed(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+def _high_passed(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:
     from napari_shadowinv.preprocessing import high_pass as remove_large
 
     width = 0.15 * min(picked.image.shape)
     return [_filtered(picked, remove_large(picked.image, width), f"high-pass σ={width:.3g} px")]
 
 
-def _beam(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+def _beam(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:
     from napari_shadowinv.preprocessing import total_variation_source
 
     source = total_variation_source(picked.image, should_stop=should_stop)
     return [_filtered(replace(picked, role=about.SOURCE), source, "source by total variation")]
 
 
-def _filtered(picked: _Picked, image: FloatArray, title: str) -> FullLayerData:
+def _filtered(picked: _Picked, image: FloatArray, title: str) -> results.FullLayerData:
     return shot_layer(
         image,
         f"{picked.name} {title}",
         picked.setup,
-        intensity_limits(picked.image),  # the same limits show what a filter did
+        results.intensity_limits(picked.image),  # the same limits show what a filter did
         picked.role,
         frame=picked.frame,
         setup_origin=picked.setup_origin or None,

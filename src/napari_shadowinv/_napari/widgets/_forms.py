@@ -290,15 +290,19 @@ class RowPicker(QtWidgets.QWidget):
 
 
 def dump_toml(values: dict[str, object], path: str | Path) -> Path:
-    """Write a TOML file; a name without suffix gets one, which no dialog asked to replace."""
     import tomli_w
 
+    return save_text(tomli_w.dumps(values), path, ".toml")
+
+
+def save_text(text: str, name: str | Path, suffix: str) -> Path:
+    """Write a file; a name without suffix gets one, which no dialog asked to replace."""
     from napari_shadowinv.io import replacing
 
-    named = Path(path)
-    path = named if named.suffix else named.with_suffix(".toml")
+    named = Path(name)
+    path = named if named.suffix else named.with_suffix(suffix)
     with replacing(path, overwrite=path == named) as unfinished:
-        unfinished.write_text(tomli_w.dumps(values), encoding="utf-8")
+        unfinished.write_text(text, encoding="utf-8")
     return path
 
 

@@ -160,7 +160,7 @@ class RunPanel(QtWidgets.QWidget):
             return
         # A notification is gone after seconds: what is wrong stays here until the next run.
         self.say(qt.error_text(outcome.error), problem=True)
-        if not outcome.is_mistake:
+        if not isinstance(outcome.error, MISTAKES):
             from napari.utils.notifications import notification_manager
 
             error = outcome.error

@@ -209,11 +209,8 @@ def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:
     rotate = np.asarray(keywords.get("rotate", upright.rotate))[-2:, -2:]
     shear = np.ravel(keywords.get("shear", upright.shear))[-1]
     affine = np.asarray(keywords.get("affine", upright.affine))[-3:, -3:]
-    return (
-        np.allclose(now.rotate, rotate)
-        and np.allclose(now.shear, shear)
-        and np.allclose(now.affine, affine)
-    )
+    pairs = ((now.rotate, rotate), (now.shear, shear), (now.affine, affine))
+    return all(np.allclose(one, other) for one, other in pairs)
 
 
 def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
@@ -227,16 +224,11 @@ def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
     if tuple(str(unit) for unit in layer.units) != tuple(keywords["units"]):
         layer.units = keywords["units"]
     limits = keywords.get("contrast_limits")
-    if limits is not None and _differ(layer.contrast_limits, limits):
-        layer.contrast_limits = limits
+    if limits is not None:
+        # Only a difference that can be seen: to set limits takes as long as data.
+        least = _VISIBLE * np.ptp(limits)
+        if not np.allclose(layer.contrast_limits, limits, rtol=0, atol=least):
+            layer.contrast_limits = limits
     for name in ("features", "length", "edge_width"):
         if name in keywords and kind_of(layer) == "vectors":
             setattr(layer, name, keywords[name])
-
-
-def _differ(shown: Sequence[float], limits: Sequence[float]) -> bool:
-    """Whether limits are so different that it can be seen: to set them takes as long as data."""
-    low, high = limits
-    return any(
-        abs(one - other) > _VISIBLE * (high - low) for one, other in zip(shown, limits, strict=True)
-    )

@@ -16,7 +16,6 @@ from typing import Any
 
 from qtpy.QtCore import QObject, Signal
 
-from napari_shadowinv._napari.notifications import MISTAKES
 from napari_shadowinv._napari.widgets._qt import timer, when_destroyed
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InversionCancelled
@@ -36,11 +35,6 @@ class Outcome:
     error: Exception | None = None
     cancelled: bool = False
     tag: Any = None
-
-    @property
-    def is_mistake(self) -> bool:
-        """Whether it ended by a mistake of the user's, not one of the program's."""
-        return isinstance(self.error, MISTAKES)
 
 
 @dataclass

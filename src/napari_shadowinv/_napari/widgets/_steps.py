@@ -8,14 +8,8 @@ from typing import Any
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
 from qtpy.QtWidgets import QSizePolicy, QWidget
 
+from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
-from napari_shadowinv._napari.widgets._forms import (
-    INDENT,
-    ModelForm,
-    labelled,
-    section,
-    small_button,
-)
 from napari_shadowinv._napari.widgets._qt import beside, column
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import STEPS, Step
@@ -29,14 +23,14 @@ class StepForm(QWidget):
     def __init__(self, kind: type[Step], move: Callable[..., None]) -> None:
         super().__init__()
         self.kind = kind
-        self.form = ModelForm(kind)
-        self.form.layout().setContentsMargins(INDENT, 0, 0, 0)
-        self.title = small_button("", "Show or hide the parameters.", self._unfold_or_fold)
+        self.form = forms.ModelForm(kind)
+        self.form.layout().setContentsMargins(forms.INDENT, 0, 0, 0)
+        self.title = forms.small_button("", "Show or hide the parameters.", self._unfold_or_fold)
         self.title.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
         self.title.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
-        self.up = small_button("↑", "Do this earlier.", lambda: move(self, -1))
-        self.down = small_button("↓", "Do this later.", lambda: move(self, 1))
-        self.remove = small_button("✕", "Leave this out.", lambda: move(self, None))
+        self.up = forms.small_button("↑", "Do this earlier.", lambda: move(self, -1))
+        self.down = forms.small_button("↓", "Do this later.", lambda: move(self, 1))
+        self.remove = forms.small_button("✕", "Leave this out.", lambda: move(self, None))
         for button in (self.title, self.up, self.down, self.remove):
             button.setAutoRaise(True)
         line = beside((self.title, 1), (self.up, 0), (self.down, 0), (self.remove, 0))
@@ -83,7 +77,7 @@ class StepsSection(QWidget):
         self.choice.setToolTip("<qt>Done to image, source and masks before the inversion.</qt>")
         self._list = QWidget()
         column(self._list)
-        self.folded = section("", self._list, labelled("", self.choice))
+        self.folded = forms.section("", self._list, forms.labelled("", self.choice))
         column(self, self.folded)
         # A long list of steps must not widen the window.
         button = self.folded.toggleButton()

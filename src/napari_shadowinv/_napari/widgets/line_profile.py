@@ -6,7 +6,6 @@ import csv
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -192,8 +191,7 @@ class LineProfile(qt.Docked):
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__()
         self.viewer = viewer
-        self._distance = np.zeros(0)
-        self._unit = "px"
+        self._distance, self._unit = np.zeros(0), "px"
         self.profiles: list[Profile] = []
         tip = "<qt>Shapes layer with the line; if it has several, the selected one is used.</qt>"
         self.lines = LayerPicker(viewer, ("shapes",), tip, "none yet")
@@ -374,9 +372,7 @@ class LineProfile(qt.Docked):
 
     @qt.notify_errors
     def _draw(self) -> None:
-        images = self.checked() or [
-            layer for layer in self.viewer.layers if kind_of(layer) == "image"
-        ]
+        images = self.checked() or [one for one in self.viewer.layers if kind_of(one) == "image"]
         if not images:
             raise InputError(
                 "there is no image to draw a line on: open one (File → Open) or use a sample "
@@ -386,19 +382,14 @@ class LineProfile(qt.Docked):
 
     @qt.notify_errors
     def _export(self) -> None:
-        from napari_shadowinv.io import replacing
         from napari_shadowinv.io.formats import SITES
 
         text = self.table()
         name, _ = QtWidgets.QFileDialog.getSaveFileName(
             self, "Export CSV", "profile.csv", "CSV (*.csv)"
         )
-        if not name:
-            return
-        path = Path(name) if Path(name).suffix else Path(name).with_suffix(SITES.suffix)
-        with replacing(path, overwrite=str(path) == name) as unfinished:
-            unfinished.write_text(text, encoding="utf-8")
-        show_info(f"Wrote {path}")
+        if name:
+            show_info(f"Wrote {forms.save_text(text, name, SITES.suffix)}")
 
 
 def _mapper(layer: Any) -> Callable[[Any], Any]:
