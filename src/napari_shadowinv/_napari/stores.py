@@ -74,7 +74,7 @@ def _shot_names(dataset: xarray.Dataset) -> list[str]:
 
 
 def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
-    """Let arrows, which cannot be lazy, show the shot in view; return what rereads them."""
+    """Let arrows, which cannot be lazy, show the shot in view; return what reads them again."""
     displacement = _displacement(layer)
     shown: list[int] = []
 

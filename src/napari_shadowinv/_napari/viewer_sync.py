@@ -22,7 +22,7 @@ def keep_in_step(viewer: Any) -> None:
 
 
 def _follow_top_image(viewer: Any, events: Any) -> None:
-    """Show colour bar and name of the topmost visible image, if ours, until it is switched off."""
+    """Show colour bar and name of the topmost visible image of ours, unless switched off."""
     shown: list[Any] = []
 
     def follow(_: Any = None) -> None:

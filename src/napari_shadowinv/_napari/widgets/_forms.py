@@ -268,7 +268,7 @@ class ModelPicker(QtWidgets.QWidget):
 
 
 class RowPicker(QtWidgets.QWidget):
-    """A choice between kinds of things, some with a control of the owner's in a row below."""
+    """A choice between kinds of things, some with a control of their own in a row below."""
 
     changed = Signal()
 
@@ -307,7 +307,7 @@ def save_text(text: str, name: str | Path, suffix: str) -> Path:
 
 
 class TomlButtons(QtWidgets.QWidget):
-    """Load… and Save…: `take` gets values and path; it and `values` raise `InputError`."""
+    """Load… and Save…; `take` gets what was loaded and its path, `values` returns what to save."""
 
     def __init__(
         self,

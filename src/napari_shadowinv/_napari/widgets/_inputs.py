@@ -39,7 +39,7 @@ class _Given:
 
 
 class SetupPicker(QWidget):
-    """A setup, kept with its image; the user's own is in the form for the next, a file's is not."""
+    """A setup, kept with its image; what the user typed or loaded is offered to the next image."""
 
     changed = Signal()
 

@@ -96,7 +96,7 @@ def warnings_of(layer: Any) -> tuple[str, ...]:
 
 
 def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArray | None:
-    """Usable pixels from labels or shapes; None if all are. `image` is None for files."""
+    """Usable pixels of an image (None for files) by labels or shapes; None if all are."""
     if layer is None:
         return None
     shape = None if image is None else tuple(_grey(image, "image").shape[-2:])
@@ -116,7 +116,7 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArr
 
 
 def crop_of(layer: Any | None, image: Any) -> tuple[slice, slice] | None:
-    """Rows and columns of an image in a drawn rectangle, the selected or the last; None if none."""
+    """Rows and columns of an image in the selected, or else the last, of the drawn shapes."""
     if layer is None or not len(layer.data):
         return None
     chosen = max(layer.selected_data, default=len(layer.data) - 1)
@@ -262,7 +262,7 @@ def shot_picker(viewer: Any) -> LayerPicker:
 
 
 class MaskPicker(QWidget):
-    """A layer that is painted on, and what the paint means; `image` returns the layer it is for."""
+    """A layer that is painted on, and what the paint means; it is for what `image` returns."""
 
     picked = Signal()
     changed = Signal()

@@ -83,8 +83,7 @@ class RunPanel(QtWidgets.QWidget):
         self.status = wrapping_label()
         qt.column(self, self.button, self.bar, self.status)
         self._activity = _Activity()
-        self._quiet = False
-        self._said = ("", False)
+        self._quiet, self._said = False, ("", False)
         self._news: Progress | None = None
         self._start = 0.0
         self._looking = qt.timer(self, _LOOK_EVERY, self._look)
@@ -327,7 +326,7 @@ class ToolPanel(qt.Docked):
 
 
 class LivePanel(ToolPanel):
-    """Runs on its button, and on changes a preview, which gives way to both."""
+    """A panel that also shows a preview after each change; a run of its button goes before."""
 
     def __init__(self, viewer: Any, name: str, panel: RunPanel) -> None:
         super().__init__(viewer, name, panel)

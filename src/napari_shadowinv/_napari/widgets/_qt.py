@@ -92,7 +92,7 @@ def tell_error(error: BaseException | str) -> None:
 
 
 def notify_errors(method: Method) -> Method:
-    """Turn a user's mistake into one notification, and `show_problem` of the nearest widget."""
+    """Turn a mistake into one notification; the nearest widget with `show_problem` shows it."""
 
     @functools.wraps(method)
     def told(*args: Any, **kwargs: Any) -> Any:
@@ -111,7 +111,7 @@ def notify_errors(method: Method) -> Method:
 
 
 class Docked(QWidget):
-    """Joins the docks on its side as a tab; napari puts it below them, where neither has room."""
+    """A widget that joins the docks on its side as a tab; napari would squeeze it below them."""
 
     _has_place = False
 

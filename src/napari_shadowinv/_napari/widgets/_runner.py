@@ -122,7 +122,7 @@ class Runner(QObject):
 class _Courtesy:
     """While entered, a thread hands over the interpreter after 1 ms instead of 5."""
 
-    # What is between the kernels needs it, and a window's event may ask for it a dozen times.
+    # Only the kernels do without it, and a window's event may ask for it a dozen times.
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

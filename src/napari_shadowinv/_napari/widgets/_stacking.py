@@ -69,7 +69,7 @@ class StackJob:
         should_stop: ShouldStop,
         on_done: Callable[[int | None], None] = lambda _: None,
     ) -> RunBooks:
-        """Invert what is not done; `on_done` gets what ended well before it is told of."""
+        """Invert what is not done; `on_done` gets a shot that ended well before the window does."""
         from napari_shadowinv.stack import run_stack
 
         def tell(news: RunProgress) -> None:

@@ -45,7 +45,7 @@ class Profile:
 
 
 def along(vertices: ArrayLike, step: float) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 2) evenly along a path of corners (k, 2), at most a step apart; distances."""
+    """Points (n, 2) at most a step apart along corners (k, 2), and their distances along it."""
     corners, reached = _corners(vertices)
     count = min(int(np.ceil(reached[-1] / step - 1e-9)) + 1, _MOST_SAMPLES)
     distance = np.linspace(0, reached[-1], max(count, 2))
@@ -84,7 +84,7 @@ def abreast(vertices: ArrayLike, distance: FloatArray, width: float, step: float
 def sampled(
     image: ArrayLike, points: FloatArray, to_pixels: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
-    """Values at points (n, 2) of the world, or means over m of (m, n, 2); NaN outside the image."""
+    """Values at points (n, 2) of the world, or means over the m of (m, n, 2); NaN outside."""
     from scipy.ndimage import map_coordinates
 
     plane = np.asarray(image, dtype=np.float64)
