@@ -1,12 +1,4 @@
-"""One click on the selected image: what the menus *Layers > Measure* and *Filter* offer.
-
-- the whole inversion with its defaults: `invert_uniform`
-- before it: `remove_hot_pixels`, `high_pass`, and the beam by `estimate_source`
-
-Each makes new layers that lie on the selected one, keep its setup, and are named after it. A
-stack gives the shot that is shown. From a menu the work is done beside the window, with a
-cross to cancel it in napari's activity dock; from a script it is done at once.
-"""
+"""What the menus *Layers > Measure* and *Filter* do with the selected image or shot in view."""
 
 from __future__ import annotations
 
@@ -16,28 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari import layers as results
+from napari_shadowinv._napari import notifications
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layer_metadata import (
-    SOURCE,
-    Result,
-    may_be_shot,
-    may_be_source,
-    role_of,
-    setup_of,
-    setup_origin_of,
-)
-from napari_shadowinv._napari.layers import (
-    FullLayerData,
-    add_layers,
-    intensity_limits,
-    result_layers,
-)
-from napari_shadowinv._napari.notifications import (
-    MISTAKES,
-    in_event_loop,
-    notify_errors,
-    show_mistake,
-)
 from napari_shadowinv._napari.shots import loaded, radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -50,10 +24,6 @@ if TYPE_CHECKING:
     import napari
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Radiograph
-
-__all__ = ["estimate_source", "high_pass", "invert_uniform", "remove_hot_pixels"]
-
-_HIGH_PASS_SHARE = 0.15
 
 
 @dataclass(frozen=True)
@@ -72,7 +42,7 @@ class _Picked:
         return self.shot.image
 
 
-@notify_errors(otherwise=list)
+@notifications.notify_errors(otherwise=list)
 def invert_uniform(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -80,25 +50,24 @@ def invert_uniform(
     return _begin(_picked(layer, viewer), _inverted, "Inverting", viewer)
 
 
-@notify_errors(otherwise=list)
+@notifications.notify_errors(otherwise=list)
 def remove_hot_pixels(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
     """Replace pixels that stand out of the noise by the median of their neighbours."""
-    return _begin(
-        _picked(layer, viewer, may_be_source), _repaired, "Removing hot pixels from", viewer
-    )
+    picked = _picked(layer, viewer, about.may_be_source)
+    return _begin(picked, _repaired, "Removing hot pixels from", viewer)
 
 
-@notify_errors(otherwise=list)
+@notifications.notify_errors(otherwise=list)
 def high_pass(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
     """Take away structures larger than some 0.15 of the image's shorter side; the mean stays."""
-    return _begin(_picked(layer, viewer, may_be_source), _high_passed, "Filtering", viewer)
+    return _begin(_picked(layer, viewer, about.may_be_source), _high_passed, "Filtering", viewer)
 
 
-@notify_errors(otherwise=list)
+@notifications.notify_errors(otherwise=list)
 def estimate_source(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -106,7 +75,7 @@ def estimate_source(
     return _begin(_picked(layer, viewer), _beam, "Estimating the source of", viewer)
 
 
-def _picked(layer: Any, viewer: Any, usable: Callable[[Any], bool] = may_be_shot) -> _Picked:
+def _picked(layer: Any, viewer: Any, usable: Callable[[Any], bool] = about.may_be_shot) -> _Picked:
     """Take the plane that is shown of an image layer."""
     from napari.layers import Image
 
@@ -117,41 +86,41 @@ def _picked(layer: Any, viewer: Any, usable: Callable[[Any], bool] = may_be_shot
         kind = "a colour image" if is_colour else f"of type {layer.__class__.__name__}"
         raise InputError(f"layer '{layer.name}' is {kind}: select a grey image")
     if not usable(layer):
-        kind = "a source" if role_of(layer) == SOURCE else "part of a result"
+        kind = "a source" if about.role_of(layer) == about.SOURCE else "part of a result"
         raise InputError(f"layer '{layer.name}' is {kind}: select the shot")
     data, name = layer.data[0] if layer.multiscale else layer.data, layer.name
     if data.ndim > 2:
         steps = [0] * data.ndim if viewer is None else viewer.dims.current_step
         at = tuple(int(step) for step in steps[-data.ndim : -2])
         data, name = data[at], f"{name} {','.join(map(str, at))}"
-    known = setup_of(layer), setup_origin_of(layer), role_of(layer)
+    known = about.setup_of(layer), about.setup_origin_of(layer), about.role_of(layer)
     return _Picked(radiograph_of(layer, np.asarray(data)), name, frame_of(layer), *known)
 
 
-Work = Callable[[_Picked, ShouldStop], "list[FullLayerData]"]
+Work = Callable[[_Picked, ShouldStop], list[results.FullLayerData]]
 
 
 def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
     """Do the work at once, or beside a window."""
-    if viewer is None or not in_event_loop():
+    if viewer is None or not notifications.in_event_loop():
         return list(work(picked, lambda: False))
     from napari.qt.threading import create_worker
     from napari.utils import cancelable_progress
 
     bar = cancelable_progress(total=0, desc=f"{doing} {picked.name}")
 
-    def finish(outcome: tuple[list[FullLayerData], Exception | None]) -> None:
+    def finish(outcome: tuple[list[results.FullLayerData], Exception | None]) -> None:
         layers, error = outcome
         bar.close()
         if error is None:
-            add_layers(viewer, layers)
-        elif isinstance(error, MISTAKES):
-            show_mistake(error)
+            results.add_layers(viewer, layers)
+        elif isinstance(error, notifications.MISTAKES):
+            notifications.show_mistake(error)
         elif not isinstance(error, InversionCancelled):
             raise error
 
     # An error must not leave the worker: what napari then does differs between its versions.
-    def run() -> tuple[list[FullLayerData], Exception | None]:
+    def run() -> tuple[list[results.FullLayerData], Exception | None]:
         # A closing window asks its workers to stop; the cross only leaves a mark on the bar.
         try:
             return work(picked, lambda: bar.is_canceled or worker.abort_requested), None
@@ -164,7 +133,7 @@ def _begin(picked: _Picked, work: Work, doing: str, viewer: Any) -> list[Any]:
     return []
 
 
-def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:
     from napari_shadowinv.pipeline._run import run
     from napari_shadowinv.preprocessing import Recipe, UniformEstimate
 
@@ -173,36 +142,38 @@ def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
     told = {"source_origin": "uniform"}
     if picked.setup_origin:
         told["setup_origin"] = picked.setup_origin
-    return result_layers(Result(inversion, picked.setup, told), picked.frame, picked.name)
+    return results.result_layers(
+        about.Result(inversion, picked.setup, told), picked.frame, picked.name
+    )
 
 
-def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:
     from napari_shadowinv.preprocessing import remove_hot_pixels as remove
 
     image, hot, dead = remove(picked.image, should_stop=should_stop)
     return [_filtered(picked, image, f"without {int((hot | dead).sum())} hot or dead pixels")]
 
 
-def _high_passed(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+def _high_passed(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:
     from napari_shadowinv.preprocessing import high_pass as remove_large
 
-    width = _HIGH_PASS_SHARE * min(picked.image.shape)
+    width = 0.15 * min(picked.image.shape)
     return [_filtered(picked, remove_large(picked.image, width), f"high-pass σ={width:.3g} px")]
 
 
-def _beam(picked: _Picked, should_stop: ShouldStop) -> list[FullLayerData]:
+def _beam(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:
     from napari_shadowinv.preprocessing import total_variation_source
 
     source = total_variation_source(picked.image, should_stop=should_stop)
-    return [_filtered(replace(picked, role=SOURCE), source, "source by total variation")]
+    return [_filtered(replace(picked, role=about.SOURCE), source, "source by total variation")]
 
 
-def _filtered(picked: _Picked, image: FloatArray, title: str) -> FullLayerData:
+def _filtered(picked: _Picked, image: FloatArray, title: str) -> results.FullLayerData:
     return shot_layer(
         image,
         f"{picked.name} {title}",
         picked.setup,
-        intensity_limits(picked.image),  # the same limits show what a filter did
+        results.intensity_limits(picked.image),  # the same limits show what a filter did
         picked.role,
         frame=picked.frame,
         setup_origin=picked.setup_origin or None,

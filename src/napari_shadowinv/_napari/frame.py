@@ -1,8 +1,4 @@
-"""Where an image lies in napari's world: `Frame`.
-
-- from a setup: `frame_for`; from a layer that is there already: `frame_of`
-- give a layer the pixel size of a setup: `place`
-"""
+"""Where an image lies in napari's world: `Frame`."""
 
 from __future__ import annotations
 
@@ -16,8 +12,6 @@ from napari_shadowinv._typing import FloatArray
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
-
-__all__ = ["Frame", "frame_for", "frame_of", "place"]
 
 Matrix = tuple[tuple[float, ...], ...]
 

@@ -1,13 +1,4 @@
-"""What a layer of this plugin knows about itself, kept in its metadata.
-
-- write it: `mark`, `keep_setup`; read it: `role_of`, `unit_of`, `setup_of`, …
-- what a layer can be used as: `may_be_shot`, `may_be_source`, `may_be_mask`
-- everything behind the layers of one result: `Result`
-
-Layers carry only the units of their axes; the role, the unit of their values, the setup and the
-result that they show are in ``layer.metadata["napari-shadowinv"]``, a plain dict. A layer of
-other origin has none of it: it may be a shot, a source or a mask.
-"""
+"""What a layer of this plugin knows about itself: a plain dict in its metadata, under `KEY`."""
 
 from __future__ import annotations
 
@@ -24,27 +15,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
-
-__all__ = [
-    "CAME_WITH",
-    "KEY",
-    "MASK",
-    "SHOT",
-    "SOURCE",
-    "Result",
-    "keep_setup",
-    "mark",
-    "mark_of",
-    "may_be_mask",
-    "may_be_shot",
-    "may_be_source",
-    "result_of",
-    "role_of",
-    "setup_of",
-    "setup_origin_of",
-    "source_of",
-    "unit_of",
-]
 
 KEY = "napari-shadowinv"
 

@@ -1,8 +1,4 @@
-"""How layers looked, kept with a result, so that they come back as they were.
-
-- a result's layers from its dataset: `layers_of_dataset`
-- a result's dataset from its layers: `dataset_of_layers`
-"""
+"""How layers looked, kept with a result, so that they come back as they were."""
 
 from __future__ import annotations
 
@@ -21,22 +17,11 @@ from napari_shadowinv.inversion.labels import setup_from_dataset
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["dataset_of_layers", "layers_of_dataset"]
-
 _LOOKS = "napari_layers"
 
 # Attributes that the dataset of a result makes anew.
-_OWN_ATTRIBUTES = {
-    "format",
-    "options",
-    "report",
-    "image_residual",
-    "setup",
-    "provenance",
-    "package_version",
-    "created",
-    _LOOKS,
-}
+_OWN_ATTRIBUTES = {_LOOKS, "format", "options", "report", "image_residual"}
+_OWN_ATTRIBUTES |= {"setup", "provenance", "package_version", "created"}
 
 _PLACE = ("scale", "translate", "units")
 _TURN = ("rotate", "shear", "affine")

@@ -1,12 +1,4 @@
-"""Results as napari layers, of one shot or of a stack of shots.
-
-- the kinds of layers: `KINDS`; a labelled dataset as layers: `dataset_layers`
-- a result as layers: `inversion_layers`, `result_layers`
-- put layers into a viewer, with or without a window: `add_inversion`, `add_layers`
-
-The lowest layer comes first. What each layer shows, in which unit, and the whole result behind
-it are in its metadata; see `napari_shadowinv._napari.layer_metadata`.
-"""
+"""Results as napari layers, of one shot or of a stack of shots; the lowest layer comes first."""
 
 from __future__ import annotations
 
@@ -31,19 +23,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = [
-    "KINDS",
-    "FullLayerData",
-    "add_inversion",
-    "add_layers",
-    "at_shot",
-    "dataset_layers",
-    "intensity_limits",
-    "inversion_layers",
-    "result_layers",
-    "thinned_arrows",
-]
-
 FullLayerData = tuple[Any, dict[str, Any], str]
 Limits = tuple[float, float]
 
@@ -54,7 +33,7 @@ _ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
 _ARROWS_ALONG = 28
 _SHORTEST_ARROW = 0.05
 _MOST_SITES_SHOWN = 200_000
-_BRIGHTEST = 99.7
+_BRIGHTEST = 99.7  # percentile
 _ENOUGH_PIXELS = 100_000
 _LARGEST_INTENSITY = 3.5
 
@@ -84,8 +63,7 @@ KINDS = (
     Kind("field x", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
     Kind("field", "displacement", "{symbol} ({unit})", colormap="inferno", visible=True),
     Kind("caustic", "caustic", "caustics", type="labels"),
-    # A magnetic field is at right angles to the displacement.
-    Kind("field arrows", "displacement", "∫B dz arrows", type="vectors", shown_of="shot"),
+    Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
     Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),
     Kind("sites", "sites", "sites{share}", colormap="inferno", type="points", shown_of="shot"),
     Kind("cells", "sites", "power cells", type="shapes", shown_of="shot"),
@@ -97,17 +75,13 @@ def inversion_layers(
     setup: Setup | None = None,
     *,
     name: str = "",
-    scale: Sequence[float] | None = None,
-    translate: Sequence[float] | None = None,
-    units: Sequence[str] | None = None,
     cells: bool = False,
     attributes: Mapping[str, str] | None = None,
+    **place: Any,
 ) -> list[FullLayerData]:
     """Describe the layers of a result; the keywords are those of `add_inversion`."""
     setup = inversion.setup if setup is None else setup
-    frame = frame_for(
-        inversion.potential.shape, setup, scale=scale, translate=translate, units=units
-    )
+    frame = frame_for(inversion.potential.shape, setup, **place)
     return result_layers(Result(inversion, setup, dict(attributes or {})), frame, name, cells=cells)
 
 
@@ -128,19 +102,15 @@ def add_inversion(
     viewer : napari.Viewer or napari.components.ViewerModel
         Where to add them; a `ViewerModel` needs neither a window nor a display.
     inversion : Inversion
-        The result.
     setup : Setup, optional
-        Gives the pixel size and the field in SI units; pixels without. Default: that of the
-        inversion's provenance.
+        Gives pixel size and SI units; default: that of the inversion's provenance, if any.
     name : str
         Name of the shot; the layers' names begin with it.
     **keywords
-        ``scale``, ``translate``, ``units`` (sequences in axis order y, x): place of the image
-        in the world, where it is not the setup's; a binned or cropped image lies on its
-        original with those of the original's layer.
+        ``scale``, ``translate``, ``units`` (in axis order y, x): place of the image in the world,
+        where it is not the setup's, such as those of the layer that it was cropped from.
         ``cells`` (bool): whether to add the power cells as polygons, for up to 5,000 sites.
-        ``attributes`` (mapping of str to str): words about its origin, beside its provenance;
-        kept for writing.
+        ``attributes`` (mapping of str to str): words about its origin, kept for writing.
 
     Returns
     -------
@@ -245,7 +215,7 @@ class _Shown:
         if not self.along_shots(kind.variable):
             return False
         if kind.role == "field arrows":
-            return self.setup is not None and self.setup.kind == "proton"
+            return bool(self.field.arrows)
         if kind.role == "cells":
             return self.cells is not None
         return kind.role != "source" or bool(np.ptp(self.plane("source")))
@@ -277,10 +247,8 @@ class _Shown:
             return self.field.vectors
         # All fields are linear in the displacement.
         matrix = np.eye(2)
-        if self.setup is not None and self.setup.kind == "proton":
-            matrix = self.setup.path_integrated_b(matrix)
-        elif self.setup is not None:
-            matrix = self.setup.deflection_angle(matrix)
+        if self.setup is not None:
+            matrix = self.setup.field_in_si(self.setup.main_field.name, matrix)
         first = np.tensordot(matrix, self.plane("displacement"), axes=1)
         matrix = matrix * _ratio(self.field.vectors, first)
         stack = self.dataset["displacement"].transpose("component", "shot", "y", "x").data
@@ -312,7 +280,10 @@ def _image(shown: _Shown, kind: Kind) -> Content:
         if kind.unit == "%":
             used = shown.plane("image")[shown.dataset["mask"].values]
             data = 100 * data / used.mean()
-        limits = _symmetric_limits(data if shown.shot is None else shown.plane("residual"))
+        plane = data if shown.shot is None else shown.plane("residual")
+        # A handful of pixels at a caustic must not blow it up.
+        limit = float(np.percentile(np.abs(_sample(plane)), _BRIGHTEST))
+        limits = -limit, limit
     else:
         limits = shown.intensity_limits
     return data, words, {"colormap": kind.colormap, "contrast_limits": _opened(limits)}
@@ -326,12 +297,11 @@ def _field(shown: _Shown, role: str) -> tuple[Any, Limits, dict[str, str]]:
         # On lazy arrays, numpy's functions are dask's.
         data = shown.magnitude if shown.shot is None else np.hypot(*shown.vectors)
         return data, (0.0, strongest), {"unit": field.unit, "symbol": field.symbol}
-    axis = role[-1]
-    letter = field.symbol.strip("|")
-    symbol = f"∫B{axis} dz" if field.symbol == "|∫B×dz|" else f"{letter}{axis}"
+    axis = "yx".index(role[-1])
     # In another shot of a stack the field may lie along the other axis.
     limit = strongest if shown.shot is not None else float(np.abs(field.vectors).max())
-    return shown.vectors["yx".index(axis)], (-limit, limit), {"unit": field.unit, "symbol": symbol}
+    words = {"unit": field.unit, "symbol": field.components[axis]}
+    return shown.vectors[axis], (-limit, limit), words
 
 
 def _caustics(shown: _Shown, kind: Kind) -> Content:
@@ -360,15 +330,12 @@ def _arrows(shown: _Shown, kind: Kind) -> Content:
         "length": float(0.95 * spacing / usual) if usual else 1.0,
         "opacity": 0.75,
     }
-    words = {"unit": shown.field.unit} if is_field else {}
+    words = {"unit": shown.field.unit, "arrows": shown.field.arrows} if is_field else {}
     return data if shown.shot is None else at_shot(data, shown.shot), words, look
 
 
 def thinned_arrows(field: FloatArray) -> tuple[FloatArray, float]:
-    """Pick vectors (y, x) of a field on a grid: starts and vectors (n, 2, 2), and the spacing.
-
-    Those of nearly no length are left out.
-    """
+    """Pick long enough vectors (y, x) on a grid: starts and vectors (n, 2, 2), and the spacing."""
     height, width = field.shape[1:]
     step = max(1, -(-max(height, width) // _ARROWS_ALONG))
     rows, columns = (
@@ -443,12 +410,6 @@ def intensity_limits(image: AnyArray) -> Limits:
     mean = float(finite.mean())
     high = min(bright, _LARGEST_INTENSITY * mean) if mean > 0 else bright
     return _opened((0.0 if 0 <= dark < 0.3 * high else dark, high))
-
-
-def _symmetric_limits(plane: FloatArray) -> Limits:
-    """Return limits around zero that a handful of pixels at a caustic cannot blow up."""
-    limit = float(np.percentile(np.abs(_sample(plane)), _BRIGHTEST))
-    return -limit, limit
 
 
 def _sample(plane: AnyArray) -> AnyArray:

@@ -1,9 +1,4 @@
-"""What napari's user is told: one sentence for a mistake, not a traceback.
-
-- whether somebody is looking: `in_event_loop`
-- a function whose user's mistakes become notifications: `notify_errors`; one such: `show_mistake`
-- what to know before trusting a file: `show_caution`
-"""
+"""What napari's user is told: one sentence for a mistake, not a traceback."""
 
 from __future__ import annotations
 
@@ -13,8 +8,6 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from napari_shadowinv.errors import InputError
-
-__all__ = ["MISTAKES", "in_event_loop", "notify_errors", "show_caution", "show_mistake"]
 
 MISTAKES = (InputError, OSError, MemoryError)
 """What a user can mend; all else is a fault of the program, whose traceback is needed."""

@@ -1,9 +1,4 @@
-"""What napari opens with this plugin: `get_reader`.
-
-Results, stores of many shots, pradformat, and the radiographs that napari itself cannot read;
-folders and lists of shots become one lazy stack. Asking whether a file can be read imports neither
-napari nor a compiler and reads a header at most.
-"""
+"""What napari opens with this plugin; to ask imports no napari and reads a header at most."""
 
 from __future__ import annotations
 
@@ -19,8 +14,6 @@ from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT,
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
-
-__all__ = ["get_reader", "read_paths"]
 
 ReaderFunction = Callable[[str | Sequence[str]], "list[Any]"]
 
@@ -42,22 +35,18 @@ def _can_read(path: Path) -> bool:
     if path.is_dir():
         return bool(images_in(path))
     if path.suffix.lower() in PRADFORMAT.suffixes:
-        return _is_ours(path)
+        from napari_shadowinv.io.pradformat import is_ours
+
+        # Pradformat or a result; much else has the ending of HDF5.
+        try:
+            return is_ours(path)
+        except FileFormatError:
+            return False
     return _is_image_name(path)
 
 
 def _is_image_name(path: Path) -> bool:
     return path.suffix.lower() in RADIOGRAPH_SUFFIXES
-
-
-def _is_ours(path: Path) -> bool:
-    """Whether HDF5 is pradformat or a result; much else has that ending."""
-    from napari_shadowinv.io.pradformat import is_ours
-
-    try:
-        return is_ours(path)
-    except FileFormatError:
-        return False
 
 
 @notify_errors(otherwise=lambda: [(None,)])  # napari's sign for: dealt with, and nothing to add

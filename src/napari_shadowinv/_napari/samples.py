@@ -1,11 +1,4 @@
-"""Sample data: shots of known objects, made when they are asked for.
-
-- one object: `toroid`, `toroid_with_caustics`, `four_toroids`; with the shadow of what stands
-  in the beam: `coaxial_line`
-- a run of shots that change with time: `wakefield_run`
-
-Each shot carries its setup, and its undisturbed beam where that is not uniform.
-"""
+"""Sample data: shots of known objects with setup and source, made when they are asked for."""
 
 from __future__ import annotations
 
@@ -19,30 +12,22 @@ from napari_shadowinv.io import Radiograph
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 
-__all__ = ["coaxial_line", "four_toroids", "toroid", "toroid_with_caustics", "wakefield_run"]
-
 _SHAPE = (200, 200)
-_COUNTS = 400.0
-"""Mean counts of a pixel: 5 % of noise."""
+_COUNTS = 400.0  # of a pixel: 5 % of noise
 
-_TOROID_RADIUS = 30e-6
-_BELOW_CAUSTICS = 97.0
-_WITH_CAUSTICS = 194.0
-"""Peak fields of the paper's toroid in MG µm; the first caustics form at 194."""
 
 _RUN_SHAPE = (120, 320)
 _RUN_LENGTH = 20
-_RUN_COUNTS = 2500.0
 
 
 def toroid() -> list[FullLayerData]:
     """Toroidal field of 97 MG µm, too weak for caustics, under a Gaussian beam."""
-    return _proton_shot("toroid", _toroid_of(_BELOW_CAUSTICS), _gaussian_beam())
+    return _proton_shot("toroid", _toroid_of(97.0), _gaussian_beam())
 
 
 def toroid_with_caustics() -> list[FullLayerData]:
     """Toroidal field of 194 MG µm, at which caustics form, under a uniform beam."""
-    return _proton_shot("toroid with caustics", _toroid_of(_WITH_CAUSTICS))
+    return _proton_shot("toroid with caustics", _toroid_of(194.0))
 
 
 def four_toroids() -> list[FullLayerData]:
@@ -67,7 +52,7 @@ def wakefield_run() -> list[FullLayerData]:
 
 
 def _toroid_of(peak: float) -> phantoms.Phantom:
-    return phantoms.toroid(_SHAPE, phantoms.paper_setup(), peak, _TOROID_RADIUS)
+    return phantoms.toroid(_SHAPE, phantoms.paper_setup(), peak, 30e-6)
 
 
 def _proton_shot(
@@ -110,4 +95,4 @@ def _wakefield_shot(shot: int) -> FloatArray:
         0.8 * np.sin(np.pi * (0.15 + 0.75 * phase)) ** 2,
         center=((height - 1) / 2, width * (0.2 + 0.6 * phase)),
     )
-    return _counted(wave, np.full(_RUN_SHAPE, _RUN_COUNTS), seed=shot)
+    return _counted(wave, np.full(_RUN_SHAPE, 2500.0), seed=shot)

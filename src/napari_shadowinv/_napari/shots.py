@@ -1,12 +1,4 @@
-"""Radiographs as layers: one, or a run of them as a lazy stack.
-
-- one image, with what its file tells: `radiograph_layers`
-- any image or stack of images: `shot_layer`
-- a layer as what an inversion takes: `radiograph_of`, `loaded`
-- many files along an axis of shots, each read when it is shown: `stack_layers`
-- any planes that are made when they are looked at: `lazy_stack`
-- the images in a folder, shot 2 before shot 10: `images_in`
-"""
+"""Radiographs as layers: one, or a run of them as a lazy stack; and layers as radiographs."""
 
 from __future__ import annotations
 
@@ -32,16 +24,6 @@ from napari_shadowinv.io.formats import RADIOGRAPH_SUFFIXES
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
-
-__all__ = [
-    "images_in",
-    "lazy_stack",
-    "loaded",
-    "radiograph_layers",
-    "radiograph_of",
-    "shot_layer",
-    "stack_layers",
-]
 
 
 def radiograph_layers(shot: io.Radiograph, name: str = "") -> list[FullLayerData]:
@@ -133,10 +115,8 @@ def loaded(shot: io.Radiograph, name: str) -> io.Radiograph:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """List the images in a folder in the order in which people count.
-
-    They have the most frequent ending: a table of settings beside a run of TIFFs is not a shot.
-    """
+    """List a folder's images of the most frequent ending in the order in which people count."""
+    # A table of settings beside a run of TIFFs is not a shot.
     files = [
         path
         for path in folder.iterdir()
@@ -150,10 +130,8 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
-    """Describe a run of shots as one lazy stack; only the first that can be read is read now.
-
-    A shot that cannot be read, or of another shape, is dark and gives a warning when it is shown.
-    """
+    """Describe a run of shots as one lazy stack; only the first that can be read is read now."""
+    # A shot that cannot be read, or of another shape, is dark and gives a warning when shown.
     first, at = _first_readable(paths)
     for text in first.warnings:
         show_caution(f"{paths[at].name}: {text}")

@@ -1,8 +1,4 @@
-"""What can be told about each site, and the shape of its cell.
-
-- numbers by site: `site_features`
-- the cells as polygons inside the image: `power_cells`
-"""
+"""What can be told about each site, and the shape of its cell."""
 
 from __future__ import annotations
 
@@ -17,10 +13,7 @@ from napari_shadowinv.errors import InputError
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.inversion import Inversion
-
-__all__ = ["Cells", "power_cells", "site_features"]
 
 Cells = tuple[list[FloatArray], NDArray[np.intp]]
 
@@ -40,25 +33,13 @@ def site_features(dataset: xarray.Dataset) -> dict[str, FloatArray]:
 
 
 def power_cells(inversion: Inversion) -> Cells:
-    """Corners (y, x) of the cells that the solver ended with, and the site of each.
-
-    They are cut off at the image's border; an empty cell has no polygon.
-    """
+    """Corners (y, x) of the last cells that are not empty, cut off at the border; their sites."""
     count = len(inversion.sites)
     if count > _MOST_CELLS:
         raise InputError(
             f"the result has {count:,} sites: power cells can be shown for up to {_MOST_CELLS:,} "
             "sites; invert with fewer sites to show the cells"
         )
-    diagram, margin = _diagram(inversion)
-    height, width = inversion.potential.shape
-    polygons = [_clipped(diagram.cell(site) - margin, height, width) for site in range(count)]
-    kept = np.flatnonzero([len(polygon) > 2 for polygon in polygons])
-    return [polygons[site] for site in kept], kept
-
-
-def _diagram(inversion: Inversion) -> tuple[PowerDiagram, int]:
-    """Return the power diagram that the solver ended with, and the margin that it has in px."""
     from napari_shadowinv.geometry.density import Density
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.geometry.triangulation import RegularTriangulation
@@ -71,7 +52,10 @@ def _diagram(inversion: Inversion) -> tuple[PowerDiagram, int]:
     triangulation = RegularTriangulation(
         inversion.sites + margin, inversion.weights, region=anything.region
     )
-    return PowerDiagram(triangulation, anything, threads=options.threads), margin
+    diagram = PowerDiagram(triangulation, anything, threads=options.threads)
+    polygons = [_clipped(diagram.cell(site) - margin, *shape) for site in range(count)]
+    kept = np.flatnonzero([len(polygon) > 2 for polygon in polygons])
+    return [polygons[site] for site in kept], kept
 
 
 def _clipped(corners: FloatArray, height: int, width: int) -> FloatArray:

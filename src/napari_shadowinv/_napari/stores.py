@@ -1,13 +1,4 @@
-"""The results of a run of shots as lazy layers with an axis of shots.
-
-- the layers of a store: `store_layers`
-- arrows that show the shot in view: `follow_shots`; those that a reader is about to hand over:
-  `follow_once_added`
-
-Shots that are not done yet are shown empty; nothing but the first shot that is done is read
-before it is looked at. Images are read by napari, a shot at a time. It has no such vectors: the
-arrows of one shot are replaced by those of the next.
-"""
+"""The results of a run of shots as lazy layers; only the first finished shot is read at once."""
 
 from __future__ import annotations
 
@@ -28,8 +19,6 @@ from napari_shadowinv.io.formats import RESULT
 
 if TYPE_CHECKING:
     import xarray
-
-__all__ = ["follow_once_added", "follow_shots", "store_layers"]
 
 
 @refusing_damage
@@ -85,10 +74,7 @@ def _shot_names(dataset: xarray.Dataset) -> list[str]:
 
 
 def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
-    """Let arrows show the shot in view while they are in the viewer; return what reads them again.
-
-    All shots are drawn at the same scale. Read again, a shot may be done that was not before.
-    """
+    """Let arrows, which cannot be lazy, show the shot in view; return what reads them again."""
     displacement = _displacement(layer)
     shown: list[int] = []
 

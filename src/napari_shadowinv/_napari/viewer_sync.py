@@ -1,8 +1,4 @@
-"""What keeps in step with a viewer that shows results: `keep_in_step`.
-
-One colour bar in the canvas, for the image that is seen, and images that are opened beside
-results.
-"""
+"""What keeps in step with a viewer that shows results: a colour bar, and where images lie."""
 
 from __future__ import annotations
 
@@ -11,8 +7,6 @@ from typing import Any
 
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import role_of
-
-__all__ = ["keep_in_step"]
 
 _watched: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -28,10 +22,7 @@ def keep_in_step(viewer: Any) -> None:
 
 
 def _follow_top_image(viewer: Any, events: Any) -> None:
-    """Show colour bar and name of the topmost visible image, if it is one of this plugin's.
-
-    The name tells the unit. Whoever switches the bar off keeps it off.
-    """
+    """Show colour bar and name of the topmost visible image of ours, unless switched off."""
     shown: list[Any] = []
 
     def follow(_: Any = None) -> None:
@@ -79,11 +70,8 @@ def _show_bar(layer: Any, on: bool) -> None:
 
 
 def _place_newcomers(viewer: Any, events: Any) -> None:
-    """Lay images that are opened from now on over results of the same size, or say how to.
-
-    Results lie in µm or mm, an image from a file in pixels: side by side, napari drops the unit
-    of its scale bar. What has a scale keeps it.
-    """
+    """Lay new images without a scale over results of the same size, or say how to."""
+    # Of pixels and lengths side by side, napari drops the unit of its scale bar.
 
     def receive(event: Any) -> None:
         layer = event.value

@@ -1,11 +1,6 @@
-"""What napari saves with this plugin: layers of one result.
+"""What napari saves with this plugin: layers of one result, a part of which stands for all."""
 
-- all of the result: `write_result`; its field for other codes: `write_pradformat`; its sites:
-  `write_sites`
-
-A part of a result's layers stands for all of it; other layers are left out. Each file is written
-whole, beside the one that it replaces; napari's own dialog asks before.
-"""
+# napari's own dialog asks before a file is replaced.
 
 from __future__ import annotations
 
@@ -21,8 +16,6 @@ from napari_shadowinv.io.formats import PRADFORMAT, RESULT, SITES, Format
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layer_metadata import Result
     from napari_shadowinv._napari.layers import FullLayerData
-
-__all__ = ["write_pradformat", "write_result", "write_sites"]
 
 
 def write_result(path: str, layers: Sequence[FullLayerData]) -> list[str]:

@@ -1,9 +1,4 @@
-"""Editors for one field of a pydantic model each, and numbers with units.
-
-- the right editor for a field: `editor_for`; what all of them have: `Editor`
-- a number with its unit, as people write it: `parsed`, `shown`; which unit a title names:
-  `unit_of_title`
-"""
+"""Editors for one field of a pydantic model each, and numbers with units."""
 
 from __future__ import annotations
 
@@ -299,11 +294,7 @@ class _Optional(Editor):
 
 
 def editor_for(field: FieldInfo, first: Any = None) -> Editor:
-    """Make the editor that suits a field's type and bounds, with its default as the value.
-
-    A number whose ``json_schema_extra`` holds ``"slider": [least, most]`` gets a slider; an
-    optional field starts with `first` when it is first checked.
-    """
+    """Make the editor for a field; an optional one starts with `first` when it is first checked."""
     kind, optional = _without_none(field.annotation)
     editor = _plain_editor(kind, field)
     if optional:

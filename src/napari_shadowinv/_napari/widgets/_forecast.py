@@ -1,8 +1,4 @@
-"""The image that an object would make, as plain arrays: no napari, no Qt.
-
-- objects to put into a beam, with their parameters, for a form: `PHANTOMS`
-- predict an image: `ForwardJob`, with a `Forecast` as the answer
-"""
+"""The image that an object would make, as plain arrays: no napari, no Qt."""
 
 from __future__ import annotations
 
@@ -50,7 +46,7 @@ class PhantomRecipe(BaseModel):
 
 
 _NEEDS = {
-    "proton": ("a magnetic field deflects particles: choose the setup 'particles' for this object"),
+    "proton": "a magnetic field deflects particles: choose the setup 'particles' for this object",
     "optical": "a plasma wave is probed by light: choose the setup 'light' for this object",
 }
 
@@ -104,15 +100,15 @@ class CoaxialRecipe(PhantomRecipe):
     rim: float = _metres(78e-6, "Outer conductor, outside", "Outer radius of the outer conductor.")
 
     def shadow(self, shape: tuple[int, int], setup: Any) -> BoolArray:
-        from napari_shadowinv.physics import phantoms
-
-        return phantoms.coaxial_line(shape, setup, self.peak, self._radii())[1]
+        return self._line(shape, setup)[1]
 
     def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
-        return phantoms.coaxial_line(shape, setup, self.peak, self._radii())[0]
+        return self._line(shape, setup)[0]
 
-    def _radii(self) -> tuple[float, float, float]:
-        return self.inner, self.outer, self.rim
+    def _line(self, shape: tuple[int, int], setup: Any) -> tuple[Phantom, BoolArray]:
+        from napari_shadowinv.physics.phantoms import coaxial_line
+
+        return coaxial_line(shape, setup, self.peak, (self.inner, self.outer, self.rim))
 
 
 class WakefieldRecipe(PhantomRecipe):

@@ -1,10 +1,4 @@
-"""Forms made from pydantic models: there is no second list of fields and defaults.
-
-- edit a model: `ModelForm`; one of several kinds of models: `ModelPicker`
-- choose one of several kinds of things, with other controls: `RowPicker`
-- their values as TOML files, as the command line reads them: `dump_toml`, `TomlButtons`
-- smaller parts: `labelled`, `with_button`, `section`, `wrapping_label`, `PathEdit`
-"""
+"""Forms made from pydantic models: there is no second list of fields and defaults."""
 
 from __future__ import annotations
 
@@ -13,17 +7,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
+from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
-from qtpy.QtWidgets import (
-    QFileDialog,
-    QFormLayout,
-    QLabel,
-    QLineEdit,
-    QPushButton,
-    QSizePolicy,
-    QToolButton,
-    QWidget,
-)
 from superqt import QCollapsible
 
 from napari_shadowinv._napari.widgets._fields import (
@@ -36,35 +21,40 @@ from napari_shadowinv._napari.widgets._qt import beside, column, notify_errors
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 
-# For each key the title to show, and what returns the model's class, if there is one: called
-# only when the kind is chosen, because some classes take a second to import.
-Kinds = dict[str, tuple[str, Callable[[], type[BaseModel]] | None]]
+# For each key the title to show, and the model's class, if there is one.
+Kinds = dict[str, tuple[str, type[BaseModel] | None]]
 
 PROBLEM_STYLE = "color: #d9822b;"
 _LABEL_WIDTH = 54
-_INDENT = 12
+INDENT = 12
 TOML = "TOML (*.toml)"
 # Of these optional fields only one may be given: checking one unchecks the other.
 _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
 
 
-def labelled(text: str, widget: QWidget) -> QWidget:
+def labelled(text: str, widget: QtWidgets.QWidget) -> QtWidgets.QWidget:
     """A widget with a label before it; all of them line up."""
-    label = QLabel(text)
+    label = QtWidgets.QLabel(text)
     label.setMinimumWidth(_LABEL_WIDTH)
     return beside((label, 0), (widget, 1))
 
 
-def with_button(widget: QWidget, text: str, tip: str, action: Callable[[], Any]) -> QWidget:
+def with_button(
+    widget: QtWidgets.QWidget, text: str, tip: str, action: Callable[[], Any]
+) -> QtWidgets.QWidget:
     """A widget with a small button on its right."""
-    button = QToolButton()
+    return beside((widget, 1), (small_button(text, tip, action), 0))
+
+
+def small_button(text: str, tip: str, action: Callable[[], Any]) -> QtWidgets.QToolButton:
+    button = QtWidgets.QToolButton()
     button.setText(text)
     button.setToolTip(tip)
     button.clicked.connect(lambda: action())
-    return beside((widget, 1), (button, 0))
+    return button
 
 
-def section(title: str, *widgets: QWidget) -> QCollapsible:
+def section(title: str, *widgets: QtWidgets.QWidget) -> QCollapsible:
     """Widgets under a title that folds them away; folded to begin with."""
     folded = QCollapsible(title, expandedIcon="▾", collapsedIcon="▸")
     folded.setDuration(0)
@@ -76,25 +66,25 @@ def section(title: str, *widgets: QWidget) -> QCollapsible:
     return folded
 
 
-def wrapping_label(text: str = "", style: str = "") -> QLabel:
+def wrapping_label(text: str = "", style: str = "") -> QtWidgets.QLabel:
     """Text that wraps at the width there is, instead of asking for more."""
-    label = QLabel(text)
+    label = QtWidgets.QLabel(text)
     label.setWordWrap(True)
     label.setMinimumWidth(0)
-    label.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Minimum)
+    label.setSizePolicy(QtWidgets.QSizePolicy.Policy.Ignored, QtWidgets.QSizePolicy.Policy.Minimum)
     label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
     label.setStyleSheet(style)
     label.setVisible(bool(text))
     return label
 
 
-class PathEdit(QWidget):
+class PathEdit(QtWidgets.QWidget):
     changed = Signal()
 
     def __init__(self, title: str, example: str = "path of a file") -> None:
         super().__init__()
         self._title = title
-        self.edit = QLineEdit()
+        self.edit = QtWidgets.QLineEdit()
         self.edit.setPlaceholderText(example)
         self.edit.setMinimumWidth(60)
         beside((with_button(self.edit, "…", title, self._choose), 0), holder=self)
@@ -106,7 +96,7 @@ class PathEdit(QWidget):
 
     def ask(self) -> str:
         """Let the user choose in a dialog; empty if he does not."""
-        path, _ = QFileDialog.getOpenFileName(self, self._title)
+        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, self._title)
         return str(path)
 
     def _choose(self) -> None:
@@ -116,12 +106,8 @@ class PathEdit(QWidget):
             self.changed.emit()
 
 
-class ModelForm(QWidget):
-    """Editors for all fields of a model, with titles, units and descriptions from it.
-
-    Fields that leave no choice (a Literal of one value) are not shown; optional ones start with
-    what `first` holds when they are first checked.
-    """
+class ModelForm(QtWidgets.QWidget):
+    """Editors for a model's fields; optional ones start with what `first` holds."""
 
     changed = Signal()
 
@@ -132,9 +118,9 @@ class ModelForm(QWidget):
         self._model_class = model_class
         self._fixed: dict[str, Any] = {}
         self.editors: dict[str, Editor] = {}
-        rows = QFormLayout()
+        rows = QtWidgets.QFormLayout()
         rows.setContentsMargins(0, 0, 0, 0)
-        rows.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
+        rows.setFieldGrowthPolicy(QtWidgets.QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
         whole = column(self)
         whole.addLayout(rows)
@@ -144,7 +130,7 @@ class ModelForm(QWidget):
                 continue
             editor = editor_for(field, (first or {}).get(name))
             title = field.title or name
-            label = QLabel(unit_of_title(title)[0] if editor.shows_unit else title)
+            label = QtWidgets.QLabel(unit_of_title(title)[0] if editor.shows_unit else title)
             for widget in (label, editor):
                 # As rich text, so that Qt breaks it into lines.
                 widget.setToolTip(f"<qt>{field.description}</qt>" if field.description else "")
@@ -213,14 +199,10 @@ class ModelForm(QWidget):
 
 def kinds_of(models: Mapping[str, Any], prefix: str = "") -> Kinds:
     """Kinds for a `ModelPicker`, from model classes that have a title."""
-
-    def returning(model: type[BaseModel]) -> Callable[[], type[BaseModel]]:
-        return lambda: model
-
-    return {name: (f"{prefix}{model.title}", returning(model)) for name, model in models.items()}
+    return {name: (f"{prefix}{model.title}", model) for name, model in models.items()}
 
 
-class ModelPicker(QWidget):
+class ModelPicker(QtWidgets.QWidget):
     """A choice between kinds of things, each with a form of its own or with none."""
 
     changed = Signal()
@@ -276,8 +258,8 @@ class ModelPicker(QWidget):
     def _form_of(self, kind: str) -> ModelForm | None:
         _, model_class = self._kinds[kind]
         if model_class is not None and kind not in self._forms:
-            form = ModelForm(model_class())
-            form.layout().setContentsMargins(_INDENT, 0, 0, 0)
+            form = ModelForm(model_class)
+            form.layout().setContentsMargins(INDENT, 0, 0, 0)
             form.setVisible(False)
             form.changed.connect(self.changed)
             self._forms[kind] = form
@@ -285,15 +267,14 @@ class ModelPicker(QWidget):
         return self._forms.get(kind)
 
 
-class RowPicker(QWidget):
-    """A choice between kinds of things, some with a control of their own in a row below.
-
-    Their owner connects the signals of these controls.
-    """
+class RowPicker(QtWidgets.QWidget):
+    """A choice between kinds of things, some with a control of their own in a row below."""
 
     changed = Signal()
 
-    def __init__(self, label: str, kinds: Kinds, tip: str, rows: Mapping[str, QWidget]) -> None:
+    def __init__(
+        self, label: str, kinds: Kinds, tip: str, rows: Mapping[str, QtWidgets.QWidget]
+    ) -> None:
         super().__init__()
         self.picker = ModelPicker(label, kinds)
         self.picker.choice.setToolTip(f"<qt>{tip}</qt>")
@@ -309,28 +290,24 @@ class RowPicker(QWidget):
 
 
 def dump_toml(values: dict[str, object], path: str | Path) -> Path:
-    """Write values as a TOML file, whole or not at all, and return its path.
-
-    A file that exists is replaced, for the dialog has asked. A name without a suffix gets
-    ``.toml``, which the dialog has not asked about: then an existing file is refused.
-    """
     import tomli_w
 
+    return save_text(tomli_w.dumps(values), path, ".toml")
+
+
+def save_text(text: str, name: str | Path, suffix: str) -> Path:
+    """Write a file; a name without suffix gets one, which no dialog asked to replace."""
     from napari_shadowinv.io import replacing
 
-    named = Path(path)
-    path = named if named.suffix else named.with_suffix(".toml")
+    named = Path(name)
+    path = named if named.suffix else named.with_suffix(suffix)
     with replacing(path, overwrite=path == named) as unfinished:
-        unfinished.write_text(tomli_w.dumps(values), encoding="utf-8")
+        unfinished.write_text(text, encoding="utf-8")
     return path
 
 
-class TomlButtons(QWidget):
-    """Load… and Save… beside each other.
-
-    `values` returns what is to be saved, `take` receives what was loaded and its path; both raise
-    an `InputError` for what cannot be used.
-    """
+class TomlButtons(QtWidgets.QWidget):
+    """Load… and Save…; `take` gets what was loaded and its path, `values` returns what to save."""
 
     def __init__(
         self,
@@ -340,8 +317,8 @@ class TomlButtons(QWidget):
     ) -> None:
         super().__init__()
         self._what, self._values, self._take = what, values, take
-        self.load_button = QPushButton("Load…")
-        self.save_button = QPushButton("Save…")
+        self.load_button = QtWidgets.QPushButton("Load…")
+        self.save_button = QtWidgets.QPushButton("Save…")
         self.load_button.setToolTip(f"Read {what} from a TOML file.")
         self.save_button.setToolTip(
             f"Write {what} to a TOML file, to reuse here or on the command line."
@@ -354,7 +331,7 @@ class TomlButtons(QWidget):
     def _load(self) -> None:
         from napari_shadowinv.io import read_toml
 
-        path, _ = QFileDialog.getOpenFileName(self, f"Load {self._what}", "", TOML)
+        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, f"Load {self._what}", "", TOML)
         if path:
             self._take(read_toml(path), path)
 
@@ -363,7 +340,7 @@ class TomlButtons(QWidget):
         values = self._values()
         if not values:
             raise InputError(f"there is no {self._what} to save: choose one first")
-        path, _ = QFileDialog.getSaveFileName(
+        path, _ = QtWidgets.QFileDialog.getSaveFileName(
             self, f"Save {self._what}", f"{self._what}.toml", TOML
         )
         if path:

@@ -1,9 +1,4 @@
-"""What an inversion is given, beside the shots.
-
-- the experiment's geometry: `SetupPicker`; the undisturbed beam: `SourcePicker`
-- how to invert: `OptionsForm`
-- all of these and the masks, as the widgets for shots and for stacks have them: `InversionInputs`
-"""
+"""What an inversion is given, beside the shots: source, masks, setup, steps and options."""
 
 from __future__ import annotations
 
@@ -15,36 +10,11 @@ from typing import Any
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QWidget
 
-from napari_shadowinv._napari.layer_metadata import (
-    CAME_WITH,
-    SOURCE,
-    keep_setup,
-    mark_of,
-    may_be_source,
-    result_of,
-    role_of,
-    setup_of,
-    setup_origin_of,
-    source_of,
-)
+from napari_shadowinv import preprocessing
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.shots import radiograph_of
-from napari_shadowinv._napari.widgets._forms import (
-    ModelForm,
-    ModelPicker,
-    PathEdit,
-    RowPicker,
-    TomlButtons,
-    kinds_of,
-    labelled,
-    wrapping_label,
-)
-from napari_shadowinv._napari.widgets._layers import (
-    LayerPicker,
-    MaskPicker,
-    crop_of,
-    image_of,
-    warnings_of,
-)
+from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._qt import column
 from napari_shadowinv._napari.widgets._recipes import RecipeButton
 from napari_shadowinv._napari.widgets._results import Origins
@@ -55,16 +25,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
 from napari_shadowinv.pipeline._run import PREVIEW_SITES
-from napari_shadowinv.preprocessing import (
-    ESTIMATES,
-    Crop,
-    Estimate,
-    MeasuredSource,
-    Radiograph,
-    Recipe,
-    Step,
-    check_masks,
-)
 
 _NONE = "none"
 _CHANGED = ", changed by hand"
@@ -79,13 +39,7 @@ class _Given:
 
 
 class SetupPicker(QWidget):
-    """No setup or one of a kind, with buttons for TOML files.
-
-    A setup belongs to an image: it is kept with the image's layer, and another image without
-    one starts with none. What the user has typed or loaded for one image is in the form when
-    he chooses its kind for the next, in the next session too; a line tells where
-    it comes from. What came with a file is never handed on.
-    """
+    """A setup, kept with its image; what the user typed or loaded is offered to the next image."""
 
     changed = Signal()
 
@@ -95,15 +49,15 @@ class SetupPicker(QWidget):
         self._name, self._keeps = "", True
         self._own: dict[str, _Given] = {}
         self._shown: dict[str, _Given] = {}
-        self.picker = ModelPicker(
-            "Setup", {_NONE: ("none: results in pixels", None), **kinds_of(SETUPS)}
+        self.picker = forms.ModelPicker(
+            "Setup", {_NONE: ("none: results in pixels", None), **forms.kinds_of(SETUPS)}
         )
         self.picker.choice.setToolTip(
             "<qt>With a setup the results are in SI units; lengths can be entered as 1.3 mm or "
             "0.0013.</qt>"
         )
-        self.note = wrapping_label()
-        self.files = TomlButtons("setup", self._to_save, self.load)
+        self.note = forms.wrapping_label()
+        self.files = forms.TomlButtons("setup", self._to_save, self.load)
         column(self, self.picker, self.note, self.files)
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
@@ -137,18 +91,15 @@ class SetupPicker(QWidget):
         self._show(_NONE)
 
     def follow(self, layer: Any, name: str = "", *, keep: bool = True) -> None:
-        """Show the setup of another image, or of images called so that are no layer.
-
-        With `keep`, what the user chooses from now on is kept with the layer.
-        """
+        """Show the setup of another image, or of files; with `keep`, changes stay with it."""
         if layer == self._layer and name == self._name:
             return
         # Files may be named after their setup is typed.
         stays = layer is None and self._layer is None and not self._name
         self._layer, self._name, self._keeps = layer, name, keep
-        setup = None if layer is None else setup_of(layer)
+        setup = None if layer is None else about.setup_of(layer)
         if setup is not None:
-            self.suggest(setup, setup_origin_of(layer) or f"{CAME_WITH} '{layer.name}'")
+            self.suggest(setup, about.setup_origin_of(layer) or f"{about.CAME_WITH} '{layer.name}'")
         elif not stays:
             self._show(_NONE)
             self.changed.emit()
@@ -194,7 +145,7 @@ class SetupPicker(QWidget):
     def _remember(self, kind: str, given: _Given) -> None:
         """Keep what is shown for other images, if it is the user's own."""
         self._shown[kind] = given
-        if not given.origin.startswith(CAME_WITH):
+        if not given.origin.startswith(about.CAME_WITH):
             self._own[kind] = given
 
     def _keep_with_image(self) -> None:
@@ -204,8 +155,10 @@ class SetupPicker(QWidget):
             setup = self.setup()
         except InputError:
             return  # half a setup: the image keeps the one it has
-        if setup != setup_of(self._layer) or self.origin != setup_origin_of(self._layer):
-            keep_setup(self._layer, setup, self.origin)
+        if setup != about.setup_of(self._layer) or self.origin != about.setup_origin_of(
+            self._layer
+        ):
+            about.keep_setup(self._layer, setup, self.origin)
 
     def _typed(self) -> str:
         name = self._name if self._layer is None else self._layer.name
@@ -232,17 +185,17 @@ class SetupPicker(QWidget):
         self.show_setup(values, f"loaded from {Path(path).name}{whom}")
 
 
-class SourcePicker(RowPicker):
+class SourcePicker(forms.RowPicker):
     """Uniform, a layer, a file, what came with the shot, or an estimate from it."""
 
     def __init__(self, viewer: Any) -> None:
         self._image: Any = None
         self._before_own = "uniform"
-        self._loaded = MeasuredSource()
+        self._loaded = preprocessing.MeasuredSource()
         tip = "Image layer of the undisturbed beam."
-        self.layers = LayerPicker(viewer, ("image",), tip, "choose a layer", self._offers)
-        self.file = PathEdit("Image of the undisturbed beam")
-        kinds = kinds_of(ESTIMATES, "estimate: ")
+        self.layers = layers.LayerPicker(viewer, ("image",), tip, "choose a layer", self._offers)
+        self.file = forms.PathEdit("Image of the undisturbed beam")
+        kinds = forms.kinds_of(preprocessing.ESTIMATES, "estimate: ")
         _, uniform = kinds.pop("uniform")
         super().__init__(
             "Source",
@@ -255,7 +208,7 @@ class SourcePicker(RowPicker):
             },
             "The beam without the object: ideally a measured reference image, otherwise uniform "
             "or estimated from the shot itself.",
-            {_LAYER: labelled("", self.layers), _FILE: labelled("", self.file)},
+            {_LAYER: forms.labelled("", self.layers), _FILE: forms.labelled("", self.file)},
         )
         self.layers.picked.connect(self.changed)
         self.file.changed.connect(self.changed)
@@ -263,7 +216,8 @@ class SourcePicker(RowPicker):
     @property
     def is_guessed(self) -> bool:
         """Whether it is an estimate from the shot, which a mask can keep from the object."""
-        return self.picker.kind in ESTIMATES and ESTIMATES[self.picker.kind].uses_mask
+        estimate = preprocessing.ESTIMATES.get(self.picker.kind)
+        return estimate is not None and estimate.uses_mask
 
     @property
     def is_own(self) -> bool:
@@ -280,25 +234,25 @@ class SourcePicker(RowPicker):
         if kind == _OWN:
             return "came with the shot"
         model = self.picker.model()
-        assert isinstance(model, Estimate)
+        assert isinstance(model, preprocessing.Estimate)
         return f"estimate: {model.described}" if self.is_guessed else model.described
 
-    def chosen(self) -> Estimate | MeasuredSource:
+    def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource:
         """What a recipe says of the source, or an `InputError`."""
         model = self.picker.model()
-        if isinstance(model, Estimate):
+        if isinstance(model, preprocessing.Estimate):
             return model
         if self.picker.kind != _FILE:
-            return MeasuredSource()
+            return preprocessing.MeasuredSource()
         if not self.file.path:
             raise InputError("no source file is selected: choose one, or choose another source")
         if self._loaded.file is not None and str(self._loaded.file) == self.file.path:
             return self._loaded  # the form has no name for what is in the file
-        return MeasuredSource(file=Path(self.file.path))
+        return preprocessing.MeasuredSource(file=Path(self.file.path))
 
     def show(self, source: Any) -> None:
         """Show the source of a recipe; None for uniform."""
-        if isinstance(source, Estimate):
+        if isinstance(source, preprocessing.Estimate):
             name = source.name()
             self.restore({"kind": name, "values": {name: source.values()}})
         elif source is None:
@@ -311,7 +265,7 @@ class SourcePicker(RowPicker):
             self.picker.set_kind(_FILE)
             self.changed.emit()
 
-    def measured(self, image_layer: Any) -> Radiograph | None:
+    def measured(self, image_layer: Any) -> preprocessing.Radiograph | None:
         """The measured source of an image layer unless it is a file, or an `InputError`."""
         kind = self.picker.kind
         if kind == _LAYER:
@@ -320,10 +274,12 @@ class SourcePicker(RowPicker):
                     "no source layer is selected: choose one below 'a layer', or choose another "
                     "source"
                 )
-            beam = radiograph_of(self.layers.layer, image_of(self.layers.layer, "source image"))
-            return replace(beam, warnings=warnings_of(self.layers.layer))
+            beam = radiograph_of(
+                self.layers.layer, layers.image_of(self.layers.layer, "source image")
+            )
+            return replace(beam, warnings=layers.warnings_of(self.layers.layer))
         if kind == _OWN:
-            own = source_of(image_layer)
+            own = about.source_of(image_layer)
             if own is None:
                 raise InputError(
                     f"'{image_layer.name}' has no source of its own: choose another kind of source"
@@ -334,9 +290,9 @@ class SourcePicker(RowPicker):
     def check(self, mask: BoolArray | None) -> None:
         """Refuse a mask over what the chosen layer was estimated without: the object."""
         layer = self.layers.layer if self.picker.kind == _LAYER else None
-        bare = None if layer is None else mark_of(layer).get("source_mask")
+        bare = None if layer is None else about.mark_of(layer).get("source_mask")
         if bare is not None and mask is not None and bare.shape == mask.shape:
-            check_masks(mask, bare)
+            preprocessing.check_masks(mask, bare)
 
     def state(self) -> dict[str, Any]:
         """What is kept: layers and files belong to a session."""
@@ -351,7 +307,7 @@ class SourcePicker(RowPicker):
         """Take the source that came with an image, or leave that of another image."""
         self._image = image_layer
         self.layers.fill()
-        if image_layer is not None and source_of(image_layer) is not None:
+        if image_layer is not None and about.source_of(image_layer) is not None:
             if self.picker.kind != _OWN:
                 self._before_own = self.picker.kind
             self.picker.set_kind(_OWN)
@@ -360,7 +316,7 @@ class SourcePicker(RowPicker):
 
     def _offers(self, layer: Any) -> bool:
         # An image is not its own source: it would differ from it nowhere.
-        return layer != self._image and may_be_source(layer)
+        return layer != self._image and about.may_be_source(layer)
 
     def _on_kind(self) -> None:
         if self.picker.kind == _LAYER and self.layers.layer is None:
@@ -368,25 +324,21 @@ class SourcePicker(RowPicker):
         super()._on_kind()
 
     def _only_source(self) -> Any | None:
-        """The layer that is known to be a source and fits the image, if there is just one.
-
-        The source of a result does not count: it is what some other run made of one.
-        """
+        """The one layer, no result's, that is known to be a source and fits the image, or None."""
         shape = None if self._image is None else tuple(self._image.data.shape[-2:])
         known = [
             layer
             for layer in self.layers.offered
-            if role_of(layer) == SOURCE
-            and result_of(layer) is None
-            and tuple(layer.data.shape[-2:]) == shape
+            if about.role_of(layer) == about.SOURCE and about.result_of(layer) is None
         ]
-        return known[0] if len(known) == 1 else None
+        fitting = [layer for layer in known if tuple(layer.data.shape[-2:]) == shape]
+        return fitting[0] if len(fitting) == 1 else None
 
 
-class OptionsForm(ModelForm):
+class OptionsForm(forms.ModelForm):
     def __init__(self) -> None:
         super().__init__(InversionOptions, first={"n_sites": PREVIEW_SITES})
-        self.files = TomlButtons("options", self._to_save, self._take)
+        self.files = forms.TomlButtons("options", self._to_save, self._take)
         self.layout().addWidget(self.files)
 
     def _to_save(self) -> dict[str, object]:
@@ -405,25 +357,23 @@ class InversionInputs:
     crop: Any = None  # a picker, where a rectangle can be drawn
 
     def make_inputs(
-        self, viewer: Any, image: Callable[[], Any], kinds: tuple[str, ...], tips: tuple[str, str]
+        self, image: Callable[[], Any], kinds: tuple[str, ...], mask_tip: str, source_mask_tip: str
     ) -> None:
-        """Make them; masks are layers of these kinds for the image, with a tooltip each."""
-        self.source = SourcePicker(viewer)
-        self.masks = MaskPicker(viewer, image, kinds, tips[0])
-        self.source_masks = MaskPicker(viewer, image, kinds, tips[1], "Source mask")
+        """Make them, in rows `beam` and `how`; masks are layers of these kinds for the image."""
+        self.source = SourcePicker(self.viewer)
+        self.masks = layers.MaskPicker(self.viewer, image, kinds, mask_tip)
+        self.source_masks = layers.MaskPicker(
+            self.viewer, image, kinds, source_mask_tip, "Source mask"
+        )
         self.setup = SetupPicker()
         self.steps = StepsSection()
         self.options = OptionsForm()
         self.recipes = RecipeButton(self)
         self.chosen_image = image
-        self.inputs = (
-            self.source,
-            self.source_masks,
-            self.masks,
-            self.setup,
-            self.steps,
-            self.options,
-        )
+        self.beam = (self.source, self.source_masks, self.masks)
+        options = forms.section("Options", self.options)
+        self.how = (self.setup, self.steps, options, self.recipes)
+        self.inputs = (*self.beam, self.setup, self.steps, self.options)
         self.source.changed.connect(self._show_source_mask)
         self._show_source_mask()
 
@@ -440,22 +390,22 @@ class InversionInputs:
             "painted_is_object": self.source_masks,
         }
 
-    def all_steps(self) -> tuple[Step, ...]:
+    def all_steps(self) -> tuple[preprocessing.Step, ...]:
         """What is done to an image first; or an `InputError`."""
-        part = None if self.crop is None else crop_of(self.crop.layer, self.chosen_image())
+        part = None if self.crop is None else layers.crop_of(self.crop.layer, self.chosen_image())
         if part is None:
             return self.steps.steps()
         rows, columns = part
-        crop = Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
+        crop = preprocessing.Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
         return (crop, *self.steps.steps())
 
     def hidden_from_source(self, image: Any) -> BoolArray | None:
         """False where the object is, as far as the source is estimated without it."""
         return self.source_masks.usable(image) if self.source.is_guessed else None
 
-    def recipe(self) -> Recipe:
+    def recipe(self) -> preprocessing.Recipe:
         """What the controls ask for, but for masks and layers; or an `InputError`."""
-        return Recipe(
+        return preprocessing.Recipe(
             steps=self.all_steps(),
             source=self.source.chosen(),
             setup=self.setup.setup(),
@@ -464,8 +414,8 @@ class InversionInputs:
 
     def companions(self, image: Any, *others: Any) -> tuple[Any, ...]:
         """Layers that lie on an image: masks and source, and others if there are any."""
-        layers = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
-        return tuple(one for one in layers if one is not None and one is not image)
+        chosen = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
+        return tuple(one for one in chosen if one is not None and one is not image)
 
     def origins(self, layer: Any, name: str) -> Origins:
         """Where all of it comes from, for an image or the images of that name."""

@@ -1,11 +1,4 @@
-"""Layers: which ones a widget works on, what is in them, new ones to draw on.
-
-- choose one: `LayerPicker`; one that marks pixels: `MaskPicker`; hear of what is painted, drawn or
-  replaced in them: `LayerWatch`
-- arrays from layers: `image_of`, `stack_of`, `shown_plane`, `mask_of`, `crop_of`
-- what a layer is: `kind_of`; what speaks against an image: `warnings_of`
-- a new layer that lies on an image: `new_mask`, `new_shapes`
-"""
+"""Layers: which ones a widget works on, what is in them, new ones to draw on."""
 
 from __future__ import annotations
 
@@ -16,15 +9,8 @@ import numpy as np
 from qtpy.QtCore import QObject, QSignalBlocker, Signal
 from qtpy.QtWidgets import QCheckBox, QWidget
 
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.layer_metadata import (
-    MASK,
-    mark,
-    mark_of,
-    may_be_mask,
-    may_be_shot,
-    role_of,
-)
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import labelled, with_button
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_alive
@@ -102,7 +88,7 @@ def _grey(layer: Any | None, role: str) -> Any:
 
 def warnings_of(layer: Any) -> tuple[str, ...]:
     """What the reader of a grey image said against it, or that it looks like scanned film."""
-    known = mark_of(layer)
+    known = about.mark_of(layer)
     path = str(layer.source.path or "").lower()
     if known or not path.endswith(tuple(SCAN_SUFFIXES)) or not isinstance(layer.data, np.ndarray):
         return tuple(known.get("warnings", ()))
@@ -110,10 +96,7 @@ def warnings_of(layer: Any) -> tuple[str, ...]:
 
 
 def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArray | None:
-    """Usable pixels of an image, or of each of a stack, from labels or shapes drawn on it.
-
-    None if nothing is painted. For files, whose shape is not known yet, `image` is None.
-    """
+    """Usable pixels of an image (None for files) by labels or shapes; None if all are."""
     if layer is None:
         return None
     shape = None if image is None else tuple(_grey(image, "image").shape[-2:])
@@ -133,10 +116,7 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArr
 
 
 def crop_of(layer: Any | None, image: Any) -> tuple[slice, slice] | None:
-    """Rows and columns of an image whose centres are within a drawn rectangle.
-
-    Of several shapes the selected one counts, else the last; None if there is none.
-    """
+    """Rows and columns of an image in the selected, or else the last, of the drawn shapes."""
     if layer is None or not len(layer.data):
         return None
     chosen = max(layer.selected_data, default=len(layer.data) - 1)
@@ -177,7 +157,7 @@ def new_mask(viewer: Any, image: Any, title: str, painted: BoolArray | None = No
         shape = (stack_of(image) if is_stack else image_of(image)).shape[-2:]
         labels = _added(viewer, image, "labels", np.zeros(shape, np.uint8), title)
         labels.mode = "paint"
-    labels.metadata = mark(MASK, "")
+    labels.metadata = about.mark(about.MASK, "")
     return labels
 
 
@@ -212,10 +192,7 @@ def _added(viewer: Any, image: Any, kind: str, data: Any, title: str, **keywords
 
 
 class LayerPicker(SteadyComboBox):
-    """A combo box of the viewer's layers of some kinds that suit.
-
-    `none` is what to show for no layer; without it the latest layer is chosen.
-    """
+    """A combo box of layers; `none` stands for no layer, without it the latest is chosen."""
 
     picked = Signal()
 
@@ -229,7 +206,7 @@ class LayerPicker(SteadyComboBox):
     ) -> None:
         super().__init__()
         self._viewer, self._kinds, self._none, self._suits = viewer, kinds, none, suits
-        self._offered: list[Any] = []
+        self.offered: list[Any] = []
         self.setToolTip(tip)
         self.fill()
         self.currentIndexChanged.connect(lambda _: self.picked.emit())
@@ -242,21 +219,17 @@ class LayerPicker(SteadyComboBox):
     @property
     def layer(self) -> Any | None:
         index = self.currentIndex() - bool(self._none)
-        return self._offered[index] if 0 <= index < len(self._offered) else None
+        return self.offered[index] if 0 <= index < len(self.offered) else None
 
     @layer.setter
     def layer(self, layer: Any | None) -> None:
         if layer is None:
             self.setCurrentIndex(0 if self._none else -1)
-        elif layer in self._offered:
-            self.setCurrentIndex(self._offered.index(layer) + bool(self._none))
+        elif layer in self.offered:
+            self.setCurrentIndex(self.offered.index(layer) + bool(self._none))
 
     def _on_insertion(self, event: Any) -> None:
         while_alive(self, event.value.events.name, self.fill)
-
-    @property
-    def offered(self) -> list[Any]:
-        return list(self._offered)
 
     def fill(self, event: Any = None) -> None:
         """Offer what the viewer has now; what is chosen stays while it is there."""
@@ -268,7 +241,7 @@ class LayerPicker(SteadyComboBox):
         ]
         with QSignalBlocker(self):
             self.clear()
-            self._offered = offered
+            self.offered = offered
             if self._none:
                 self.addItem(self._none)
             for layer in offered:
@@ -283,14 +256,13 @@ class LayerPicker(SteadyComboBox):
 
 def shot_picker(viewer: Any) -> LayerPicker:
     """A picker of the layer that is a shot."""
-    return LayerPicker(viewer, ("image",), "The shot: a greyscale image layer.", suits=may_be_shot)
+    return LayerPicker(
+        viewer, ("image",), "The shot: a greyscale image layer.", suits=about.may_be_shot
+    )
 
 
 class MaskPicker(QWidget):
-    """A layer that is painted on, and what the paint means.
-
-    `image` returns the image layer that a new mask is for; names of new layers end with `title`.
-    """
+    """A layer that is painted on, and what the paint means; it is for what `image` returns."""
 
     picked = Signal()
     changed = Signal()
@@ -305,7 +277,7 @@ class MaskPicker(QWidget):
     ) -> None:
         super().__init__()
         self._viewer, self._image, self.title = viewer, image, title
-        self.layers = LayerPicker(viewer, kinds, f"<qt>{tip}</qt>", "none", may_be_mask)
+        self.layers = LayerPicker(viewer, kinds, f"<qt>{tip}</qt>", "none", about.may_be_mask)
         self.painted_is_unusable = QCheckBox("painted = unusable")
         self.painted_is_unusable.setChecked(True)
         self.painted_is_unusable.setToolTip(
@@ -343,9 +315,13 @@ class MaskPicker(QWidget):
 
     def follow(self, image: Any) -> None:
         """Choose the mask that came with an image's file, if one did."""
-        path = mark_of(image).get("path")
+        path = about.mark_of(image).get("path")
         for layer in self._viewer.layers:
-            if path and role_of(layer) == MASK and mark_of(layer).get("path") == path:
+            if (
+                path
+                and about.role_of(layer) == about.MASK
+                and about.mark_of(layer).get("path") == path
+            ):
                 self.layer = layer
                 self.painted_is_unusable.setChecked(True)
 

@@ -1,9 +1,4 @@
-"""The frame of a widget: controls in a column, the run button, progress, the report.
-
-- a widget that runs on a button: `ToolPanel`; also on every change: `LivePanel`
-- start, cancel and watch: `RunPanel`
-- how an inversion went: `ReportTable`, `report_rows`
-"""
+"""The frame of a widget: controls in a column, the run button, progress, the report."""
 
 from __future__ import annotations
 
@@ -12,33 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from napari.utils import progress as activity
+from qtpy import QtWidgets
 from qtpy.QtCore import QSize, Qt
-from qtpy.QtWidgets import (
-    QAbstractItemView,
-    QCheckBox,
-    QFrame,
-    QHeaderView,
-    QProgressBar,
-    QPushButton,
-    QScrollArea,
-    QSizePolicy,
-    QTableWidget,
-    QTableWidgetItem,
-    QWidget,
-)
 
+from napari_shadowinv._napari.notifications import MISTAKES
+from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, wrapping_label
-from napari_shadowinv._napari.widgets._qt import (
-    MISTAKES,
-    Docked,
-    StateKeeper,
-    column,
-    error_text,
-    notify_errors,
-    tell_error,
-    timer,
-    when_destroyed,
-)
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv._system.progress import Progress
@@ -87,39 +61,36 @@ class _Activity:
             self._bar = None
 
 
-class RunPanel(QWidget):
-    """A button that runs and cancels, with a progress bar and a line of text.
+class RunPanel(QtWidgets.QWidget):
+    """A button that runs and cancels, with a progress bar and a line of text."""
 
-    Whatever changes beside the canvas makes the whole window be drawn anew. Without a graphics
-    card, an animated bar thus takes the processor that the work needs: the bar stands still
-    between two looks, and napari's activity dock, which is animated, is used only while the
-    panel cannot be seen.
-    """
+    # A change beside the canvas redraws the whole window. Without a graphics card, an animated bar
+    # takes the processor that the work needs: the bar stands still between two looks, and napari's
+    # animated activity dock is used only while the panel cannot be seen.
 
     def __init__(self, what: str, run_text: str, run_tip: str, **keywords: float) -> None:
         super().__init__()
         self._what, self._run_text = what, run_text
         self.runner = Runner(self, **keywords)
-        self.button = QPushButton(run_text)
+        self.button = QtWidgets.QPushButton(run_text)
         self.button.setToolTip(run_tip)
-        self.bar = QProgressBar()
+        self.bar = QtWidgets.QProgressBar()
         self.bar.setTextVisible(False)
         self.bar.setFixedHeight(8)
         self.bar.setVisible(False)
         # Nothing of napari's or of the system's style animates a bar that has a range.
         self.bar.setRange(0, 1)
         self.status = wrapping_label()
-        column(self, self.button, self.bar, self.status)
+        qt.column(self, self.button, self.bar, self.status)
         self._activity = _Activity()
-        self._quiet = False
-        self._said = ("", False)
+        self._quiet, self._said = False, ("", False)
         self._news: Progress | None = None
         self._start = 0.0
-        self._looking = timer(self, _LOOK_EVERY, self._look)
+        self._looking = qt.timer(self, _LOOK_EVERY, self._look)
         self.runner.started.connect(self._on_start)
         self.runner.progressed.connect(self._on_progress)
         self.runner.ended.connect(self._on_end)
-        when_destroyed(self, self._activity.close)
+        qt.when_destroyed(self, self._activity.close)
 
     def run(self, work: Work, tag: object = None, *, quiet: bool = False) -> None:
         """Begin some work; if quiet, it neither shows its progress nor sends notifications."""
@@ -144,8 +115,8 @@ class RunPanel(QWidget):
 
     def refuse(self, error: BaseException) -> None:
         """Tell a mistake of the user's; it stands here when the notification is gone."""
-        tell_error(error)
-        self.say(error_text(error), problem=True)
+        qt.tell_error(error)
+        self.say(qt.error_text(error), problem=True)
 
     def _on_start(self) -> None:
         if self._quiet:
@@ -187,14 +158,14 @@ class RunPanel(QWidget):
         if outcome.error is None:
             return
         # A notification is gone after seconds: what is wrong stays here until the next run.
-        self.say(error_text(outcome.error), problem=True)
-        if not outcome.is_mistake:
+        self.say(qt.error_text(outcome.error), problem=True)
+        if not isinstance(outcome.error, MISTAKES):
             from napari.utils.notifications import notification_manager
 
             error = outcome.error
             notification_manager.receive_error(type(error), error, error.__traceback__)
         elif not self._quiet:
-            tell_error(outcome.error)
+            qt.tell_error(outcome.error)
 
 
 def report_rows(inversion: Inversion) -> list[tuple[str, str]]:
@@ -214,29 +185,29 @@ def report_rows(inversion: Inversion) -> list[tuple[str, str]]:
     ]
 
 
-class ReportTable(QTableWidget):
+class ReportTable(QtWidgets.QTableWidget):
     """Rows of names and values, as high as they need."""
 
     def __init__(self) -> None:
         super().__init__(0, 2)
         self.horizontalHeader().setVisible(False)
         self.verticalHeader().setVisible(False)
-        self.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
+        self.setEditTriggers(QtWidgets.QAbstractItemView.EditTrigger.NoEditTriggers)
         self.setShowGrid(False)
         self.setWordWrap(True)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
+        self.setSizePolicy(QtWidgets.QSizePolicy.Policy.Ignored, QtWidgets.QSizePolicy.Policy.Fixed)
         header = self.horizontalHeader()
-        header.setSectionResizeMode(0, QHeaderView.ResizeMode.ResizeToContents)
-        header.setSectionResizeMode(1, QHeaderView.ResizeMode.Stretch)
+        header.setSectionResizeMode(0, QtWidgets.QHeaderView.ResizeMode.ResizeToContents)
+        header.setSectionResizeMode(1, QtWidgets.QHeaderView.ResizeMode.Stretch)
         self.setVisible(False)
 
     def show_rows(self, rows: list[tuple[str, str]]) -> None:
         self.setRowCount(len(rows))
         for row, texts in enumerate(rows):
             for place, text in enumerate(texts):
-                item = QTableWidgetItem(text)
+                item = QtWidgets.QTableWidgetItem(text)
                 item.setTextAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignTop)
                 item.setToolTip(text)
                 self.setItem(row, place, item)
@@ -260,29 +231,28 @@ class ReportTable(QTableWidget):
         self.setFixedHeight(self.verticalHeader().length() + 2 * self.frameWidth())
 
 
-class ToolPanel(Docked):
-    """A column of controls that scrolls where the window is low, never sideways.
-
-    Its button runs what `request` describes; a subclass says what that is and shows the result.
-    """
+class ToolPanel(qt.Docked):
+    """A column of controls that scrolls down only; its button runs what `request` describes."""
 
     def __init__(self, viewer: Any, name: str, panel: RunPanel) -> None:
         super().__init__()
         self.viewer, self.panel = viewer, panel
         self._ready = False
         self._running_preview = False
-        content = QWidget()
-        self.column = column(content, margin=6)
+        content = QtWidgets.QWidget()
+        self.column = qt.column(content, margin=6)
         self.column.setAlignment(Qt.AlignmentFlag.AlignTop)
-        self.area = QScrollArea()
+        self.area = QtWidgets.QScrollArea()
         self.area.setWidgetResizable(True)
-        self.area.setFrameShape(QFrame.Shape.NoFrame)
+        self.area.setFrameShape(QtWidgets.QFrame.Shape.NoFrame)
         self.area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.area.setWidget(content)
-        column(self, self.area)
+        qt.column(self, self.area)
         self.setMinimumWidth(WIDTH)
-        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
-        self._keeper = StateKeeper(self, name, self.state)
+        self.setSizePolicy(
+            QtWidgets.QSizePolicy.Policy.Preferred, QtWidgets.QSizePolicy.Policy.Expanding
+        )
+        self._keeper = qt.StateKeeper(self, name, self.state)
         panel.button.clicked.connect(lambda: self._run_or_cancel())
         panel.runner.ended.connect(self._on_end)
 
@@ -292,6 +262,10 @@ class ToolPanel(Docked):
     def show_problem(self, text: str) -> None:
         """Show what is wrong, where it can be read until the next run."""
         self.panel.say(text, problem=True)
+
+    def add(self, *rows: QtWidgets.QWidget) -> None:
+        for row in rows:
+            self.column.addWidget(row)
 
     # What is kept between sessions, made of what JSON knows
 
@@ -345,26 +319,22 @@ class ToolPanel(Docked):
         self._running_preview = False
         self.panel.run(request.run, request)
 
-    @notify_errors
+    @qt.notify_errors
     def _on_end(self, outcome: Outcome) -> None:
         if outcome.value is not None:
             self.show_result(outcome.value, outcome.tag)
 
 
 class LivePanel(ToolPanel):
-    """Runs on its button, and with a preview on every change.
-
-    At most one run is under way and one, the latest, waits. A preview gives way to the
-    next and to the button; a run that the button began is not disturbed by previews.
-    """
+    """A panel that also shows a preview after each change; a run of its button goes before."""
 
     def __init__(self, viewer: Any, name: str, panel: RunPanel) -> None:
         super().__init__(viewer, name, panel)
-        self.live = QCheckBox("Live preview")
+        self.live = QtWidgets.QCheckBox("Live preview")
         self.previewed = ResultLayers(viewer, self)
         self._last = LastResults(viewer, self)
         self.keep_earlier = self._last.keep_earlier
-        self._settle = timer(self, _SETTLE, self._preview, once=True)
+        self._settle = qt.timer(self, _SETTLE, self._preview, once=True)
         self.live.toggled.connect(self.on_change)
 
     def request(self, preview: bool = False) -> Any:

@@ -1,10 +1,4 @@
-"""What all widgets need of Qt and napari.
-
-- lay out: `column`, `beside`; do something later, or again and again: `timer`
-- until a Qt object is gone: `when_destroyed`, `while_alive`
-- one sentence in napari's notifications, no traceback: `tell_error`, `notify_errors`
-- share the place of other docks: `Docked`; remember between sessions: `StateKeeper`
-"""
+"""What all widgets need of Qt and napari."""
 
 from __future__ import annotations
 
@@ -18,13 +12,9 @@ from napari.utils.notifications import show_error
 from qtpy.QtCore import QObject, QSettings, Qt, QTimer
 from qtpy.QtWidgets import QDockWidget, QHBoxLayout, QMainWindow, QVBoxLayout, QWidget
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv._napari.notifications import MISTAKES
 
 Method = TypeVar("Method", bound=Callable[..., Any])
-
-# A user's mistake, a file system that refuses, or no memory; all else is a fault of the
-# program's, whose traceback somebody needs.
-MISTAKES = (InputError, OSError, MemoryError)
 
 _WRITE_AFTER = 300  # ms; a slider on the move is not worth writing
 # napari's own docks, which users expect to see beside a plugin's.
@@ -102,10 +92,7 @@ def tell_error(error: BaseException | str) -> None:
 
 
 def notify_errors(method: Method) -> Method:
-    """Turn a user's mistake in a widget's method into one notification.
-
-    The widget, or the first around it that can, also shows it: with a method `show_problem`.
-    """
+    """Turn a mistake into one notification; the nearest widget with `show_problem` shows it."""
 
     @functools.wraps(method)
     def told(*args: Any, **kwargs: Any) -> Any:
@@ -124,10 +111,7 @@ def notify_errors(method: Method) -> Method:
 
 
 class Docked(QWidget):
-    """A widget that joins the docks on its side of the window as a tab when it opens.
-
-    napari puts a second dock below the first, where neither of them has room.
-    """
+    """A widget that joins the docks on its side as a tab; napari would squeeze it below them."""
 
     _has_place = False
 

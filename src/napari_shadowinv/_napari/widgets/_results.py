@@ -1,10 +1,4 @@
-"""Results as layers that stay where they are when the next result comes.
-
-- place an image and what belongs to it by a setup: `place_together`; a result: `result_frame`
-- show a result in layers of its own: `ResultLayers`; in those of the last result of the same
-  shot: `LastResults`
-- where the parts of a result come from: `Origins`
-"""
+"""Results as layers that stay where they are when the next result comes."""
 
 from __future__ import annotations
 
@@ -39,11 +33,8 @@ def result_frame(image: Any, recipe: Recipe) -> Frame:
 
 
 def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> None:
-    """Give an image the pixel size of its setup, and what lies on it, too; the camera follows.
-
-    Source, mask and crop that lie as the image does go with it, and so do other images of its
-    size: pixels and lengths side by side would make napari warn at each layer.
-    """
+    """Give an image, and what lies on it, the setup's pixels; the camera follows."""
+    # Pixels and lengths side by side would make napari warn at each layer.
     before = frame_of(image)
     others = [
         layer
@@ -86,12 +77,8 @@ class ResultLayers(QObject):
         return bool(self._timer.isActive())
 
     def show(self, described: Sequence[FullLayerData], *, select: bool = True) -> None:
-        """Replace the data of the layers, the lowest first; add those that are not there.
-
-        Adding a layer takes napari some tenths of a second, so they are added one by one
-        while the window stays alive: what is visible first, the hidden ones below and between
-        afterwards. They are selected unless the user goes on painting where he was.
-        """
+        """Replace the data of the layers, the lowest first; add those that are not there."""
+        # Adding a layer takes napari some tenths of a second: one by one, the window stays alive.
         self._select = select
         self._before = self._viewer.layers.selection.active
         here = self.layers
@@ -222,11 +209,8 @@ def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:
     rotate = np.asarray(keywords.get("rotate", upright.rotate))[-2:, -2:]
     shear = np.ravel(keywords.get("shear", upright.shear))[-1]
     affine = np.asarray(keywords.get("affine", upright.affine))[-3:, -3:]
-    return (
-        np.allclose(now.rotate, rotate)
-        and np.allclose(now.shear, shear)
-        and np.allclose(now.affine, affine)
-    )
+    pairs = ((now.rotate, rotate), (now.shear, shear), (now.affine, affine))
+    return all(np.allclose(one, other) for one, other in pairs)
 
 
 def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
@@ -240,16 +224,11 @@ def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
     if tuple(str(unit) for unit in layer.units) != tuple(keywords["units"]):
         layer.units = keywords["units"]
     limits = keywords.get("contrast_limits")
-    if limits is not None and _differ(layer.contrast_limits, limits):
-        layer.contrast_limits = limits
+    if limits is not None:
+        # Only a difference that can be seen: to set limits takes as long as data.
+        least = _VISIBLE * np.ptp(limits)
+        if not np.allclose(layer.contrast_limits, limits, rtol=0, atol=least):
+            layer.contrast_limits = limits
     for name in ("features", "length", "edge_width"):
         if name in keywords and kind_of(layer) == "vectors":
             setattr(layer, name, keywords[name])
-
-
-def _differ(shown: Sequence[float], limits: Sequence[float]) -> bool:
-    """Whether limits are so different that it can be seen: to set them takes as long as data."""
-    low, high = limits
-    return any(
-        abs(one - other) > _VISIBLE * (high - low) for one, other in zip(shown, limits, strict=True)
-    )

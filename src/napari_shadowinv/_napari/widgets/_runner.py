@@ -1,9 +1,7 @@
-"""Long work beside a responsive window: `Runner`, `Outcome`.
+"""Long work beside a responsive window: `Runner`, `Outcome`."""
 
-The thread talks to nobody: it leaves progress and outcome in a letter box that a timer of
-the window looks into. So no signal crosses threads, a closed window can be reached by
-nothing, and it is the same with every Qt binding.
-"""
+# The thread leaves progress and outcome in a letter box that a timer of the window looks into:
+# no signal crosses threads, nothing reaches a closed window, and all Qt bindings behave alike.
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ from typing import Any
 
 from qtpy.QtCore import QObject, Signal
 
-from napari_shadowinv._napari.widgets._qt import MISTAKES, timer, when_destroyed
+from napari_shadowinv._napari.widgets._qt import timer, when_destroyed
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InversionCancelled
 
@@ -38,11 +36,6 @@ class Outcome:
     cancelled: bool = False
     tag: Any = None
 
-    @property
-    def is_mistake(self) -> bool:
-        """Whether it ended by a mistake of the user's, not one of the program's."""
-        return isinstance(self.error, MISTAKES)
-
 
 @dataclass
 class _LetterBox:
@@ -54,11 +47,7 @@ class _LetterBox:
 
 
 class Runner(QObject):
-    """Runs one piece of work at a time in a thread of its own.
-
-    Work that was cancelled has `patience` seconds to stop. After that it counts as cancelled,
-    nobody listens to it any more, and its thread ends where it next asks whether to stop.
-    """
+    """One piece of work at a time in a thread; it has `patience` (s) to stop when cancelled."""
 
     started = Signal()
     progressed = Signal(object)
@@ -131,11 +120,9 @@ class Runner(QObject):
 
 
 class _Courtesy:
-    """While entered, a thread hands over the interpreter after 1 ms instead of 5.
+    """While entered, a thread hands over the interpreter after 1 ms instead of 5."""
 
-    The kernels run without the interpreter, but what is between them does not, and one event
-    of the window may have to ask for it a dozen times.
-    """
+    # Only the kernels do without it, and a window's event may ask for it a dozen times.
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -1,13 +1,9 @@
-"""A run over many shots.
-
-- what to do: `StackJob`; what has come of it so far, for the window to look at: `RunBooks`
-- a run and the layers over its store: `StackRequest`; where they lie: `place_on`
-"""
+"""A run over many shots, and the layers over its store."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +49,7 @@ class RunBooks:
 
 @dataclass(frozen=True, eq=False)
 class StackJob:
-    """Many shots to invert into a store; what is not told here, see `stack.run_stack`."""
+    """Many shots to invert into a store: the arguments of `stack.run_stack`, and its books."""
 
     shots: Any  # an array (shot, y, x), also a lazy one, or files
     out: Path
@@ -73,11 +69,7 @@ class StackJob:
         should_stop: ShouldStop,
         on_done: Callable[[int | None], None] = lambda _: None,
     ) -> RunBooks:
-        """Invert all shots that are not done yet.
-
-        `on_done` is called before it is told that there are finished shots, with the one that has
-        just ended well, if any.
-        """
+        """Invert what is not done; `on_done` gets a shot that ended well before the window does."""
         from napari_shadowinv.stack import run_stack
 
         def tell(news: RunProgress) -> None:
@@ -95,20 +87,8 @@ class StackJob:
             on_progress(Progress("shots", step, news.total, self.books.text))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
-        run_stack(
-            self.shots,
-            self.out,
-            recipe=self.recipe,
-            source=self.source,
-            mask=self.mask,
-            source_mask=self.source_mask,
-            scheduler=self.scheduler,
-            workers=self.workers,
-            overwrite=self.overwrite,
-            redo_failed=self.redo_failed,
-            on_progress=tell,
-            should_stop=should_stop,
-        )
+        told = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "books"}
+        run_stack(**told, on_progress=tell, should_stop=should_stop)
         return self.books
 
     def _recall(self) -> None:
@@ -144,10 +124,7 @@ class StackRequest:
         return self.job.run(on_progress, should_stop, self._look)
 
     def follow(self, layers: Sequence[Any]) -> None:
-        """Let the colours of layers reach to the strongest shot so far.
-
-        Where the user has chosen other contrast limits, they stay.
-        """
+        """Let layers whose limits the user left alone reach to the strongest shot so far."""
         for layer in filter(_is_image, layers):
             role = str(role_of(layer))
             if role not in self._limits:

@@ -6,24 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
-from qtpy.QtWidgets import QSizePolicy, QToolButton, QWidget
+from qtpy.QtWidgets import QSizePolicy, QWidget
 
+from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
-from napari_shadowinv._napari.widgets._forms import ModelForm, labelled, section
 from napari_shadowinv._napari.widgets._qt import beside, column
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import STEPS, Step
-
-_INDENT = 12
-
-
-def _small_button(text: str, tip: str, action: Callable[[], Any]) -> QToolButton:
-    button = QToolButton()
-    button.setText(text)
-    button.setToolTip(tip)
-    button.setAutoRaise(True)
-    button.clicked.connect(lambda: action())
-    return button
 
 
 class StepForm(QWidget):
@@ -34,14 +23,16 @@ class StepForm(QWidget):
     def __init__(self, kind: type[Step], move: Callable[..., None]) -> None:
         super().__init__()
         self.kind = kind
-        self.form = ModelForm(kind)
-        self.form.layout().setContentsMargins(_INDENT, 0, 0, 0)
-        self.title = _small_button("", "Show or hide the parameters.", self._unfold_or_fold)
+        self.form = forms.ModelForm(kind)
+        self.form.layout().setContentsMargins(forms.INDENT, 0, 0, 0)
+        self.title = forms.small_button("", "Show or hide the parameters.", self._unfold_or_fold)
         self.title.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
         self.title.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
-        self.up = _small_button("↑", "Do this earlier.", lambda: move(self, -1))
-        self.down = _small_button("↓", "Do this later.", lambda: move(self, 1))
-        self.remove = _small_button("✕", "Leave this out.", lambda: move(self, None))
+        self.up = forms.small_button("↑", "Do this earlier.", lambda: move(self, -1))
+        self.down = forms.small_button("↓", "Do this later.", lambda: move(self, 1))
+        self.remove = forms.small_button("✕", "Leave this out.", lambda: move(self, None))
+        for button in (self.title, self.up, self.down, self.remove):
+            button.setAutoRaise(True)
         line = beside((self.title, 1), (self.up, 0), (self.down, 0), (self.remove, 0))
         line.layout().setSpacing(0)
         column(self, line, self.form)
@@ -86,7 +77,7 @@ class StepsSection(QWidget):
         self.choice.setToolTip("<qt>Done to image, source and masks before the inversion.</qt>")
         self._list = QWidget()
         column(self._list)
-        self.folded = section("", self._list, labelled("", self.choice))
+        self.folded = forms.section("", self._list, forms.labelled("", self.choice))
         column(self, self.folded)
         # A long list of steps must not widen the window.
         button = self.folded.toggleButton()

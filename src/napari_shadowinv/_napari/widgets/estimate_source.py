@@ -6,13 +6,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.layer_metadata import (
-    SOURCE,
-    mark,
-    setup_of,
-    setup_origin_of,
-)
 from napari_shadowinv._napari.shots import loaded
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._layers import LayerWatch, MaskPicker, image_of, shot_picker
@@ -50,32 +45,16 @@ class EstimateSource(LivePanel):
     """Choose a shot and a method; the estimate becomes an image layer."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(
-            viewer,
-            "estimate-source",
-            RunPanel(
-                "Estimate source", "Estimate", "Create an image layer with the estimated beam."
-            ),
-        )
+        tip = "Create an image layer with the estimated beam."
+        super().__init__(viewer, "estimate-source", RunPanel("Estimate source", "Estimate", tip))
         self.image = shot_picker(viewer)
-        self.masks = MaskPicker(
-            viewer,
-            lambda: self.image.layer,
-            ("labels", "shapes"),
-            "Labels or shapes marking pixels that the estimate ignores.",
-        )
+        tip = "Labels or shapes marking pixels that the estimate ignores."
+        self.masks = MaskPicker(viewer, lambda: self.image.layer, ("labels", "shapes"), tip)
         self.method = ModelPicker("Method", kinds_of(ESTIMATES))
         self.method.set_kind("total-variation")
         self.live.setToolTip("Update the estimate after every change.")
-        for row in (
-            labelled("Image", self.image),
-            self.masks,
-            self.method,
-            self.live,
-            self.keep_earlier,
-            self.panel,
-        ):
-            self.column.addWidget(row)
+        self.add(labelled("Image", self.image), self.masks, self.method)
+        self.add(self.live, self.keep_earlier, self.panel)
         edits = LayerWatch(self, (self.image, self.masks))
         for signal in (self.image.picked, self.masks.changed, self.method.changed, edits.edited):
             signal.connect(self.on_change)
@@ -90,7 +69,7 @@ class EstimateSource(LivePanel):
         image = image_of(layer)
         mask = self.masks.usable(layer)
         model: Any = self.method.model()
-        estimate = model.placed(setup_of(layer), image.shape)
+        estimate = model.placed(about.setup_of(layer), image.shape)
         made_from = {"image": layer.name, "estimate": estimate.described}
         if mask is not None:
             made_from["source_mask"] = self.masks.described(layer)
@@ -104,11 +83,11 @@ class EstimateSource(LivePanel):
             value,
             {
                 "name": f"{layer.name} source{' preview' if preview else ''}",
-                "metadata": mark(
-                    SOURCE,
+                "metadata": about.mark(
+                    about.SOURCE,
                     "",
-                    setup_of(layer),
-                    setup_origin=setup_origin_of(layer),
+                    about.setup_of(layer),
+                    setup_origin=about.setup_origin_of(layer),
                     made_from=request.made_from,
                     source_mask=request.shot.source_mask,
                 ),

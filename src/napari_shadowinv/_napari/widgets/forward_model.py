@@ -9,28 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from qtpy.QtWidgets import QLabel, QSpinBox
 
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of
-from napari_shadowinv._napari.layer_metadata import (
-    CAME_WITH,
-    SHOT,
-    mark,
-    may_be_shot,
-    may_be_source,
-    result_of,
-    role_of,
-    setup_of,
-    unit_of,
-)
 from napari_shadowinv._napari.layers import intensity_limits
+from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox, parsed
 from napari_shadowinv._napari.widgets._forecast import PHANTOMS, Forecast, ForwardJob
-from napari_shadowinv._napari.widgets._forms import (
-    PROBLEM_STYLE,
-    ModelPicker,
-    kinds_of,
-    labelled,
-    wrapping_label,
-)
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
@@ -62,39 +46,35 @@ class KnownField:
 
 def is_surely_a_field(layer: Any) -> bool:
     """Whether a layer says of itself that it is a potential, or the field of one result."""
-    if role_of(layer) == "potential":
+    if about.role_of(layer) == "potential":
         return True
-    return role_of(layer) in _FIELDS and result_of(layer) is not None
+    return about.role_of(layer) in _FIELDS and about.result_of(layer) is not None
 
 
 def may_be_a_field(layer: Any) -> bool:
     """Whether a layer is a field, or an image that does not tell what it is."""
-    unknown = may_be_shot(layer) and result_of(layer) is None
+    unknown = about.may_be_shot(layer) and about.result_of(layer) is None
     return is_surely_a_field(layer) or (unknown and not getattr(layer, "rgb", False))
 
 
 def known_field(layer: Any | None, point: Any, setup: Any) -> KnownField:
-    """Take what a layer holds; of a stack, the shot at a viewer's ``dims.point``.
-
-    The setup is for a potential in m that does not know its own; without it, or without a
-    layer, there is an `InputError`.
-    """
+    """What a layer, or its shot in view, holds; `setup` is for a potential in m without one."""
     if layer is None:
         raise InputError(
             "there is no potential or result to start from: invert a shot (Plugins → Invert "
             "shot), open a .shadowinv file or an image of a potential in px² (File → Open), or "
             "choose one of the simulated objects"
         )
-    result = result_of(layer)
-    if result is not None and role_of(layer) in _FIELDS:
+    result = about.result_of(layer)
+    if result is not None and about.role_of(layer) in _FIELDS:
         content: Any = result.content
         displacement = np.asarray(
             content["displacement"] if hasattr(content, "data_vars") else content.displacement
         )
         return KnownField(displacement, 1.0, result.setup, "The displacement of this result.")
     potential = shown_plane(layer, point) if layer.ndim == 3 else image_of(layer, "potential")
-    unit, own = unit_of(layer), setup_of(layer)
-    if role_of(layer) != "potential":
+    unit, own = about.unit_of(layer), about.setup_of(layer)
+    if about.role_of(layer) != "potential":
         text = (
             "This image is not labelled as a potential: its values are treated as a potential "
             "in px² of the object plane."
@@ -128,13 +108,10 @@ class ForwardModel(ToolPanel):
     """Choose an object or a potential; see the image that it would make."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(
-            viewer,
-            "forward-model",
-            RunPanel("Forward model", "Simulate", "Trace the beam through the object."),
-        )
-        self.object = ModelPicker(
-            "Object", {**kinds_of(PHANTOMS), _LAYER: ("a result or potential", None)}
+        panel = RunPanel("Forward model", "Simulate", "Trace the beam through the object.")
+        super().__init__(viewer, "forward-model", panel)
+        self.object = forms.ModelPicker(
+            "Object", {**forms.kinds_of(PHANTOMS), _LAYER: ("a result or potential", None)}
         )
         self.object.choice.setToolTip("Object that deflects the beam.")
         self.potential = LayerPicker(
@@ -144,7 +121,7 @@ class ForwardModel(ToolPanel):
             "stack, the shot in view.</qt>",
             suits=may_be_a_field,
         )
-        self.expected = wrapping_label()
+        self.expected = forms.wrapping_label()
         self.deflector = SteadyComboBox()
         self.deflector.addItem("default for the beam", None)
         for name in get_args(Deflector):
@@ -156,27 +133,19 @@ class ForwardModel(ToolPanel):
         self.height_px, self.width_px = _side("Height"), _side("Width")
         self.setup = SetupPicker()
         tip = "Image layer of the undisturbed beam."
-        self.source = LayerPicker(viewer, ("image",), tip, "uniform", may_be_source)
-        self.warning = wrapping_label(style=PROBLEM_STYLE)
+        self.source = LayerPicker(viewer, ("image",), tip, "uniform", about.may_be_source)
+        self.warning = forms.wrapping_label(style=forms.PROBLEM_STYLE)
         self._potential_rows = (
-            labelled("Layer", self.potential),
+            forms.labelled("Layer", self.potential),
             self.expected,
-            labelled("Bent by", self.deflector),
+            forms.labelled("Bent by", self.deflector),
         )
         self._last = LastResults(viewer, self)
         size = beside((self.width_px, 1), (QLabel("×"), 0), (self.height_px, 1))
-        self._size_row = labelled("Size", size)
-        for row in (
-            self.object,
-            *self._potential_rows,
-            self._size_row,
-            self.setup,
-            labelled("Source", self.source),
-            self._last.keep_earlier,
-            self.panel,
-            self.warning,
-        ):
-            self.column.addWidget(row)
+        self._size_row = forms.labelled("Size", size)
+        self.add(self.object, *self._potential_rows, self._size_row, self.setup)
+        self.add(forms.labelled("Source", self.source), self._last.keep_earlier)
+        self.add(self.panel, self.warning)
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
         self.object.changed.connect(self._on_change)
         self.potential.picked.connect(self._follow_potential)
@@ -218,7 +187,7 @@ class ForwardModel(ToolPanel):
                 source=source,
             )
             # The unit in the name of a field is not that of the image.
-            name = layer.name.removesuffix(f" ({unit_of(layer)})")
+            name = layer.name.removesuffix(f" ({about.unit_of(layer)})")
             return _Request(job, f"{name} image", frame_of(layer), self.setup.origin, layer)
         recipe: Any = self.object.model()
         shape = (self.height_px.value(), self.width_px.value())
@@ -280,14 +249,14 @@ class ForwardModel(ToolPanel):
             known = known_field(layer, self.viewer.dims.point, self.setup.setup())
         except InputError as error:
             self.expected.setText(error_text(error))
-            self.expected.setStyleSheet(PROBLEM_STYLE)
+            self.expected.setStyleSheet(forms.PROBLEM_STYLE)
             return
         self.expected.setText(known.text)
         unsure = not is_surely_a_field(layer)
-        self.expected.setStyleSheet(PROBLEM_STYLE if unsure else "")
+        self.expected.setStyleSheet(forms.PROBLEM_STYLE if unsure else "")
 
     def show_result(self, value: Forecast, request: _Request) -> None:
-        unit = "" if request.job.source is None else unit_of(self.source.layer or {})
+        unit = "" if request.job.source is None else about.unit_of(self.source.layer or {})
         # Whoever inverts the image finds its source.
         came_with: dict[str, Any] = {} if value.source is None else {"source": value.source}
         # In another experiment the same object may be seen with other pixels.
@@ -295,10 +264,12 @@ class ForwardModel(ToolPanel):
         if made_with is not None and made_with != request.job.setup:
             frame = frame_for(value.image.shape, request.job.setup)
         if request.setup_origin:
-            came_with["setup_origin"] = f"{CAME_WITH} the forward model, {request.setup_origin}"
+            came_with["setup_origin"] = (
+                f"{about.CAME_WITH} the forward model, {request.setup_origin}"
+            )
         keywords = {
             "name": request.name,
-            "metadata": mark(SHOT, unit, request.job.setup, **came_with),
+            "metadata": about.mark(about.SHOT, unit, request.job.setup, **came_with),
             "contrast_limits": intensity_limits(value.image),
             **frame.keywords(),
         }

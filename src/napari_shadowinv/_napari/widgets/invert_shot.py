@@ -10,22 +10,9 @@ from napari.utils.notifications import show_warning
 from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, role_of
 from napari_shadowinv._napari.shots import loaded, radiograph_of
-from napari_shadowinv._napari.widgets._forms import (
-    PROBLEM_STYLE,
-    labelled,
-    section,
-    with_button,
-    wrapping_label,
-)
+from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
-from napari_shadowinv._napari.widgets._layers import (
-    LayerPicker,
-    LayerWatch,
-    image_of,
-    new_shapes,
-    shot_picker,
-    warnings_of,
-)
 from napari_shadowinv._napari.widgets._panels import LivePanel, ReportTable, RunPanel, report_rows
 from napari_shadowinv._napari.widgets._qt import notify_errors
 from napari_shadowinv._napari.widgets._results import Origins, place_together, result_frame
@@ -156,11 +143,8 @@ class InvertShot(InversionInputs, LivePanel):
     """Choose an image, press Run; all else has a default."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(
-            viewer,
-            "invert-shot",
-            RunPanel("Invert shot", "Run", "Invert the image and show the result as layers."),
-        )
+        panel = RunPanel("Invert shot", "Run", "Invert the image and show the result as layers.")
+        super().__init__(viewer, "invert-shot", panel)
         self._cache = Cache()
         self._build()
         self._connect()
@@ -169,54 +153,32 @@ class InvertShot(InversionInputs, LivePanel):
         self._ready = True
 
     def _build(self) -> None:
-        viewer = self.viewer
-        self.image = shot_picker(viewer)
+        self.image = layers.shot_picker(self.viewer)
         self.make_inputs(
-            viewer,
             lambda: self.image.layer,
             ("labels", "shapes"),
-            (
-                "Labels or shapes marking detector pixels. The inversion ignores masked pixels, so "
-                "do not mask the object.",
-                "Labels or shapes that hide the object from the source estimate only; the "
-                "inversion still uses it.",
-            ),
+            "Labels or shapes marking detector pixels. The inversion ignores masked pixels, so "
+            "do not mask the object.",
+            "Labels or shapes that hide the object from the source estimate only; the "
+            "inversion still uses it.",
         )
-        self.crop = LayerPicker(
-            viewer,
-            ("shapes",),
-            "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>",
-            none="none",
-        )
+        tip = "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>"
+        self.crop = layers.LayerPicker(self.viewer, ("shapes",), tip, none="none")
         self.live.setToolTip(
             f"<qt>Update the field after every change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
-        self.cost, self._pace = wrapping_label(), 1.0
+        self.cost, self._pace = forms.wrapping_label(), 1.0
         self.report = ReportTable()
-        for row in (
-            labelled("Image", self.image),
-            self.source,
-            self.source_masks,
-            self.masks,
-            labelled("Crop", with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)),
-            self.setup,
-            self.steps,
-            section("Options", self.options),
-            self.recipes,
-            self.live,
-            self.keep_earlier,
-            self.cost,
-            self.panel,
-            self.report,
-        ):
-            self.column.addWidget(row)
+        crop = forms.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
+        self.add(forms.labelled("Image", self.image), *self.beam, forms.labelled("Crop", crop))
+        self.add(*self.how, self.live, self.keep_earlier, self.cost, self.panel, self.report)
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
-        edits = LayerWatch(
+        edits = layers.LayerWatch(
             self, (self.image, self.masks, self.source_masks, self.crop, self.source.layers)
         )
-        LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
+        layers.LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
         # Also for a run that is cancelled, or refused before it starts.
         for signal in (self.panel.button.clicked, self.panel.runner.started):
             signal.connect(lambda: self.report.empty())
@@ -226,13 +188,13 @@ class InvertShot(InversionInputs, LivePanel):
 
     def request(self, preview: bool = False) -> _Request:
         layer: Any = self.image.layer
-        image = image_of(layer)
+        image = layers.image_of(layer)
         recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)
         shot = replace(
             radiograph_of(layer, image),
-            warnings=warnings_of(layer),
+            warnings=layers.warnings_of(layer),
             mask=mask,
             source_mask=self.hidden_from_source(layer),
         )
@@ -273,13 +235,13 @@ class InvertShot(InversionInputs, LivePanel):
         """Say how long it will take, once the image is large."""
         try:
             recipe = Recipe(steps=self.all_steps())
-            shape = recipe.shape_after(image_of(self.image.layer).shape)
+            shape = recipe.shape_after(layers.image_of(self.image.layer).shape)
             cost = cost_of(shape, self.options.model(), self._pace)  # type: ignore[arg-type]
         except InputError:
             self.cost.setVisible(False)  # Run tells what is wrong
             return
         self.cost.setText(cost.text)
-        self.cost.setStyleSheet(PROBLEM_STYLE if cost.is_too_much else "")
+        self.cost.setStyleSheet(forms.PROBLEM_STYLE if cost.is_too_much else "")
         self.cost.setVisible(bool(cost.text))
 
     def _learn_pace(self, inversion: Inversion) -> None:
@@ -309,5 +271,5 @@ class InvertShot(InversionInputs, LivePanel):
 
     @notify_errors
     def _draw_crop(self) -> None:
-        image_of(self.image.layer)
-        self.crop.layer = new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")
+        layers.image_of(self.image.layer)
+        self.crop.layer = layers.new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")

@@ -14,7 +14,7 @@ from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdi
 
 from napari_shadowinv._napari.layer_metadata import may_be_shot, role_of
 from napari_shadowinv._napari.stores import follow_shots
-from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled, section
+from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
@@ -157,11 +157,8 @@ class EnginePicker(RowPicker):
         return address, None
 
     def state(self) -> dict[str, Any]:
-        return {
-            "kind": self.picker.kind,
-            "workers": self.workers.value(),
-            "address": self.address.text(),
-        }
+        workers, address = self.workers.value(), self.address.text()
+        return {"kind": self.picker.kind, "workers": workers, "address": address}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self.picker.set_kind(str(state.get("kind", _HERE)))
@@ -191,20 +188,13 @@ class InvertStack(InversionInputs, ToolPanel):
     """Choose shots and a store, press Run; again to go on after an interruption."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        super().__init__(
-            viewer,
-            "invert-stack",
-            RunPanel(
-                "Invert stack",
-                "Run",
-                "Invert all shots not yet in the store.",
-                patience=math.inf,  # until it has left the store
-            ),
-        )
+        tip = "Invert all shots not yet in the store."
+        # A cancelled run has all the time that it needs to leave the store.
+        panel = RunPanel("Invert stack", "Run", tip, patience=math.inf)
+        super().__init__(viewer, "invert-stack", panel)
         self.results = ResultLayers(viewer, self)
         self._shown: StackRequest | None = None
-        self._heard = 0
-        self._look_at = False
+        self._heard, self._look_at = 0, False
         self._arrows: Any = None
         self._read_arrows: Callable[[], None] | None = None
         self._soon = timer(self, _REFRESH_AFTER, self._refresh, once=True)
@@ -217,15 +207,12 @@ class InvertStack(InversionInputs, ToolPanel):
     def _build(self) -> None:
         self.shots = ShotsPicker(self.viewer)
         self.make_inputs(
-            self.viewer,
             lambda: self.shots.layer,
             ("labels",),
-            (
-                "Labels marking detector pixels in all shots. The inversion ignores masked pixels, "
-                "so do not mask the object.",
-                "Labels that hide the object from the source estimates only; the inversion still "
-                "uses it.",
-            ),
+            "Labels marking detector pixels in all shots. The inversion ignores masked pixels, "
+            "so do not mask the object.",
+            "Labels that hide the object from the source estimates only; the inversion still "
+            "uses it.",
         )
         self.store = StoreEdit()
         self.overwrite = QCheckBox("overwrite the store")
@@ -237,25 +224,9 @@ class InvertStack(InversionInputs, ToolPanel):
         self.failures_title = QLabel("Failed shots")
         self.failures_title.setVisible(False)
         self.failures = FailureTable()
-        for row in (
-            self.shots,
-            self.source,
-            self.source_masks,
-            self.masks,
-            self.setup,
-            self.steps,
-            section("Options", self.options),
-            self.recipes,
-            labelled("Store", self.store),
-            labelled("", self.overwrite),
-            labelled("", self.redo_failed),
-            self.engine,
-            self.panel,
-            self.report,
-            self.failures_title,
-            self.failures,
-        ):
-            self.column.addWidget(row)
+        self.add(self.shots, *self.beam, *self.how, labelled("Store", self.store))
+        self.add(labelled("", self.overwrite), labelled("", self.redo_failed), self.engine)
+        self.add(self.panel, self.report, self.failures_title, self.failures)
 
     def _connect(self) -> None:
         self.shots.changed.connect(self._on_layer)

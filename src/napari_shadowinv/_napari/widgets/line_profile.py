@@ -1,9 +1,4 @@
-"""The widget that reads values off a line across layers: `LineProfile`.
-
-- points along a line: `along`; beside it, to average over: `abreast`
-- sample an image: `sampled`; several of them on one axis: `Profile`; as a table: `table_text`
-- draw them: `ProfilePlot`
-"""
+"""The widget that reads values off a line across layers: `LineProfile`."""
 
 from __future__ import annotations
 
@@ -11,41 +6,20 @@ import csv
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from napari.utils.notifications import show_info
 from numpy.typing import ArrayLike
+from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, QSize, Qt
-from qtpy.QtWidgets import (
-    QDoubleSpinBox,
-    QFileDialog,
-    QListWidget,
-    QListWidgetItem,
-    QPushButton,
-    QSizePolicy,
-    QWidget,
-)
 
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
+from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
-from napari_shadowinv._napari.widgets._forms import (
-    PROBLEM_STYLE,
-    labelled,
-    with_button,
-    wrapping_label,
-)
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
 from napari_shadowinv._napari.widgets._panels import WIDTH
-from napari_shadowinv._napari.widgets._qt import (
-    Docked,
-    beside,
-    column,
-    notify_errors,
-    timer,
-    while_alive,
-)
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
@@ -71,10 +45,7 @@ class Profile:
 
 
 def along(vertices: ArrayLike, step: float) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 2) along a path of corners (k, 2), no further apart than the step.
-
-    They lie evenly from the first corner to the last; returned with their distance along the path.
-    """
+    """Points (n, 2) at most a step apart along corners (k, 2), and their distances along it."""
     corners, reached = _corners(vertices)
     count = min(int(np.ceil(reached[-1] / step - 1e-9)) + 1, _MOST_SAMPLES)
     distance = np.linspace(0, reached[-1], max(count, 2))
@@ -96,11 +67,7 @@ def _on_path(corners: FloatArray, reached: FloatArray, distance: FloatArray) -> 
 
 
 def abreast(vertices: ArrayLike, distance: FloatArray, width: float, step: float) -> FloatArray:
-    """Points (m, n, 2) of a strip around a path, in n rows at right angles to it.
-
-    The rows are at these distances, their m points in the middles of equal parts of the width, no
-    further apart than the step; with no width, each row is the point on the path alone.
-    """
+    """Points (m, n, 2) of a strip: n rows across a path, of m points at most a step apart."""
     corners, reached = _corners(vertices)
     points = _on_path(corners, reached, distance)
     edges = np.diff(corners, axis=0)
@@ -117,11 +84,7 @@ def abreast(vertices: ArrayLike, distance: FloatArray, width: float, step: float
 def sampled(
     image: ArrayLike, points: FloatArray, to_pixels: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
-    """Values of an image at points (n, 2) of the world, linear between the pixels' centres.
-
-    Of points (m, n, 2) those inside are averaged over the m. NaN outside the image, whose pixels
-    reach half a pixel beyond their centres.
-    """
+    """Values at points (n, 2) of the world, or means over the m of (m, n, 2); NaN outside."""
     from scipy.ndimage import map_coordinates
 
     plane = np.asarray(image, dtype=np.float64)
@@ -152,14 +115,16 @@ def _heading(profile: Profile) -> str:
     return f"{name}, {profile.averaged}" if profile.averaged else name
 
 
-class ProfilePlot(QWidget):
+class ProfilePlot(QtWidgets.QWidget):
     """One plot for each unit, one above the other, with the distance in common."""
 
     def __init__(self) -> None:
         super().__init__()
         self.setMinimumHeight(220)
-        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
-        column(self)
+        self.setSizePolicy(
+            QtWidgets.QSizePolicy.Policy.Expanding, QtWidgets.QSizePolicy.Policy.Expanding
+        )
+        qt.column(self)
         self.figure: Any = None
         self._canvas: Any = None
 
@@ -179,8 +144,9 @@ class ProfilePlot(QWidget):
             axis.set_ylabel(of_unit or "value", color=ink)
             for number, profile in enumerate(profiles):
                 if profile.unit == of_unit:
-                    colour = _COLOURS[number % len(_COLOURS)]
-                    axis.plot(distance, profile.values, color=colour, label=_short(profile.name))
+                    colour, name = _COLOURS[number % len(_COLOURS)], profile.name
+                    name = name if len(name) <= _LONGEST_NAME else f"…{name[1 - _LONGEST_NAME :]}"
+                    axis.plot(distance, profile.values, color=colour, label=name)
             if profiles:
                 axis.legend(fontsize=8, labelcolor=ink, facecolor=paper, edgecolor=ink)
         averaged = f", {profiles[0].averaged}" if profiles and profiles[0].averaged else ""
@@ -219,28 +185,21 @@ def _dress(axis: Any, ink: str, paper: str) -> None:
     axis.grid(color=ink, alpha=0.15)
 
 
-def _short(name: str) -> str:
-    if len(name) <= _LONGEST_NAME:
-        return name
-    return f"…{name[-_LONGEST_NAME + 1 :]}"
-
-
-class LineProfile(Docked):
+class LineProfile(qt.Docked):
     """Draw a line; see the values of the checked layers along it, in their units."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__()
         self.viewer = viewer
-        self._distance = np.zeros(0)
-        self._unit = "px"
+        self._distance, self._unit = np.zeros(0), "px"
         self.profiles: list[Profile] = []
         tip = "<qt>Shapes layer with the line; if it has several, the selected one is used.</qt>"
         self.lines = LayerPicker(viewer, ("shapes",), tip, "none yet")
-        self.layers = QListWidget()
+        self.layers = QtWidgets.QListWidget()
         self.layers.setToolTip("Layers to plot.")
         self.layers.setMaximumHeight(110)
         self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        self.width_edit = QDoubleSpinBox()
+        self.width_edit = QtWidgets.QDoubleSpinBox()
         self.width_edit.setRange(0.0, _WIDEST)
         self.width_edit.setDecimals(2)
         self.width_edit.setSpecialValueText("0: line only")
@@ -253,19 +212,26 @@ class LineProfile(Docked):
                 "averaged.</qt>"
             )
         self.plot = ProfilePlot()
-        self.hint = wrapping_label("Press ✎ and draw a line on the image.")
-        self.problem = wrapping_label(style=PROBLEM_STYLE)
-        self.export = QPushButton("Export CSV…")
+        self.hint = forms.wrapping_label("Press ✎ and draw a line on the image.")
+        self.problem = forms.wrapping_label(style=forms.PROBLEM_STYLE)
+        self.export = QtWidgets.QPushButton("Export CSV…")
         self.export.setToolTip("Save the profile as a table.")
-        lines = with_button(self.lines, "✎", "Draw a new line.", self._draw)
-        width = beside((self.width_edit, 2), (self.width_unit, 1))
-        rows = (labelled("Line", lines), self.layers, labelled("Width", width), self.hint)
-        whole = column(self, *rows, margin=6)
+        lines = forms.with_button(self.lines, "✎", "Draw a new line.", self._draw)
+        width = qt.beside((self.width_edit, 2), (self.width_unit, 1))
+        rows = (
+            forms.labelled("Line", lines),
+            self.layers,
+            forms.labelled("Width", width),
+            self.hint,
+        )
+        whole = qt.column(self, *rows, margin=6)
         whole.addWidget(self.plot, 1)
         for widget in (self.export, self.problem):
             whole.addWidget(widget)
         self.setMinimumWidth(WIDTH)
-        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
+        self.setSizePolicy(
+            QtWidgets.QSizePolicy.Policy.Preferred, QtWidgets.QSizePolicy.Policy.Expanding
+        )
         self._connect()
         self._fill()
 
@@ -273,12 +239,12 @@ class LineProfile(Docked):
         return QSize(WIDTH + 50, 600)
 
     def _connect(self) -> None:
-        self._timer = timer(self, _FOLLOW, self.update_plot, once=True)
+        self._timer = qt.timer(self, _FOLLOW, self.update_plot, once=True)
         self._watched: list[Any] = []
         events = self.viewer.layers.events
         for emitter in (events.inserted, events.removed, events.reordered):
-            while_alive(self, emitter, self._fill)
-        while_alive(self, self.viewer.dims.events.current_step, self._soon)
+            qt.while_alive(self, emitter, self._fill)
+        qt.while_alive(self, self.viewer.dims.events.current_step, self._soon)
         self.lines.picked.connect(self._soon)
         for signal in (
             self.layers.itemChanged,
@@ -288,16 +254,18 @@ class LineProfile(Docked):
             signal.connect(lambda _: self._soon())
         self.export.clicked.connect(lambda: self._export())
 
-    def checked(self) -> list[Any]:
+    def _items(self) -> list[tuple[Any, Any]]:
+        """The rows of the list, each with its layer."""
         items = [self.layers.item(row) for row in range(self.layers.count())]
-        return [
-            item.data(_LAYER_ROLE) for item in items if item.checkState() == Qt.CheckState.Checked
-        ]
+        return [(item, item.data(_LAYER_ROLE)) for item in items]
+
+    def checked(self) -> list[Any]:
+        on = Qt.CheckState.Checked
+        return [layer for item, layer in self._items() if item.checkState() == on]
 
     def check(self, layer: Any, on: bool = True) -> None:
-        for row in range(self.layers.count()):
-            item = self.layers.item(row)
-            if item.data(_LAYER_ROLE) is layer:
+        for item, known in self._items():
+            if known is layer:
                 item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
 
     def update_plot(self) -> None:
@@ -376,7 +344,7 @@ class LineProfile(Docked):
             if layer is None or any(layer is known for known in self._watched):
                 continue
             self._watched.append(layer)
-            while_alive(self, layer.events.set_data, self._on_layer)
+            qt.while_alive(self, layer.events.set_data, self._on_layer)
 
     def _on_layer(self, event: Any) -> None:
         if event.source is self.lines.layer or any(event.source is one for one in self.checked()):
@@ -384,8 +352,7 @@ class LineProfile(Docked):
 
     def _fill(self, event: Any = None) -> None:
         """Offer all plane images, the ones that can be seen checked when they are new."""
-        known = [self.layers.item(row).data(_LAYER_ROLE) for row in range(self.layers.count())]
-        checked = self.checked()
+        known, checked = [layer for _, layer in self._items()], self.checked()
         self.layers.blockSignals(True)
         self.layers.clear()
         for layer in reversed(self.viewer.layers):
@@ -395,7 +362,7 @@ class LineProfile(Docked):
             on = any(layer is one for one in checked) or (
                 new and layer.visible and (role_of(layer) is not None or not known)
             )
-            item = QListWidgetItem(layer.name)
+            item = QtWidgets.QListWidgetItem(layer.name)
             item.setData(_LAYER_ROLE, layer)
             item.setToolTip(layer.name)
             item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
@@ -403,11 +370,9 @@ class LineProfile(Docked):
         self.layers.blockSignals(False)
         self._soon()
 
-    @notify_errors
+    @qt.notify_errors
     def _draw(self) -> None:
-        images = self.checked() or [
-            layer for layer in self.viewer.layers if kind_of(layer) == "image"
-        ]
+        images = self.checked() or [one for one in self.viewer.layers if kind_of(one) == "image"]
         if not images:
             raise InputError(
                 "there is no image to draw a line on: open one (File → Open) or use a sample "
@@ -415,19 +380,16 @@ class LineProfile(Docked):
             )
         self.lines.layer = new_shapes(self.viewer, images[-1], "profile", "add_line")
 
-    @notify_errors
+    @qt.notify_errors
     def _export(self) -> None:
-        from napari_shadowinv.io import replacing
         from napari_shadowinv.io.formats import SITES
 
         text = self.table()
-        name, _ = QFileDialog.getSaveFileName(self, "Export CSV", "profile.csv", "CSV (*.csv)")
-        if not name:
-            return
-        path = Path(name) if Path(name).suffix else Path(name).with_suffix(SITES.suffix)
-        with replacing(path, overwrite=str(path) == name) as unfinished:
-            unfinished.write_text(text, encoding="utf-8")
-        show_info(f"Wrote {path}")
+        name, _ = QtWidgets.QFileDialog.getSaveFileName(
+            self, "Export CSV", "profile.csv", "CSV (*.csv)"
+        )
+        if name:
+            show_info(f"Wrote {forms.save_text(text, name, SITES.suffix)}")
 
 
 def _mapper(layer: Any) -> Callable[[Any], Any]:
