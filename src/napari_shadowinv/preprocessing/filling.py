@@ -76,16 +76,6 @@ def interpolated_source(
     ----------
     D. Garcia, "Robust smoothing of gridded data in one and higher dimensions with missing
     values", Computational Statistics & Data Analysis 54, 1167 (2010).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> y, x = np.mgrid[:48, :64]
-    >>> beam = 100 * np.exp(-((y - 20) ** 2 + (x - 30) ** 2) / 2000)
-    >>> mask = np.hypot(y - 24, x - 34) > 8
-    >>> shot = np.where(mask, beam, 0)
-    >>> float(abs(interpolated_source(shot, mask, width=2.0) / beam - 1).max()) < 0.01
-    True
     """
     if kind not in ("biharmonic", "laplace"):
         raise InputError(f"kind is {kind!r}, expected 'biharmonic' or 'laplace'")

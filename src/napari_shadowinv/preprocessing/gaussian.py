@@ -60,8 +60,7 @@ def gaussian_source(
     Parameters
     ----------
     image : array_like, shape (H, W)
-    mask : array_like of bool, shape (H, W), optional
-    should_stop : callable, optional
+    mask, should_stop : optional
     on_warning : callable, optional
         Receives a sentence where the fit has to be doubted. Default: `warnings.warn`.
 
@@ -78,14 +77,6 @@ def gaussian_source(
     last two are not negative. Large images are averaged in blocks for the fit. A Gaussian
     narrower than 1/256 of the image, higher than 1000 times the mean, or more than three sides
     away from the middle of what is seen is not considered.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> y, x = np.mgrid[:40, :50]
-    >>> beam = 3 + 7 * np.exp(-((y - 18) ** 2) / 200 - (x - 30) ** 2 / 300)
-    >>> float(abs(gaussian_source(beam) / beam - 1).max()) < 1e-4
-    True
     """
     values, usable = beam_pixels(image, mask)
     side, mean = max(values.shape), values[usable].mean()
@@ -163,36 +154,6 @@ def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     ]
     least, most = np.transpose(ranges)
     return least, most
-
-
-def _refitted(
-    parameters: FloatArray,
-    y: FloatArray,
-    x: FloatArray,
-    sample: FloatArray,
-    report: Reporter,
-    bounds: tuple[FloatArray, FloatArray],
-    *,
-    loss: Literal["linear", "soft_l1"],
-    scale: float,
-) -> FloatArray:
-    """Parameters of `_gaussian` nearest to samples, in the sense of a loss of some scale."""
-
-    def excess(p: FloatArray) -> FloatArray:
-        report("source", 0)
-        return _gaussian(p, y, x) - sample
-
-    fit = scipy.optimize.least_squares(
-        excess,
-        parameters,
-        jac=lambda p: _gaussian_slopes(p, y, x),
-        bounds=bounds,
-        loss=loss,
-        f_scale=scale,
-        x_scale="jac",
-        max_nfev=200,
-    )
-    return np.asarray(fit.x)
 
 
 def _first_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:

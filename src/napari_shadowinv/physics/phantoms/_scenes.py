@@ -37,11 +37,6 @@ def paper_setup() -> ProtonSetup:
 
     Protons of 14.7 MeV, 1.3 mm from source to object, 2 cm on to the detector, pixels
     of 1.5 µm in the object plane: 200 pixels are ten times the toroid's σ of 30 µm.
-
-    Examples
-    --------
-    >>> paper_setup().magnification
-    16.38
     """
     return ProtonSetup.example()
 
@@ -104,13 +99,11 @@ def coaxial_line(
 
     Parameters
     ----------
-    shape : tuple of int
-    setup : ProtonSetup
+    shape, setup, center
     peak : float, default 60
         Path-integrated field at the inner conductor's surface in MG µm.
     radii : tuple of float
         Radius of the inner conductor, inner and outer radius of the outer one, in m; increasing.
-    center : tuple of float, optional
 
     Returns
     -------
@@ -118,12 +111,6 @@ def coaxial_line(
         Potential and displacement, inside the conductors too.
     obstructed : ndarray of bool, shape (H, W)
         Pixels whose centres are in a conductor: there the source of the image is dark.
-
-    Examples
-    --------
-    >>> phantom, obstructed = coaxial_line((200, 200), paper_setup())
-    >>> bool(obstructed[100, 100]), float(phantom.potential[0, 0])
-    (True, 0.0)
     """
     require_finite(peak=peak)
     if len(radii) != 3 or not (np.isfinite(radii).all() and 0 < radii[0] < radii[1] < radii[2]):
