@@ -38,15 +38,9 @@ from pydantic import Field
 from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.filling import FILL_WIDTH, filled, interpolated_source
 from napari_shadowinv.preprocessing.filters import low_pass
-from napari_shadowinv.preprocessing.pixels import (
-    beam_pixels,
-    checked_integer,
-    checked_number,
-    fit_polynomial,
-    with_flux_of,
-)
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
 if TYPE_CHECKING:
@@ -126,7 +120,7 @@ def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatA
     >>> uniform_source([[1, 2], [3, 6]])
     array([[3., 3.], [3., 3.]])
     """
-    values, usable = beam_pixels(image, mask)
+    values, usable = pixels.beam_pixels(image, mask)
     return np.full(values.shape, values[usable].mean())
 
 
@@ -163,9 +157,9 @@ def polynomial_source(
     ndarray of float64, shape (H, W)
         Where the polynomial falls below 0.001 of the image's mean, it is that.
     """
-    values, usable = beam_pixels(image, mask)
-    fit = fit_polynomial(values, degree, mask=usable, should_stop=should_stop)
-    return with_flux_of(fit, values, usable)
+    values, usable = pixels.beam_pixels(image, mask)
+    fit = pixels.fit_polynomial(values, degree, mask=usable, should_stop=should_stop)
+    return pixels.with_flux_of(fit, values, usable)
 
 
 class PolynomialEstimate(Estimate):
@@ -200,15 +194,15 @@ def low_pass_source(
         At each pixel the mean of the usable pixels around it, weighted by the Gaussian; its border
         is mirrored. Where none is within reach, the width is doubled until there is one.
     """
-    values, usable = beam_pixels(image, mask)
-    width = checked_number("width", width, above=0, unit="px")
+    values, usable = pixels.beam_pixels(image, mask)
+    width = pixels.checked_number("width", width, above=0, unit="px")
     report = Reporter(None, should_stop)
     beam, support = _masked_blur(values, usable, width, report)
     while not support.all():
         width *= 2
         wider, reached = _masked_blur(values, usable, width, report)
         beam, support = np.where(support, beam, wider), support | reached
-    return with_flux_of(beam, values, usable)
+    return pixels.with_flux_of(beam, values, usable)
 
 
 class LowPassEstimate(Estimate):
@@ -274,14 +268,14 @@ def total_variation_source(
     """
     from napari_shadowinv.preprocessing._total_variation import least_variation
 
-    values, usable = beam_pixels(image, mask)
-    weight = checked_number("weight", weight, above=0, unit="px")
-    iterations = checked_integer("iterations", iterations, least=1)
+    values, usable = pixels.beam_pixels(image, mask)
+    weight = pixels.checked_number("weight", weight, above=0, unit="px")
+    iterations = pixels.checked_integer("iterations", iterations, least=1)
     report = Reporter(None, should_stop)
     whole = values if usable.all() else filled(values, usable, FILL_WIDTH, 2, report)
     mean = values[usable].mean()
     beam = mean * least_variation(whole / mean, weight, iterations, report)
-    return with_flux_of(beam, values, usable)
+    return pixels.with_flux_of(beam, values, usable)
 
 
 class TotalVariationEstimate(Estimate):

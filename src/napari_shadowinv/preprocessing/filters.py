@@ -31,13 +31,8 @@ from pydantic import Field
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.filling import without_masked
-from napari_shadowinv.preprocessing.pixels import (
-    checked_integer,
-    checked_number,
-    checked_pixels,
-    fit_polynomial,
-)
 from napari_shadowinv.preprocessing.steps import Step, degree_field, width_field
 
 if TYPE_CHECKING:
@@ -111,8 +106,8 @@ def low_pass(image: ArrayLike, width: float) -> FloatArray:
     >>> float((low_pass(wave, 2.0) / wave).mean()), float(np.exp(-((np.pi / 8 * 2) ** 2) / 2))
     (0.7346, 0.7346)
     """
-    values, _ = checked_pixels(image)
-    width = checked_number("width", width, above=0, unit="px")
+    values, _ = pixels.checked_pixels(image)
+    width = pixels.checked_number("width", width, above=0, unit="px")
     return _filtered(values, np.exp(-0.5 * (width * _wave_numbers(values.shape)) ** 2))
 
 
@@ -147,7 +142,7 @@ def high_pass(image: ArrayLike, width: float, *, keep_mean: bool = True) -> Floa
     word. `invert` treats such pixels as its option `negative` says. For a beam that uneven,
     dividing (`remove_background`, or a source estimate) serves better: it keeps the sign.
     """
-    values, _ = checked_pixels(image)
+    values, _ = pixels.checked_pixels(image)
     kept = values.mean() if keep_mean else 0.0
     return values - low_pass(values, width) + kept
 
@@ -209,9 +204,9 @@ def butterworth(
     >>> float((butterworth(wave, 16.0, 3) / wave).mean())
     0.7071
     """
-    values, _ = checked_pixels(image)
-    cutoff = checked_number("cutoff", cutoff, above=0, unit="px")
-    order = checked_integer("order", order, least=1)
+    values, _ = pixels.checked_pixels(image)
+    cutoff = pixels.checked_number("cutoff", cutoff, above=0, unit="px")
+    order = pixels.checked_integer("order", order, least=1)
     if kind not in ("high", "low"):
         raise InputError(f"kind is {kind!r}, expected 'high' or 'low'")
     wave_numbers = _wave_numbers(values.shape)
@@ -300,8 +295,8 @@ def remove_background(
     """
     if kind not in ("divide", "subtract"):
         raise InputError(f"kind is {kind!r}, expected 'divide' or 'subtract'")
-    values, _ = checked_pixels(image)
-    background = fit_polynomial(values, degree, mask=mask, should_stop=should_stop)
+    values, _ = pixels.checked_pixels(image)
+    background = pixels.fit_polynomial(values, degree, mask=mask, should_stop=should_stop)
     if kind == "subtract":
         return np.asarray(values - background + background.mean())
     if background.min() <= 0 or values.mean() <= 0:

@@ -13,14 +13,8 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.estimates import Estimate, uniform_source
-from napari_shadowinv.preprocessing.pixels import (
-    MOST_EXTRAPOLATION,
-    NORMAL_MAD,
-    beam_pixels,
-    block_means,
-    with_flux_of,
-)
 
 _MOST_FITTED_PIXELS = 2**16
 _MOST_FITS = 10
@@ -78,7 +72,7 @@ def gaussian_source(
     narrower than 1/256 of the image, higher than 1000 times the mean, or more than three sides
     away from the middle of what is seen is not considered.
     """
-    values, usable = beam_pixels(image, mask)
+    values, usable = pixels.beam_pixels(image, mask)
     side, mean = max(values.shape), values[usable].mean()
     y, x, sample = _samples(values / mean, usable)
     report = Reporter(None, should_stop)
@@ -87,7 +81,7 @@ def gaussian_source(
     beam = _gaussian(parameters, rows[:, None], columns)
     rise = float(beam.max() / sample.max())
     tell = on_warning or partial(warnings.warn, stacklevel=2)
-    if rise > MOST_EXTRAPOLATION:
+    if rise > pixels.MOST_EXTRAPOLATION:
         tell(
             "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
             "uniform: mask less, or choose another estimate"
@@ -98,14 +92,14 @@ def gaussian_source(
             f"the Gaussian beam rises to {rise:.2g} times the fitted data under the mask: "
             "compare it with another estimate, or mask less"
         )
-    return with_flux_of(mean * beam, values, usable)
+    return pixels.with_flux_of(mean * beam, values, usable)
 
 
 def _samples(values: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Positions y, x and means of blocks of usable pixels, few enough for a fit."""
     block = int(np.ceil(np.sqrt(values.size / _MOST_FITTED_PIXELS)))
-    share = block_means(usable.astype(np.float64), block)
-    means = block_means(np.where(usable, values, 0.0), block)
+    share = pixels.block_means(usable.astype(np.float64), block)
+    means = pixels.block_means(np.where(usable, values, 0.0), block)
     # A block is taken only if it is whole: the middle of a part of it lies elsewhere.
     # A mask so fine that no block is whole leaves the fullest.
     y, x = np.nonzero(share >= share.max())
@@ -136,7 +130,7 @@ def _fitted_gaussian(
     scale = 0.0
     for _ in range(_MOST_FITS):
         residual = _gaussian(parameters, y, x) - sample
-        previous, scale = scale, max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
+        previous, scale = scale, max(pixels.NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
         if abs(scale - previous) < 1e-2 * scale:
             break
         parameters = fitted(parameters, "soft_l1", scale)
