@@ -65,21 +65,15 @@ def _counting(name: str) -> list[tuple[int, int, str]]:
 def check_output(
     path: str | Path, overwrite: bool = False, *, suffixes: Collection[str] = ()
 ) -> Path:
-    """Refuse a path that cannot be written, before any long work.
+    """Refuse a path that cannot be written, before any long work; return it.
 
     Parameters
     ----------
     path : str or Path
-        The file to be written later.
     overwrite : bool
         Whether an existing file may be replaced.
     suffixes : collection of str
         The endings that are allowed; empty for all.
-
-    Returns
-    -------
-    Path
-        The same path.
 
     Raises
     ------
@@ -118,12 +112,7 @@ def check_folder_of(path: Path) -> None:
 
 @contextmanager
 def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
-    """Write a file completely or not at all.
-
-    Parameters
-    ----------
-    path, overwrite
-        As for `check_output`.
+    """Write a file completely or not at all; path and overwrite are those of `check_output`.
 
     Yields
     ------

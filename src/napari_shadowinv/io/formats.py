@@ -68,91 +68,53 @@ def function(reference: str) -> Callable[..., Any]:
 # MATLAB 7.3 is HDF5 behind a header of its own, which other programs keep when they add to a file.
 _HDF5 = ((0, b"\x89HDF\r\n\x1a\n"), (0, b"MATLAB"))
 
+# fmt: off
 TIFF = Format(
-    "tiff",
-    (".tif", ".tiff"),
-    "TIFF",
+    "tiff", (".tif", ".tiff"), "TIFF",
     ((0, b"II*\x00"), (0, b"MM\x00*"), (0, b"II+\x00"), (0, b"MM\x00+")),
-    reader="images:read_tiff",
-    image_writer="images:write_tiff",
-    is_scan=True,
+    reader="images:read_tiff", image_writer="images:write_tiff", is_scan=True,
 )
 PNG = Format(
-    "png",
-    (".png",),
-    "PNG",
-    ((0, b"\x89PNG\r\n\x1a\n"),),
-    reader="images:read_png",
-    image_writer="images:write_png",
-    is_scan=True,
+    "png", (".png",), "PNG", ((0, b"\x89PNG\r\n\x1a\n"),),
+    reader="images:read_png", image_writer="images:write_png", is_scan=True,
 )
 BMP = Format("bmp", (".bmp",), "BMP", ((0, b"BM"),), reader="images:read_eight_bits", is_scan=True)
 JPEG = Format(
-    "jpeg",
-    (".jpg", ".jpeg"),
-    "JPEG",
-    ((0, b"\xff\xd8\xff"),),
-    reader="images:read_eight_bits",
-    is_scan=True,
+    "jpeg", (".jpg", ".jpeg"), "JPEG", ((0, b"\xff\xd8\xff"),),
+    reader="images:read_eight_bits", is_scan=True,
 )
 NPY = Format(
-    "npy",
-    (".npy",),
-    "NPY",
-    ((0, b"\x93NUMPY"),),
-    reader="images:read_npy_plane",
-    image_writer="images:write_npy",
+    "npy", (".npy",), "NPY", ((0, b"\x93NUMPY"),),
+    reader="images:read_npy_plane", image_writer="images:write_npy",
 )
 MATLAB = Format(
-    "mat",
-    (".mat",),
-    "MATLAB",
-    _HDF5,
-    test="matlab:is_matlab",
-    reader="matlab:read_mat",
-    named_reader="matlab:read_mat",
+    "mat", (".mat",), "MATLAB", _HDF5, test="matlab:is_matlab",
+    reader="matlab:read_mat", named_reader="matlab:read_mat",
 )
 PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader="camera:read_b16")
 RESULT = Format(
-    "shadowinv",
-    (".shadowinv",),
-    ".shadowinv",
-    _HDF5,
-    test="pradformat:is_result",
-    holds=("result",),
-    reader="dataset:read_result",
-    named_reader="hdf5:read_plane",
+    "shadowinv", (".shadowinv",), ".shadowinv", _HDF5, test="pradformat:is_result",
+    holds=("result",), reader="dataset:read_result", named_reader="hdf5:read_plane",
     result_writer="dataset:write_result",
 )
 # The reader of all other HDF5 files: it says which array can be named.
 PRADFORMAT = Format(
-    "hdf5",
-    (".h5", ".hdf5"),
-    "pradformat HDF5",
-    _HDF5,
-    holds=("image", "result"),
-    reader="pradformat:read_pradformat",
-    named_reader="hdf5:read_plane",
-    result_writer="pradformat:write_pradformat",
+    "hdf5", (".h5", ".hdf5"), "pradformat HDF5", _HDF5,
+    holds=("image", "result"), reader="pradformat:read_pradformat",
+    named_reader="hdf5:read_plane", result_writer="pradformat:write_pradformat",
 )
 # The oldest programs left the marks out.
 SPE = Format(
-    "spe",
-    (".spe",),
-    "Princeton .spe",
-    ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55")),
-    unmarked="binary",
-    reader="camera:read_spe",
+    "spe", (".spe",), "Princeton .spe", ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55")),
+    unmarked="binary", reader="camera:read_spe",
 )
 SITES = Format("sites", (".csv",), holds=(), result_writer="dataset:write_sites")
 TEXT = Format(
-    "text",
-    (".txt", SITES.suffix, ".dat", ".asc"),
-    "numbers as .txt, .csv or .dat",
-    unmarked="text",
-    reader="text:read_text",
+    "text", (".txt", SITES.suffix, ".dat", ".asc"), "numbers as .txt, .csv or .dat",
+    unmarked="text", reader="text:read_text",
 )
 STORE = Format("store", (".shadowinv.zarr",), holds=("result",))
+# fmt: on
 
 FORMATS = (TIFF, PNG, BMP, JPEG, NPY, PCO, MATLAB, RESULT, PRADFORMAT, SPE, TEXT, SITES, STORE)
 

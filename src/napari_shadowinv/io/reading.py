@@ -117,18 +117,7 @@ def _complete_setup(path: Path, geometry: dict[str, Any]) -> Setup | None:
 def read_radiograph(
     path: str | Path, *, channel: str | int | None = None, variable: str | None = None
 ) -> Radiograph:
-    """Read an image; the arguments are those of `read`.
-
-    Returns
-    -------
-    Radiograph
-        The image and what is known about it.
-
-    Raises
-    ------
-    FileFormatError, InputError
-        As `read`, and if the file holds a result.
-    """
+    """Read an image, as by `read`; a result raises a `FileFormatError`, too."""
     content = read(path, channel=channel, variable=variable)
     if not isinstance(content, Radiograph):
         raise FileFormatError(
@@ -138,22 +127,10 @@ def read_radiograph(
 
 
 def read_dataset(path: str | Path) -> xarray.Dataset:
-    """Read a result or an inversion.
+    """Read a ``.shadowinv`` file, a pradformat inversion, or a ``.shadowinv.zarr`` store.
 
-    Parameters
-    ----------
-    path : str or Path
-        A ``.shadowinv`` file, a pradformat inversion, or a ``.shadowinv.zarr`` store.
-
-    Returns
-    -------
-    xarray.Dataset
-        With the displacement at least.
-
-    Raises
-    ------
-    FileFormatError
-        As `read`, and if the file holds an image.
+    The dataset has the displacement at least. Errors are those of `read`, and a `FileFormatError`
+    if the file holds an image.
     """
     content = read(path) if is_stack(path) or "result" in format_of(path).holds else None
     if content is None or isinstance(content, Radiograph):
@@ -167,12 +144,8 @@ def read_dataset(path: str | Path) -> xarray.Dataset:
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the keys and values of a TOML file.
 
-    Raises
-    ------
-    FileFormatError
-        If it is missing or cannot be opened.
-    InputError
-        If it is not TOML; the message names the line.
+    A `FileFormatError` if it is missing or cannot be opened; an `InputError`, which names the line,
+    if it is not TOML.
     """
     text = small_text(path, "a TOML file")
     try:

@@ -47,7 +47,6 @@ def write(
     Returns
     -------
     Path
-        The file.
 
     Raises
     ------

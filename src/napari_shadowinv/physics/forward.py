@@ -63,10 +63,8 @@ def synthetic_image(
         Tiles that each pixel of the source is cut into; the next square number is used.
     threads : int, optional
         Threads to use. Default: all cores. The result does not depend on it.
-    on_progress : callable, optional
-        Receives a `Progress` for each band of rows.
-    should_stop : callable, optional
-        Asked after each band; when it returns true the work ends.
+    on_progress, should_stop : callable, optional
+        Receives a `Progress` for each band of rows; ends the work when it returns true after one.
 
     Returns
     -------
@@ -131,7 +129,8 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
     """Area, in the image, of each pixel of the source: det(1 + ∇d), Eq. 4 of the paper.
 
     Negative where the map has folded the pixel over; small where rays crowd. Made of
-    differences that are of second order up to the border.
+    differences that are of second order up to the border. An `InputError` if the shape does not
+    fit or a value is not finite.
 
     Parameters
     ----------
@@ -141,11 +140,6 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
     Returns
     -------
     ndarray of float64, shape (H, W)
-
-    Raises
-    ------
-    InputError
-        If the shape does not fit or a value is not finite.
 
     Examples
     --------

@@ -88,16 +88,6 @@ def project(
     ------
     InputError
         As `transferred_displacement` and `synthetic_image`.
-
-    Examples
-    --------
-    In its own experiment, a field makes the image that it was found in:
-
-    >>> from napari_shadowinv.physics.phantoms import paper_setup, toroid
-    >>> setup = paper_setup()
-    >>> truth = toroid((60, 60), setup, peak=20, sigma=15e-6).displacement
-    >>> bool((project(truth, setup, setup) == synthetic_image(truth)).all())
-    True
     """
     if source is not None and shape is None:
         height, width = np.shape(source)[:2] if np.ndim(source) == 2 else (0, 0)

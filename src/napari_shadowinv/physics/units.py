@@ -37,22 +37,14 @@ def prefix_for(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> t
 
 @dataclass(frozen=True)
 class ShownField:
-    """A vector field in the unit that it is shown in.
+    """A vector field in the unit that it is shown in."""
 
-    Attributes
-    ----------
-    vectors : ndarray, shape (2, H, W)
-        Components, whose symbols `components` holds.
-    arrows : str
-        Title of the field's arrows; empty where they would point along the displacement.
-    """
-
-    vectors: FloatArray
+    vectors: FloatArray  # (2, H, W)
     name: str
     symbol: str
     unit: str
-    components: tuple[str, str]
-    arrows: str = ""
+    components: tuple[str, str]  # their symbols
+    arrows: str = ""  # title of its arrows; empty where they would point along the displacement
 
     @property
     def magnitude(self) -> FloatArray:

@@ -43,7 +43,6 @@ def report_figure(
     Parameters
     ----------
     inversion : Inversion
-        The result.
     setup : Setup, optional
         Gives axes in metres and the field in SI units; pixels without.
     title : str, optional
@@ -118,26 +117,10 @@ def comparison_figure(
 
 
 def save_figure(path: str | Path, figure: Figure, overwrite: bool = False) -> Path:
-    """Write a figure, whole or not at all.
+    """Write a figure, whole or not at all, in the format of the ending (PNG, PDF, SVG).
 
-    Parameters
-    ----------
-    path : str or Path
-        The file; its ending chooses the format (PNG, PDF, SVG).
-    figure : matplotlib.figure.Figure
-        What to write.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    FileFormatError
-        If the file exists and must not be replaced, or its folder cannot be written.
+    Returns the path. A `FileFormatError` if the file exists and `overwrite` does not allow to
+    replace it, or its folder cannot be written.
     """
     with replacing(path, overwrite) as temporary:
         figure.savefig(temporary, dpi=DOTS_PER_INCH)

@@ -164,7 +164,7 @@ def _palette() -> tuple[Any, NDArray[np.uint8]]:
 def write_film(
     path: Path, frames: Iterable[NDArray[np.uint8]], rate: float, *, overwrite: bool = False
 ) -> int:
-    """Write frames as a film, whole or not at all.
+    """Write frames as a film, whole or not at all; return their number.
 
     Parameters
     ----------
@@ -174,18 +174,11 @@ def write_film(
         From `stack_frames`, one at least.
     rate : float
         Frames a second.
-    overwrite : bool
-        Whether an existing film may be replaced.
-
-    Returns
-    -------
-    int
-        Number of frames.
 
     Raises
     ------
     FileFormatError
-        If the film exists and must not be replaced, or cannot be written.
+        If the film exists and `overwrite` does not allow to replace it, or it cannot be written.
     """
     with replacing(path, overwrite) as temporary:
         if path.suffix.lower() == ".gif":

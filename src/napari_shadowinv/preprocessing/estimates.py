@@ -38,15 +38,9 @@ from pydantic import Field
 from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.filling import FILL_WIDTH, filled, interpolated_source
 from napari_shadowinv.preprocessing.filters import low_pass
-from napari_shadowinv.preprocessing.pixels import (
-    beam_pixels,
-    checked_integer,
-    checked_number,
-    fit_polynomial,
-    with_flux_of,
-)
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
 if TYPE_CHECKING:
@@ -57,40 +51,22 @@ _NARROWEST_WAVES = 2.0  # px; a Gaussian that is narrower has waves too short fo
 
 
 class Estimate(Choice):
-    """A way to guess the undisturbed beam from the shot.
-
-    Attributes
-    ----------
-    function : callable
-        Makes the source; takes the image, the parameters, ``mask`` and ``should_stop``.
-    needs_mask, uses_mask : bool
-        Whether it does nothing without a mask, or anything with one.
-    """
+    """A way to guess the undisturbed beam from the shot."""
 
     key = "method"
+    # Makes the source; takes the image, the parameters, ``mask`` and ``should_stop``.
     function: ClassVar[Callable[..., FloatArray]]
-    needs_mask: ClassVar[bool] = False
-    uses_mask: ClassVar[bool] = True
+    needs_mask: ClassVar[bool] = False  # does it nothing without a mask
+    uses_mask: ClassVar[bool] = True  # does it anything with one
 
     def placed(
         self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
     ) -> Estimate:
         """Return the same for the images of an experiment; most estimates do not depend on it.
 
-        Parameters
-        ----------
-        setup : Setup or None
-            Of the image whose source is to be estimated, None if it is not known.
-        shape : tuple of int
-            Shape (H, W) of the image as recorded.
-        matrix : ndarray, shape (3, 3), optional
-            Takes (y, x, 1) from the image whose source is to be estimated to the image as recorded.
-            Default: they are the same.
-
-        Raises
-        ------
-        InputError
-            If the estimate needs another setup.
+        The setup, None if it is not known, is that of the image whose source is estimated, the
+        shape (H, W) that of the image as recorded; the matrix, shape (3, 3), takes (y, x, 1) from
+        the first to the second, by default the same. An `InputError` if it needs another setup.
         """
         return self
 
@@ -103,10 +79,7 @@ class Estimate(Choice):
     ) -> FloatArray:
         """Estimate the source; `on_warning` receives a sentence where it has to be doubted.
 
-        Raises
-        ------
-        InputError
-            If the image cannot be used, or there is no mask where one is needed.
+        An `InputError` if the image cannot be used, or there is no mask where one is needed.
         """
         if self.needs_mask and mask is None:
             raise InputError(
@@ -147,7 +120,7 @@ def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatA
     >>> uniform_source([[1, 2], [3, 6]])
     array([[3., 3.], [3., 3.]])
     """
-    values, usable = beam_pixels(image, mask)
+    values, usable = pixels.beam_pixels(image, mask)
     return np.full(values.shape, values[usable].mean())
 
 
@@ -183,17 +156,10 @@ def polynomial_source(
     -------
     ndarray of float64, shape (H, W)
         Where the polynomial falls below 0.001 of the image's mean, it is that.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> ramp = np.linspace(1, 3, 50) * np.ones((50, 1))
-    >>> float(abs(polynomial_source(ramp, degree=1) - ramp).max()) < 1e-12
-    True
     """
-    values, usable = beam_pixels(image, mask)
-    fit = fit_polynomial(values, degree, mask=usable, should_stop=should_stop)
-    return with_flux_of(fit, values, usable)
+    values, usable = pixels.beam_pixels(image, mask)
+    fit = pixels.fit_polynomial(values, degree, mask=usable, should_stop=should_stop)
+    return pixels.with_flux_of(fit, values, usable)
 
 
 class PolynomialEstimate(Estimate):
@@ -227,23 +193,16 @@ def low_pass_source(
     ndarray of float64, shape (H, W)
         At each pixel the mean of the usable pixels around it, weighted by the Gaussian; its border
         is mirrored. Where none is within reach, the width is doubled until there is one.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> shot = 5 + np.random.default_rng(0).normal(size=(60, 60))
-    >>> float(low_pass_source(shot, 10.0).std()) < 0.05
-    True
     """
-    values, usable = beam_pixels(image, mask)
-    width = checked_number("width", width, above=0, unit="px")
+    values, usable = pixels.beam_pixels(image, mask)
+    width = pixels.checked_number("width", width, above=0, unit="px")
     report = Reporter(None, should_stop)
     beam, support = _masked_blur(values, usable, width, report)
     while not support.all():
         width *= 2
         wider, reached = _masked_blur(values, usable, width, report)
         beam, support = np.where(support, beam, wider), support | reached
-    return with_flux_of(beam, values, usable)
+    return pixels.with_flux_of(beam, values, usable)
 
 
 class LowPassEstimate(Estimate):
@@ -306,26 +265,17 @@ def total_variation_source(
     ----------
     A. Chambolle, "An algorithm for total variation minimization and applications", Journal
     of Mathematical Imaging and Vision 20, 89 (2004).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> shot = np.where(np.arange(60) < 30, 2.0, 4.0) + np.zeros((60, 1))
-    >>> shot[10:14, 10:14] = 3.0
-    >>> beam = total_variation_source(shot, weight=0.5)
-    >>> bool(abs(beam[10:14, 10:14] - 2).max() < 0.1), bool(beam[40, 30] - beam[40, 29] > 1.8)
-    (True, True)
     """
     from napari_shadowinv.preprocessing._total_variation import least_variation
 
-    values, usable = beam_pixels(image, mask)
-    weight = checked_number("weight", weight, above=0, unit="px")
-    iterations = checked_integer("iterations", iterations, least=1)
+    values, usable = pixels.beam_pixels(image, mask)
+    weight = pixels.checked_number("weight", weight, above=0, unit="px")
+    iterations = pixels.checked_integer("iterations", iterations, least=1)
     report = Reporter(None, should_stop)
     whole = values if usable.all() else filled(values, usable, FILL_WIDTH, 2, report)
     mean = values[usable].mean()
     beam = mean * least_variation(whole / mean, weight, iterations, report)
-    return with_flux_of(beam, values, usable)
+    return pixels.with_flux_of(beam, values, usable)
 
 
 class TotalVariationEstimate(Estimate):

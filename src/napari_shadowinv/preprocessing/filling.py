@@ -15,12 +15,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.preprocessing.pixels import (
-    beam_pixels,
-    block_means,
-    checked_number,
-    with_flux_of,
-)
+from napari_shadowinv.preprocessing import pixels
 
 FILL_WIDTH = 5.0  # px
 _COARSEST_SIDE = 32
@@ -76,25 +71,15 @@ def interpolated_source(
     ----------
     D. Garcia, "Robust smoothing of gridded data in one and higher dimensions with missing
     values", Computational Statistics & Data Analysis 54, 1167 (2010).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> y, x = np.mgrid[:48, :64]
-    >>> beam = 100 * np.exp(-((y - 20) ** 2 + (x - 30) ** 2) / 2000)
-    >>> mask = np.hypot(y - 24, x - 34) > 8
-    >>> shot = np.where(mask, beam, 0)
-    >>> float(abs(interpolated_source(shot, mask, width=2.0) / beam - 1).max()) < 0.01
-    True
     """
     if kind not in ("biharmonic", "laplace"):
         raise InputError(f"kind is {kind!r}, expected 'biharmonic' or 'laplace'")
-    values, usable = beam_pixels(image, mask)
-    width = checked_number("width", width, above=0, unit="px")
+    values, usable = pixels.beam_pixels(image, mask)
+    width = pixels.checked_number("width", width, above=0, unit="px")
     power = 2 if kind == "biharmonic" else 1
     report = Reporter(None, should_stop)
     beam = np.where(usable, values, filled(values, usable, width, power, report))
-    return with_flux_of(beam, values, usable)
+    return pixels.with_flux_of(beam, values, usable)
 
 
 def filled(
@@ -146,7 +131,9 @@ def _coarse_spline(
     """First guess of `_spline`, from pixels twice as large."""
     if min(known.shape) < _COARSEST_SIDE:
         return np.full(known.shape, known.sum() / share.sum())
-    coarse = _spline(block_means(known, 2), block_means(share, 2), width / 2, power, report)
+    coarse = _spline(
+        pixels.block_means(known, 2), pixels.block_means(share, 2), width / 2, power, report
+    )
     height, length = known.shape
     return _doubled(_doubled(coarse, height).T, length).T
 

@@ -13,14 +13,8 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.estimates import Estimate, uniform_source
-from napari_shadowinv.preprocessing.pixels import (
-    MOST_EXTRAPOLATION,
-    NORMAL_MAD,
-    beam_pixels,
-    block_means,
-    with_flux_of,
-)
 
 _MOST_FITTED_PIXELS = 2**16
 _MOST_FITS = 10
@@ -60,8 +54,7 @@ def gaussian_source(
     Parameters
     ----------
     image : array_like, shape (H, W)
-    mask : array_like of bool, shape (H, W), optional
-    should_stop : callable, optional
+    mask, should_stop : optional
     on_warning : callable, optional
         Receives a sentence where the fit has to be doubted. Default: `warnings.warn`.
 
@@ -78,16 +71,8 @@ def gaussian_source(
     last two are not negative. Large images are averaged in blocks for the fit. A Gaussian
     narrower than 1/256 of the image, higher than 1000 times the mean, or more than three sides
     away from the middle of what is seen is not considered.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> y, x = np.mgrid[:40, :50]
-    >>> beam = 3 + 7 * np.exp(-((y - 18) ** 2) / 200 - (x - 30) ** 2 / 300)
-    >>> float(abs(gaussian_source(beam) / beam - 1).max()) < 1e-4
-    True
     """
-    values, usable = beam_pixels(image, mask)
+    values, usable = pixels.beam_pixels(image, mask)
     side, mean = max(values.shape), values[usable].mean()
     y, x, sample = _samples(values / mean, usable)
     report = Reporter(None, should_stop)
@@ -96,7 +81,7 @@ def gaussian_source(
     beam = _gaussian(parameters, rows[:, None], columns)
     rise = float(beam.max() / sample.max())
     tell = on_warning or partial(warnings.warn, stacklevel=2)
-    if rise > MOST_EXTRAPOLATION:
+    if rise > pixels.MOST_EXTRAPOLATION:
         tell(
             "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
             "uniform: mask less, or choose another estimate"
@@ -107,14 +92,14 @@ def gaussian_source(
             f"the Gaussian beam rises to {rise:.2g} times the fitted data under the mask: "
             "compare it with another estimate, or mask less"
         )
-    return with_flux_of(mean * beam, values, usable)
+    return pixels.with_flux_of(mean * beam, values, usable)
 
 
 def _samples(values: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Positions y, x and means of blocks of usable pixels, few enough for a fit."""
     block = int(np.ceil(np.sqrt(values.size / _MOST_FITTED_PIXELS)))
-    share = block_means(usable.astype(np.float64), block)
-    means = block_means(np.where(usable, values, 0.0), block)
+    share = pixels.block_means(usable.astype(np.float64), block)
+    means = pixels.block_means(np.where(usable, values, 0.0), block)
     # A block is taken only if it is whole: the middle of a part of it lies elsewhere.
     # A mask so fine that no block is whole leaves the fullest.
     y, x = np.nonzero(share >= share.max())
@@ -145,7 +130,7 @@ def _fitted_gaussian(
     scale = 0.0
     for _ in range(_MOST_FITS):
         residual = _gaussian(parameters, y, x) - sample
-        previous, scale = scale, max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
+        previous, scale = scale, max(pixels.NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
         if abs(scale - previous) < 1e-2 * scale:
             break
         parameters = fitted(parameters, "soft_l1", scale)
@@ -163,36 +148,6 @@ def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     ]
     least, most = np.transpose(ranges)
     return least, most
-
-
-def _refitted(
-    parameters: FloatArray,
-    y: FloatArray,
-    x: FloatArray,
-    sample: FloatArray,
-    report: Reporter,
-    bounds: tuple[FloatArray, FloatArray],
-    *,
-    loss: Literal["linear", "soft_l1"],
-    scale: float,
-) -> FloatArray:
-    """Parameters of `_gaussian` nearest to samples, in the sense of a loss of some scale."""
-
-    def excess(p: FloatArray) -> FloatArray:
-        report("source", 0)
-        return _gaussian(p, y, x) - sample
-
-    fit = scipy.optimize.least_squares(
-        excess,
-        parameters,
-        jac=lambda p: _gaussian_slopes(p, y, x),
-        bounds=bounds,
-        loss=loss,
-        f_scale=scale,
-        x_scale="jac",
-        max_nfev=200,
-    )
-    return np.asarray(fit.x)
 
 
 def _first_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:

@@ -12,13 +12,8 @@ from pydantic import Field
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.filters import Filter
-from napari_shadowinv.preprocessing.pixels import (
-    NORMAL_MAD,
-    checked_integer,
-    checked_number,
-    checked_pixels,
-)
 
 _NORMAL_MEAN = 1.2533  # standard deviation over mean absolute deviation, normal noise
 _PIXELS_PER_NOISE_BIN = 400
@@ -118,9 +113,9 @@ def remove_hot_pixels(
     >>> np.argwhere(hot).tolist(), np.argwhere(dead).tolist()
     ([[3, 5]], [[20, 0]])
     """
-    values, _ = checked_pixels(image)
-    threshold = checked_number("threshold", threshold, above=0, unit="deviations")
-    size = checked_integer("size", size, least=3)
+    values, _ = pixels.checked_pixels(image)
+    threshold = pixels.checked_number("threshold", threshold, above=0, unit="deviations")
+    size = pixels.checked_integer("size", size, least=3)
     if size % 2 == 0:
         raise InputError(
             f"size is {size}, expected an odd number, so that the window is centred on a pixel"
@@ -176,4 +171,4 @@ def _deviation(difference: FloatArray) -> float:
     """Robust standard deviation about zero."""
     size = np.abs(difference)
     # In few-bit images more than half the pixels can equal their median.
-    return float(NORMAL_MAD * np.median(size)) or float(_NORMAL_MEAN * size.mean())
+    return float(pixels.NORMAL_MAD * np.median(size)) or float(_NORMAL_MEAN * size.mean())

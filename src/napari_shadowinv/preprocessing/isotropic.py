@@ -95,7 +95,7 @@ def _without_setup() -> InputError:
 def uniform_warnings(
     shape: tuple[int, int], setup: Setup | None, *, centre: tuple[float, float] | None = None
 ) -> tuple[str, ...]:
-    """Say whether a point source would light an image too unevenly to be taken as uniform.
+    """Say if a point source would light an image too unevenly to be taken as uniform.
 
     Parameters
     ----------
@@ -110,14 +110,6 @@ def uniform_warnings(
     -------
     tuple of str
         Empty where the fluence of an isotropic point source varies by 1 % at most.
-
-    Examples
-    --------
-    >>> from napari_shadowinv.physics.phantoms import paper_setup
-    >>> uniform_warnings((60, 60), paper_setup())
-    ()
-    >>> len(uniform_warnings((400, 400), paper_setup()))
-    1
     """
     if setup is None or setup.collimated:
         return ()

@@ -133,18 +133,20 @@ def fit_polynomial(
     mask: ArrayLike | None = None,
     should_stop: ShouldStop | None = None,
 ) -> FloatArray:
-    """Fit a polynomial in y and x to an image, robust against outliers.
+    """Fit a polynomial in y and x, of a total degree from 0 to 10, robust against outliers.
+
+    Iteratively reweighted least squares of the soft L1 loss: residuals count squared within the
+    noise (the median absolute deviation of the residuals), in proportion beyond.
 
     Parameters
     ----------
     image : array_like, shape (H, W)
         An image or a potential, any unit.
     degree : int
-        Total degree of the polynomial, from 0 to 10.
     mask : array_like of bool, shape (H, W), optional
         True where the fit may look. Default: everywhere.
     should_stop : callable, optional
-        Asked at each step; when it returns true the fit ends.
+        Asked at each step; `InversionCancelled` when it returns true.
 
     Returns
     -------
@@ -154,23 +156,7 @@ def fit_polynomial(
     Raises
     ------
     InputError
-        If image and mask cannot be used, the degree is out of range, or there are fewer
-        usable pixels than coefficients.
-    InversionCancelled
-        If `should_stop` returned true.
-
-    Notes
-    -----
-    Iteratively reweighted least squares of the soft L1 loss: residuals count squared within
-    the noise (the median absolute deviation of the residuals), in proportion beyond.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> image = np.linspace(1, 3, 50) * np.ones((50, 1))
-    >>> image[20:30, 20:30] *= 5
-    >>> float(abs(fit_polynomial(image, 1)[0] - image[0]).max()) < 1e-3
-    True
+        If image, mask or degree cannot be used, or usable pixels are fewer than coefficients.
     """
     values, usable = checked_pixels(image, mask)
     degree = checked_integer("degree", degree, least=0, most=_HIGHEST_DEGREE)

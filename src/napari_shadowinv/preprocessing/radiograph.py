@@ -24,19 +24,15 @@ class Radiograph:
     ----------
     image : ndarray of float64, shape (H, W)
         Intensity or counts, ``[y, x]``, as stored.
-    setup : Setup or None
-        The geometry, where the file tells all of it.
-    path : Path or None
-        The file it comes from.
+    setup, path : optional
+        The geometry, where the file tells all of it; the file it comes from.
     metadata : mapping
         What else the file says: ``kind``, ``dtype``, ``bits``, ``sha256``, and for pradformat
         ``geometry``, the part of the setup that the file knows.
     source : ndarray, shape (H, W), or None
         The undisturbed beam.
-    mask : ndarray of bool, shape (H, W), or None
-        True where a pixel can be used.
-    source_mask : ndarray of bool, shape (H, W), or None
-        True where the object is not; an estimate of the source looks at no other pixels.
+    mask, source_mask : ndarray of bool, shape (H, W), or None
+        True where a pixel can be used; where the object is not, and the source can be estimated.
     warnings : tuple of str
         What the user should know before trusting what the file says.
     """
@@ -81,12 +77,8 @@ class Radiograph:
         """Sum blocks of `factor` × `factor` pixels; the setup's pixel grows with them.
 
         Rows and columns that fill no block are cut off at the end. A block can be used if all its
-        pixels can. The metadata's ``bin`` tells the factor.
-
-        Raises
-        ------
-        InputError
-            If `factor` is less than 1 or leaves less than 2×2 blocks.
+        pixels can. The metadata's ``bin`` tells the factor. An `InputError` if `factor` is less
+        than 1 or leaves less than 2×2 blocks.
 
         Examples
         --------

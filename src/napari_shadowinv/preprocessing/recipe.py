@@ -144,12 +144,9 @@ class Recipe(BaseModel):
     def check(self, shot: Radiograph) -> None:
         """Reject choices that contradict each other, or the shot, before any work is done.
 
-        Raises
-        ------
-        InputError
-            If arrays differ in shape, there is a source though the image is flattened or the
-            source estimated, no source mask for an estimate that needs one, or the mask hides
-            the object, too.
+        An `InputError` if arrays differ in shape, there is a source though the image is flattened
+        or the source estimated, no source mask for an estimate that needs one, or the mask hides
+        the object, too.
         """
         for name in ("source", "mask", "source_mask"):
             array = getattr(shot, name)
@@ -193,13 +190,7 @@ class Recipe(BaseModel):
 
 
 def check_masks(mask: BoolArray | None, bare: BoolArray | None) -> None:
-    """Reject a mask that excludes the object, as marked by the source mask, from the inversion.
-
-    Raises
-    ------
-    InputError
-        If next to nothing of the object, where `bare` is False, is left.
-    """
+    """Reject with an `InputError` a mask that leaves next to nothing of the object, ``~bare``."""
     if mask is None or bare is None or bare.all():
         return
     from scipy.ndimage import label
@@ -233,10 +224,8 @@ def estimated_source(
     Parameters
     ----------
     estimate : Estimate
-        How, placed for the shot.
+        How, placed for the shot; its `source` takes `should_stop` and `on_warning`.
     shot : Radiograph
-    should_stop, on_warning : callable, optional
-        For `Estimate.source`.
     by : callable, optional
         Called in place of `Estimate.source`, such as one that remembers.
     """
@@ -274,10 +263,9 @@ class Origin(BaseModel):
 
     Attributes
     ----------
-    file : str
-        Name of the file, without its folder; "" if it was an array.
-    sha256 : str
-        Checksum of the file; of the array's values if it was no file.
+    file, sha256 : str
+        Name of the file, without its folder, and its checksum; "" and that of the values if it
+        was an array.
     variable, channel : str or int or None
         What of the file was taken.
     pixels, shape : str and tuple of int, or None
@@ -312,18 +300,8 @@ class Origin(BaseModel):
 class Provenance(BaseModel):
     """How a result was made, so that it can be made again.
 
-    Attributes
-    ----------
-    version : str
-        Of the package.
-    recipe : Recipe
-        What was done; with the setup and the kind of source that came with the image's file.
-    image, source, mask, source_mask : Origin or None
-        What it was done to.
-    setup : Setup or None
-        Of the result's pixels.
-    notes : tuple of str
-        What the steps found and did, for people.
+    The `recipe` has the setup and the kind of source that came with the image's file, too; `setup`
+    is that of the result's pixels; `notes` tell people what the steps found and did.
     """
 
     model_config = _CONFIG

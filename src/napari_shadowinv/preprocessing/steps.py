@@ -24,24 +24,14 @@ _WHOLE = 0.999  # share of a rotated pixel that must be known
 
 
 class Choice(BaseModel):
-    """One of several ways to do something, with its parameters.
-
-    Attributes
-    ----------
-    title : str
-        What the forms call it.
-    key : str
-        The field that names it in files, ``"step"`` or ``"method"``.
-    primary : str
-        The parameter that the command's flag of the same name sets; "" if each has its own flag.
-    place : int
-        Where it stands in lists; steps that flags ask for are done in the order of their places.
-    """
+    """One of several ways to do something, with its parameters."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    title: ClassVar[str]
-    key: ClassVar[str]
+    title: ClassVar[str]  # what the forms call it
+    key: ClassVar[str]  # the field that names it in files, "step" or "method"
+    # The parameter that the command's flag of the same name sets; "" if each has its own flag.
     primary: ClassVar[str] = ""
+    # Where it stands in lists; steps that flags ask for are done in the order of their places.
     place: ClassVar[int] = 100
 
     @classmethod
@@ -61,9 +51,8 @@ class Choice(BaseModel):
     @property
     def described(self) -> str:
         """Title and parameters, the same for the same choices."""
-        return ", ".join(
-            [self.title, *(f"{name} {value}" for name, value in self.values().items())]
-        )
+        values = (f"{name} {value}" for name, value in self.values().items())
+        return ", ".join([self.title, *values])
 
 
 C = TypeVar("C", bound=Choice)
@@ -115,12 +104,8 @@ class Step(Choice):
     def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         """Return the shot with this done to image, source, masks and setup.
 
-        Raises
-        ------
-        InputError
-            If it cannot be done to this image.
-        InversionCancelled
-            If `should_stop`, asked now and then by steps that take long, returned true.
+        An `InputError` if it cannot be done to this image; `InversionCancelled` if `should_stop`,
+        asked now and then by steps that take long, returned true.
         """
         raise NotImplementedError
 

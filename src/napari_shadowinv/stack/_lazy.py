@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import variable_labels
 from napari_shadowinv.io.store import SUMMARY
-from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack import _spec
-from napari_shadowinv.stack._references import Reader, Shot, read_shot
+from napari_shadowinv.stack._references import Shot
 from napari_shadowinv.stack._worker import Beam, Work
 
 if TYPE_CHECKING:
     import xarray
-
-    from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Recipe, Step
 
 # One number for each shot, beside the arrays of an inversion.
 _NUMBERS = ("converged", "flux_residual", "image_residual", "iterations")
@@ -31,18 +26,12 @@ _NUMBERS = ("converged", "flux_residual", "image_residual", "iterations")
 def invert_stack(
     shots: Any,
     *,
-    source: Any = None,
-    mask: ArrayLike | None = None,
-    options: InversionOptions | None = None,
-    setup: Setup | None = None,
-    recipe: Recipe | None = None,
-    filters: Sequence[Step] = (),
-    source_mask: ArrayLike | None = None,
     variables: Collection[str] | None = None,
-    reader: Reader = read_shot,
-    warm_start: int = 1,
+    **keywords: Unpack[_spec.StackKeywords],
 ) -> xarray.Dataset:
     """Describe the inversion of many shots; dask does the work where and when it is asked for.
+
+    The values do not depend on scheduler, chunks, order or number of workers.
 
     Parameters
     ----------
@@ -91,12 +80,10 @@ def invert_stack(
     FileFormatError
         If the source, or all of the first shots, cannot be read.
 
-    Notes
-    -----
-    The values do not depend on scheduler, chunks, order or number of workers.
-
     Examples
     --------
+    >>> import numpy as np
+    >>> from napari_shadowinv import InversionOptions
     >>> shots = np.ones((3, 20, 20))
     >>> stack = invert_stack(shots, options=InversionOptions(n_sites=50))
     >>> dict(stack.potential.sizes)
@@ -104,20 +91,7 @@ def invert_stack(
     >>> float(abs(stack.displacement.isel(shot=1)).max())
     0.0
     """
-    stack = _spec.describe_stack(
-        shots,
-        source=source,
-        mask=mask,
-        options=options,
-        setup=setup,
-        variables=variables,
-        reader=reader,
-        warm_start=warm_start,
-        recipe=recipe,
-        filters=filters,
-        source_mask=source_mask,
-    )
-    return _Graph(stack).dataset()
+    return _Graph(_spec.describe_stack(shots, variables=variables, **keywords)).dataset()
 
 
 def _invert(

@@ -46,23 +46,16 @@ def read_shot(
 
     Parameters
     ----------
-    path : Path
-        The file.
+    path, channel, variable
+        As for `napari_shadowinv.io.read_radiograph`, whose errors this raises.
     page : int, optional
         Of a TIFF with many pages, from 0.
-    channel, variable
-        As for `napari_shadowinv.io.read_radiograph`.
     warnings : list of str, optional
         What the user should know before trusting the image is put in here.
 
     Returns
     -------
     ndarray, shape (H, W)
-
-    Raises
-    ------
-    FileFormatError, InputError
-        See `napari_shadowinv.io.read_radiograph`.
     """
     if page is None:
         shot = read_radiograph(path, channel=channel, variable=variable)

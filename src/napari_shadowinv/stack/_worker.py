@@ -219,10 +219,8 @@ class ShotOutcome:
         Its number, and DONE or FAILED of `napari_shadowinv.io.store`.
     seconds : float
         Time that its worker spent on it, reading and writing included.
-    reason : str
-        Why it failed.
-    converged : bool
-        Whether the solver reached its tolerance.
+    reason, converged : str and bool
+        Why it failed, and whether the solver reached its tolerance.
     """
 
     index: int

@@ -13,18 +13,8 @@ import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.phantoms._shapes import (
-    Center,
-    Phantom,
-    Radii,
-    cosine_toroid,
-    gaussian_blob,
-    offsets,
-    outward_displacement,
-    require_finite,
-    require_positive,
-    toroid,
-)
+from napari_shadowinv.physics.phantoms import _shapes
+from napari_shadowinv.physics.phantoms._shapes import Center, Phantom, Radii, cosine_toroid, toroid
 from napari_shadowinv.physics.setup import ProtonSetup
 
 # Peak in MG µm, radii in shares of the image's smaller side, centre in shares of height
@@ -37,11 +27,6 @@ def paper_setup() -> ProtonSetup:
 
     Protons of 14.7 MeV, 1.3 mm from source to object, 2 cm on to the detector, pixels
     of 1.5 µm in the object plane: 200 pixels are ten times the toroid's σ of 30 µm.
-
-    Examples
-    --------
-    >>> paper_setup().magnification
-    16.38
     """
     return ProtonSetup.example()
 
@@ -104,13 +89,11 @@ def coaxial_line(
 
     Parameters
     ----------
-    shape : tuple of int
-    setup : ProtonSetup
+    shape, setup, center
     peak : float, default 60
         Path-integrated field at the inner conductor's surface in MG µm.
     radii : tuple of float
         Radius of the inner conductor, inner and outer radius of the outer one, in m; increasing.
-    center : tuple of float, optional
 
     Returns
     -------
@@ -118,20 +101,14 @@ def coaxial_line(
         Potential and displacement, inside the conductors too.
     obstructed : ndarray of bool, shape (H, W)
         Pixels whose centres are in a conductor: there the source of the image is dark.
-
-    Examples
-    --------
-    >>> phantom, obstructed = coaxial_line((200, 200), paper_setup())
-    >>> bool(obstructed[100, 100]), float(phantom.potential[0, 0])
-    (True, 0.0)
     """
-    require_finite(peak=peak)
+    _shapes.require_finite(peak=peak)
     if len(radii) != 3 or not (np.isfinite(radii).all() and 0 < radii[0] < radii[1] < radii[2]):
         raise InputError(f"radii are {radii}: expected three positive, increasing values, in m")
     inner, outer, rim = (radius / setup.object_pixel_size for radius in radii)
-    y, x = offsets(shape, center)
+    y, x = _shapes.offsets(shape, center)
     r = np.hypot(y, x)
-    enclosed = outward_displacement(setup, peak) * inner  # d = enclosed / r between the two
+    enclosed = _shapes.outward_displacement(setup, peak) * inner  # d = enclosed / r between the two
     share, potential = _coaxial_profile(r, inner, outer, rim)
     obstructed = (r < inner) | ((r > outer) & (r < rim))
     return Phantom(enclosed * potential, enclosed * np.stack([share * y, share * x])), obstructed
@@ -163,9 +140,9 @@ def ellipse_pair(shape: tuple[int, int], strength: float = 1.0) -> Phantom:
     unit = min(height, width) / 100
     one, other = 45.0 * strength * unit**2, -15.0 * strength * unit**2
     first_place, second_place = (0.37 * height, 0.42 * width), (0.63 * height, 0.66 * width)
-    return gaussian_blob(shape, one, (7.0 * unit, 12.0 * unit), first_place, 0.5) + gaussian_blob(
-        shape, other, (10.0 * unit, 6.0 * unit), second_place, 0.3
-    )
+    blob = _shapes.gaussian_blob
+    first = blob(shape, one, (7.0 * unit, 12.0 * unit), first_place, 0.5)
+    return first + blob(shape, other, (10.0 * unit, 6.0 * unit), second_place, 0.3)
 
 
 def _scene(
@@ -173,8 +150,8 @@ def _scene(
     setup: ProtonSetup, strength: float,
 ) -> Phantom:  # fmt: skip
     """Sum of the parts, each made by `toroid` or `cosine_toroid`."""
-    require_finite(strength=strength)
-    require_positive("smaller side of the image", min(shape), "px")
+    _shapes.require_finite(strength=strength)
+    _shapes.require_positive("smaller side of the image", min(shape), "px")
     side = min(shape) * setup.object_pixel_size
     made = []
     for peak, radii, share, angle in parts:

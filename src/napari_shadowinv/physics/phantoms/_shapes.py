@@ -54,13 +54,11 @@ def offsets(shape: tuple[int, int], center: Center) -> tuple[FloatArray, FloatAr
 
 
 def require_positive(name: str, value: float, unit: str) -> None:
-    """Refuse a length that is none."""
     if not (np.isfinite(value) and value > 0):
         raise InputError(f"{name} is {value}: it must be positive, in {unit}")
 
 
 def require_finite(**values: float) -> None:
-    """Refuse numbers that are infinite or not a number."""
     if not np.isfinite(list(values.values())).all():
         received = ", ".join(f"{name} {value}" for name, value in values.items())
         verb = "it must" if len(values) == 1 else "all must"
@@ -79,18 +77,12 @@ def toroid(
 
     Parameters
     ----------
-    shape : tuple of int
-    setup : ProtonSetup
+    shape, setup, center, angle
     peak : float
-        Path-integrated field D_m in MG µm, reached at r = σ.
+        Path-integrated field D_m in MG µm, reached at r = σ; Eq. 10 of the paper.
     sigma : float or tuple of float
         Radius σ in m, in the object plane; two radii (σ_u, σ_v) stretch the potential to
         an ellipse, whose field reaches the peak on its shorter axis.
-    center, angle : optional
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Eq. 10.
 
     Examples
     --------
@@ -116,17 +108,11 @@ def gaussian_blob(
 
     Parameters
     ----------
-    shape : tuple of int
+    shape, center, angle
     amplitude : float
         Amplitude A in px²; positive drives rays apart, negative gathers them.
     sigma : float or tuple of float
         Radius in px, or the radii (σ_u, σ_v); without rotation u is along y, v along x.
-    center, angle : optional
-
-    Examples
-    --------
-    >>> float(gaussian_blob((5, 5), amplitude=2.0, sigma=1.5).potential[2, 2])
-    2.0
     """
     radii = _checked_radii("sigma", sigma, "px")
     require_finite(amplitude=amplitude, angle=angle)
@@ -151,13 +137,11 @@ def cosine_toroid(
 
     Parameters
     ----------
-    shape : tuple of int
-    setup : ProtonSetup
+    shape, setup, center, angle
     peak : float
         Largest path-integrated field in MG µm, half-way to the rim on the shorter axis.
     radius : float or tuple of float
         Radius, or the half axes (R_u, R_v), in m in the object plane.
-    center, angle : optional
     """
     radii = _pixels_of(setup, "radius", radius)
     require_finite(peak=peak, angle=angle)

@@ -8,13 +8,8 @@ import numpy as np
 from scipy import constants
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.phantoms._shapes import (
-    Center,
-    Phantom,
-    offsets,
-    require_finite,
-    require_positive,
-)
+from napari_shadowinv.physics.phantoms import _shapes
+from napari_shadowinv.physics.phantoms._shapes import Center, Phantom, require_positive
 from napari_shadowinv.physics.setup import OpticalSetup
 
 PAPER_DENSITY = 1.65e25
@@ -31,17 +26,7 @@ def wakefield_setup() -> OpticalSetup:
 
 
 def plasma_wavelength(density: float) -> float:
-    """Wavelength 2πc/ω_p in m of the density wave in a cold plasma.
-
-    Parameters
-    ----------
-    density : float
-        Electron density n₀ in m⁻³.
-
-    Raises
-    ------
-    InputError
-        If the density is not positive.
+    """Wavelength 2πc/ω_p in m of the density wave in a cold plasma of n₀ electrons per m³.
 
     Examples
     --------
@@ -77,8 +62,7 @@ def wakefield(
 
     Parameters
     ----------
-    shape : tuple of int
-    setup : OpticalSetup
+    shape, setup, center
     amplitude : float, default 0.8
         Amplitude A of Δn/n₀ in the centre; below 1 the density stays positive.
     density : float, default 1.65e25
@@ -88,7 +72,6 @@ def wakefield(
     curvature_radius : float
         Radius R of the wavefronts on the axis in m; negative bends them the other way,
         infinite makes them plane.
-    center : tuple of float, optional
 
     Returns
     -------
@@ -103,27 +86,15 @@ def wakefield(
         ∫Δn/n₀ dz = A exp(-ξ²/2ℓ²) Re[√(π/s) exp(i k_p ξ - s y²)].
 
     The potential is that of a thin plasma, Φ = n₀/2n_c ∫Δn/n₀ dz, the first order of the
-    paper's Eq. 11 in n₀/n_c, which is 1 % for the paper's plasma and probe.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Section V, Eqs. 11 and 12.
-
-    Examples
-    --------
-    >>> setup = wakefield_setup()
-    >>> wave = wakefield((240, 400), setup)
-    >>> modulation = setup.relative_density_modulation(wave.potential, 1.65e25)
-    >>> round(float(modulation.max()) * 1e6, 1)  # µm
-    9.2
+    paper's Eq. 11 (Section V) in n₀/n_c, which is 1 % for the paper's plasma and probe.
     """
-    require_finite(amplitude=amplitude)
+    _shapes.require_finite(amplitude=amplitude)
     require_positive("width", width, "m")
     require_positive("length", length, "m")
     if curvature_radius == 0 or math.isnan(curvature_radius):
         raise InputError(f"curvature_radius is {curvature_radius}: it must not be 0, in m")
     wave_number = 2 * math.pi / plasma_wavelength(density)
-    y, xi = (setup.object_pixel_size * offset for offset in offsets(shape, center))
+    y, xi = (setup.object_pixel_size * offset for offset in _shapes.offsets(shape, center))
     s = complex(1 / (2 * width**2), wave_number / (2 * curvature_radius))
     integral = amplitude * np.sqrt(np.pi / s) * np.exp(1j * wave_number * xi - s * y**2)
     integral *= np.exp(-(xi**2) / (2 * length**2))

@@ -46,33 +46,28 @@ class MainField:
     arrows: str = ""
 
 
+def positive_field(title: str, description: str, default: Any = ...) -> Any:
+    """Return the field of a positive, finite number."""
+    return Field(default=default, gt=0, allow_inf_nan=False, title=title, description=description)
+
+
 class BeamSetup(BaseModel):
     """Geometry that every probe has: distances, pixels, magnification.
 
     Made only as one of its kinds, which describe themselves: nothing else asks for the kind.
     A dump holds no None and takes inf, so it can be written as TOML or JSON and read back.
-
-    Attributes
-    ----------
-    title, beam : str
-        What the kind is called in a form, and what its beam is made of.
-    si_fields : tuple of SIField
-        What a result holds in SI units; `main_field` is the one of them that is shown.
-    deflectors : tuple of str
-        What can deflect the beam; see `angle_ratio`.
-    in_pradformat : bool
-        Whether pradformat can describe the beam.
     """
 
-    title: ClassVar[str]
-    beam: ClassVar[str]
+    title: ClassVar[str]  # what the kind is called in a form
+    beam: ClassVar[str]  # what it is made of
+    # What a result holds in SI units; `main_field` is the one of them that is shown.
     si_fields: ClassVar[tuple[SIField, ...]] = (
         SIField("potential_si", "m", "Deflection potential", method="potential"),
         SIField("deflection_angle", "rad", "Deflection angle", is_vector=True),
     )
     main_field: ClassVar = MainField("deflection_angle", "Deflection angle", "|α|", ("αy", "αx"))
-    deflectors: ClassVar[tuple[str, ...]]
-    in_pradformat: ClassVar[bool] = False
+    deflectors: ClassVar[tuple[str, ...]]  # what can deflect the beam; see `angle_ratio`
+    in_pradformat: ClassVar[bool] = False  # whether that format can describe the beam
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
@@ -82,30 +77,19 @@ class BeamSetup(BaseModel):
         title="Source to object (m)",
         description="Distance l from the beam source to the object, in m; inf if collimated.",
     )
-    object_image_distance: float = Field(
-        gt=0,
-        allow_inf_nan=False,
-        title="Object to image (m)",
-        description="Distance L from the object to the detector, in m.",
+    object_image_distance: float = positive_field(
+        "Object to image (m)", "Distance L from the object to the detector, in m."
     )
-    pixel_size: float | None = Field(
-        default=None,
-        gt=0,
-        allow_inf_nan=False,
-        title="Pixel size at the object (m)",
-        description=(
-            "Pixel size in the object plane, in m. Give either this or the detector pixel size."
-        ),
+    pixel_size: float | None = positive_field(
+        "Pixel size at the object (m)",
+        "Pixel size in the object plane, in m. Give either this or the detector pixel size.",
+        None,
     )
-    detector_pixel_size: float | None = Field(
-        default=None,
-        gt=0,
-        allow_inf_nan=False,
-        title="Pixel size at the detector (m)",
-        description=(
-            "Pixel size in the detector plane, in m; it is divided by the magnification. Give "
-            "either this or the pixel size at the object."
-        ),
+    detector_pixel_size: float | None = positive_field(
+        "Pixel size at the detector (m)",
+        "Pixel size in the detector plane, in m; it is divided by the magnification. Give "
+        "either this or the pixel size at the object.",
+        None,
     )
 
     @model_validator(mode="after")
@@ -198,20 +182,8 @@ class BeamSetup(BaseModel):
 def displacement_from_potential(potential: ArrayLike) -> FloatArray:
     """Displacement d = -∇φ by central differences, where a file tells only the potential.
 
-    Parameters
-    ----------
-    potential : array_like, shape (H, W)
-        Normalised potential in px².
-
-    Returns
-    -------
-    ndarray, shape (2, H, W)
-        Displacement in px, of second order up to the border.
-
-    Raises
-    ------
-    InputError
-        If the potential is no plane, or smaller than 3 × 3.
+    Takes the normalised potential in px², shape (H, W); returns px, shape (2, H, W), of second
+    order up to the border. An `InputError` if the potential is no plane, or smaller than 3 × 3.
 
     Examples
     --------

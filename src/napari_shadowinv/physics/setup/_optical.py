@@ -11,7 +11,7 @@ from scipy import constants
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup._beam import BeamSetup, SIField, scaled
+from napari_shadowinv.physics.setup._beam import BeamSetup, SIField, positive_field, scaled
 
 LightDeflector = Literal["plasma", "refractive index"]
 
@@ -19,15 +19,8 @@ LightDeflector = Literal["plasma", "refractive index"]
 class OpticalSetup(BeamSetup):
     """A beam of light through a transparent object, onto a detector.
 
-    Raises
-    ------
-    pydantic.ValidationError
-        (a `ValueError`) if a value is out of range, a name is unknown, or not exactly one
-        pixel size is given.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Sections II A and V.
+    A `pydantic.ValidationError` (a `ValueError`) if a value is out of range, a name is unknown, or
+    not exactly one pixel size is given. Numbers of equations are the paper's.
 
     Examples
     --------
@@ -60,12 +53,7 @@ class OpticalSetup(BeamSetup):
             "Distance l from the beam source to the object, in m. Default: inf (collimated beam)."
         ),
     )
-    wavelength: float = Field(
-        gt=0,
-        allow_inf_nan=False,
-        title="Wavelength (m)",
-        description="Vacuum wavelength of the light, in m.",
-    )
+    wavelength: float = positive_field("Wavelength (m)", "Vacuum wavelength of the light, in m.")
 
     @property
     def probe(self) -> str:
@@ -121,17 +109,8 @@ class OpticalSetup(BeamSetup):
     def relative_density_modulation(self, phi: ArrayLike, density: float) -> FloatArray:
         """Modulation of a plasma's density, relative to its mean: ∫Δn/n₀ dz in m.
 
-        Parameters
-        ----------
-        phi : array_like
-            Normalised potential φ in px², zero where the plasma is undisturbed.
-        density : float
-            Density n₀ of the undisturbed plasma in m⁻³.
-
-        Raises
-        ------
-        InputError
-            If the density is not positive and finite.
+        The normalised potential φ in px² is zero where the plasma is undisturbed, with the density
+        n₀ in m⁻³; an `InputError` if that is not positive and finite.
         """
         return self.line_integrated_density(phi) / _positive_density(density)
 

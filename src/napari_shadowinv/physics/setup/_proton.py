@@ -13,7 +13,7 @@ from scipy import constants
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup._beam import BeamSetup, MainField, SIField
+from napari_shadowinv.physics.setup._beam import BeamSetup, MainField, SIField, positive_field
 
 ParticleDeflector = Literal["magnetic field", "electric field"]
 Species = Literal["proton", "deuteron", "triton", "helion", "alpha", "electron"]
@@ -52,25 +52,13 @@ SPECIES: dict[Species, Particle] = {
 class ProtonSetup(BeamSetup):
     """A beam of charged particles through an object, onto a film or a plate.
 
-    Raises
-    ------
-    pydantic.ValidationError
-        (a `ValueError`) if a value is out of range, a name is unknown, or not exactly one
-        pixel size is given.
-
-    References
-    ----------
-    Kasim et al., arXiv:1607.04179, Section IV A.
+    A `pydantic.ValidationError` (a `ValueError`) if a value is out of range, a name is unknown, or
+    not exactly one pixel size is given.
 
     Examples
     --------
-    >>> setup = ProtonSetup(
-    ...     energy=14.7,
-    ...     source_object_distance=1.3e-3,
-    ...     object_image_distance=2e-2,
-    ...     pixel_size=1.5e-6,
-    ... )
-    >>> setup.magnification
+    >>> lengths = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2}
+    >>> ProtonSetup(energy=14.7, pixel_size=1.5e-6, **lengths).magnification
     16.38
     """
 
@@ -80,17 +68,14 @@ class ProtonSetup(BeamSetup):
     in_pradformat: ClassVar = True
     si_fields: ClassVar = (
         *BeamSetup.si_fields,
-        SIField(
-            "path_integrated_b",
-            "T m",
-            "Path-integrated magnetic field, assuming purely magnetic deflection",
-            is_vector=True,
-        ),
-        SIField(
-            "path_integrated_e",
-            "V",
-            "Path-integrated electric field, assuming purely electric deflection",
-            is_vector=True,
+        *(
+            SIField(
+                f"path_integrated_{symbol}",
+                unit,
+                f"Path-integrated {kind} field, assuming purely {kind} deflection",
+                is_vector=True,
+            )
+            for symbol, unit, kind in (("b", "T m", "magnetic"), ("e", "V", "electric"))
         ),
     )
     # A magnetic field is at right angles to the displacement: it has arrows of its own.
@@ -105,11 +90,8 @@ class ProtonSetup(BeamSetup):
     kind: Literal["proton"] = Field(
         default="proton", title="Kind", description="Kind of probe: a beam of charged particles."
     )
-    energy: float = Field(
-        gt=0,
-        allow_inf_nan=False,
-        title="Kinetic energy (MeV)",
-        description="Kinetic energy per particle (not per nucleon), in MeV.",
+    energy: float = positive_field(
+        "Kinetic energy (MeV)", "Kinetic energy per particle (not per nucleon), in MeV."
     )
     species: Species = Field(
         default="proton",
@@ -124,12 +106,8 @@ class ProtonSetup(BeamSetup):
     @classmethod
     def example(cls) -> Self:
         """Return the experiment of the paper's benchmark; see `phantoms.paper_setup`."""
-        return cls(
-            energy=14.7,
-            source_object_distance=1.3e-3,
-            object_image_distance=2e-2,
-            pixel_size=1.5e-6,
-        )
+        lengths = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2}
+        return cls(energy=14.7, pixel_size=1.5e-6, **lengths)
 
     def default_deflector(self, made_with: Any) -> ParticleDeflector:
         return "magnetic field"
@@ -178,12 +156,13 @@ class ProtonSetup(BeamSetup):
         """Magnetic field integrated along the beam, if it alone deflects.
 
         From a = -(q/p) ∫B × dz: in components a_x = -(q/p) ∫B_y dz and
-        a_y = (q/p) ∫B_x dz. The component along the beam does not deflect.
+        a_y = (q/p) ∫B_x dz (the paper, Section IV A, with the momentum √(2 m W)). The component
+        along the beam does not deflect.
 
         Parameters
         ----------
         displacement : array_like, shape (2, ...)
-            Displacement in px.
+            Displacement in px; an `InputError` if it has not two components.
         unit : {"T m", "MG um"}, default "T m"
             Unit of the result; 1 MG µm is 1e-4 T m.
 
@@ -191,15 +170,6 @@ class ProtonSetup(BeamSetup):
         -------
         ndarray, of the same shape
             (∫B_y dz, ∫B_x dz).
-
-        Raises
-        ------
-        InputError
-            If the displacement has not two components, or the unit is unknown.
-
-        References
-        ----------
-        Kasim et al., arXiv:1607.04179, Section IV A (there with the momentum √(2 m W)).
         """
         angle_y, angle_x = self.deflection_angle(_vector("displacement", displacement))
         rigidity = self._rigidity(unit)
