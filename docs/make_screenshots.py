@@ -3,8 +3,8 @@
     QT_API=pyqt6 xvfb-run -a -s "-screen 0 2560x1440x24" python docs/make_screenshots.py [NAME ...]
 
 NAME is a window below, such as `toroid` or `first`; all of them without one. Each picture shows
-the window as a new user sees it, 1280 pixels wide. The burner shadowgrams (see the README's credits) are
-looked for in the data folder and left out where they are absent.
+the window as a new user sees it, 1280 pixels wide. The burner shadowgrams (see the README's
+credits) are looked for in the data folder and left out where they are absent.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PLUGIN = "napari-shadowinv"
 LARGEST_FILE = 300_000  # bytes
 FRAMES, SHOWN = 6, 2
 ABOVE, BELOW = 190, 50  # px of the canvas that colour bar and scale bar take
-NIGHT_ARROWS = 4.0  # their length, as the tutorial tells to type
+NIGHT_ARROWS = 7.0  # their length, as the tutorial tells to type
 # What the tutorial tells to type.
 PROTON_FIELDS = {
     "energy": 14.7,
@@ -68,7 +68,7 @@ def fit(viewer: napari.Viewer) -> None:
         return
     height = viewer.window._qt_viewer.canvas.size[0]
     low, high = viewer.layers.extent.world[:, -2]
-    camera = viewer.camera
+    camera = viewer.scene.camera
     camera.zoom *= min(1.0, (height - ABOVE - BELOW) / ((high - low) * camera.zoom))
     top = (height - (high - low) * camera.zoom) / 2
     depth, y, x = camera.center
@@ -79,6 +79,8 @@ def photograph(viewer: napari.Viewer, name: str, *, close: bool = True) -> None:
     """Save the window as it is seen, and close it."""
     settle()
     fit(viewer)
+    # It may go on turning when a file has been opened.
+    viewer.window._qt_window._activity_dialog.maybe_hide_progress_indicator()
     settle(3.0)
     pixels = viewer.window.screenshot(canvas_only=False, flash=False)
     path = HERE / name
@@ -129,7 +131,7 @@ def toroid_window() -> None:
 
 def stack_window(folder: Path) -> None:
     """A run over real shadowgrams without a reference: the widget, and a shot's field."""
-    viewer = new_window("alcohol burner", height=900)
+    viewer = new_window("alcohol burner", height=840)
     shots = [read_radiograph(path, channel="mean").binned(4).image for path in frames(folder)]
     viewer.add_image(np.stack(shots), name="burner", axis_labels=("shot", "y", "x"))
     widget = open_widget(viewer, "Invert stack")
@@ -203,7 +205,7 @@ def source_windows() -> None:
 
 def night_window() -> None:
     """Tutorial: a run of shots, inverted into a store."""
-    viewer = new_window("a night's stack", height=900)
+    viewer = new_window("a night's stack", height=840)
     viewer.open_sample(PLUGIN, "wakefield_run")
     invert_stack = open_widget(viewer, "Invert stack")
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
@@ -213,11 +215,6 @@ def night_window() -> None:
         print(invert_stack.panel.status.text(), [layer.name for layer in viewer.layers])
         viewer.dims.set_current_step(0, 10)
         settle(3.0)
-        print(
-            "LEN",
-            viewer.layers["night displacement arrows"].length,
-            viewer.layers["night displacement arrows"].features.max(),
-        )
         viewer.layers["night displacement arrows"].length = NIGHT_ARROWS
         photograph(viewer, "tutorial-night.png")
 
