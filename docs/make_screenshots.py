@@ -147,7 +147,7 @@ def stack_window(folder: Path) -> None:
 
 def first_windows() -> None:
     """Tutorial: the sample and its widget, the field, and a line profile through both."""
-    viewer = new_window("first shadowgram")
+    viewer = new_window("first shadowgram", height=820)
     viewer.open_sample(PLUGIN, "toroid")
     invert_shot = open_widget(viewer, "Invert shot")
     photograph(viewer, "tutorial-first-shot.png", close=False)
@@ -205,7 +205,7 @@ def source_windows() -> None:
 
 def night_window() -> None:
     """Tutorial: a run of shots, inverted into a store."""
-    viewer = new_window("a night's stack", height=840)
+    viewer = new_window("a night's stack", height=880)
     viewer.open_sample(PLUGIN, "wakefield_run")
     invert_stack = open_widget(viewer, "Invert stack")
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
