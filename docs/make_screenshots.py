@@ -2,9 +2,9 @@
 
     QT_API=pyqt6 xvfb-run -a -s "-screen 0 2560x1440x24" python docs/make_screenshots.py [NAME ...]
 
-NAME is a window below, such as `toroid` or `first`; all of them without one. Each picture is of
-1280 × 800 pixels, as a user sees the window. The burner shadowgrams (see the README's credits) are
-looked for in the data folder and left out where they are absent.
+NAME is a window below, such as `toroid` or `first`; all of them without one. Each picture shows
+the window as a new user sees it, 1280 pixels wide. The burner shadowgrams (see the README's
+credits) are looked for in the data folder and left out where they are absent.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ import argparse
 import re
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
+from qtpy.QtCore import QSettings
 from qtpy.QtWidgets import QApplication
 
 import napari
@@ -30,6 +32,8 @@ HERE = Path(__file__).parent / "pictures"
 PLUGIN = "napari-shadowinv"
 LARGEST_FILE = 300_000  # bytes
 FRAMES, SHOWN = 6, 2
+ABOVE, BELOW = 190, 50  # px of the canvas that colour bar and scale bar take
+NIGHT_ARROWS = 7.0  # their length, as the tutorial tells to type
 # What the tutorial tells to type.
 PROTON_FIELDS = {
     "energy": 14.7,
@@ -39,10 +43,11 @@ PROTON_FIELDS = {
 }
 
 
-def new_window(title: str) -> napari.Viewer:
+def new_window(title: str, height: int = 800) -> napari.Viewer:
     """Open an empty window of the pictures' size."""
     viewer = napari.Viewer(title=title)
-    viewer.window._qt_window.resize(1280, 800)
+    viewer.window._qt_window.resize(1280, height)
+    settle()
     return viewer
 
 
@@ -54,9 +59,28 @@ def settle(seconds: float = 1.0) -> None:
         time.sleep(0.02)
 
 
+def fit(viewer: napari.Viewer) -> None:
+    """Show the whole image, below the colour bar if there is one."""
+    viewer.reset_view()
+    if not any(
+        getattr(layer, "colorbar", None) and layer.colorbar.visible for layer in viewer.layers
+    ):
+        return
+    height = viewer.window._qt_viewer.canvas.size[0]
+    low, high = viewer.layers.extent.world[:, -2]
+    camera = viewer.scene.camera
+    camera.zoom *= min(1.0, (height - ABOVE - BELOW) / ((high - low) * camera.zoom))
+    top = (height - (high - low) * camera.zoom) / 2
+    depth, y, x = camera.center
+    camera.center = (depth, y - max(0.0, ABOVE - top) / camera.zoom, x)
+
+
 def photograph(viewer: napari.Viewer, name: str, *, close: bool = True) -> None:
     """Save the window as it is seen, and close it."""
-    viewer.reset_view()
+    settle()
+    fit(viewer)
+    # It may go on turning when a file has been opened.
+    viewer.window._qt_window._activity_dialog.maybe_hide_progress_indicator()
     settle(3.0)
     pixels = viewer.window.screenshot(canvas_only=False, flash=False)
     path = HERE / name
@@ -84,6 +108,8 @@ def press_run(widget: Any) -> None:
     while widget.panel.runner.running or (hasattr(widget, "results") and widget.results.busy):
         settle(0.2)
     settle()
+    bar = widget.area.verticalScrollBar()
+    bar.setValue(bar.maximum())
 
 
 def show_only(viewer: napari.Viewer, *endings: str) -> None:
@@ -105,25 +131,23 @@ def toroid_window() -> None:
 
 def stack_window(folder: Path) -> None:
     """A run over real shadowgrams without a reference: the widget, and a shot's field."""
-    viewer = new_window("alcohol burner")
+    viewer = new_window("alcohol burner", height=840)
     shots = [read_radiograph(path, channel="mean").binned(4).image for path in frames(folder)]
-    viewer.add_image(np.stack(shots), name="burner")
-    _, widget = viewer.window.add_plugin_dock_widget(PLUGIN, "Invert stack")
+    viewer.add_image(np.stack(shots), name="burner", axis_labels=("shot", "y", "x"))
+    widget = open_widget(viewer, "Invert stack")
     widget.source.picker.set_kind("polynomial")
     widget.steps.add("hot-pixels")
     widget.steps.folded.expand()
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
         widget.store.edit.setText("burner.shadowinv.zarr")
-        widget.panel.button.click()
-        while widget.panel.runner.running or widget.results.busy:
-            settle(0.2)
+        press_run(widget)
         viewer.dims.set_current_step(0, SHOWN)
         photograph(viewer, "napari-stack.png")
 
 
 def first_windows() -> None:
     """Tutorial: the sample and its widget, the field, and a line profile through both."""
-    viewer = new_window("first shadowgram")
+    viewer = new_window("first shadowgram", height=820)
     viewer.open_sample(PLUGIN, "toroid")
     invert_shot = open_widget(viewer, "Invert shot")
     photograph(viewer, "tutorial-first-shot.png", close=False)
@@ -181,7 +205,7 @@ def source_windows() -> None:
 
 def night_window() -> None:
     """Tutorial: a run of shots, inverted into a store."""
-    viewer = new_window("a night's stack")
+    viewer = new_window("a night's stack", height=880)
     viewer.open_sample(PLUGIN, "wakefield_run")
     invert_stack = open_widget(viewer, "Invert stack")
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
@@ -191,7 +215,15 @@ def night_window() -> None:
         print(invert_stack.panel.status.text(), [layer.name for layer in viewer.layers])
         viewer.dims.set_current_step(0, 10)
         settle(3.0)
+        viewer.layers["night displacement arrows"].length = NIGHT_ARROWS
         photograph(viewer, "tutorial-night.png")
+
+
+def make_as_new_user(make: Callable[[], None]) -> None:
+    """Make pictures with widgets that remember nothing, and change no settings of one's own."""
+    with tempfile.TemporaryDirectory() as settings:
+        QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, settings)
+        make()
 
 
 def frames(folder: Path) -> list[Path]:
@@ -207,11 +239,11 @@ def main() -> None:
     HERE.mkdir(exist_ok=True)
     for name, make in WINDOWS.items():
         if not options.names or name in options.names:
-            make()
+            make_as_new_user(make)
     if options.names and "burner" not in options.names:
         return
     if frames(folder):
-        stack_window(folder)
+        make_as_new_user(lambda: stack_window(folder))
     else:
         print(f"no burner shadowgrams in {folder}: their picture is left out")
 
