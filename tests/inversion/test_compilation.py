@@ -88,6 +88,8 @@ class TestReadOnlyInstallation:
         """Run a script with another folder for temporary files."""
         if os.getuid() == 0 and not shutil.which("setpriv"):
             pytest.skip("root may write everywhere")
+        if "NUMBA_CACHE_DIR" in os.environ:
+            pytest.skip("the package's own folder holds no compiled code")
         import napari_shadowinv
 
         exec(ONE_KERNEL, {})
