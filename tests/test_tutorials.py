@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from napari_shadowinv import InversionOptions, invert, read
+from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cli import app
 
 FOLDER = Path(__file__).parents[1] / "docs" / "tutorials"
@@ -76,6 +77,25 @@ def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch
     assert peak(uniform.displacement) == pytest.approx(13.7, abs=0.1)
     assert uniform.report.image_residual == pytest.approx(0.0441, abs=5e-4)
     assert any("reaches the image's edge" in text for text in uniform.report.warnings)
+
+
+def test_the_recipe_of_the_first_shadowgram_repeats_its_report(
+    make_napari_viewer, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    viewer = make_napari_viewer()
+    viewer.open_sample("napari-shadowinv", "toroid")
+    tool = InvertShot(viewer)
+    assert tool.source.picker.choice.currentText() == "the one supplied with the shot"
+    tool.recipes.save(Path("recipe.toml"))
+    viewer.layers["toroid"].save("toroid.tif")
+    page = text_of("first-shadowgram.md")
+    (line,) = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
+    result = CliRunner().invoke(app, shlex.split(line))
+    assert result.exit_code == 0, result.output
+    assert Path("recipe_source.npy").exists()
+    found = float(read("toroid.shadowinv").attrs["image_residual"])
+    assert f"{100 * found:.2f} %" in page
 
 
 @pytest.mark.parametrize("page", sorted(FOLDER.glob("*.md")), ids=lambda page: page.stem)
