@@ -11,7 +11,6 @@ import pytest
 from typer.testing import CliRunner
 
 from napari_shadowinv import InversionOptions, invert, read
-from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cli import app
 
 FOLDER = Path(__file__).parents[1] / "docs" / "tutorials"
@@ -82,6 +81,12 @@ def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch
 def test_the_recipe_of_the_first_shadowgram_repeats_its_report(
     make_napari_viewer, tmp_path, monkeypatch
 ):
+    from qtpy.QtCore import QSettings
+
+    from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+
+    # The widget must not remember the settings of whoever runs the test.
+    QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(tmp_path))
     monkeypatch.chdir(tmp_path)
     viewer = make_napari_viewer()
     viewer.open_sample("napari-shadowinv", "toroid")
