@@ -78,6 +78,31 @@ def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch
     assert any("reaches the image's edge" in text for text in uniform.report.warnings)
 
 
+def test_the_recipe_of_the_first_shadowgram_repeats_its_report(
+    make_napari_viewer, tmp_path, monkeypatch
+):
+    from qtpy.QtCore import QSettings
+
+    from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+
+    # The widget must not remember the settings of whoever runs the test.
+    QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    viewer = make_napari_viewer()
+    viewer.open_sample("napari-shadowinv", "toroid")
+    tool = InvertShot(viewer)
+    assert tool.source.picker.choice.currentText() == "the one supplied with the shot"
+    tool.recipes.save(Path("recipe.toml"))
+    viewer.layers["toroid"].save("toroid.tif")
+    page = text_of("first-shadowgram.md")
+    (line,) = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
+    result = CliRunner().invoke(app, shlex.split(line))
+    assert result.exit_code == 0, result.output
+    assert Path("recipe_source.npy").exists()
+    found = float(read("toroid.shadowinv").attrs["image_residual"])
+    assert f"{100 * found:.2f} %" in page
+
+
 @pytest.mark.parametrize("page", sorted(FOLDER.glob("*.md")), ids=lambda page: page.stem)
 def test_the_pictures_and_pages_of_a_tutorial_exist(page):
     targets = re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8"))
