@@ -261,6 +261,21 @@ def shot_picker(viewer: Any) -> LayerPicker:
     )
 
 
+# By the mask's title: what paint marks, and what that means.
+_PAINT = {
+    "Mask": (
+        "unusable",
+        "Checked: painted pixels are excluded (handwriting, dead pixels). Unchecked: only painted "
+        "pixels are used. Set opaque obstacles to zero in the source instead.",
+    ),
+    "Source mask": (
+        "object",
+        "Checked: the source is estimated from the pixels that are not painted. Unchecked: from "
+        "those that are.",
+    ),
+}
+
+
 class MaskPicker(QWidget):
     """A layer that is painted on, and what the paint means; it is for what `image` returns."""
 
@@ -278,13 +293,10 @@ class MaskPicker(QWidget):
         super().__init__()
         self._viewer, self._image, self.title = viewer, image, title
         self.layers = LayerPicker(viewer, kinds, f"<qt>{tip}</qt>", "none", about.may_be_mask)
-        self.painted_is_unusable = QCheckBox("painted = unusable")
+        hides, meaning = _PAINT[title]
+        self.painted_is_unusable = QCheckBox(f"painted = {hides}")
         self.painted_is_unusable.setChecked(True)
-        self.painted_is_unusable.setToolTip(
-            "<qt>Checked: painted pixels are excluded (handwriting, dead pixels). Unchecked: "
-            "only painted pixels are used. Set opaque obstacles to zero in the source "
-            "instead.</qt>"
-        )
+        self.painted_is_unusable.setToolTip(f"<qt>{meaning}</qt>")
         column(
             self,
             labelled(title, with_button(self.layers, "✎", f"Paint a {title.lower()}.", self.paint)),
