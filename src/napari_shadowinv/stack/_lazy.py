@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import variable_labels
 from napari_shadowinv.io.store import SUMMARY
+from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack import _spec
-from napari_shadowinv.stack._references import Shot
+from napari_shadowinv.stack._references import Reader, Shot, read_shot
 from napari_shadowinv.stack._worker import Beam, Work
 
 if TYPE_CHECKING:
     import xarray
+
+    from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.preprocessing import Recipe, Step
 
 # One number for each shot, beside the arrays of an inversion.
 _NUMBERS = ("converged", "flux_residual", "image_residual", "iterations")
@@ -26,8 +31,16 @@ _NUMBERS = ("converged", "flux_residual", "image_residual", "iterations")
 def invert_stack(
     shots: Any,
     *,
+    source: Any = None,
+    mask: ArrayLike | None = None,
+    recipe: Recipe | None = None,
+    options: InversionOptions | None = None,
+    setup: Setup | None = None,
+    filters: Sequence[Step] = (),
+    source_mask: ArrayLike | None = None,
+    reader: Reader = read_shot,
+    warm_start: int = 1,
     variables: Collection[str] | None = None,
-    **keywords: Unpack[_spec.StackKeywords],
 ) -> xarray.Dataset:
     """Describe the inversion of many shots; dask does the work where and when it is asked for.
 
@@ -91,7 +104,20 @@ def invert_stack(
     >>> float(abs(stack.displacement.isel(shot=1)).max())
     0.0
     """
-    return _Graph(_spec.describe_stack(shots, variables=variables, **keywords)).dataset()
+    stack = _spec.describe_stack(
+        shots,
+        variables=variables,
+        source=source,
+        mask=mask,
+        recipe=recipe,
+        options=options,
+        setup=setup,
+        filters=filters,
+        source_mask=source_mask,
+        reader=reader,
+        warm_start=warm_start,
+    )
+    return _Graph(stack).dataset()
 
 
 def _invert(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.locking import locked
 from napari_shadowinv._system.progress import Progress, ShouldStop
@@ -19,13 +20,18 @@ from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
 from napari_shadowinv.io.store_layout import create_store
+from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
+from napari_shadowinv.stack._references import Reader, read_shot
 from napari_shadowinv.stack._resuming import append_shots, contents_of, resume
-from napari_shadowinv.stack._spec import Stack, StackKeywords, describe_stack
+from napari_shadowinv.stack._spec import Stack, describe_stack
 from napari_shadowinv.stack._worker import Settings, ShotOutcome, run_shots
 
 if TYPE_CHECKING:
     import xarray
+
+    from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.preprocessing import Recipe, Step
 
 STORED = ("potential", "displacement", "caustic")
 _POLL = 0.25  # seconds between two looks at the engine and at `should_stop`
@@ -63,6 +69,15 @@ def run_stack(
     shots: Any,
     out: str | Path,
     *,
+    source: Any = None,
+    mask: ArrayLike | None = None,
+    recipe: Recipe | None = None,
+    options: InversionOptions | None = None,
+    setup: Setup | None = None,
+    filters: Sequence[Step] = (),
+    source_mask: ArrayLike | None = None,
+    reader: Reader = read_shot,
+    warm_start: int = 1,
     variables: Collection[str] = STORED,
     dtype: str = "float32",
     scheduler: Any = None,
@@ -71,7 +86,6 @@ def run_stack(
     redo_failed: bool = False,
     on_progress: OnRunProgress | None = None,
     should_stop: ShouldStop | None = None,
-    **keywords: Unpack[StackKeywords],
 ) -> xarray.Dataset:
     """Invert every shot into one store; run again, it goes on where it stopped.
 
@@ -81,9 +95,8 @@ def run_stack(
 
     Parameters
     ----------
-    shots, **keywords
-        As for `invert_stack`: source, mask, options, setup, recipe, filters, source_mask, reader
-        and warm_start. They and earlier shots must be those of a store that is resumed.
+    shots, source, mask, recipe, options, setup, filters, source_mask, reader, warm_start
+        As for `invert_stack`. They and earlier shots must be those of a store that is resumed.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
     variables : collection of str, optional
@@ -123,7 +136,19 @@ def run_stack(
     if dtype not in ("float32", "float64"):
         raise InputError(f"dtype is {dtype!r}: expected 'float32' or 'float64'")
     kept = np.dtype(dtype)
-    stack = describe_stack(shots, variables=variables, **keywords)
+    stack = describe_stack(
+        shots,
+        variables=variables,
+        source=source,
+        mask=mask,
+        recipe=recipe,
+        options=options,
+        setup=setup,
+        filters=filters,
+        source_mask=source_mask,
+        reader=reader,
+        warm_start=warm_start,
+    )
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
     if is_here(scheduler):
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +29,7 @@ from napari_shadowinv.preprocessing import (
     UniformEstimate,
 )
 from napari_shadowinv.stack._discovery import Shots, find_shots, find_source
-from napari_shadowinv.stack._references import Reader, Shot, described_reader, read_shot
+from napari_shadowinv.stack._references import Reader, Shot, described_reader
 from napari_shadowinv.stack._worker import Beam, Work, shared_plan, threads_here
 
 if TYPE_CHECKING:
@@ -103,33 +103,19 @@ class Stack:
         return ""
 
 
-class StackKeywords(TypedDict, total=False):
-    """What `invert_stack` explains, and `run_stack` takes as well."""
-
-    source: Any
-    mask: ArrayLike | None
-    options: InversionOptions | None
-    setup: Setup | None
-    recipe: Recipe | None
-    filters: Sequence[Step]
-    source_mask: ArrayLike | None
-    reader: Reader
-    warm_start: int
-
-
 def describe_stack(
     shots: Any,
     *,
     variables: Collection[str] | None,
-    source: Any = None,
-    mask: ArrayLike | None = None,
-    options: InversionOptions | None = None,
-    setup: Setup | None = None,
-    recipe: Recipe | None = None,
-    filters: Sequence[Step] = (),
-    source_mask: ArrayLike | None = None,
-    reader: Reader = read_shot,
-    warm_start: int = 1,
+    source: Any,
+    mask: ArrayLike | None,
+    recipe: Recipe | None,
+    options: InversionOptions | None,
+    setup: Setup | None,
+    filters: Sequence[Step],
+    source_mask: ArrayLike | None,
+    reader: Reader,
+    warm_start: int,
 ) -> Stack:
     """Check everything that can be checked before a shot is read."""
     if warm_start < 1:
