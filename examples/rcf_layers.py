@@ -5,7 +5,7 @@
 FOLDER holds the scans `RCF_18H.tif` to `RCF_18L.tif` (16 bits, 300 dpi), unexposed film
 `HDV2.tif` and the dose calibration `HDV2_3_calibration.csv`.
 
-What cannot be known from this. The beam without the object was not recorded: it is guessed
+What cannot be known from this. the beam without the object was not recorded: it is estimated
 by blurring the dose, so structures wider than the blur are lost, and the guess decides the
 strength of the rest. A layer stops protons of one nominal energy, but faster ones leave dose in
 it, too, and each energy is deflected by another angle. Distances were not told, so displacements

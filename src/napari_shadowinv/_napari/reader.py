@@ -51,7 +51,7 @@ def _is_image_name(path: Path) -> bool:
 
 @notify_errors(otherwise=lambda: [(None,)])  # napari's sign for: dealt with, and nothing to add
 def read_paths(path: str | Sequence[str]) -> list[Any]:
-    """Read what `get_reader` accepts as layers; in a window, the user is told of errors."""
+    """Read what `get_reader` accepts as layers; in a window, errors are shown to the user."""
     from napari_shadowinv._napari.shots import images_in, stack_layers
 
     if not isinstance(path, str):

@@ -89,7 +89,7 @@ def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
         try:
             plane = displacement[shot].values
         except OSError:
-            return  # the field comes from the same place, and tells of it
+            return  # the field comes from the same place, and reports it
         data, _ = thinned_arrows(plane)
         layer.data = at_shot(data, shot)
         layer.features = {"displacement": np.hypot(*data[:, 1].T)}

@@ -182,7 +182,7 @@ else:
         except OSError as error:
             has_none = error.errno in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
             return None if has_none else False
-        # Whoever had it may have removed the file after it was opened here.
+        # The previous holder may have removed the file after it was opened here.
         return os.fstat(file.fileno()).st_nlink > 0
 
     def _free(file: BinaryIO) -> None:

@@ -40,7 +40,7 @@ _NAMED = 10  # failures that a table names
 
 @dataclass
 class _Ledger:
-    """What a run told of itself."""
+    """What a run has reported so far."""
 
     start: float = field(default_factory=time.monotonic)
     now: RunProgress | None = None
@@ -62,7 +62,7 @@ class _Ledger:
         return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
 
     @property
-    def left_text(self) -> str:
+    def remaining_text(self) -> str:
         if self.now is None or not self.ended:
             return ""
         pending = self.now.total - self.now.done - self.now.failed
@@ -158,7 +158,7 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
                 total=news.total,
                 completed=news.done + news.failed,
                 rate=ledger.rate_text,
-                left=ledger.left_text,
+                left=ledger.remaining_text,
                 failed=f"{news.failed} failed" if news.failed else "",
                 last=plain(last).plain,
             )

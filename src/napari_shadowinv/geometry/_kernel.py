@@ -96,7 +96,7 @@ def _copy_code(made: Path, kept: Path) -> None:
         return
     # Numba does without what is missing.
     with suppress(OSError, shutil.Error):
-        # The index of a kernel after its code, which it tells of.
+        # The index of a kernel after its code, to which it refers.
         for path in sorted(made.glob("*.nb[ci]")):
             shutil.copy(path, kept)
 

@@ -84,7 +84,7 @@ class CheckedStore(LocalStore):
             check_size(path, path.stat().st_size)
 
     def _metadata(self, name: str) -> dict[str, Any]:
-        """What is told of an array: the folder's own copy counts, where there is one."""
+        """The description of an array: the folder's own copy counts, where there is one."""
         whole = _json(self.root / _METADATA).get("consolidated_metadata") or {"metadata": {}}
         return whole["metadata"].get(name) or _json(self.root / name / _METADATA)
 

@@ -100,7 +100,7 @@ def grow_store(
         for name in longer:
             array: Any = arrays[name]
             before = array.shape[0]
-            # Beyond the end that the folder's own copy tells of: nobody sees it yet.
+            # Beyond the end stated in the folder's own copy: nobody sees it yet.
             array.resize((length, *array.shape[1:]))
             if name in values:
                 array[before:] = values[name][before:]
@@ -142,7 +142,7 @@ def _write_template(path: Path, contents: Contents) -> None:
 
 
 def _own_variables(shots: int) -> dict[str, Variable]:
-    """What every store tells of its shots."""
+    """What every store says about its shots."""
     status = {
         "units": "1",
         "long_name": "Status of the shot",

@@ -204,7 +204,7 @@ def _is_number(word: str) -> bool:
 
 
 def _geometry_of(path: Path, number: int, line: str) -> dict[str, float]:
-    """What a comment tells of the geometry, in m and MeV: one entry or none."""
+    """The geometry that a comment states, in m and MeV: one entry or none."""
     entry = _ENTRY.match(line) if len(line) <= _LONGEST_ENTRY else None
     if entry is None:
         return {}

@@ -120,7 +120,7 @@ def synthetic_image(
             image[top : top + len(window)] += window
             report("image", done, len(bands))
     finally:
-        # Whoever asks to stop need not wait for bands that nobody has begun.
+        # On a request to stop, bands that have not begun are skipped.
         pool.shutdown(cancel_futures=True)
     return image
 

@@ -51,7 +51,7 @@ _NARROWEST_WAVES = 2.0  # px; a Gaussian that is narrower has waves too short fo
 
 
 class Estimate(Choice):
-    """A way to guess the undisturbed beam from the shot."""
+    """A way to estimate the undisturbed beam from the shot."""
 
     key = "method"
     # Makes the source; takes the image, the parameters, ``mask`` and ``should_stop``.

@@ -189,7 +189,7 @@ def point_distance(setup: Setup) -> float:
 
 
 def _edges(side: int, name: str, centre: float | None) -> FloatArray:
-    """Edges of so many pixels, relative to the centre of one, or to the middle of all."""
+    """Edges of `side` pixels, relative to the given centre or to their middle."""
     if centre is not None and not math.isfinite(centre):
         raise InputError(f"{name} is {centre!r}, expected a finite number of px")
     return np.arange(-0.5, side) - ((side - 1) / 2 if centre is None else centre)

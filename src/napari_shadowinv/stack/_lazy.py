@@ -54,7 +54,7 @@ def invert_stack(
         page for each shot. Files are read by the tasks that invert them.
     source : array (y, x), path, Estimate, or as `shots`, optional
         The undisturbed beam, one for all shots or one for each, or an estimate of
-        `napari_shadowinv.preprocessing` by which it is guessed from each shot. Default: uniform,
+        `napari_shadowinv.preprocessing` by which it is estimated from each shot. Default: uniform,
         and then intensities in the result are relative to each shot's mean.
     mask : array_like of bool, shape (H, W), optional
         The pixels that can be used in all shots; see `napari_shadowinv.invert`.
@@ -74,7 +74,7 @@ def invert_stack(
         Makes an image of a path; one with a keyword ``page`` reads TIFFs with many pages, too.
         `functools.partial(read_shot, channel="red")` reads one channel of colour images.
     warm_start : int, optional
-        Start from the answer to the shot before, in runs of so many shots, one after the other:
+        Initialise from the previous shot, in groups of this many, one after the other:
         for alike shots that share their source. The answers agree within the tolerance.
 
     Returns

@@ -1,6 +1,6 @@
 """Worker processes on this machine: `local_client` starts some, connected.
 
-Whoever may talk to a scheduler or a worker of dask can have it run any code. So these talk among
+Anyone who can talk to a dask scheduler or worker can have it run any code. So these talk among
 themselves only: encrypted, with a key that is made for the run and exists nowhere but in them.
 """
 
@@ -32,7 +32,7 @@ def local_client(count: int) -> Iterator[Any]:
         environment = dask.config.get(_ENVIRONMENT)
         opened.enter_context(dask.config.set(_settings(environment)))
         opened.enter_context(_forgotten(_TRIMMING, environment.get(_TRIMMING)))
-        # What they put aside when memory is short is code to whoever could exchange it.
+        # Data spilled to disk when memory is short could be exchanged for code.
         own = opened.enter_context(TemporaryDirectory(prefix="shadowinv-"))
         # A cluster that is half made cannot be closed.
         with interrupts_put_off(), _hidden_from_workers():
@@ -45,7 +45,7 @@ def local_client(count: int) -> Iterator[Any]:
                 dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
                 local_directory=own,
-                # Workers that die are told of by the shots that they were at.
+                # Workers that die are reported by the shots they were working on.
                 silence_logs=logging.CRITICAL,
                 preload=[__name__],
             )

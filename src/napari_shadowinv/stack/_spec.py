@@ -45,7 +45,7 @@ class Stack:
     beam: Beam | None  # source, after all steps, and mask of all shots; None if each has its own
     sources: Shots | None  # one for each shot, if these were measured
     variables: tuple[str, ...]
-    warm_start: int = 1  # so many shots in a row start from the answer to the one before
+    warm_start: int = 1  # shots in a group, each initialised from the one before
     reader: str = ""  # name of what reads the files
 
     @property
@@ -82,7 +82,7 @@ class Stack:
         )
 
     def source_of(self, index: int) -> Shot | None:
-        """Reference to the measured source of one shot; None if it is shared, or guessed."""
+        """Reference to the measured source of one shot; None if it is shared, or estimated."""
         return None if self.sources is None else self.sources.items[index]
 
     def chosen(self, order: Sequence[int]) -> Stack:

@@ -186,7 +186,7 @@ class Origins:
         return {name: text for name, text in told.items() if text}
 
     def rows(self) -> list[tuple[str, str]]:
-        """What a report tells of it, in two columns of text."""
+        """The report of an inversion, in two columns of text."""
         told = [
             ("Image", self.image),
             ("Source", self.source),

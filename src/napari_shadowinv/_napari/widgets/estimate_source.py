@@ -1,4 +1,4 @@
-"""The widget that guesses the undisturbed beam: `EstimateSource`."""
+"""The widget that estimates the undisturbed beam: `EstimateSource`."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class KnownField:
 
 
 def is_surely_a_field(layer: Any) -> bool:
-    """Whether a layer says of itself that it is a potential, or the field of one result."""
+    """Whether a layer is marked as a potential, or as the field of one result."""
     if about.role_of(layer) == "potential":
         return True
     return about.role_of(layer) in _FIELDS and about.result_of(layer) is not None
@@ -257,7 +257,7 @@ class ForwardModel(ToolPanel):
 
     def show_result(self, value: Forecast, request: _Request) -> None:
         unit = "" if request.job.source is None else about.unit_of(self.source.layer or {})
-        # Whoever inverts the image finds its source.
+        # So that an inversion of the image finds its source.
         came_with: dict[str, Any] = {} if value.source is None else {"source": value.source}
         # In another experiment the same object may be seen with other pixels.
         frame, made_with = request.frame, request.job.made_with

@@ -1,7 +1,7 @@
 """The experiment's geometry and probe, and what they make of a displacement.
 
 - describe an experiment: `ProtonSetup`, `OpticalSetup`; any of them: `Setup`, by kind `SETUPS`
-- what a kind of setup says of itself: `BeamSetup`, `SIField`, `MainField`, `Deflector`
+- how a kind of setup is described: `BeamSetup`, `SIField`, `MainField`, `Deflector`
 - get it back from a file's content: `setup_from_dict`; with larger pixels: `binned_setup`
 - convert pixels to SI and back: methods of `BeamSetup`; path-integrated fields: of `ProtonSetup`;
   line integrals of the refractive index or the density: of `OpticalSetup`

@@ -1,4 +1,4 @@
-"""What every setup has, and what each kind of setup says of itself."""
+"""What every setup has, and how each kind of setup is described."""
 
 from __future__ import annotations
 
