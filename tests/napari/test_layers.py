@@ -33,7 +33,8 @@ def test_all_of_a_result_is_there_and_the_field_and_arrows_are_visible(
     ]  # fmt: skip
     assert {role for role, layer in layers.items() if layer.visible} == {"field", "arrows"}
     assert all(layer.name.startswith("shot 7 ") for layer in viewer.layers)
-    assert viewer.canvas.overlays.scale_bar.visible
+    overlays = getattr(getattr(viewer, "canvas", None), "overlays", viewer)  # napari before 0.9
+    assert overlays.scale_bar.visible
     assert viewer.layers.selection.active is layers["field"]
 
 
