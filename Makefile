@@ -1,5 +1,5 @@
 # make demo   simulate and invert the paper's toroidal shot, write figures to demo/
-# make test   check style and types, build the site, then run the whole test suite
+# make test   check style and types, build the site, run the whole test suite, try the wheel
 # make docs   build the documentation site into build/docs; GALLERY=1 runs the examples for it, too
 # make coverage  run the tests once more and report which lines they reach
 # make test-oldest  test the core with the lowest versions that pyproject.toml allows
@@ -37,6 +37,7 @@ test: lint docs
 	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES)
 	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES) -q \
 		tests/napari/widgets/test_tools.py tests/napari/widgets/test_forms.py
+	@$(MAKE) --no-print-directory check-wheel
 
 coverage: $(VENV)/installed-dev
 	@sh .ci/need-display
