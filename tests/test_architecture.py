@@ -26,7 +26,7 @@ ROOMS = (
     ("geometry",),
     ("physics",),
     ("preprocessing",),
-    ("transport",),
+    ("transport", "fitting"),
     ("inversion",),
     ("io",),
     ("pipeline",),

@@ -1,0 +1,1 @@
+"""The forward model fitted to images: what rays through potentials would make of them."""
