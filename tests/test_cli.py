@@ -862,6 +862,43 @@ def test_a_recipe_that_was_saved_does_the_same(folder: Path, shot: Path) -> None
     assert made.setup.object_pixel_size == pytest.approx(3e-5)
 
 
+def test_what_a_recipe_names_is_never_overwritten(
+    folder: Path, shot: Path, refused: Callable[..., None]
+) -> None:
+    iio.imwrite("shot.png", np.ones((24, 32), np.uint8))  # a mask with the figure's usual name
+    (folder / "recipe.toml").write_text("mask = 'shot.png'\n[options]\nn_sites = 100\n")
+    flags = ["--recipe", "recipe.toml", "--overwrite"]
+    refused("invert", shot, *flags, names=("shot.png", "both read and written"))
+    out = ["--out", "a.shadowinv", "--save-recipe"]
+    refused("invert", shot, *flags, *out, "recipe.toml", names="recipe.toml is both read")
+    store = ["--out", "n.shadowinv.zarr", "--save-recipe"]
+    refused("batch", shot, *flags, *store, "recipe.toml", names="recipe.toml is both read")
+    refused("batch", shot, *flags, *store, "shot.npy", names=("shot.npy", ".toml"))
+    assert shadowinv("invert", shot, *flags, "--out", "a.shadowinv").exit_code == 0
+    iio.imwrite("b.png", np.random.default_rng(0).integers(90, 110, (24, 32)).astype(np.uint8))
+    assert shadowinv("invert", "b.png", "--out", "c.shadowinv").exit_code == 0
+    again = ["--out", "b.shadowinv", "--overwrite"]
+    refused("rerun", "c.shadowinv", *again, names=("b.png", "both read and written"))
+
+
+def test_a_damaged_mask_in_a_result_is_told(
+    folder: Path, shot: Path, refused: Callable[..., None]
+) -> None:
+    usable = np.ones((24, 32), np.uint8)
+    usable[3, 4:6] = 0
+    iio.imwrite("usable.png", usable)
+    assert shadowinv("invert", shot, "--mask", "usable.png").exit_code == 0
+    saved = dataset("shot.shadowinv")
+    made = Provenance.of(saved.attrs)
+    assert made is not None
+    assert made.mask is not None
+    for change in ({"pixels": "nonsense"}, {"pixels": "\N{BULLET}"}, {"shape": (10**9, 10**9)}):
+        mask = made.mask.model_copy(update=change)
+        text = made.model_copy(update={"mask": mask}).model_dump_json()
+        write("bad.shadowinv", saved.assign_attrs(provenance=text), overwrite=True)
+        refused("rerun", "bad.shadowinv", names="the mask kept with the result is damaged")
+
+
 def test_a_result_is_made_again_bit_for_bit(
     folder: Path, shot: Path, refused: Callable[..., None]
 ) -> None:

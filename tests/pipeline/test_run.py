@@ -278,6 +278,14 @@ def test_a_cache_spares_sites_and_estimates_without_changing_results(image: Floa
     assert_same(run(recipe, image, cache=cache), first)
 
 
+def test_the_default_number_of_sites_is_that_of_invert(image: FloatArray) -> None:
+    for options in (InversionOptions(), InversionOptions(boundary="free", flux="known")):
+        assert_same(
+            run(Recipe(options=options), image, source=image.mean() + 0 * image),
+            invert(image, source=image.mean() + 0 * image, options=options),
+        )
+
+
 @pytest.mark.parametrize(
     ("recipe", "given", "named"),
     [

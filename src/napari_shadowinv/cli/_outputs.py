@@ -12,7 +12,7 @@ from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Radiograph
+    from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 
 def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:
@@ -44,6 +44,12 @@ def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
             raise InputError(f"{path} is both read and written: choose another name for the output")
     if len({path.resolve() for path in outputs}) < len(outputs):
         raise InputError(f"{outputs[0]} would be written twice: choose two names")
+
+
+def protect_files_of(recipe: Recipe, outputs: list[Path]) -> None:
+    """Refuse to overwrite what a recipe reads."""
+    source = getattr(recipe.source, "file", None)
+    protect(outputs, [recipe.mask, recipe.source_mask, source])
 
 
 def protect_store(store: Path, output: Path) -> None:

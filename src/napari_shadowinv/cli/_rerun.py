@@ -11,6 +11,7 @@ import numpy as np
 
 from napari_shadowinv import __version__
 from napari_shadowinv.cli._inputs import read_shot
+from napari_shadowinv.cli._outputs import protect
 from napari_shadowinv.cli._terminal import inverted
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
@@ -32,9 +33,17 @@ class Again:
 
 
 def made_again(
-    result: Path, image: Path | None, source: Path | None, *, quiet: bool = False
+    result: Path,
+    image: Path | None,
+    source: Path | None,
+    outputs: list[Path],
+    *,
+    quiet: bool = False,
 ) -> Again:
-    """Make a result again; files are looked for beside it and in the current folder."""
+    """Make a result again; files are looked for beside it and in the current folder.
+
+    Nothing that is read may be among `outputs`.
+    """
     before = Inversion.from_dataset(read_dataset(result))
     made = before.provenance
     if made is None:
@@ -47,6 +56,7 @@ def made_again(
     beam, own = None, (made.image.file, made.image.variable)
     if made.source is not None and (made.source.file, made.source.variable) != own:
         beam = _read(made.source, source, folders, "the source")
+    protect(outputs, [result, shot.path, None if beam is None else beam.path])
     masks = {"mask": made.mask, "source_mask": made.source_mask}
     drawn = {name: _mask(origin, name.replace("_", " ")) for name, origin in masks.items()}
     inversion = inverted(made.recipe, shot, beam, quiet, **drawn)
@@ -83,7 +93,11 @@ def _changes(before: Provenance, again: Inversion) -> list[str]:
         changes.append(f"made by version {before.version}, now {__version__}")
     for name in ("image", "source"):
         old, new = getattr(before, name), getattr(now, name)
-        if old is not None and new is not None and old.sha256 != new.sha256:
+        if old is None or new is None:
+            continue
+        if not old.sha256:
+            changes.append(f"the {name} was no file before: {new.file} may differ from it")
+        elif old.sha256 != new.sha256:
             changes.append(f"the {name} {new.file} differs from the {old.file} used before")
     return changes
 

@@ -103,7 +103,7 @@ def invert(
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
     _outputs.check_outputs(outputs, overwrite)
-    _outputs.protect(list(outputs), [image, source, mask, setup, options, source_mask])
+    _outputs.protect(list(outputs), [image, recipe, setup, options])
     chosen = _inputs.recipe_from(
         flags,
         recipe,
@@ -114,6 +114,7 @@ def invert(
         mask=mask,
         source_mask=source_mask,
     )
+    _outputs.protect_files_of(chosen, list(outputs))
     shot = _inputs.read_shot(image, channel, variable)
     chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
     _outputs.check_setup(result, chosen.setup)
@@ -122,7 +123,7 @@ def invert(
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
     if not quiet:
-        say(summary(inversion, shot, [path for path in outputs if path.exists()]))
+        say(summary(inversion, shot, list(outputs)))
     alarm_unless_converged(inversion.report, result)
 
 
@@ -153,8 +154,7 @@ def rerun(
     target = out or Path(f"{result.stem}_again{result.suffix}")
     again_out, figure = _outputs.result_and_figure(result, target, report)
     _outputs.check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
-    _outputs.protect([again_out, figure], [result, image, source])
-    again = made_again(result, image, source, quiet=quiet)
+    again = made_again(result, image, source, [again_out, figure], quiet=quiet)
     _outputs.write_all(again.inversion, again.shot, again_out, figure, overwrite)
     if not quiet:
         say(rerun_table(again, [again_out, figure]))

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from napari_shadowinv.cli import _flags
+from napari_shadowinv.cli import _flags, _outputs
 from napari_shadowinv.cli._inputs import recipe_from, setup_from
 from napari_shadowinv.cli._terminal import notify_errors, say
 
@@ -90,6 +90,9 @@ def batch(
     if setup is not None:
         chosen = chosen.model_copy(update={"setup": setup_from(setup)})
     if save_recipe is not None:
+        _outputs.check_outputs({save_recipe: (".toml",)}, overwrite)
+        _outputs.protect([save_recipe], [recipe, setup, options])
+        _outputs.protect_files_of(chosen, [save_recipe])
         write_recipe(save_recipe, chosen, overwrite=overwrite)
     run_batch(
         shots,

@@ -173,6 +173,14 @@ def _slope(
 
 
 @njit(nogil=True)
+def _fine_cell(place: float) -> tuple[int, float]:
+    """The fine cell at or before a place in px, and how far the place is towards the next."""
+    fine = place * _FINE - 0.5
+    cell = math.floor(fine)
+    return cell, fine - cell
+
+
+@njit(nogil=True)
 def _flux_of(source: FloatArray, y: float, x: float) -> float:
     height, width = source.shape
     row = min(max(math.floor(y), 0), height - 1)
@@ -202,13 +210,13 @@ def _deposit(
                 share = (KNOT / n) ** 2
                 for a in range(n):
                     y = (row + (a + 0.5) / n) * KNOT - pad
+                    along_y = (values[a], slopes[a])
                     for b in range(n):
                         x = (column + (b + 0.5) / n) * KNOT - pad
-                        along_y, along_x = (values[a], slopes[a]), (values[b], slopes[b])
-                        in_y, in_x = _slope(potential, (row, column), along_y, along_x)
-                        v, u = (y - in_y) * _FINE - 0.5, (x - in_x) * _FINE - 0.5
-                        i, j = math.floor(v), math.floor(u)
-                        down, right = v - i, u - j
+                        along_x = (values[b], slopes[b])
+                        slope = _slope(potential, (row, column), along_y, along_x)
+                        i, down = _fine_cell(y - slope[0])
+                        j, right = _fine_cell(x - slope[1])
                         flux = _flux_of(source, y, x) * share
                         for di in range(2):
                             if not 0 <= i + di < height:
@@ -251,13 +259,13 @@ def _gather(
                 share = (KNOT / n) ** 2 * _FINE
                 for a in range(n):
                     y = (row + (a + 0.5) / n) * KNOT - pad
+                    along_y = (values[a], slopes[a])
                     for b in range(n):
                         x = (column + (b + 0.5) / n) * KNOT - pad
-                        along_y, along_x = (values[a], slopes[a]), (values[b], slopes[b])
-                        in_y, in_x = _slope(potential, (row, column), along_y, along_x)
-                        v, u = (y - in_y) * _FINE - 0.5, (x - in_x) * _FINE - 0.5
-                        i, j = math.floor(v), math.floor(u)
-                        down, right = v - i, u - j
+                        along_x = (values[b], slopes[b])
+                        slope = _slope(potential, (row, column), along_y, along_x)
+                        i, down = _fine_cell(y - slope[0])
+                        j, right = _fine_cell(x - slope[1])
                         above, beside = _at(pull, i, j), _at(pull, i, j + 1)
                         below, across = _at(pull, i + 1, j), _at(pull, i + 1, j + 1)
                         flux = -_flux_of(source, y, x) * share

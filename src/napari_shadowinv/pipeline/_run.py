@@ -21,7 +21,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.inversion.compilation import ensure_compiled
-from napari_shadowinv.inversion.normalise import checked_source, number_of_sites, prepare
+from napari_shadowinv.inversion.normalise import checked_source, prepare
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.pipeline.cache import Cache
@@ -184,8 +184,7 @@ def run_prepared(
     seconds["source"] = time.perf_counter() - clock
     ensure_compiled(on_progress, should_stop)
     clock = time.perf_counter()
-    counted = options.model_copy(update={"n_sites": number_of_sites(shot.shape, options)})
-    plan = cache.plan(source, shot.mask, counted, on_progress, should_stop)
+    plan = cache.plan(source, shot.mask, options, on_progress, should_stop)
     seconds["sites"] = time.perf_counter() - clock
     inversion = invert(
         shot.image,

@@ -130,10 +130,6 @@ class Recipe(BaseModel):
             shape = step.shape_after(shape)
         return matrix
 
-    def setup_after(self, shape: tuple[int, int]) -> Setup | None:
-        """Return the setup of what is inverted, whose pixels may be larger."""
-        return self.moved(Radiograph(np.ones(shape), setup=self.setup)).setup
-
     def moved(self, shot: Radiograph) -> Radiograph:
         """Return a shot after those steps alone that move pixels, such as for its masks."""
         for step in self.steps:
@@ -264,8 +260,7 @@ class Origin(BaseModel):
     Attributes
     ----------
     file, sha256 : str
-        Name of the file, without its folder, and its checksum; "" and that of the values if it
-        was an array.
+        Name of the file, without its folder, and its checksum; "" if it was an array.
     variable, channel : str or int or None
         What of the file was taken.
     pixels, shape : str and tuple of int, or None
@@ -292,7 +287,12 @@ class Origin(BaseModel):
         if self.pixels is None or self.shape is None:
             return None
         size = self.shape[0] * self.shape[1]
-        bits = zlib.decompressobj().decompress(base64.b85decode(self.pixels), size // 8 + 8)
+        try:
+            bits = zlib.decompressobj().decompress(base64.b85decode(self.pixels), size // 8 + 8)
+        except (ValueError, zlib.error):
+            bits = b""
+        if min(self.shape) < 1 or len(bits) != -(-size // 8):
+            raise InputError("the mask kept with the result is damaged: give the mask again")
         packed = np.frombuffer(bits, np.uint8)
         return np.unpackbits(packed, count=size).reshape(self.shape).astype(bool)
 
