@@ -33,6 +33,7 @@ from napari_shadowinv.preprocessing import (
     MeasuredSource,
     PolynomialEstimate,
     Provenance,
+    Radiograph,
     Recipe,
     Rotate,
     Step,
@@ -219,7 +220,7 @@ def test_a_feature_of_image_and_result_is_at_one_place(
 
 def recipe_size(tool: Any, setup: ProtonSetup) -> float:
     """Side of a result's pixel in µm."""
-    after = Recipe(steps=tool.steps.steps(), setup=setup).setup_after((48, 60))
+    after = Recipe(steps=tool.steps.steps()).moved(Radiograph(np.ones((48, 60)), setup=setup)).setup
     assert after is not None
     return after.object_pixel_size * 1e6
 
