@@ -1,28 +1,40 @@
 """Rays through potentials of cubic B-splines, and the images where they land: `RayModel`.
 
 A ray that starts at x lands at x - ∇ψ(x), also where rays have crossed. Pixels are boxes, as those
-of a camera: each ray is shared bilinearly between the cells of a grid three times as fine, and a
-pixel sums nine of them. The gradient of any function of the image with respect to the spline's
-coefficients follows exactly, ray by ray.
+of a camera: a ray counts in the pixel where it lands; within a sixth of a pixel from its edge it
+is shared with the neighbour, so that an image changes smoothly with the potential. The derivative
+of any function of the image follows exactly, ray by ray.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray, IntArray
-from napari_shadowinv.geometry._kernel import njit
+from napari_shadowinv.fitting import _ray_kernels as kernels
+from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
 
-__all__ = ["KNOT", "RayModel"]
+__all__ = ["KNOT", "Pulls", "RayModel", "at_rest"]
 
-KNOT = 2  # px between knots
-
-_FINE = 3  # cells of the fine grid along a pixel's side
+_SHARED = 1 / 3  # px, around an edge between pixels, where a ray counts in both
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
+_GUARD = 2  # px around the detector, for rays that miss it
+_WORTH_A_THREAD = 20_000  # rays
+
+
+class Pulls(NamedTuple):
+    """Derivatives with respect to a potential's coefficients, the beam and the frame."""
+
+    potential: FloatArray
+    beam: FloatArray
+    frame: FloatArray
 
 
 @dataclass(frozen=True)
@@ -30,26 +42,31 @@ class RayModel:
     """What a beam behind a potential looks like.
 
     A potential is an array of coefficients with `shape`, in px², of cubic B-splines with a knot
-    every 2 px.
+    every 2 px. A beam is the flux of each pixel, also of those of the strip: `around` continues one
+    from the image. A frame tells where the detector sees what lands at (y, x): at
+    (f0 + f1 y + f2 x, f3 + f4 y + f5 x), in px from the image's middle.
 
     Attributes
     ----------
-    source : ndarray, shape (H, W)
-        Flux per pixel without the object; the pixels at its edge go on beyond it.
+    size : tuple of int
+        Height and width of the image in px.
     pad : int
         Width in px, even, of the strip around the image from which rays may enter.
+    beyond : int
+        Width in px of the strip around the image where what lands is wanted, too.
     threads : int or None
         Number of threads. Default: all cores. It does not affect the result.
     """
 
-    source: FloatArray
+    size: tuple[int, int]
     pad: int = 12
+    beyond: int = 0
     threads: int | None = None
 
     @property
     def cells(self) -> tuple[int, int]:
         """Cells between knots along y and x, those of the strip among them."""
-        height, width = self.source.shape
+        height, width = self.size
         return math.ceil(height / KNOT) + self.pad, math.ceil(width / KNOT) + self.pad
 
     @property
@@ -58,8 +75,18 @@ class RayModel:
         rows, columns = self.cells
         return rows + 3, columns + 3
 
+    @property
+    def seen(self) -> tuple[int, int]:
+        """Shape of an image, with what lies beyond."""
+        return self.size[0] + 2 * self.beyond, self.size[1] + 2 * self.beyond
+
+    def around(self, image: FloatArray) -> FloatArray:
+        """Return a beam that goes on beyond an image's edge as at its edge."""
+        rows, columns = (KNOT * n - self.pad - side for n, side in zip(self.cells, self.size))  # noqa: B905
+        return np.pad(image, ((self.pad, rows), (self.pad, columns)), mode="edge")
+
     def ray_counts(self, potential: FloatArray, spacing: float = 0.25) -> IntArray:
-        """Return how many rays along y and x, a multiple of 4, each cell needs to land so densely.
+        """Return how many rays along y and x each cell needs to land so densely.
 
         Parameters
         ----------
@@ -70,20 +97,28 @@ class RayModel:
 
         Returns
         -------
-        ndarray of int64, shape `cells`
+        ndarray of int64, shape (2, *cells)
         """
         middle = potential[1:-1, 1:-1]
-        along_y = np.abs(potential[2:, 1:-1] - 2 * middle + potential[:-2, 1:-1])
-        along_x = np.abs(potential[1:-1, 2:] - 2 * middle + potential[1:-1, :-2])
-        twist = potential[2:, 2:] - potential[2:, :-2] - potential[:-2, 2:] + potential[:-2, :-2]
-        bent = (np.maximum(along_y, along_x) + np.abs(twist) / 4) / KNOT**2
+        yy = (potential[2:, 1:-1] - 2 * middle + potential[:-2, 1:-1]) / KNOT**2
+        xx = (potential[1:-1, 2:] - 2 * middle + potential[1:-1, :-2]) / KNOT**2
+        yx = potential[2:, 2:] - potential[2:, :-2] - potential[:-2, 2:] + potential[:-2, :-2]
+        yx = yx / (2 * KNOT) ** 2
+        stretch = np.stack([np.hypot(1 - yy, yx), np.hypot(1 - xx, yx)])
         # The curvature within a cell is a mean of that at its four corners.
-        most = np.maximum(bent[1:], bent[:-1])
-        stretch = 1 + np.maximum(most[:, 1:], most[:, :-1])
-        # Multiples of 4: rays at rest then keep off pixels' edges and the kinks of their shares.
-        return 4 * np.ceil(KNOT * stretch / spacing / 4).astype(np.int64)
+        most = np.maximum(stretch[:, 1:], stretch[:, :-1])
+        most = np.maximum(most[:, :, 1:], most[:, :, :-1])
+        wanted = np.ceil(KNOT * np.maximum(most, 0.5) / spacing).astype(np.int64)
+        # Rays at rest shall not land on the kinks of their shares.
+        return np.minimum(wanted + (wanted % 4 == 2), MOST_RAYS)
 
-    def image(self, potential: FloatArray, counts: IntArray) -> FloatArray:
+    def image(
+        self,
+        potential: FloatArray,
+        counts: IntArray,
+        beam: FloatArray,
+        frame: FloatArray | None = None,
+    ) -> FloatArray:
         """Return the flux that lands in each pixel.
 
         Parameters
@@ -92,202 +127,154 @@ class RayModel:
             The coefficients.
         counts : ndarray of int64
             As `ray_counts` returns them.
+        beam : ndarray
+            As `around` returns it.
+        frame : ndarray of 6, optional
+            Where the detector sees the rays. Default: where they land.
 
         Returns
         -------
-        ndarray, shape (H, W)
+        ndarray, with the shape `seen`
         """
-        height, width = self.source.shape
-        fine = np.zeros((_BANDS, _FINE * height, _FINE * width))
-        self._in_bands(_deposit, potential, counts, self.source, self.pad, fine)
-        total = fine.sum(axis=0).reshape(height, _FINE, width, _FINE)
-        return np.asarray(total.sum(axis=(1, 3)))
+        images = self._blank()
+        self._in_bands(kernels.deposit, potential, counts, beam, frame, images)
+        return self._of_detector(images)
 
-    def gradient(self, potential: FloatArray, counts: IntArray, pull: FloatArray) -> FloatArray:
-        """Return the derivative of ``(pull * image(potential, counts)).sum()``.
+    def gradient(
+        self,
+        potential: FloatArray,
+        counts: IntArray,
+        beam: FloatArray,
+        pull: FloatArray,
+        frame: FloatArray | None = None,
+    ) -> Pulls:
+        """Return the derivatives of ``(pull * image(…)).sum()`` at fixed `counts`.
 
         Parameters
         ----------
-        potential, counts
+        potential, counts, beam, frame
             As for `image`.
-        pull : ndarray, shape (H, W)
-            Weight of each pixel.
-
-        Returns
-        -------
-        ndarray
-            With respect to each coefficient, at fixed `counts`.
+        pull : ndarray
+            Weight of each pixel, with the shape `seen`.
         """
-        fine = np.repeat(np.repeat(pull, _FINE, axis=0), _FINE, axis=1)
-        parts = np.zeros((_BANDS, *self.shape))
-        self._in_bands(_gather, potential, counts, self.source, self.pad, fine, parts)
-        return np.asarray(parts.sum(axis=0))
+        coefficients = np.zeros((_BANDS, *self.shape))
+        of_beam, of_frame = np.zeros(beam.shape), np.zeros((_BANDS, 6))
+        guarded = np.pad(pull, _GUARD)
+        self._in_bands(
+            kernels.gather, potential, counts, beam, frame, guarded, coefficients, of_beam, of_frame
+        )
+        return Pulls(coefficients.sum(axis=0), of_beam, self._about_middle(of_frame.sum(axis=0)))
+
+    def change(
+        self,
+        potential: FloatArray,
+        counts: IntArray,
+        beam: FloatArray,
+        by: Pulls,
+        frame: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return how the image changes, to first order, with potential, beam and frame.
+
+        Parameters
+        ----------
+        potential, counts, beam, frame
+            As for `image`.
+        by : Pulls
+            Their changes.
+        """
+        images = self._blank()
+        turned = self._from_corner(by.frame)
+        self._in_bands(
+            kernels.push, potential, counts, beam, frame, by.potential, by.beam, turned, images
+        )
+        return self._of_detector(images)
 
     def displacement(self, potential: FloatArray) -> FloatArray:
         """Return -∇ψ in px at the pixels' centres, shape (2, H, W), in axis order (y, x)."""
-        found = np.empty((2, *self.source.shape))
-        _slopes_at_pixels(potential, self.pad, found)
-        return -found
+        height, width = self.size
+        values, slopes = kernels.spline_tables((np.arange(KNOT) + 0.5) / KNOT)
+        along_y = _at_pixels(potential, slopes, self.pad, height)
+        along_x = _at_pixels(potential.T, slopes, self.pad, width).T
+        down = _at_pixels(along_y.T, values, self.pad, width).T
+        return -np.stack([down, _at_pixels(along_x, values, self.pad, height)])
 
-    def _in_bands(self, kernel: object, *arguments: object) -> None:
-        in_ranges(kernel, _BANDS, available_threads(self.threads), *arguments, smallest=1)  # type: ignore[arg-type]
+    def values(self, potential: FloatArray) -> FloatArray:
+        """Return ψ in px² at the pixels' centres, shape (H, W)."""
+        height, width = self.size
+        values, _ = kernels.spline_tables((np.arange(KNOT) + 0.5) / KNOT)
+        along_y = _at_pixels(potential, values, self.pad, height)
+        return _at_pixels(along_y.T, values, self.pad, width).T
 
+    def _blank(self) -> FloatArray:
+        height, width = (side + 2 * _GUARD for side in self.seen)
+        return np.zeros((_BANDS, height, width))
 
-@njit(nogil=True)
-def _splines(place: float, values: FloatArray, slopes: FloatArray) -> None:
-    """The four B-splines at a place (0 to 1) of a cell, and their slopes per px."""
-    t, s = place, 1 - place
-    values[0], slopes[0] = s**3 / 6, -(s**2) / 2 / KNOT
-    values[1], slopes[1] = (4 - 6 * t**2 + 3 * t**3) / 6, (3 * t**2 - 4 * t) / 2 / KNOT
-    values[2], slopes[2] = (4 - 6 * s**2 + 3 * s**3) / 6, (4 * s - 3 * s**2) / 2 / KNOT
-    values[3], slopes[3] = t**3 / 6, t**2 / 2 / KNOT
+    def _of_detector(self, images: FloatArray) -> FloatArray:
+        return np.asarray(images[:, _GUARD:-_GUARD, _GUARD:-_GUARD].sum(axis=0))
 
+    def _in_bands(
+        self,
+        kernel: Callable[..., Any],
+        potential: FloatArray,
+        counts: IntArray,
+        beam: FloatArray,
+        frame: FloatArray | None,
+        *rest: FloatArray,
+    ) -> None:
+        seen = self._to_pixels(at_rest() if frame is None else frame)
+        threads = available_threads(self.threads)
+        if (counts[0] * counts[1]).sum() < _WORTH_A_THREAD:
+            threads = 1
+        fixed = (potential, counts, beam, _tables(), seen, self.pad, 1 / _SHARED)
+        in_ranges(kernel, _BANDS, threads, *fixed, *rest, smallest=1)
 
-@njit(nogil=True)
-def _tables(n: int) -> tuple[FloatArray, FloatArray]:
-    """B-splines and their slopes at the rays of a cell."""
-    values, slopes = np.empty((n, 4)), np.empty((n, 4))
-    for k in range(n):
-        _splines((k + 0.5) / n, values[k], slopes[k])
-    return values, slopes
+    @property
+    def _middle(self) -> tuple[float, float]:
+        return self.size[0] / 2, self.size[1] / 2
 
+    def _to_pixels(self, frame: FloatArray) -> FloatArray:
+        """A frame about the image's corner, that gives pixels of a guarded detector."""
+        turned = self._from_corner(frame)
+        # From a pixel's edge to its middle: a ray there is shared with none.
+        offset = self.beyond + _GUARD - 0.5
+        turned[0] += self._middle[0] + offset
+        turned[3] += self._middle[1] + offset
+        return turned
 
-@njit(nogil=True)
-def _slope(
-    potential: FloatArray,
-    corner: tuple[int, int],
-    along_y: tuple[FloatArray, FloatArray],
-    along_x: tuple[FloatArray, FloatArray],
-) -> tuple[float, float]:
-    """Gradient of a potential, from the splines (values, slopes) at a place of a cell."""
-    in_y = in_x = 0.0
-    for i in range(4):
-        plain = steep = 0.0
-        for j in range(4):
-            coefficient = potential[corner[0] + i, corner[1] + j]
-            plain += along_x[0][j] * coefficient
-            steep += along_x[1][j] * coefficient
-        in_y += along_y[1][i] * plain
-        in_x += along_y[0][i] * steep
-    return in_y, in_x
+    def _from_corner(self, frame: FloatArray) -> FloatArray:
+        y, x = self._middle
+        turned = np.array(frame, dtype=np.float64)
+        turned[0] -= frame[1] * y + frame[2] * x
+        turned[3] -= frame[4] * y + frame[5] * x
+        return turned
 
-
-@njit(nogil=True)
-def _fine_cell(place: float) -> tuple[int, float]:
-    """The fine cell at or before a place in px, and how far the place is towards the next."""
-    fine = place * _FINE - 0.5
-    cell = math.floor(fine)
-    return cell, fine - cell
-
-
-@njit(nogil=True)
-def _flux_of(source: FloatArray, y: float, x: float) -> float:
-    height, width = source.shape
-    row = min(max(math.floor(y), 0), height - 1)
-    column = min(max(math.floor(x), 0), width - 1)
-    return float(source[row, column])
-
-
-@njit(nogil=True)
-def _deposit(
-    start: int,
-    stop: int,
-    potential: FloatArray,
-    counts: IntArray,
-    source: FloatArray,
-    pad: int,
-    images: FloatArray,
-) -> None:
-    """Share the rays of bands of cells among the fine cells of each band's image."""
-    rows, columns = counts.shape
-    bands, height, width = images.shape
-    for band in range(start, stop):
-        image = images[band]
-        for row in range(rows * band // bands, rows * (band + 1) // bands):
-            for column in range(columns):
-                n = counts[row, column]
-                values, slopes = _tables(n)
-                share = (KNOT / n) ** 2
-                for a in range(n):
-                    y = (row + (a + 0.5) / n) * KNOT - pad
-                    along_y = (values[a], slopes[a])
-                    for b in range(n):
-                        x = (column + (b + 0.5) / n) * KNOT - pad
-                        along_x = (values[b], slopes[b])
-                        slope = _slope(potential, (row, column), along_y, along_x)
-                        i, down = _fine_cell(y - slope[0])
-                        j, right = _fine_cell(x - slope[1])
-                        flux = _flux_of(source, y, x) * share
-                        for di in range(2):
-                            if not 0 <= i + di < height:
-                                continue
-                            part = flux * (down if di else 1 - down)
-                            for dj in range(2):
-                                if 0 <= j + dj < width:
-                                    image[i + di, j + dj] += part * (right if dj else 1 - right)
+    def _about_middle(self, pulls: FloatArray) -> FloatArray:
+        y, x = self._middle
+        found = pulls.copy()
+        for k in (0, 3):
+            found[k + 1] -= y * pulls[k]
+            found[k + 2] -= x * pulls[k]
+        return found
 
 
-@njit(nogil=True)
-def _at(plane: FloatArray, row: int, column: int) -> float:
-    """Value of a plane that is zero outside."""
-    height, width = plane.shape
-    if not (0 <= row < height and 0 <= column < width):
-        return 0.0
-    return float(plane[row, column])
+def at_rest() -> FloatArray:
+    """Return the frame of a detector that sees rays where they land."""
+    return np.array([0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
 
 
-@njit(nogil=True)
-def _gather(
-    start: int,
-    stop: int,
-    potential: FloatArray,
-    counts: IntArray,
-    source: FloatArray,
-    pad: int,
-    pull: FloatArray,
-    gradients: FloatArray,
-) -> None:
-    """Gradients that bands of cells give the coefficients, from the pull where their rays land."""
-    rows, columns = counts.shape
-    bands = len(gradients)
-    for band in range(start, stop):
-        gradient = gradients[band]
-        for row in range(rows * band // bands, rows * (band + 1) // bands):
-            for column in range(columns):
-                n = counts[row, column]
-                values, slopes = _tables(n)
-                share = (KNOT / n) ** 2 * _FINE
-                for a in range(n):
-                    y = (row + (a + 0.5) / n) * KNOT - pad
-                    along_y = (values[a], slopes[a])
-                    for b in range(n):
-                        x = (column + (b + 0.5) / n) * KNOT - pad
-                        along_x = (values[b], slopes[b])
-                        slope = _slope(potential, (row, column), along_y, along_x)
-                        i, down = _fine_cell(y - slope[0])
-                        j, right = _fine_cell(x - slope[1])
-                        above, beside = _at(pull, i, j), _at(pull, i, j + 1)
-                        below, across = _at(pull, i + 1, j), _at(pull, i + 1, j + 1)
-                        flux = -_flux_of(source, y, x) * share
-                        to_y = flux * ((1 - right) * (below - above) + right * (across - beside))
-                        to_x = flux * ((1 - down) * (beside - above) + down * (across - below))
-                        for r in range(4):
-                            plain, steep = to_x * values[a, r], to_y * slopes[a, r]
-                            for s in range(4):
-                                gradient[row + r, column + s] += (
-                                    steep * values[b, s] + plain * slopes[b, s]
-                                )
+@cache
+def _tables() -> FloatArray:
+    """B-splines and their slopes at the rays of cells with n of them, [n, which, spline, ray]."""
+    tables = np.zeros((MOST_RAYS + 1, 2, 4, MOST_RAYS))
+    for n in range(1, MOST_RAYS + 1):
+        tables[n, :, :, :n] = kernels.spline_tables((np.arange(n) + 0.5) / n)
+    return tables
 
 
-@njit(nogil=True)
-def _slopes_at_pixels(potential: FloatArray, pad: int, found: FloatArray) -> None:
-    """Gradient of a potential at the pixels' centres."""
-    _, height, width = found.shape
-    values, slopes = _tables(KNOT)
-    for y in range(height):
-        for x in range(width):
-            row, a = divmod(y + pad, KNOT)
-            column, b = divmod(x + pad, KNOT)
-            found[0, y, x], found[1, y, x] = _slope(
-                potential, (row, column), (values[a], slopes[a]), (values[b], slopes[b])
-            )
+def _at_pixels(coefficients: FloatArray, table: FloatArray, pad: int, count: int) -> FloatArray:
+    """Splines along the first axis at the pixels' centres; `table` is that of a cell's pixels."""
+    cells = len(coefficients) - 3
+    found = np.empty((KNOT * cells, coefficients.shape[1]))
+    for k in range(KNOT):
+        found[k::KNOT] = sum(table[i, k] * coefficients[i : i + cells] for i in range(4))
+    return found[pad : pad + count]

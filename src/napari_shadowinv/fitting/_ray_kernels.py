@@ -1,0 +1,326 @@
+"""Kernels of `RayModel`: rays of a cell between knots, where they land, and what follows there.
+
+A cell's side is two pixels of the beam. Its rays start at the middles of n × m equal parts. Each
+row of them is traced at once; what a row shares (a spline's values along y) is worked out once.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from napari_shadowinv._typing import FloatArray, IntArray
+from napari_shadowinv.geometry._kernel import njit
+
+__all__ = ["KNOT", "MOST_RAYS", "deposit", "gather", "push", "spline_tables"]
+
+KNOT = 2  # px between knots
+MOST_RAYS = 64  # along a cell's side
+
+_FAST = {"contract"}  # a product and a sum in one instruction
+
+
+def spline_tables(places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The four B-splines at places (0 to 1) of a cell, and their slopes per px; shape (4, n)."""
+    t, s = places, 1 - places
+    values = [s**3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * s**2 + 3 * s**3) / 6, t**3 / 6]
+    slopes = [-(s**2) / 2, (3 * t**2 - 4 * t) / 2, (4 * s - 3 * s**2) / 2, t**2 / 2]
+    return np.stack(values), np.stack(slopes) / KNOT
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def _slopes_of_row(
+    potential: FloatArray,
+    row: int,
+    column: int,
+    value: FloatArray,
+    slope: FloatArray,
+    values: FloatArray,
+    slopes: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Gradient of a potential, (y, x), at a row of rays of a cell."""
+    s0 = s1 = s2 = s3 = p0 = p1 = p2 = p3 = 0.0
+    for i in range(4):
+        steep, plain = slope[i], value[i]
+        c0, c1 = potential[row + i, column], potential[row + i, column + 1]
+        c2, c3 = potential[row + i, column + 2], potential[row + i, column + 3]
+        s0, s1, s2, s3 = s0 + steep * c0, s1 + steep * c1, s2 + steep * c2, s3 + steep * c3
+        p0, p1, p2, p3 = p0 + plain * c0, p1 + plain * c1, p2 + plain * c2, p3 + plain * c3
+    for b in range(values.shape[1]):
+        out[0, b] = values[0, b] * s0 + values[1, b] * s1 + values[2, b] * s2 + values[3, b] * s3
+        out[1, b] = slopes[0, b] * p0 + slopes[1, b] * p1 + slopes[2, b] * p2 + slopes[3, b] * p3
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def _land(
+    slopes: FloatArray,
+    y: float,
+    x: float,
+    step: float,
+    frame: FloatArray,
+    steepness: float,
+    size: tuple[int, int],
+    pixels: IntArray,
+    shares: FloatArray,
+) -> None:
+    """The pixel at or before each ray of a row, and the share of the next one, along y and x."""
+    n = slopes.shape[1]
+    last_row, last_column = size[0] - 2.0, size[1] - 2.0
+    for b in range(n):
+        down = y - slopes[0, b]
+        right = x + (b + 0.5) * step - slopes[1, b]
+        v = frame[0] + frame[1] * down + frame[2] * right
+        u = frame[3] + frame[4] * down + frame[5] * right
+        # Rays that miss land in the outermost pixels, which nobody looks at.
+        v = min(max(v, 0.0), last_row)
+        u = min(max(u, 0.0), last_column)
+        i, j = math.floor(v), math.floor(u)
+        pixels[0, b], pixels[1, b] = int(i), int(j)
+        shares[0, b] = min(max((v - i - 0.5) * steepness + 0.5, 0.0), 1.0)
+        shares[1, b] = min(max((u - j - 0.5) * steepness + 0.5, 0.0), 1.0)
+
+
+@njit(nogil=True, error_model="numpy")
+def _first_pixels_share(a: int, n: int) -> float:
+    """How much of part `a` of `n` of a cell's side lies in the first of its two pixels."""
+    return min(max(n / 2 - a, 0.0), 1.0)
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def _flux_of_row(
+    beam: FloatArray, row: int, column: int, a: int, n: int, m: int, out: FloatArray
+) -> None:
+    upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
+    lower = KNOT**2 / (n * m) - upper
+    i, j = KNOT * row, KNOT * column
+    left = upper * beam[i, j] + lower * beam[i + 1, j]
+    right = upper * beam[i, j + 1] + lower * beam[i + 1, j + 1]
+    for b in range(m):
+        first = _first_pixels_share(b, m)
+        out[b] = first * left + (1 - first) * right
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def deposit(
+    start: int,
+    stop: int,
+    potential: FloatArray,
+    counts: IntArray,
+    beam: FloatArray,
+    tables: FloatArray,
+    frame: FloatArray,
+    pad: int,
+    steepness: float,
+    images: FloatArray,
+) -> None:
+    """Share the rays of bands of cells among the pixels of each band's image."""
+    rows, columns = counts.shape[1:]
+    bands, height, width = images.shape
+    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((2, MOST_RAYS))
+    pixels, flux = np.empty((2, MOST_RAYS), np.int64), np.empty(MOST_RAYS)
+    for band in range(start, stop):
+        image = images[band]
+        for row in range(rows * band // bands, rows * (band + 1) // bands):
+            for column in range(columns):
+                n, m = counts[0, row, column], counts[1, row, column]
+                along_x = tables[m, 0, :, :m], tables[m, 1, :, :m]
+                for a in range(n):
+                    along_y = tables[n, 0, :, a], tables[n, 1, :, a]
+                    _slopes_of_row(
+                        potential, row, column, *along_y, *along_x, slopes[:, :m]
+                    )
+                    y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
+                    _land(
+                        slopes[:, :m], y, x, KNOT / m, frame, steepness, (height, width),
+                        pixels, shares,
+                    )
+                    _flux_of_row(beam, row, column, a, n, m, flux)
+                    for b in range(m):
+                        i, j = pixels[0, b], pixels[1, b]
+                        down, right = shares[0, b], shares[1, b]
+                        below = flux[b] * down
+                        above = flux[b] - below
+                        image[i, j] += above - above * right
+                        image[i, j + 1] += above * right
+                        image[i + 1, j] += below - below * right
+                        image[i + 1, j + 1] += below * right
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def _edge(share: float, steepness: float) -> float:
+    """How fast a share grows with the place: nothing well inside of a pixel."""
+    return steepness if 0.0 < share < 1.0 else 0.0
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def gather(
+    start: int,
+    stop: int,
+    potential: FloatArray,
+    counts: IntArray,
+    beam: FloatArray,
+    tables: FloatArray,
+    frame: FloatArray,
+    pad: int,
+    steepness: float,
+    pull: FloatArray,
+    gradients: FloatArray,
+    of_beam: FloatArray,
+    of_frame: FloatArray,
+) -> None:
+    """Gradients with respect to coefficients, beam and frame, from the pull where rays land."""
+    rows, columns = counts.shape[1:]
+    bands = len(gradients)
+    size = pull.shape[0], pull.shape[1]
+    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((2, MOST_RAYS))
+    pixels, flux = np.empty((2, MOST_RAYS), np.int64), np.empty(MOST_RAYS)
+    to_y, to_x, bright = np.empty(MOST_RAYS), np.empty(MOST_RAYS), np.empty(MOST_RAYS)
+    lifted, shifted = np.empty(4), np.empty(4)
+    for band in range(start, stop):
+        gradient = gradients[band]
+        moments = of_frame[band]
+        for row in range(rows * band // bands, rows * (band + 1) // bands):
+            for column in range(columns):
+                n, m = counts[0, row, column], counts[1, row, column]
+                along_x = tables[m, 0, :, :m], tables[m, 1, :, :m]
+                for a in range(n):
+                    along_y = tables[n, 0, :, a], tables[n, 1, :, a]
+                    _slopes_of_row(
+                        potential, row, column, *along_y, *along_x, slopes[:, :m]
+                    )
+                    y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
+                    _land(
+                        slopes[:, :m], y, x, KNOT / m, frame, steepness, size,
+                        pixels, shares,
+                    )
+                    _flux_of_row(beam, row, column, a, n, m, flux)
+                    for b in range(m):
+                        i, j = pixels[0, b], pixels[1, b]
+                        down, right = shares[0, b], shares[1, b]
+                        above, beside = pull[i, j], pull[i, j + 1]
+                        below, across = pull[i + 1, j], pull[i + 1, j + 1]
+                        left = above + down * (below - above)
+                        bright[b] = left + right * (beside + down * (across - beside) - left)
+                        in_v = below - above + right * (across - beside - below + above)
+                        in_u = beside - above + down * (across - beside - below + above)
+                        in_v *= flux[b] * _edge(down, steepness)
+                        in_u *= flux[b] * _edge(right, steepness)
+                        to_y[b], to_x[b] = in_v, in_u
+                    lifted[:] = 0
+                    shifted[:] = 0
+                    sum_v = sum_u = vy = vx = uy = ux = 0.0
+                    for b in range(m):
+                        in_v, in_u = to_y[b], to_x[b]
+                        landed_y = y - slopes[0, b]
+                        landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
+                        sum_v += in_v
+                        sum_u += in_u
+                        vy += in_v * landed_y
+                        vx += in_v * landed_x
+                        uy += in_u * landed_y
+                        ux += in_u * landed_x
+                        along, across = (
+                            frame[1] * in_v + frame[4] * in_u,
+                            frame[2] * in_v + frame[5] * in_u,
+                        )
+                        for s in range(4):
+                            lifted[s] += along * tables[m, 0, s, b]
+                            shifted[s] += across * tables[m, 1, s, b]
+                    for r in range(4):
+                        for s in range(4):
+                            gradient[row + r, column + s] -= (
+                                along_y[1][r] * lifted[s] + along_y[0][r] * shifted[s]
+                            )
+                    moments[0] += sum_v
+                    moments[1] += vy
+                    moments[2] += vx
+                    moments[3] += sum_u
+                    moments[4] += uy
+                    moments[5] += ux
+                    upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
+                    lower = KNOT**2 / (n * m) - upper
+                    first = second = 0.0
+                    for b in range(m):
+                        share = _first_pixels_share(b, m)
+                        first += share * bright[b]
+                        second += (1 - share) * bright[b]
+                    i, j = KNOT * row, KNOT * column
+                    of_beam[i, j] += upper * first
+                    of_beam[i, j + 1] += upper * second
+                    of_beam[i + 1, j] += lower * first
+                    of_beam[i + 1, j + 1] += lower * second
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def push(
+    start: int,
+    stop: int,
+    potential: FloatArray,
+    counts: IntArray,
+    beam: FloatArray,
+    tables: FloatArray,
+    frame: FloatArray,
+    pad: int,
+    steepness: float,
+    change: FloatArray,
+    beam_change: FloatArray,
+    frame_change: FloatArray,
+    images: FloatArray,
+) -> None:
+    """Change of each band's image with that of coefficients, beam and frame: `gather` turned."""
+    rows, columns = counts.shape[1:]
+    bands, height, width = images.shape
+    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((2, MOST_RAYS))
+    moves = np.empty((2, MOST_RAYS))
+    pixels, flux = np.empty((2, MOST_RAYS), np.int64), np.empty(MOST_RAYS)
+    more = np.empty(MOST_RAYS)
+    for band in range(start, stop):
+        image = images[band]
+        for row in range(rows * band // bands, rows * (band + 1) // bands):
+            for column in range(columns):
+                n, m = counts[0, row, column], counts[1, row, column]
+                along_x = tables[m, 0, :, :m], tables[m, 1, :, :m]
+                for a in range(n):
+                    along_y = tables[n, 0, :, a], tables[n, 1, :, a]
+                    _slopes_of_row(
+                        potential, row, column, *along_y, *along_x, slopes[:, :m]
+                    )
+                    _slopes_of_row(change, row, column, *along_y, *along_x, moves[:, :m])
+                    y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
+                    _land(
+                        slopes[:, :m], y, x, KNOT / m, frame, steepness, (height, width),
+                        pixels, shares,
+                    )
+                    _flux_of_row(beam, row, column, a, n, m, flux)
+                    _flux_of_row(beam_change, row, column, a, n, m, more)
+                    for b in range(m):
+                        i, j = pixels[0, b], pixels[1, b]
+                        down, right = shares[0, b], shares[1, b]
+                        landed_y = y - slopes[0, b]
+                        landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
+                        in_v = (
+                            frame_change[0] + frame_change[1] * landed_y
+                            + frame_change[2] * landed_x
+                            - frame[1] * moves[0, b] - frame[2] * moves[1, b]
+                        )
+                        in_u = (
+                            frame_change[3] + frame_change[4] * landed_y
+                            + frame_change[5] * landed_x
+                            - frame[4] * moves[0, b] - frame[5] * moves[1, b]
+                        )
+                        in_v *= flux[b] * _edge(down, steepness)
+                        in_u *= flux[b] * _edge(right, steepness)
+                        grown = more[b]
+                        image[i, j] += (
+                            grown * (1 - down) * (1 - right) - in_v * (1 - right)
+                            - in_u * (1 - down)
+                        )
+                        image[i, j + 1] += (
+                            grown * (1 - down) * right - in_v * right + in_u * (1 - down)
+                        )
+                        image[i + 1, j] += (
+                            grown * down * (1 - right) + in_v * (1 - right) - in_u * down
+                        )
+                        image[i + 1, j + 1] += grown * down * right + in_v * right + in_u * down
