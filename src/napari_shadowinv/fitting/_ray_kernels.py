@@ -54,6 +54,15 @@ def _slopes_of_row(
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def _share(place: float, steepness: float) -> tuple[float, float]:
+    """What the next pixel gets of a ray between two pixels' middles, and how fast that grows."""
+    t = min(max((place - 0.5) * steepness + 0.5, 0.0), 1.0)
+    nearer = min(t, 1 - t)
+    part = 2 * nearer * nearer
+    return (part if t < 0.5 else 1 - part), 4 * nearer * steepness
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
 def _land(
     slopes: FloatArray,
     y: float,
@@ -65,7 +74,7 @@ def _land(
     pixels: IntArray,
     shares: FloatArray,
 ) -> None:
-    """The pixel at or before each ray of a row, and the share of the next one, along y and x."""
+    """The pixel at or before each ray of a row, and the share of the next one, with its slope."""
     n = slopes.shape[1]
     last_row, last_column = size[0] - 2.0, size[1] - 2.0
     for b in range(n):
@@ -78,8 +87,8 @@ def _land(
         u = min(max(u, 0.0), last_column)
         i, j = math.floor(v), math.floor(u)
         pixels[0, b], pixels[1, b] = int(i), int(j)
-        shares[0, b] = min(max((v - i - 0.5) * steepness + 0.5, 0.0), 1.0)
-        shares[1, b] = min(max((u - j - 0.5) * steepness + 0.5, 0.0), 1.0)
+        shares[0, b], shares[2, b] = _share(v - i, steepness)
+        shares[1, b], shares[3, b] = _share(u - j, steepness)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -118,7 +127,7 @@ def deposit(
     """Share the rays of bands of cells among the pixels of each band's image."""
     rows, columns = counts.shape[1:]
     bands, height, width = images.shape
-    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((2, MOST_RAYS))
+    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
     pixels, flux = np.empty((2, MOST_RAYS), np.int64), np.empty(MOST_RAYS)
     for band in range(start, stop):
         image = images[band]
@@ -149,12 +158,6 @@ def deposit(
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
-def _edge(share: float, steepness: float) -> float:
-    """How fast a share grows with the place: nothing well inside of a pixel."""
-    return steepness if 0.0 < share < 1.0 else 0.0
-
-
-@njit(nogil=True, error_model="numpy", fastmath=_FAST)
 def gather(
     start: int,
     stop: int,
@@ -174,7 +177,7 @@ def gather(
     rows, columns = counts.shape[1:]
     bands = len(gradients)
     size = pull.shape[0], pull.shape[1]
-    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((2, MOST_RAYS))
+    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
     pixels, flux = np.empty((2, MOST_RAYS), np.int64), np.empty(MOST_RAYS)
     to_y, to_x, bright = np.empty(MOST_RAYS), np.empty(MOST_RAYS), np.empty(MOST_RAYS)
     lifted, shifted = np.empty(4), np.empty(4)
@@ -205,8 +208,8 @@ def gather(
                         bright[b] = left + right * (beside + down * (across - beside) - left)
                         in_v = below - above + right * (across - beside - below + above)
                         in_u = beside - above + down * (across - beside - below + above)
-                        in_v *= flux[b] * _edge(down, steepness)
-                        in_u *= flux[b] * _edge(right, steepness)
+                        in_v *= flux[b] * shares[2, b]
+                        in_u *= flux[b] * shares[3, b]
                         to_y[b], to_x[b] = in_v, in_u
                     lifted[:] = 0
                     shifted[:] = 0
@@ -272,7 +275,7 @@ def push(
     """Change of each band's image with that of coefficients, beam and frame: `gather` turned."""
     rows, columns = counts.shape[1:]
     bands, height, width = images.shape
-    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((2, MOST_RAYS))
+    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
     moves = np.empty((2, MOST_RAYS))
     pixels, flux = np.empty((2, MOST_RAYS), np.int64), np.empty(MOST_RAYS)
     more = np.empty(MOST_RAYS)
@@ -310,8 +313,8 @@ def push(
                             + frame_change[5] * landed_x
                             - frame[4] * moves[0, b] - frame[5] * moves[1, b]
                         )
-                        in_v *= flux[b] * _edge(down, steepness)
-                        in_u *= flux[b] * _edge(right, steepness)
+                        in_v *= flux[b] * shares[2, b]
+                        in_u *= flux[b] * shares[3, b]
                         grown = more[b]
                         image[i, j] += (
                             grown * (1 - down) * (1 - right) - in_v * (1 - right)

@@ -99,6 +99,7 @@ class Scene:
     beam_modes: int = 0
     free_gains: bool = False
     free_frames: BoolArray = field(default_factory=lambda: np.zeros(6, bool))
+    spacing: float = 0.25
     bin: int = 1
     threads: int | None = None
 
@@ -107,7 +108,7 @@ class Scene:
         """The rays of all images."""
         beyond = max(_reach(width) for width in self.psf)
         size = self.images.shape[1], self.images.shape[2]
-        return RayModel(size, PAD // self.bin, beyond, self.threads)
+        return RayModel(size, PAD // self.bin, beyond, self.spacing, self.threads)
 
     def nothing(self) -> Unknowns:
         """Return the unknowns of no object in a beam as known."""
@@ -122,9 +123,9 @@ class Scene:
         """Return the coefficients of each image's own potential."""
         return np.einsum("lm,myx->lyx", self.strengths, unknowns.potentials)
 
-    def ray_counts(self, unknowns: Unknowns, spacing: float) -> list[IntArray]:
+    def ray_counts(self, unknowns: Unknowns) -> list[IntArray]:
         """Return how many rays each cell of each image needs; see `RayModel.ray_counts`."""
-        return [self.rays.ray_counts(psi, spacing) for psi in self.potentials(unknowns)]
+        return [self.rays.ray_counts(psi) for psi in self.potentials(unknowns)]
 
     def model(self, unknowns: Unknowns, counts: list[IntArray]) -> FloatArray:
         """Return the images that the unknowns make, shape (L, H, W)."""

@@ -1,9 +1,9 @@
 """Rays through potentials of cubic B-splines, and the images where they land: `RayModel`.
 
 A ray that starts at x lands at x - ∇ψ(x), also where rays have crossed. Pixels are boxes, as those
-of a camera: a ray counts in the pixel where it lands; within a sixth of a pixel from its edge it
-is shared with the neighbour, so that an image changes smoothly with the potential. The derivative
-of any function of the image follows exactly, ray by ray.
+of a camera: a ray counts in the pixel where it lands; near an edge it is shared with the
+neighbour, smoothly, so that images neither ripple nor jump. The derivative of any function of the
+image follows exactly, ray by ray.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
 
 __all__ = ["KNOT", "Pulls", "RayModel", "at_rest"]
 
-_SHARED = 1 / 3  # px, around an edge between pixels, where a ray counts in both
+_SHARED = 1.5  # of the spacing: width around an edge between pixels where a ray counts in both
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
 _GUARD = 2  # px around the detector, for rays that miss it
 _WORTH_A_THREAD = 20_000  # rays
@@ -54,6 +54,8 @@ class RayModel:
         Width in px, even, of the strip around the image from which rays may enter.
     beyond : int
         Width in px of the strip around the image where what lands is wanted, too.
+    spacing : float
+        Largest distance in px between the landing points of neighbouring rays.
     threads : int or None
         Number of threads. Default: all cores. It does not affect the result.
     """
@@ -61,6 +63,7 @@ class RayModel:
     size: tuple[int, int]
     pad: int = 12
     beyond: int = 0
+    spacing: float = 0.25
     threads: int | None = None
 
     @property
@@ -85,15 +88,13 @@ class RayModel:
         rows, columns = (KNOT * n - self.pad - side for n, side in zip(self.cells, self.size))  # noqa: B905
         return np.pad(image, ((self.pad, rows), (self.pad, columns)), mode="edge")
 
-    def ray_counts(self, potential: FloatArray, spacing: float = 0.25) -> IntArray:
+    def ray_counts(self, potential: FloatArray) -> IntArray:
         """Return how many rays along y and x each cell needs to land so densely.
 
         Parameters
         ----------
         potential : ndarray
             The coefficients.
-        spacing : float, default 0.25
-            Largest distance in px between the landing points of neighbouring rays.
 
         Returns
         -------
@@ -108,7 +109,7 @@ class RayModel:
         # The curvature within a cell is a mean of that at its four corners.
         most = np.maximum(stretch[:, 1:], stretch[:, :-1])
         most = np.maximum(most[:, :, 1:], most[:, :, :-1])
-        wanted = np.ceil(KNOT * np.maximum(most, 0.5) / spacing).astype(np.int64)
+        wanted = np.ceil(KNOT * np.maximum(most, 0.5) / self.spacing).astype(np.int64)
         # Rays at rest shall not land on the kinks of their shares.
         return np.minimum(wanted + (wanted % 4 == 2), MOST_RAYS)
 
@@ -225,7 +226,7 @@ class RayModel:
         threads = available_threads(self.threads)
         if (counts[0] * counts[1]).sum() < _WORTH_A_THREAD:
             threads = 1
-        fixed = (potential, counts, beam, _tables(), seen, self.pad, 1 / _SHARED)
+        fixed = (potential, counts, beam, _tables(), seen, self.pad, 1 / (_SHARED * self.spacing))
         in_ranges(kernel, _BANDS, threads, *fixed, *rest, smallest=1)
 
     @property

@@ -67,11 +67,11 @@ class Preconditioner:
         )
 
 
-def descend(scene, start, *, spacing=0.25, iterations=100, tolerance=1e-7, renewals=2, after_step=None):
+def descend(scene, start, *, iterations=100, tolerance=1e-7, renewals=2, after_step=None):
     pre = Preconditioner(scene)
     unknowns, steps, value = start, 0, np.inf
     for k in range(renewals):
-        counts = scene.ray_counts(unknowns, spacing)
+        counts = scene.ray_counts(unknowns)
         base = unknowns
 
         def objective(flat):
