@@ -34,11 +34,10 @@ def minimise(
     start: FloatArray,
     *,
     iterations: int,
-    tolerance: float,
-    first_step: float = 1.0,
+    least_gain: float,
     after_step: Callable[[int, float], None] | None = None,
 ) -> tuple[FloatArray, float, int]:
-    """Minimise by L-BFGS.
+    """Minimise by L-BFGS, starting with the identity as Hessian.
 
     Parameters
     ----------
@@ -48,10 +47,8 @@ def minimise(
         Where to start; scaled so that the Hessian is about the identity.
     iterations : int
         Most steps.
-    tolerance : float
-        Ends once five steps lower the value by less than this share of it.
-    first_step : float, default 1
-        Most length of the first trial step.
+    least_gain : float
+        Ends once five steps lower the value by less.
     after_step : callable, optional
         Receives the number of steps and the value.
 
@@ -65,7 +62,7 @@ def minimise(
     value, gradient = objective(point)
     values = [value]
     pairs: deque[tuple[FloatArray, FloatArray, float]] = deque(maxlen=_PAIRS)
-    step = min(1.0, first_step / max(np.sqrt(product(gradient, gradient)), 1e-300))
+    step = 1.0
     for _ in range(iterations):
         direction = -_times_inverse_hessian(gradient, pairs)
         slope = product(direction, gradient)
@@ -85,7 +82,7 @@ def minimise(
         values.append(value)
         if after_step is not None:
             after_step(len(values) - 1, value)
-        if len(values) > 5 and values[-6] - value <= tolerance * abs(value):
+        if len(values) > 5 and values[-6] - value < least_gain:
             break
     return point, value, len(values) - 1
 

@@ -1,0 +1,356 @@
+"""The forward model fitted to images: `fit`, `compare`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter
+
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting.descent import coarser, descend, finer
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.measurements import Measured, measured
+from napari_shadowinv.fitting.options import FitOptions
+from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
+from napari_shadowinv.fitting.search import (
+    Found,
+    Start,
+    refined,
+    search,
+    with_likely_smoothness,
+)
+from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.fitting.verdict import judged
+from napari_shadowinv.inversion import invert
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.forward import jacobian_determinant
+from napari_shadowinv.physics.setup import Setup
+
+__all__ = ["fit"]
+
+_FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
+_FROM_NEAR = ((2, 4.0), (2, 2.0), (2, 1.0))
+_FROM_FIELD = ((4, 1.0), (2, 1.0))
+_SHARES_OF_TRANSPORT = (1.0, 1.4, 1.9, 2.4)  # past caustics, transport is too weak
+_ROUNDED = 8.0  # px
+_TRANSPORT_SITES = 10_000
+_SMOOTHED_ERRORS = 4.0  # px
+_MIDDLE = 2
+
+
+def fit(
+    images: ArrayLike,
+    *,
+    strengths: ArrayLike | None = None,
+    setups: Sequence[Setup] | None = None,
+    fields: Sequence[str] = ("B",),
+    source: ArrayLike | Literal["unknown"] | None = None,
+    noise: ArrayLike | Literal["poisson"] | None = None,
+    psf: Any = 0.0,
+    mask: ArrayLike | None = None,
+    gains: ArrayLike | Literal["known", "free"] = "known",
+    fiducials: ArrayLike | None = None,
+    options: FitOptions | None = None,
+    start: ArrayLike | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Fit:
+    """Find the fields, and the beam, that explain one or several images of one object.
+
+    Rays may cross, images may be blurred, the beam may be unknown: the forward model is fitted
+    as it is. Several images at different energies tell what one cannot; the verdict of the
+    result says whether they do.
+
+    Parameters
+    ----------
+    images : array_like, shape (L, H, W) or (H, W)
+        Images on one grid of pixels in the object plane.
+    strengths : array_like, shape (L,) or (L, M), optional
+        Displacement of each image by each field, relative to the first image.
+    setups : sequence of Setup, optional
+        The experiment of each image, from which the strengths follow.
+    fields : sequence of {"B", "E", "plasma", "phase"}, default ("B",)
+        What deflects. Two fields need images of at least two energies.
+    source : array_like or "unknown", optional
+        The undisturbed beam, (H, W) or one for each image, in the units of the images; or
+        "unknown": a smooth beam is fitted, the same for all images but for gains. Default:
+        uniform, with the mean of each image.
+    noise : array_like or "poisson", optional
+        Standard deviation of the noise: one number, one an image, or one a pixel. "poisson" if
+        the images are counts. Default: estimated from differences of neighbouring pixels.
+    psf : float or array_like, default 0
+        Standard deviation in px of the point spread, or a kernel with odd sides; one, or one for
+        each image. See `point_spread`.
+    mask : array_like of bool, shape (H, W) or (L, H, W), optional
+        The pixels to use. Default: all.
+    gains : "known", "free" or array_like, default "known"
+        Whether each image is brighter than the source by an unknown factor, or by what.
+    fiducials : array_like, shape (n, 5), optional
+        Known displacements in the first image: rows of y, x, dy, dx and their σ, in px.
+    options : FitOptions, optional
+        Everything else.
+    start : array_like, shape (H, W), optional
+        A potential in px² to start from, too, of the first field in the first image.
+    on_progress, should_stop : callable, optional
+        Receives a `Progress` after each step, with the objective in its message; ends the work
+        when it returns true.
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    InputError
+        If shapes or values do not fit, or one image with an unknown source is given without
+        ``FitOptions(ambiguous=True)``.
+    InversionCancelled
+        If `should_stop` returned true.
+
+    Examples
+    --------
+    >>> from napari_shadowinv import synthetic_image
+    >>> from napari_shadowinv.physics.phantoms import gaussian_blob
+    >>> truth = gaussian_blob((64, 64), 40.0, 9.0).displacement
+    >>> shots = [synthetic_image(truth), synthetic_image(0.6 * truth)]
+    >>> found = fit(shots, strengths=[1, 0.6], noise=0.02, options=FitOptions(samples=0))
+    >>> bool(np.abs(found.fields[0].displacement - truth).max() < 0.2)
+    True
+    """
+    options = options or FitOptions()
+    report = Reporter(on_progress, should_stop)
+    seconds: dict[str, float] = {}
+    rng = np.random.default_rng(options.seed)
+    given = measured(
+        images,
+        strengths=strengths,
+        setups=setups,
+        fields=fields,
+        source=source,
+        noise=noise,
+        psf=psf,
+        mask=mask,
+        gains=gains,
+        fiducials=fiducials,
+        options=options,
+    )
+    scene = replace(given.scene, smoothness=np.full(len(fields), options.smoothness or 0.0))
+    steps = 0
+
+    def tell(stage: str, objective: float) -> None:
+        nonlocal steps
+        steps += 1
+        report("fit", steps, None, f"{stage}, objective {objective:.6g}")
+
+    with _timed("starts", seconds):
+        starts = _starts(given, start, tell)
+        found = search(scene, starts, tell)
+    with _timed("smoothness", seconds):
+        scene, best = with_likely_smoothness(scene, found[0], rng, tell)
+        if given.counted:
+            scene = _reweighted(given, scene, best)
+        basins = _basins(scene, best, found[1:], tell)
+    with _timed("full size", seconds):
+        fine = replace(scene, spacing=options.spacing)
+        unknowns, value, taken = refined(fine, best, iterations=options.max_iterations, tell=tell)
+    with _timed("samples", seconds):
+        errors = _errors(scene, best, given, options, rng, tell)
+    return _result(
+        given, fine, unknowns, fields, setups, options, basins, errors,
+        FitReport(value, taken, taken < options.max_iterations, seconds, float("nan")),
+    )  # fmt: skip
+
+
+@contextmanager
+def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
+    begun = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - begun
+
+
+def _starts(given: Measured, start: ArrayLike | None, tell: Any) -> list[Start]:
+    """What to start from: nothing, a field that was given, what transport makes of an image."""
+    scene = given.scene
+    starts = []
+    if start is not None:
+        potential = np.array(start, dtype=np.float64)
+        if potential.shape != given.size or not np.isfinite(potential).all():
+            raise InputError(
+                f"start has shape {potential.shape}: expected a finite potential in px² of the "
+                f"images' shape {given.size}"
+            )
+        starts.append(Start("given", ((2, 1.0),), potential))
+    if not given.single:
+        starts.append(Start("from far", _FROM_FAR))
+    starts.append(Start("from near", _FROM_NEAR))
+    if scene.strengths.shape[1] > 1 or scene.beam_modes:
+        return starts
+    weakest = int(np.argmin(np.abs(scene.strengths[:, 0])))
+    tell("transport", float("nan"))
+    potential = _transported(given, weakest)
+    if potential is None:
+        return starts
+    potential = gaussian_filter(potential, _ROUNDED) / scene.strengths[weakest, 0]
+    if not given.single:
+        return [*starts, Start("transport", ((2, 2.0), (2, 1.0)), potential)]
+    return starts + [
+        Start(f"{share:g} × transport", _FROM_FIELD, share * potential)
+        for share in _SHARES_OF_TRANSPORT
+    ]
+
+
+def _transported(given: Measured, number: int) -> FloatArray | None:
+    """The potential that transport makes of an image; None if it makes none of it."""
+    height, width = given.size
+    scene = given.scene
+    image = scene.images[number, :height, :width]
+    used = scene.weights[number, :height, :width] > 0
+    pad = scene.pad
+    beam = scene.beams[number, pad : pad + height, pad : pad + width]
+    options = InversionOptions(
+        n_sites=min(_TRANSPORT_SITES, height * width),
+        negative="clip",
+        threads=scene.threads,
+        tolerance=0.05,
+    )
+    try:
+        return invert(image, source=beam, mask=used, options=options).potential
+    except InputError:
+        return None
+
+
+def _reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
+    """Weights of counts, by what is expected instead of what was counted."""
+    unknowns = finer(found.unknowns)
+    expected = scene.model(unknowns, scene.ray_counts(unknowns))
+    units = given.units[:, None, None]
+    weights = units**2 / np.maximum(expected * units, 1.0)
+    return replace(scene, weights=np.where(scene.weights > 0, weights, 0.0))
+
+
+def _basins(
+    scene: Scene, best: Found, others: Sequence[Found], tell: Any
+) -> tuple[Basin, ...]:
+    """The best answer and others, with the same λ and without blur."""
+    middle = replace(coarser(scene, _MIDDLE), spacing=1 / 3)
+    found = []
+    for one in (best, *others[:3]):
+        unknowns, value, _ = descend(
+            middle,
+            one.unknowns,
+            iterations=60,
+            least_gain=3.0,
+            after_step=lambda now: tell("other starts", now),
+        )
+        chi2 = middle.chi2(unknowns, middle.ray_counts(unknowns)).mean()
+        displacement = 2 * np.stack([middle.rays.displacement(p) for p in unknowns.potentials])
+        end = replace(one, unknowns=unknowns, value=value, displacement=displacement)
+        found.append((end, float(chi2)))
+    first = found[0][0]
+    return tuple(
+        Basin(end.start, end.value, chi2, first.distance(end), end.displacement)
+        for end, chi2 in found
+    )
+
+
+def _errors(
+    scene: Scene, best: Found, given: Measured, options: FitOptions, rng: Any, tell: Any
+) -> FloatArray | None:
+    """Standard deviation of each field's displacement in px, (M, 2, H, W)."""
+    if options.samples < 2:
+        return None
+    middle = replace(coarser(scene, _MIDDLE), spacing=1 / 3)
+    posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", best.value))
+    squares: FloatArray | float = 0.0
+    for _ in range(options.samples):
+        change = finer(posterior.drawn())
+        drawn = np.stack([scene.rays.displacement(p) for p in change.potentials])
+        squares = squares + drawn**2
+    variance = np.asarray(squares) / options.samples
+    smooth = gaussian_filter(variance, (0, 0, _SMOOTHED_ERRORS, _SMOOTHED_ERRORS))
+    height, width = given.size
+    return np.sqrt(smooth[..., :height, :width])
+
+
+def _result(
+    given: Measured,
+    scene: Scene,
+    unknowns: Unknowns,
+    names: Sequence[str],
+    setups: Sequence[Setup] | None,
+    options: FitOptions,
+    basins: tuple[Basin, ...],
+    errors: FloatArray | None,
+    report: FitReport,
+) -> Fit:
+    height, width = given.size
+    counts = scene.ray_counts(unknowns)
+    units = given.units[:, None, None]
+    used = scene.weights[:, :height, :width] > 0
+    data = scene.images[:, :height, :width] * units
+    made = scene.model(unknowns, counts)[:, :height, :width] * units
+    gains = np.exp(unknowns.gains)
+    chi2 = scene.chi2(unknowns, counts)
+    fields = []
+    for m, name in enumerate(names):
+        potential = scene.rays.values(unknowns.potentials[m])[:height, :width]
+        edge = np.concatenate([potential[0], potential[-1], potential[:, 0], potential[:, -1]])
+        displacement = scene.rays.displacement(unknowns.potentials[m])[:, :height, :width]
+        error = None if errors is None else errors[m]
+        smoothness = float(scene.smoothness[m])
+        fields.append(FittedField(name, potential - edge.mean(), displacement, error, smoothness))
+    found = np.stack([field.displacement for field in fields])
+    uncertainty = float("nan")
+    if errors is not None:
+        size = (found**2).mean(axis=(1, 2, 3))
+        uncertainty = float(np.sqrt(((errors**2).mean(axis=(1, 2, 3)) / np.maximum(size, 1e-12)).max()))
+    folded = max(
+        float((jacobian_determinant(moved) < 0).mean())
+        for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, found)
+    )
+    others = [
+        (basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]
+    ]
+    verdict, explanation = judged(
+        chi2=chi2,
+        names=_names(setups, len(data)),
+        others=others,
+        single=given.single,
+        beam_unknown=scene.beam_modes > 0,
+        folded=folded,
+        uncertainty=uncertainty,
+    )
+    return Fit(
+        images=data,
+        mask=used,
+        strengths=scene.strengths,
+        fields=tuple(fields),
+        source=scene.beam(unknowns)[:, :height, :width] * units * gains[:, None, None],
+        gains=gains,
+        frames=unknowns.frames,
+        reprojection=made,
+        residual=np.where(used, data - made, 0.0),
+        chi2=chi2,
+        basins=basins,
+        folded=folded,
+        verdict=verdict,
+        explanation=explanation,
+        report=replace(report, uncertainty=uncertainty),
+        options=options,
+        setups=tuple(setups or ()),
+    )
+
+
+def _names(setups: Sequence[Setup] | None, count: int) -> list[str]:
+    if setups is None:
+        return [f"image {k + 1}" for k in range(count)]
+    return [f"image {k + 1} ({setup.probe})" for k, setup in enumerate(setups)]

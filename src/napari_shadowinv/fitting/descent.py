@@ -1,0 +1,192 @@
+"""Steps towards the best unknowns: `Preconditioner`, `descend`; pixels: `coarser`, `finer`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.fft import dctn, idctn
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.minimise import minimise
+from napari_shadowinv.fitting.rays import KNOT
+from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+
+__all__ = ["Preconditioner", "binned", "coarser", "descend", "finer"]
+
+_DESCENTS = 3  # with fixed numbers of rays each
+_FEW = 10  # steps, after which the numbers of rays still fit
+
+
+class Preconditioner:
+    """Scales in which the Hessian is about the identity: Sᵀ H S ≈ 1.
+
+    Diagonal in the cosines of the potentials, but for what fields have in common.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        prior, squares = scene.prior, scene.prior.wave_numbers
+        data = np.zeros((*squares.shape, *[scene.strengths.shape[1]] * 2))
+        for strengths, weights, psf in zip(scene.strengths, scene.weights, scene.psf, strict=True):
+            width = psf if isinstance(psf, float) else 0.0
+            seen = np.exp(-squares * (scene.blur**2 + width**2))
+            # An image's change by a weak potential is its Laplacian.
+            each = weights.mean() * (KNOT * squares) ** 2 * seen
+            data += each[..., None, None] * np.outer(strengths, strengths)
+        held = np.moveaxis(prior.of_potentials(), 0, -1)
+        matrix = data + held[..., None] * np.eye(held.shape[-1])
+        self._potentials = np.linalg.inv(np.linalg.cholesky(matrix))
+        self._log_ratio = 0.5 * float(np.linalg.slogdet(matrix)[1].sum())
+        self._log_ratio -= 0.5 * float(np.log(held).sum())
+        pixels = scene.weights.sum(axis=(1, 2))
+        used = prior.beam_weights > 0
+        self._beam = np.where(used, 1 / np.sqrt(prior.beam_weights + pixels.sum() / 4), 0.0)
+        self._gains = np.where(scene.free_gains, 1 / np.sqrt(pixels + 1), 0.0)
+        # Images have contrasts of some tenths over some pixels; stretching moves the edge by more.
+        arm = max(scene.rays.size) / 4
+        moved = 0.02 * pixels[:, None] * np.array([1, arm, arm, 1, arm, arm]) ** 2
+        self._frames = np.where(scene.free_frames, 1 / np.sqrt(moved + prior.frame_weights), 0.0)
+        self._frames[0] = 0
+
+    def times(self, scaled: Unknowns) -> Unknowns:
+        """Return S times scaled unknowns: their change."""
+        waves = np.einsum("yxnm,nyx->myx", self._potentials, scaled.potentials)
+        return Unknowns(
+            idctn(waves, axes=(1, 2), norm="ortho"),
+            self._beam * scaled.beam,
+            self._gains * scaled.gains,
+            self._frames * scaled.frames,
+        )
+
+    def turned(self, slope: Unknowns) -> Unknowns:
+        """Return Sᵀ times derivatives: those with respect to scaled unknowns."""
+        waves = dctn(slope.potentials, axes=(1, 2), norm="ortho")
+        return Unknowns(
+            np.einsum("yxnm,myx->nyx", self._potentials, waves),
+            self._beam * slope.beam,
+            self._gains * slope.gains,
+            self._frames * slope.frames,
+        )
+
+
+    def log_size(self) -> float:
+        """Return log |det S| plus half the logarithm of what the prior's determinant is, about."""
+        beam, frames = self._beam[self._beam > 0], self._frames[self._frames > 0]
+        return -self._log_ratio + float(np.log(beam).sum() + np.log(frames).sum())
+
+
+def descend(
+    scene: Scene,
+    start: Unknowns,
+    *,
+    iterations: int,
+    least_gain: float,
+    after_step: Callable[[float], None] | None = None,
+) -> tuple[Unknowns, float, int]:
+    """Minimise a scene's objective; the numbers of rays are renewed between descents.
+
+    Parameters
+    ----------
+    scene, start
+        What to explain, and from where.
+    iterations : int
+        Most steps.
+    least_gain : float
+        Ends where five steps lower the objective by less; 1 is what chance makes of it.
+    after_step : callable, optional
+        Receives the objective after each step.
+
+    Returns
+    -------
+    unknowns : Unknowns
+    value : float
+        The objective.
+    steps : int
+    """
+    scales = Preconditioner(scene)
+    unknowns, steps, value = start, 0, np.inf
+    for _ in range(_DESCENTS):
+        counts, base = scene.ray_counts(unknowns), unknowns
+
+        def objective(flat: FloatArray) -> tuple[float, FloatArray]:
+            there = base.plus(scales.times(base.like(flat)))  # noqa: B023
+            value, slope = scene.value_and_gradient(there, counts)  # noqa: B023
+            return value, scales.turned(slope).flat()
+
+        flat, value, taken = minimise(
+            objective,
+            np.zeros(base.flat().size),
+            iterations=iterations - steps,
+            least_gain=least_gain,
+            after_step=None if after_step is None else lambda _, now: after_step(now),
+        )
+        unknowns = base.plus(scales.times(base.like(flat)))
+        steps += taken
+        if steps >= iterations or taken < _FEW:
+            break
+    return unknowns, value, steps
+
+
+def binned(planes: FloatArray, factor: int) -> FloatArray:
+    """Return the sums of square blocks of pixels of each plane."""
+    count, height, width = planes.shape
+    blocks = planes.reshape(count, height // factor, factor, width // factor, factor)
+    return np.asarray(blocks.sum(axis=(2, 4)))
+
+
+def coarser(scene: Scene, factor: int) -> Scene:
+    """Return the same scene in larger pixels, those less than half used left out."""
+    if factor == 1:
+        return scene
+    used = scene.weights > 0
+    count = binned(used.astype(np.float64), factor)
+    images = binned(np.where(used, scene.images, 0), factor) / np.maximum(count, 1)
+    variances = np.divide(1, scene.weights, out=np.zeros_like(scene.weights), where=used)
+    variance = binned(variances, factor) / np.maximum(count, 1) ** 2
+    weights = np.divide(
+        1, variance, out=np.zeros_like(variance), where=(count >= factor**2 / 2) & (variance > 0)
+    )
+    fiducials = scene.fiducials
+    return replace(
+        scene,
+        images=images,
+        weights=weights,
+        beams=binned(scene.beams, factor) / factor**2,
+        psf=[_narrower(width, factor) for width in scene.psf],
+        # What is held against a potential is the same in all pixels.
+        smoothness=scene.smoothness / factor**2,
+        tie=scene.tie * factor**4,
+        decay=scene.decay / factor,
+        pad=scene.pad // factor,
+        fiducials=None if fiducials is None else Fiducials(*(part / factor for part in fiducials)),
+        bin=scene.bin * factor,
+    )
+
+
+def _narrower(width: float | FloatArray, factor: int) -> float:
+    """A point spread in larger pixels: a Gaussian with the same variance."""
+    if isinstance(width, float):
+        return width / factor
+    total = width.sum()
+    variance = 0.0
+    for axis in (0, 1):
+        line = width.sum(axis=1 - axis) / total
+        place = np.arange(len(line)) - (line * np.arange(len(line))).sum()
+        variance += float((line * place**2).sum()) / 2
+    return float(np.sqrt(max(variance, 0.0)) / factor)
+
+
+def finer(unknowns: Unknowns) -> Unknowns:
+    """Return the same unknowns in pixels half as wide, with knots twice as dense: no change."""
+    potentials = unknowns.potentials
+    for axis in (1, 2):
+        old = np.moveaxis(potentials, axis, 0)
+        new = np.empty((2 * len(old) - 3, *old.shape[1:]))
+        new[0::2] = (old[:-1] + old[1:]) / 2
+        new[1::2] = (old[:-2] + 6 * old[1:-1] + old[2:]) / 8
+        potentials = np.moveaxis(new, 0, axis)
+    frames = unknowns.frames.copy()
+    frames[:, [0, 3]] *= 2
+    return unknowns._replace(potentials=4 * potentials, frames=frames)

@@ -1,0 +1,382 @@
+"""What is given to a fit, checked and brought into one unit: `measured`.
+
+- standard deviation of an image's noise: `estimated_noise`
+- displacement by each field in each image, from the setups: `strengths_of`
+- width of the point spread, from the beam's source and the detector: `point_spread`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.ndimage import uniform_filter
+
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.options import FitOptions
+from napari_shadowinv.fitting.unknowns import Fiducials
+from napari_shadowinv.physics.projection import transferred_displacement
+from napari_shadowinv.physics.setup import Setup
+
+__all__ = ["FIELDS", "Measured", "estimated_noise", "measured", "point_spread", "strengths_of"]
+
+FIELDS = {
+    "B": "magnetic field",
+    "E": "electric field",
+    "plasma": "plasma",
+    "phase": "refractive index",
+}
+"""What can deflect a beam, by the names that a fit takes."""
+
+_BLOCK = 8  # px; sides are filled up to a multiple of it, for pixels four times as wide
+_SMALLEST_SIDE = 32
+_NORMAL_MAD = 1.4826
+_LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
+_LEAST_COUNTS = 1.0
+_SMOOTHED = 5  # px, over which counts are averaged for their first standard deviation
+_SAME = 1e-6
+_FREE_SHARE = 0.1  # of the shorter side
+_FREE_TIE = 0.3
+
+_ALIGNED = {
+    "none": np.zeros(6, bool),
+    "shift": np.array([True, False, False] * 2),
+    "affine": np.ones(6, bool),
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Images in units of their beams, and what is known about them.
+
+    `scene` has the sides of blocks; the images are its first `size` pixels. `units` (L,) is what
+    one unit is in each recorded image; `counted` whether the noise is that of counts.
+    """
+
+    scene: Scene
+    size: tuple[int, int]
+    units: FloatArray
+    counted: bool
+    single: bool  # one image, or several with the same information
+
+
+def measured(
+    images: ArrayLike,
+    *,
+    strengths: ArrayLike | None,
+    setups: Sequence[Setup] | None,
+    fields: Sequence[str],
+    source: ArrayLike | Literal["unknown"] | None,
+    noise: ArrayLike | Literal["poisson"] | None,
+    psf: Any,
+    mask: ArrayLike | None,
+    gains: ArrayLike | Literal["known", "free"],
+    fiducials: ArrayLike | None,
+    options: FitOptions,
+) -> Measured:
+    """Check what is given to a fit; see `fit` for what it may be."""
+    data = _checked_images(images)
+    count, height, width = data.shape
+    used = _checked_mask(mask, data)
+    matrix = strengths_of(setups, fields, count) if strengths is None else strengths
+    matrix = _checked_strengths(matrix, count)
+    if strengths is not None and setups is not None:
+        raise InputError("received both strengths and setups, expected one of them")
+    _refuse_what_one_image_cannot_tell(matrix, source, options)
+    free_gains, factors = _checked_gains(gains, count)
+    beams = factors[:, None, None] * _checked_source(source, data, used)
+    unknown = isinstance(source, str)
+    units = np.array([beam[use].mean() for beam, use in zip(beams, used, strict=True)])
+    scaled = np.where(used, data / units[:, None, None], 0.0)
+    deviations = _deviations(noise, data, used) / units[:, None, None]
+    weights = np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0)
+
+    fill = [(0, 0), *((0, -side % _BLOCK) for side in (height, width))]
+    size = height + fill[1][1], width + fill[2][1]
+    free = options.boundary == "free"
+    usual = max(16, 8 * round(_FREE_SHARE * min(height, width) / 8)) if free else 16
+    pad = options.margin or usual
+    around = [(0, 0), *((pad, pad + filled) for _, filled in fill[1:])]
+    scene = Scene(
+        images=np.pad(scaled, fill),
+        weights=np.pad(weights, fill),
+        strengths=matrix,
+        beams=np.pad(beams / units[:, None, None], around, mode="edge"),
+        psf=_checked_psf(psf, count, size),
+        smoothness=np.full(matrix.shape[1], 1.0),
+        pad=pad,
+        tie=_FREE_TIE if free else 30.0,
+        decay=(options.decay_length or pad) if free else np.inf,
+        beam_modes=options.beam_modes if unknown else 0,
+        free_gains=free_gains or unknown,
+        free_frames=_ALIGNED[options.align],
+        fiducials=_checked_fiducials(fiducials, (height, width)),
+        threads=options.threads,
+    )
+    spread = np.linalg.norm(matrix, axis=1)
+    single = count == 1 or spread.max() < _SAME_STRENGTH * spread.min()
+    return Measured(scene, (height, width), units, isinstance(noise, str), single)
+
+
+_SAME_STRENGTH = 1.08  # images that differ by less tell no more than one
+
+
+def strengths_of(setups: Sequence[Setup] | None, fields: Sequence[str], count: int) -> FloatArray:
+    """Return the displacement by each field in each image relative to the first, shape (L, M).
+
+    Parameters
+    ----------
+    setups : sequence of Setup
+        One for each image, with pixels of the same size at the object.
+    fields : sequence of str
+        Of `FIELDS`.
+    count : int
+        Number of images.
+
+    Raises
+    ------
+    InputError
+        If a field is unknown or does not bend the beam, or setups do not fit the images.
+    """
+    unknown = [field for field in fields if field not in FIELDS]
+    if unknown or not fields or len(set(fields)) < len(fields):
+        raise InputError(f"fields are {list(fields)}: expected some of {', '.join(FIELDS)}")
+    if setups is None:
+        if count > 1:
+            raise InputError(
+                f"received {count} images and neither strengths nor setups: give the setup of each "
+                "image, or how much each is displaced relative to the first"
+            )
+        return np.ones((1, len(fields)))
+    if len(setups) != count:
+        raise InputError(f"received {count} images and {len(setups)} setups: expected one each")
+    first = setups[0]
+    for k, setup in enumerate(setups):
+        ratio = setup.object_pixel_size / first.object_pixel_size
+        if abs(ratio - 1) > _SAME:
+            raise InputError(
+                f"image {k + 1} has pixels of {setup.object_pixel_size * 1e6:.6g} µm at the object, "
+                f"the first of {first.object_pixel_size * 1e6:.6g} µm: bring all images to the same "
+                "pixels first"
+            )
+    one = np.ones((2, 4, 4))
+    return np.array(
+        [
+            [
+                transferred_displacement(one, first, setup, deflector=FIELDS[field])[0, 0, 0]  # type: ignore[arg-type]
+                for field in fields
+            ]
+            for setup in setups
+        ]
+    )
+
+
+def point_spread(setup: Setup, source_size: float = 0.0, resolution: float = 0.0) -> float:
+    """Return the standard deviation in px by which an image is blurred.
+
+    Parameters
+    ----------
+    setup : Setup
+        The experiment.
+    source_size : float, default 0
+        Standard deviation of the beam's source in m; a FWHM is 2.355 times as large.
+    resolution : float, default 0
+        Standard deviation of the detector's point spread in m, at the detector.
+
+    Returns
+    -------
+    float
+        σ in px at the object: a source of size s is seen as s L/l at the detector, all of it
+        divided by the magnification.
+
+    Raises
+    ------
+    InputError
+        If a length is negative or not finite.
+    """
+    for name, length in (("source_size", source_size), ("resolution", resolution)):
+        if not 0 <= length < np.inf:
+            raise InputError(f"{name} is {length}: expected a length in m, 0 or more")
+    magnification = setup.magnification
+    width = np.hypot(source_size * (magnification - 1), resolution)
+    return float(width / magnification / setup.object_pixel_size)
+
+
+def estimated_noise(image: FloatArray, used: BoolArray) -> float:
+    """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
+    differences = image[1:, 1:] - image[1:, :-1] - image[:-1, 1:] + image[:-1, :-1]
+    known = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
+    if not known.any():
+        return 0.0
+    return float(_NORMAL_MAD * np.median(np.abs(differences[known])) / 2)
+
+
+def _checked_images(images: ArrayLike) -> FloatArray:
+    try:
+        data = np.array(images, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            "images are no stack of numbers: expected planes of the same height and width"
+        ) from error
+    data = data[None] if data.ndim == 2 else data
+    if data.ndim != 3 or not len(data):
+        raise InputError(
+            f"images have shape {data.shape}: expected (images, height, width), or one plane"
+        )
+    if min(data.shape[1:]) < _SMALLEST_SIDE:
+        raise InputError(
+            f"images have shape {data.shape[1:]}: expected at least {_SMALLEST_SIDE} pixels each way"
+        )
+    return data
+
+
+def _checked_mask(mask: ArrayLike | None, data: FloatArray) -> BoolArray:
+    if mask is None:
+        used = np.ones(data.shape, bool)
+    else:
+        used = np.asarray(mask, dtype=bool)
+        if used.shape not in (data.shape, data.shape[1:]):
+            raise InputError(
+                f"mask has shape {used.shape}: expected {data.shape[1:]} or {data.shape}, like the "
+                "images"
+            )
+        used = np.broadcast_to(used, data.shape)
+    bad = int((~np.isfinite(data) & used).sum())
+    if bad:
+        raise InputError(
+            f"images have {bad} pixels that are NaN or infinite, expected finite numbers: mask them"
+        )
+    for k, plane in enumerate(used):
+        if plane.mean() < 0.05:
+            raise InputError(f"image {k + 1} has {plane.mean():.1%} of its pixels in use: unmask some")
+        if not data[k][plane].mean() > 0:
+            raise InputError(f"image {k + 1} has no flux: expected a beam; check its background")
+    return used
+
+
+def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
+    matrix = np.array(strengths, dtype=np.float64)
+    matrix = matrix[:, None] if matrix.ndim == 1 else matrix
+    if matrix.ndim != 2 or len(matrix) != count or not np.isfinite(matrix).all():
+        raise InputError(
+            f"strengths have shape {matrix.shape}: expected a finite number for each of {count} "
+            "images, and each field"
+        )
+    if not matrix[0].all():
+        raise InputError(
+            f"strengths of the first image are {matrix[0].tolist()}: expected all fields to act in it"
+        )
+    if matrix.shape[1] > 1 and np.linalg.matrix_rank(matrix, tol=0.02) < matrix.shape[1]:
+        raise InputError(
+            f"{matrix.shape[1]} fields cannot be told apart by images of these energies: expected "
+            "strengths that differ between the fields; give more energies or one field"
+        )
+    # All in units of the first image's.
+    return matrix / matrix[0]
+
+
+def _refuse_what_one_image_cannot_tell(
+    matrix: FloatArray, source: object, options: FitOptions
+) -> None:
+    if len(matrix) == 1 and isinstance(source, str) and not options.ambiguous:
+        raise InputError(
+            "received one image and an unknown source: one image cannot tell the beam from the "
+            "object; give the source or an image of another energy, or ask for one of the many "
+            "answers (ambiguous=True, --ambiguous)"
+        )
+
+
+def _checked_gains(gains: ArrayLike | str, count: int) -> tuple[bool, FloatArray]:
+    if isinstance(gains, str):
+        if gains not in ("known", "free"):
+            raise InputError(f"gains are {gains!r}: expected 'known', 'free' or a number an image")
+        return gains == "free", np.ones(count)
+    factors = np.array(gains, dtype=np.float64)
+    if factors.shape != (count,) or not (np.isfinite(factors) & (factors > 0)).all():
+        raise InputError(f"gains are {gains}: expected a positive number for each of {count} images")
+    return False, factors
+
+
+def _checked_source(source: Any, data: FloatArray, used: BoolArray) -> FloatArray:
+    if source is None or isinstance(source, str):
+        if source not in (None, "unknown"):
+            raise InputError(f"source is {source!r}: expected an array, None or 'unknown'")
+        levels = [image[use].mean() for image, use in zip(data, used, strict=True)]
+        return np.ones(data.shape) * np.array(levels)[:, None, None]
+    beams = np.array(source, dtype=np.float64)
+    if beams.shape not in (data.shape, data.shape[1:]):
+        raise InputError(
+            f"source has shape {beams.shape}: expected {data.shape[1:]} or {data.shape}, like the "
+            "images"
+        )
+    if not np.isfinite(beams).all() or beams.min() < 0 or not beams.any():
+        raise InputError(
+            "source has pixels that are negative or not finite, or no flux: expected a beam"
+        )
+    return np.array(np.broadcast_to(beams, data.shape))
+
+
+def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
+    """Standard deviation of each pixel's noise."""
+    if isinstance(noise, str):
+        if noise != "poisson":
+            raise InputError(f"noise is {noise!r}: expected 'poisson', standard deviations or None")
+        if (data[used] < 0).any():
+            raise InputError("images have negative pixels, so they are no counts: give the noise")
+        means = np.stack([uniform_filter(plane, _SMOOTHED) for plane in np.where(used, data, 0)])
+        return np.sqrt(np.maximum(means, _LEAST_COUNTS))
+    if noise is None:
+        levels = [estimated_noise(plane, use) for plane, use in zip(data, used, strict=True)]
+        return np.ones(data.shape) * np.array(levels)[:, None, None]
+    sigma = np.array(noise, dtype=np.float64)
+    if not np.isfinite(sigma).all() or sigma.min() <= 0:
+        raise InputError("noise is not positive everywhere: expected standard deviations")
+    if sigma.shape == (len(data),):
+        sigma = sigma[:, None, None]
+    if sigma.shape not in ((), (len(data), 1, 1), data.shape[1:], data.shape):
+        raise InputError(
+            f"noise has shape {sigma.shape}: expected one number, one an image, or an array like "
+            "the images"
+        )
+    return np.array(np.broadcast_to(sigma, data.shape))
+
+
+def _checked_psf(psf: Any, count: int, size: tuple[int, int]) -> list[float | FloatArray]:
+    kernel = np.ndim(psf) == 2
+    each = [psf] * count if kernel or np.ndim(psf) == 0 else list(psf)
+    if len(each) != count:
+        raise InputError(f"psf has {len(each)} entries: expected one, or one for each of {count}")
+    found: list[float | FloatArray] = []
+    for one in each:
+        values = np.array(one, dtype=np.float64)
+        if not np.isfinite(values).all() or values.min() < 0:
+            raise InputError(f"psf is {one}: expected a standard deviation in px or a kernel")
+        if values.ndim == 0:
+            if float(values) > min(size) / 8:
+                raise InputError(f"psf is {float(values):g} px: expected less than an eighth of a side")
+            found.append(float(values))
+            continue
+        if values.ndim != 2 or not all(side % 2 for side in values.shape) or not values.sum() > 0:
+            raise InputError(f"psf has shape {values.shape}: expected a kernel with odd sides")
+        found.append(values / values.sum())
+    return found
+
+
+def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fiducials | None:
+    if fiducials is None:
+        return None
+    table = np.array(fiducials, dtype=np.float64)
+    if table.ndim != 2 or table.shape[1] != 5 or not np.isfinite(table).all():
+        raise InputError(
+            f"fiducials have shape {table.shape}: expected rows of y, x, dy, dx, σ in px"
+        )
+    places, known, errors = table[:, :2], table[:, 2:4], table[:, 4]
+    if ((places < -0.5) | (places > np.array(size) - 0.5)).any() or not (errors > 0).all():
+        raise InputError("fiducials lie outside the image or have no positive σ: check their rows")
+    # A pixel's centre is at its index; the rays count from the image's corner.
+    return Fiducials(places + 0.5, known, errors)

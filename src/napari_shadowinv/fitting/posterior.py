@@ -1,0 +1,118 @@
+"""What the data leave open around the best unknowns, by the Gauss-Newton Hessian there.
+
+- how smooth the fields are, as the data tell: `likely_smoothness`
+- how well a choice of fields explains the data: `log_evidence`
+- unknowns that explain them as well as the best: `drawn_unknowns`
+
+References
+----------
+D. J. C. MacKay, Neural Comput. 4, 415 (1992); S. Ubaru, J. Chen and Y. Saad, SIAM J. Matrix Anal.
+Appl. 38, 1075 (2017).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import eigh_tridiagonal
+
+from napari_shadowinv._typing import FloatArray, IntArray
+from napari_shadowinv.fitting.descent import Preconditioner
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.minimise import product, solve
+from napari_shadowinv.fitting.unknowns import Unknowns
+
+__all__ = ["Posterior"]
+
+_TOLERANCE, _MOST_STEPS = 0.05, 60
+_PROBES, _LANCZOS = 4, 25
+
+
+class Posterior:
+    """The Gaussian around unknowns at which a scene's objective is least.
+
+    Parameters
+    ----------
+    scene, unknowns
+        What is explained, and how.
+    rng : numpy.random.Generator
+        For all random choices.
+    after_step : callable, optional
+        Called often, to tell of progress and to be stopped.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        unknowns: Unknowns,
+        rng: np.random.Generator,
+        after_step: Callable[[], None] | None = None,
+    ) -> None:
+        self._scene, self._unknowns, self._rng = scene, unknowns, rng
+        self._counts: list[IntArray] = scene.ray_counts(unknowns)
+        self._scales = Preconditioner(scene)
+        self._after_step = after_step or (lambda: None)
+
+    def likely_smoothness(self) -> FloatArray:
+        """Return the λ of each field for which it is as rough as the data make it, shape (M,).
+
+        λ |∇⁴φ|² is the number of coefficients that the data determine.
+        """
+        prior = self._scene.prior
+        rough = prior.roughness(self._unknowns)
+        found = np.empty(len(rough))
+        for m in range(len(rough)):
+            signs = self._rng.choice([-1.0, 1.0], self._scene.rays.shape)
+            slope = self._unknowns.zeros()
+            slope.potentials[m] = prior.root_of_smoothness(m, signs)
+            right = self._scales.turned(slope).flat()
+            determined = signs.size - product(right, self._solved(right))
+            found[m] = max(determined, 1.0) / max(rough[m], 1e-300)
+        return found
+
+    def drawn(self) -> Unknowns:
+        """Return a random change of the unknowns, as large as the data leave possible."""
+        noise = self._rng.normal(size=self._scene.images.shape)
+        slope = self._scene.pulled(self._unknowns, self._counts, noise)
+        slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
+        found = self._solved(self._scales.turned(slope).flat())
+        return self._scales.times(self._unknowns.like(found))
+
+    def log_volume(self) -> float:
+        """Return half the logarithm of the Hessian's determinant in the cosines' scales.
+
+        By stochastic Lanczos quadrature.
+        """
+        size = self._unknowns.flat().size
+        total = 0.0
+        for _ in range(_PROBES):
+            signs = self._rng.choice([-1.0, 1.0], size)
+            diagonal, beside = self._lanczos(signs / np.sqrt(size))
+            values, vectors = eigh_tridiagonal(diagonal, beside)
+            total += size * float((vectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
+        return total / _PROBES / 2 - self._scales.log_size()
+
+    def _times(self, flat: FloatArray) -> FloatArray:
+        self._after_step()
+        change = self._scales.times(self._unknowns.like(flat))
+        turned = self._scene.hessian_times(self._unknowns, self._counts, change)
+        return self._scales.turned(turned).flat()
+
+    def _solved(self, right: FloatArray) -> FloatArray:
+        return solve(self._times, right, tolerance=_TOLERANCE, iterations=_MOST_STEPS)
+
+    def _lanczos(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Diagonal and off-diagonal of the Hessian in the space of its first powers."""
+        vectors, diagonal, beside = [start], [], []
+        for k in range(_LANCZOS):
+            image = self._times(vectors[-1])
+            diagonal.append(product(image, vectors[-1]))
+            for vector in vectors:
+                image -= product(image, vector) * vector
+            length = float(np.sqrt(product(image, image)))
+            if length < 1e-10 or k == _LANCZOS - 1:
+                break
+            beside.append(length)
+            vectors.append(image / length)
+        return np.array(diagonal), np.array(beside[: len(diagonal) - 1])

@@ -1,0 +1,197 @@
+"""What is known of potentials, beam, gains and frames before an image is looked at: `Prior`.
+
+    ½ Σ_m λ_m |∇⁴φ_m|² + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²) + ½ Σ (θ_ij / s_ij)² + ½ Σ (d(x_k) - d_k)²/σ_k²
+
+and the same for gains and frames. All of it is quadratic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.fft import dctn, idctn
+
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv.fitting._ray_kernels import spline_tables
+from napari_shadowinv.fitting.rays import KNOT, RayModel, at_rest
+from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+
+__all__ = ["Prior"]
+
+_GAIN_WEIGHT = 1.0  # 1 / s² of their logarithm
+_BEAM_SPREAD = 0.3  # of the first cosines of its logarithm
+_SHIFT_SPREAD, _STRETCH_SPREAD = 5.0, 0.05  # px of the recorded image, and shares
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is held against unknowns, in pixels of one size.
+
+    Attributes
+    ----------
+    rays : RayModel
+        The rays of all images.
+    strengths : ndarray, shape (M,)
+        Displacement in the first image by each field's displacement.
+    smoothness : ndarray, shape (M,)
+        λ of each field.
+    tie, decay : float
+        µ, and the length ℓ in px over which potentials fade in the pad.
+    beam_modes : int
+        Cosines of the beam's logarithm along each axis.
+    fiducials : Fiducials or None
+        Displacements known at points.
+    bin : int
+        Side of a pixel in those of the recorded images.
+    """
+
+    rays: RayModel
+    strengths: FloatArray
+    smoothness: FloatArray
+    tie: float
+    decay: float
+    beam_modes: int
+    fiducials: Fiducials | None
+    bin: int
+
+    def value_and_slope(self, unknowns: Unknowns) -> tuple[float, Unknowns]:
+        """Return the sum of all terms, and its derivatives."""
+        about_rest = unknowns._replace(frames=unknowns.frames - at_rest())
+        slope = self.times(about_rest)
+        value = sum(float(np.sum(a * b)) for a, b in zip(slope, about_rest, strict=True)) / 2
+        if self.fiducials is None:
+            return value, slope
+        weights = 1 / self.fiducials.errors[:, None] ** 2
+        goal = weights * self.fiducials.displacements
+        found = self._displacements_there(unknowns.potentials)
+        value += float(np.sum(goal * (self.fiducials.displacements / 2 - found)))
+        self._add_there(slope.potentials, -goal)
+        return value, slope
+
+    def times(self, change: Unknowns) -> Unknowns:
+        """Return the terms' Hessian times a change."""
+        waves = dctn(change.potentials, axes=(1, 2), norm="ortho")
+        waves *= self.smoothness[:, None, None] * (KNOT * self.wave_numbers**2) ** 2
+        slope = idctn(waves, axes=(1, 2), norm="ortho")
+        steps_y, steps_x = self._steps(change.potentials)
+        slope -= self.tie * np.diff(steps_y, axis=1, prepend=0, append=0)
+        slope -= self.tie * np.diff(steps_x, axis=2, prepend=0, append=0)
+        slope += self.tie * self._fading * change.potentials
+        if self.fiducials is not None:
+            weights = 1 / self.fiducials.errors[:, None] ** 2
+            self._add_there(slope, weights * self._displacements_there(change.potentials))
+        return Unknowns(
+            slope,
+            self.beam_weights * change.beam,
+            _GAIN_WEIGHT * change.gains,
+            self.frame_weights * change.frames,
+        )
+
+    def drawn(self, like: Unknowns, rng: np.random.Generator) -> Unknowns:
+        """Return a random slope whose covariance is the terms' Hessian."""
+        potentials = np.stack([self.root_of_smoothness(m, rng.normal(size=self.rays.shape))
+                               for m in range(len(self.smoothness))])  # fmt: skip
+        steps_y, steps_x = self._steps(potentials)
+        in_y, in_x = (rng.normal(size=steps.shape) for steps in (steps_y, steps_x))
+        along_y, along_x = self._in_pad
+        root = np.sqrt(self.tie)
+        potentials -= root * np.diff(in_y * along_y, axis=1, prepend=0, append=0)
+        potentials -= root * np.diff(in_x * along_x, axis=2, prepend=0, append=0)
+        potentials += root * np.sqrt(self._fading) * rng.normal(size=potentials.shape)
+        if self.fiducials is not None:
+            errors = self.fiducials.errors[:, None]
+            self._add_there(potentials, rng.normal(size=(len(errors), 2)) / errors)
+        return Unknowns(
+            potentials,
+            np.sqrt(self.beam_weights) * rng.normal(size=like.beam.shape),
+            np.sqrt(_GAIN_WEIGHT) * rng.normal(size=like.gains.shape),
+            np.sqrt(self.frame_weights) * rng.normal(size=like.frames.shape),
+        )
+
+    def root_of_smoothness(self, field: int, values: FloatArray) -> FloatArray:
+        """Return the root of what is held against rough coefficients, times values per cosine."""
+        waves = np.sqrt(self.smoothness[field]) * KNOT * self.wave_numbers**2 * values
+        return np.asarray(idctn(waves, norm="ortho"))
+
+    def roughness(self, unknowns: Unknowns) -> FloatArray:
+        """Return |∇⁴φ|² of each field."""
+        waves = dctn(unknowns.potentials, axes=(1, 2), norm="ortho")
+        return np.asarray(((KNOT * self.wave_numbers**2 * waves) ** 2).sum(axis=(1, 2)))
+
+    @cached_property
+    def wave_numbers(self) -> FloatArray:
+        """k² of each cosine of the coefficients, px⁻²."""
+        waves = [np.pi * np.arange(n) / (n * KNOT) for n in self.rays.shape]
+        return np.asarray(waves[0][:, None] ** 2 + waves[1] ** 2)
+
+    def of_potentials(self) -> FloatArray:
+        """Return what is held against each field's cosines, about; shape (M, …)."""
+        squares = self.wave_numbers
+        lowest = (np.pi / (max(self.rays.shape) * KNOT)) ** 2 + (0.2 / self.decay) ** 2
+        # A fifth of the coefficients or so lies in the pad.
+        tied = self.tie * (0.2 * squares + lowest)
+        return KNOT**2 * (self.smoothness[:, None, None] * squares**4 + tied)
+
+    @cached_property
+    def beam_weights(self) -> FloatArray:
+        """1 / s² of the beam's cosines, zero for those that are not used."""
+        order = np.arange(self.beam_modes)
+        square = order[:, None] ** 2 + order**2
+        used = (square > 0) & (square < self.beam_modes**2)
+        return np.where(used, square / _BEAM_SPREAD**2, 0.0)
+
+    @cached_property
+    def frame_weights(self) -> FloatArray:
+        """1 / s² of a frame's numbers."""
+        shift, stretch = _SHIFT_SPREAD / self.bin, _STRETCH_SPREAD
+        return 1 / np.array([shift, stretch, stretch, shift, stretch, stretch]) ** 2
+
+    @cached_property
+    def _within(self) -> BoolArray:
+        """Which coefficients belong to the image."""
+        lines = [
+            np.abs(KNOT * (np.arange(n) - 1.0) - self.rays.pad - side / 2) <= side / 2
+            for n, side in zip(self.rays.shape, self.rays.size, strict=True)
+        ]
+        return np.asarray(lines[0][:, None] & lines[1])
+
+    @cached_property
+    def _in_pad(self) -> tuple[BoolArray, BoolArray]:
+        """Which steps between coefficients along y and x lie in the pad."""
+        inside = self._within
+        return ~(inside[1:] & inside[:-1]), ~(inside[:, 1:] & inside[:, :-1])
+
+    @cached_property
+    def _fading(self) -> FloatArray:
+        return np.where(self._within, 0.0, (KNOT / self.decay) ** 2)
+
+    def _steps(self, potentials: FloatArray) -> tuple[FloatArray, FloatArray]:
+        along_y, along_x = self._in_pad
+        return np.diff(potentials, axis=1) * along_y, np.diff(potentials, axis=2) * along_x
+
+    @cached_property
+    def _splines_there(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """Rows and columns of the coefficients around each fiducial; displacement by each, (y, x)."""
+        assert self.fiducials is not None
+        place = (self.fiducials.places + self.rays.pad) / KNOT
+        cell = np.floor(place).astype(np.int64)
+        (value_y, slope_y), (value_x, slope_x) = map(spline_tables, (place - cell).T)
+        each = np.arange(4)
+        rows = (cell[:, :1] + each)[:, :, None]
+        columns = (cell[:, 1:] + each)[:, None, :]
+        along_y = np.einsum("in,jn->nij", slope_y, value_x)
+        along_x = np.einsum("in,jn->nij", value_y, slope_x)
+        return rows, columns, -np.stack([along_y, along_x], axis=1)
+
+    def _displacements_there(self, potentials: FloatArray) -> FloatArray:
+        rows, columns, tables = self._splines_there
+        total = np.einsum("m,myx->yx", self.strengths, potentials)
+        return np.einsum("ncij,nij->nc", tables, total[rows, columns])
+
+    def _add_there(self, potentials: FloatArray, pulls: FloatArray) -> None:
+        rows, columns, tables = self._splines_there
+        total = np.zeros(self.rays.shape)
+        np.add.at(total, (rows, columns), np.einsum("ncij,nc->nij", tables, pulls))
+        potentials += self.strengths[:, None, None] * total

@@ -1,0 +1,155 @@
+"""From several starts to the best unknowns, coarse pixels first: `search`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.descent import coarser, descend, finer
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.fitting.rays import KNOT
+from napari_shadowinv.fitting.unknowns import Unknowns
+
+__all__ = ["Found", "Start", "refined", "search", "splines_of"]
+
+Tell = Callable[[str, float], None]
+
+_MIDDLE = 2  # pixels in which starts are compared and λ is found
+_FIRST_SMOOTHNESS, _COARSE_SMOOTHNESS = 100.0, 3.0
+_COARSE_STEPS, _COARSE_GAIN = 60, 3.0
+_COARSE_SPACING = 1 / 3
+_ROUNDS, _SETTLED = 3, 0.25  # of λ; and by what share it may still change
+_SAME_FIELD = 0.03  # of the displacement, r.m.s.
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a descent begins: a potential in px² at the pixels, or none; pixels and blurs of it.
+
+    `stages` are (side of a pixel, blur in such pixels).
+    """
+
+    name: str
+    stages: tuple[tuple[int, float], ...]
+    potential: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a descent has ended, in pixels of `_MIDDLE`."""
+
+    start: str
+    unknowns: Unknowns
+    value: float
+    displacement: FloatArray  # of all fields in the first image, px of the recorded image
+
+    def distance(self, other: Found) -> float:
+        """Return how far another displacement is from this one, relative to it (r.m.s.)."""
+        size = float(np.sqrt((self.displacement**2).mean()))
+        difference = self.displacement - other.displacement
+        return float(np.sqrt((difference**2).mean())) / max(size, 1e-12)
+
+
+def splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
+    """Return coefficients of a potential given at the recorded image's pixels, about."""
+    rays = scene.rays
+    lines = ((KNOT * (np.arange(n) - 1.0) - rays.pad) * scene.bin - 0.5 for n in rays.shape)
+    places = np.meshgrid(*lines, indexing="ij")
+    edge = np.concatenate([potential[0], potential[-1], potential[:, 0], potential[:, -1]]).mean()
+    values = map_coordinates(potential - edge, places, order=1, mode="nearest")
+    return np.asarray(values) / scene.bin**2
+
+
+def search(scene: Scene, starts: Sequence[Start], tell: Tell) -> list[Found]:
+    """Descend from each start to pixels of two; return what differs, best first."""
+    rough = replace(
+        scene,
+        smoothness=_COARSE_SMOOTHNESS * _FIRST_SMOOTHNESS * np.ones_like(scene.smoothness),
+        spacing=_COARSE_SPACING,
+    )
+    ends: list[Found] = []
+    for start in starts:
+        end = _descended(rough, start, tell)
+        ends.append(end)
+    ends.sort(key=lambda end: end.value)
+    different: list[Found] = []
+    for end in ends:
+        if all(kept.distance(end) > _SAME_FIELD for kept in different):
+            different.append(end)
+    return different
+
+
+def _descended(scene: Scene, start: Start, tell: Tell) -> Found:
+    unknowns: Unknowns | None = None
+    value, before = np.inf, 0
+    for factor, blur in start.stages:
+        stage = replace(coarser(scene, factor), blur=blur)
+        if unknowns is None:
+            unknowns = stage.nothing()
+            if start.potential is not None:
+                unknowns.potentials[0] = splines_of(stage, start.potential)
+        else:
+            for _ in range(int(np.log2(before // factor))):
+                unknowns = finer(unknowns)
+        before = factor
+        unknowns, value, _ = descend(
+            stage,
+            unknowns,
+            iterations=_COARSE_STEPS,
+            least_gain=_COARSE_GAIN,
+            after_step=lambda now: tell(start.name, now),
+        )
+    assert unknowns is not None
+    return Found(start.name, unknowns, value, _displacement(stage, unknowns))
+
+
+def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
+    each = [scene.rays.displacement(potential) for potential in unknowns.potentials]
+    return scene.bin * np.stack(each)
+
+
+def with_likely_smoothness(
+    scene: Scene, found: Found, rng: np.random.Generator, tell: Tell
+) -> tuple[Scene, Found]:
+    """Find λ and the unknowns that belong to it, in pixels of two; λ for the scene's own."""
+    given = scene.smoothness.copy()
+    smoothness = np.where(given > 0, given, _FIRST_SMOOTHNESS)
+    unknowns = found.unknowns
+    for k in range(_ROUNDS):
+        middle = coarser(replace(scene, smoothness=smoothness, spacing=_COARSE_SPACING), _MIDDLE)
+        unknowns, value, _ = descend(
+            middle,
+            unknowns,
+            iterations=_COARSE_STEPS,
+            least_gain=_COARSE_GAIN,
+            after_step=lambda now: tell("smoothness", now),
+        )
+        if (given > 0).all():
+            break
+        posterior = Posterior(middle, unknowns, rng, lambda: tell("smoothness", value))  # noqa: B023
+        likely = posterior.likely_smoothness() * _MIDDLE**2
+        change = np.abs(np.log(likely / smoothness)).max()
+        smoothness = likely
+        if change < _SETTLED:
+            break
+    end = replace(found, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns))
+    return replace(scene, smoothness=smoothness), end
+
+
+def refined(
+    scene: Scene, found: Found, *, iterations: int, tell: Tell
+) -> tuple[Unknowns, float, int]:
+    """Descend with the pixels as recorded."""
+    unknowns = finer(found.unknowns)
+    return descend(
+        scene,
+        unknowns,
+        iterations=iterations,
+        least_gain=1.0,
+        after_step=lambda now: tell("full size", now),
+    )

@@ -1,0 +1,55 @@
+"""What a fit looks for, and displacements known beforehand: `Unknowns`, `Fiducials`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from napari_shadowinv._typing import FloatArray
+
+__all__ = ["Fiducials", "Unknowns"]
+
+
+class Unknowns(NamedTuple):
+    """What a fit looks for; also its derivatives and changes.
+
+    `potentials` (M, …) are B-spline coefficients of the fields' potentials, `beam` (n, n) cosine
+    coefficients of the beam's logarithm, `gains` (L,) logarithms, `frames` (L, 6) as a `RayModel`
+    takes them.
+    """
+
+    potentials: FloatArray
+    beam: FloatArray
+    gains: FloatArray
+    frames: FloatArray
+
+    def flat(self) -> FloatArray:
+        """Return all values as one array."""
+        return np.concatenate([part.ravel() for part in self])
+
+    def like(self, flat: FloatArray) -> Unknowns:
+        """Return the same unknowns with the values of a flat array."""
+        ends = np.cumsum([part.size for part in self])[:-1]
+        parts = np.split(flat, ends)
+        return Unknowns(*(new.reshape(old.shape) for new, old in zip(parts, self, strict=True)))
+
+    def plus(self, other: Unknowns) -> Unknowns:
+        """Return the sum of both."""
+        return Unknowns(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def zeros(self) -> Unknowns:
+        """Return as many zeros."""
+        return Unknowns(*(np.zeros_like(part) for part in self))
+
+
+class Fiducials(NamedTuple):
+    """Points whose displacement in the first image is known: crossings of a mesh, say.
+
+    `places` (n, 2) in px from the image's corner, `displacements` (n, 2) and their standard
+    deviations `errors` (n,) in px.
+    """
+
+    places: FloatArray
+    displacements: FloatArray
+    errors: FloatArray

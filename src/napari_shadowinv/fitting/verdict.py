@@ -1,0 +1,96 @@
+"""Whether a fit's field may be believed: `Verdict`, `judged`.
+
+χ² alone does not tell: one image, or several that the object displaces alike, can be explained
+perfectly by a wrong field. What tells is whether other fields explain them as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+
+from napari_shadowinv._typing import FloatArray
+
+__all__ = ["Verdict", "judged"]
+
+_FOLDED = 0.15  # of the pixels, in one image
+_MISFIT = 1.3  # χ²
+_AS_GOOD = 0.03  # of the objective
+_OTHER_FIELD = 0.05  # of the displacement, r.m.s.
+_OPEN = 0.05  # of the displacement, r.m.s.
+
+
+class Verdict(StrEnum):
+    """What a fit's field is worth."""
+
+    DETERMINED = "determined"
+    SEVERAL = "one of several"
+    AMBIGUOUS = "one image cannot tell"
+    UNCERTAIN = "too uncertain"
+    MISFIT = "does not fit"
+
+
+def judged(
+    *,
+    chi2: FloatArray,
+    names: Sequence[str],
+    others: Sequence[tuple[float, float]],
+    single: bool,
+    beam_unknown: bool,
+    folded: float,
+    uncertainty: float,
+) -> tuple[Verdict, str]:
+    """Return the verdict on a fit, and a sentence that says why.
+
+    Parameters
+    ----------
+    chi2 : ndarray, shape (L,)
+        Of each image.
+    names : sequence of str
+        What to call the images.
+    others : sequence of (float, float)
+        Other answers: how much worse their objective is, as a share, and how far away they are.
+    single : bool
+        Whether there is one image only, or several with the same information.
+    beam_unknown : bool
+        Whether the beam is fitted, too.
+    folded : float
+        Share of the pixels whose rays have crossed others, in the image where it is largest.
+    uncertainty : float
+        R.m.s. standard deviation of the displacement as a share of it; NaN if it is not known.
+    """
+    worst = [f"{name} ({value:.2g})" for name, value in zip(names, chi2, strict=True) if value > _MISFIT]
+    if worst:
+        return Verdict.MISFIT, (
+            f"the forward model does not explain {', '.join(worst)}: χ² should be 1. The object may "
+            "have changed between images; or energies, noise, source or point spread are not as "
+            "given"
+        )
+    if single and beam_unknown:
+        return Verdict.AMBIGUOUS, (
+            "one image cannot tell the beam from the object: many pairs of them explain it; take "
+            "another energy, or an image of the beam"
+        )
+    if single and folded > _FOLDED:
+        return Verdict.AMBIGUOUS, (
+            f"rays cross over {folded:.0%} of the image, and one image does not tell which came from "
+            "where: the field may be wrong though the image is explained; take another energy"
+        )
+    rivals = [away for worse, away in others if worse < _AS_GOOD and away > _OTHER_FIELD]
+    if rivals:
+        return Verdict.SEVERAL, (
+            f"{len(rivals) + 1} different fields explain the data about as well; they differ by up "
+            f"to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is known"
+        )
+    if uncertainty > _OPEN:
+        return Verdict.UNCERTAIN, (
+            f"the noise leaves {uncertainty:.0%} of the displacement open (r.m.s.): average shots, or "
+            "take images at energies that differ more"
+        )
+    several = "one image" if single else f"{len(chi2)} images"
+    return Verdict.DETERMINED, (
+        f"all starts lead to one field, which explains {several} to the noise (χ² "
+        f"{np.min(chi2):.2f} to {np.max(chi2):.2f})"
+    )
