@@ -18,7 +18,8 @@ __all__ = ["KNOT", "MOST_RAYS", "deposit", "gather", "push", "spline_tables"]
 KNOT = 2  # px between knots
 MOST_RAYS = 64  # along a cell's side
 
-_FAST = {"contract"}  # a product and a sum in one instruction
+_ONE = np.uint32(1)  # unsigned, for which no index counts from the end
+_FAST = {"contract", "reassoc", "nsz"}  # sums in an order that suits the processor
 
 
 def spline_tables(places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -34,23 +35,33 @@ def _slopes_of_row(
     potential: FloatArray,
     row: int,
     column: int,
-    value: FloatArray,
-    slope: FloatArray,
-    values: FloatArray,
-    slopes: FloatArray,
+    tables: FloatArray,
+    a: int,
+    n: int,
+    m: int,
     out: FloatArray,
 ) -> None:
-    """Gradient of a potential, (y, x), at a row of rays of a cell."""
+    """Gradient of a potential, (y, x), at row `a` of a cell's n rows of m rays."""
     s0 = s1 = s2 = s3 = p0 = p1 = p2 = p3 = 0.0
     for i in range(4):
-        steep, plain = slope[i], value[i]
+        plain, steep = tables[n, 0, i, a], tables[n, 1, i, a]
         c0, c1 = potential[row + i, column], potential[row + i, column + 1]
         c2, c3 = potential[row + i, column + 2], potential[row + i, column + 3]
         s0, s1, s2, s3 = s0 + steep * c0, s1 + steep * c1, s2 + steep * c2, s3 + steep * c3
         p0, p1, p2, p3 = p0 + plain * c0, p1 + plain * c1, p2 + plain * c2, p3 + plain * c3
-    for b in range(values.shape[1]):
-        out[0, b] = values[0, b] * s0 + values[1, b] * s1 + values[2, b] * s2 + values[3, b] * s3
-        out[1, b] = slopes[0, b] * p0 + slopes[1, b] * p1 + slopes[2, b] * p2 + slopes[3, b] * p3
+    for b in range(m):
+        out[0, b] = (
+            tables[m, 0, 0, b] * s0
+            + tables[m, 0, 1, b] * s1
+            + tables[m, 0, 2, b] * s2
+            + tables[m, 0, 3, b] * s3
+        )
+        out[1, b] = (
+            tables[m, 1, 0, b] * p0
+            + tables[m, 1, 1, b] * p1
+            + tables[m, 1, 2, b] * p2
+            + tables[m, 1, 3, b] * p3
+        )
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
@@ -65,6 +76,7 @@ def _share(place: float, steepness: float) -> tuple[float, float]:
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
 def _land(
     slopes: FloatArray,
+    m: int,
     y: float,
     x: float,
     step: float,
@@ -75,9 +87,8 @@ def _land(
     shares: FloatArray,
 ) -> None:
     """The pixel at or before each ray of a row, and the share of the next one, with its slope."""
-    n = slopes.shape[1]
     last_row, last_column = size[0] - 2.0, size[1] - 2.0
-    for b in range(n):
+    for b in range(m):
         down = y - slopes[0, b]
         right = x + (b + 0.5) * step - slopes[1, b]
         v = frame[0] + frame[1] * down + frame[2] * right
@@ -86,7 +97,7 @@ def _land(
         v = min(max(v, 0.0), last_row)
         u = min(max(u, 0.0), last_column)
         i, j = math.floor(v), math.floor(u)
-        pixels[0, b], pixels[1, b] = int(i), int(j)
+        pixels[0, b], pixels[1, b] = np.uint32(i), np.uint32(j)
         shares[0, b], shares[2, b] = _share(v - i, steepness)
         shares[1, b], shares[3, b] = _share(u - j, steepness)
 
@@ -128,33 +139,72 @@ def deposit(
     rows, columns = counts.shape[1:]
     bands, height, width = images.shape
     slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
-    pixels, flux = np.empty((2, MOST_RAYS), np.int64), np.empty(MOST_RAYS)
+    pixels, flux = np.empty((2, MOST_RAYS), np.uint32), np.empty(MOST_RAYS)
     for band in range(start, stop):
         image = images[band]
         for row in range(rows * band // bands, rows * (band + 1) // bands):
             for column in range(columns):
                 n, m = counts[0, row, column], counts[1, row, column]
-                along_x = tables[m, 0, :, :m], tables[m, 1, :, :m]
                 for a in range(n):
-                    along_y = tables[n, 0, :, a], tables[n, 1, :, a]
-                    _slopes_of_row(
-                        potential, row, column, *along_y, *along_x, slopes[:, :m]
-                    )
+                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
                     _land(
-                        slopes[:, :m], y, x, KNOT / m, frame, steepness, (height, width),
+                        slopes, m, y, x, KNOT / m, frame, steepness, (height, width),
                         pixels, shares,
                     )
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     for b in range(m):
                         i, j = pixels[0, b], pixels[1, b]
+                        i1, j1 = i + _ONE, j + _ONE
                         down, right = shares[0, b], shares[1, b]
                         below = flux[b] * down
                         above = flux[b] - below
                         image[i, j] += above - above * right
-                        image[i, j + 1] += above * right
-                        image[i + 1, j] += below - below * right
-                        image[i + 1, j + 1] += below * right
+                        image[i, j1] += above * right
+                        image[i1, j] += below - below * right
+                        image[i1, j1] += below * right
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def _add_moments(
+    to_y: FloatArray,
+    to_x: FloatArray,
+    slopes: FloatArray,
+    m: int,
+    y: float,
+    x: float,
+    moments: FloatArray,
+) -> None:
+    """What a row of rays adds to the derivatives of a frame."""
+    for b in range(m):
+        in_v, in_u = to_y[b], to_x[b]
+        landed_y = y - slopes[0, b]
+        landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
+        moments[0] += in_v
+        moments[1] += in_v * landed_y
+        moments[2] += in_v * landed_x
+        moments[3] += in_u
+        moments[4] += in_u * landed_y
+        moments[5] += in_u * landed_x
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def _add_to_beam(
+    bright: FloatArray, row: int, column: int, a: int, n: int, m: int, of_beam: FloatArray
+) -> None:
+    """What a row of rays adds to the derivatives of the beam in its cell's four pixels."""
+    upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
+    lower = KNOT**2 / (n * m) - upper
+    left = right = 0.0
+    for b in range(m):
+        share = _first_pixels_share(b, m)
+        left += share * bright[b]
+        right += (1 - share) * bright[b]
+    i, j = KNOT * row, KNOT * column
+    of_beam[i, j] += upper * left
+    of_beam[i, j + 1] += upper * right
+    of_beam[i + 1, j] += lower * left
+    of_beam[i + 1, j + 1] += lower * right
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
@@ -171,89 +221,60 @@ def gather(
     pull: FloatArray,
     gradients: FloatArray,
     of_beam: FloatArray,
+    beam_is_free: bool,
     of_frame: FloatArray,
+    frame_is_free: bool,
 ) -> None:
     """Gradients with respect to coefficients, beam and frame, from the pull where rays land."""
     rows, columns = counts.shape[1:]
     bands = len(gradients)
     size = pull.shape[0], pull.shape[1]
     slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
-    pixels, flux = np.empty((2, MOST_RAYS), np.int64), np.empty(MOST_RAYS)
+    pixels, flux = np.empty((2, MOST_RAYS), np.uint32), np.empty(MOST_RAYS)
     to_y, to_x, bright = np.empty(MOST_RAYS), np.empty(MOST_RAYS), np.empty(MOST_RAYS)
     lifted, shifted = np.empty(4), np.empty(4)
     for band in range(start, stop):
-        gradient = gradients[band]
-        moments = of_frame[band]
+        gradient, moments = gradients[band], of_frame[band]
         for row in range(rows * band // bands, rows * (band + 1) // bands):
             for column in range(columns):
                 n, m = counts[0, row, column], counts[1, row, column]
-                along_x = tables[m, 0, :, :m], tables[m, 1, :, :m]
                 for a in range(n):
-                    along_y = tables[n, 0, :, a], tables[n, 1, :, a]
-                    _slopes_of_row(
-                        potential, row, column, *along_y, *along_x, slopes[:, :m]
-                    )
+                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
                     _land(
-                        slopes[:, :m], y, x, KNOT / m, frame, steepness, size,
+                        slopes, m, y, x, KNOT / m, frame, steepness, size,
                         pixels, shares,
                     )
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     for b in range(m):
                         i, j = pixels[0, b], pixels[1, b]
+                        i1, j1 = i + _ONE, j + _ONE
                         down, right = shares[0, b], shares[1, b]
-                        above, beside = pull[i, j], pull[i, j + 1]
-                        below, across = pull[i + 1, j], pull[i + 1, j + 1]
-                        left = above + down * (below - above)
-                        bright[b] = left + right * (beside + down * (across - beside) - left)
-                        in_v = below - above + right * (across - beside - below + above)
-                        in_u = beside - above + down * (across - beside - below + above)
-                        in_v *= flux[b] * shares[2, b]
-                        in_u *= flux[b] * shares[3, b]
-                        to_y[b], to_x[b] = in_v, in_u
-                    lifted[:] = 0
-                    shifted[:] = 0
-                    sum_v = sum_u = vy = vx = uy = ux = 0.0
-                    for b in range(m):
-                        in_v, in_u = to_y[b], to_x[b]
-                        landed_y = y - slopes[0, b]
-                        landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
-                        sum_v += in_v
-                        sum_u += in_u
-                        vy += in_v * landed_y
-                        vx += in_v * landed_x
-                        uy += in_u * landed_y
-                        ux += in_u * landed_x
-                        along, across = (
-                            frame[1] * in_v + frame[4] * in_u,
-                            frame[2] * in_v + frame[5] * in_u,
-                        )
-                        for s in range(4):
-                            lifted[s] += along * tables[m, 0, s, b]
-                            shifted[s] += across * tables[m, 1, s, b]
+                        above, beside = pull[i, j], pull[i, j1]
+                        below, across = pull[i1, j], pull[i1, j1]
+                        twist = across - beside - below + above
+                        if beam_is_free:
+                            left = above + down * (below - above)
+                            bright[b] = left + right * (beside - above + down * twist)
+                        to_y[b] = flux[b] * shares[2, b] * (below - above + right * twist)
+                        to_x[b] = flux[b] * shares[3, b] * (beside - above + down * twist)
+                    if frame_is_free:
+                        _add_moments(to_y, to_x, slopes, m, y, x, moments)
+                    for s in range(4):
+                        to_lift = to_shift = 0.0
+                        for b in range(m):
+                            along = frame[1] * to_y[b] + frame[4] * to_x[b]
+                            across = frame[2] * to_y[b] + frame[5] * to_x[b]
+                            to_lift += along * tables[m, 0, s, b]
+                            to_shift += across * tables[m, 1, s, b]
+                        lifted[s], shifted[s] = to_lift, to_shift
                     for r in range(4):
                         for s in range(4):
                             gradient[row + r, column + s] -= (
-                                along_y[1][r] * lifted[s] + along_y[0][r] * shifted[s]
+                                tables[n, 1, r, a] * lifted[s] + tables[n, 0, r, a] * shifted[s]
                             )
-                    moments[0] += sum_v
-                    moments[1] += vy
-                    moments[2] += vx
-                    moments[3] += sum_u
-                    moments[4] += uy
-                    moments[5] += ux
-                    upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
-                    lower = KNOT**2 / (n * m) - upper
-                    first = second = 0.0
-                    for b in range(m):
-                        share = _first_pixels_share(b, m)
-                        first += share * bright[b]
-                        second += (1 - share) * bright[b]
-                    i, j = KNOT * row, KNOT * column
-                    of_beam[i, j] += upper * first
-                    of_beam[i, j + 1] += upper * second
-                    of_beam[i + 1, j] += lower * first
-                    of_beam[i + 1, j + 1] += lower * second
+                    if beam_is_free:
+                        _add_to_beam(bright, row, column, a, n, m, of_beam)
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
@@ -277,29 +298,26 @@ def push(
     bands, height, width = images.shape
     slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
     moves = np.empty((2, MOST_RAYS))
-    pixels, flux = np.empty((2, MOST_RAYS), np.int64), np.empty(MOST_RAYS)
+    pixels, flux = np.empty((2, MOST_RAYS), np.uint32), np.empty(MOST_RAYS)
     more = np.empty(MOST_RAYS)
     for band in range(start, stop):
         image = images[band]
         for row in range(rows * band // bands, rows * (band + 1) // bands):
             for column in range(columns):
                 n, m = counts[0, row, column], counts[1, row, column]
-                along_x = tables[m, 0, :, :m], tables[m, 1, :, :m]
                 for a in range(n):
-                    along_y = tables[n, 0, :, a], tables[n, 1, :, a]
-                    _slopes_of_row(
-                        potential, row, column, *along_y, *along_x, slopes[:, :m]
-                    )
-                    _slopes_of_row(change, row, column, *along_y, *along_x, moves[:, :m])
+                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
+                    _slopes_of_row(change, row, column, tables, a, n, m, moves)
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
                     _land(
-                        slopes[:, :m], y, x, KNOT / m, frame, steepness, (height, width),
+                        slopes, m, y, x, KNOT / m, frame, steepness, (height, width),
                         pixels, shares,
                     )
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     _flux_of_row(beam_change, row, column, a, n, m, more)
                     for b in range(m):
                         i, j = pixels[0, b], pixels[1, b]
+                        i1, j1 = i + _ONE, j + _ONE
                         down, right = shares[0, b], shares[1, b]
                         landed_y = y - slopes[0, b]
                         landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
@@ -320,10 +338,10 @@ def push(
                             grown * (1 - down) * (1 - right) - in_v * (1 - right)
                             - in_u * (1 - down)
                         )
-                        image[i, j + 1] += (
+                        image[i, j1] += (
                             grown * (1 - down) * right - in_v * right + in_u * (1 - down)
                         )
-                        image[i + 1, j] += (
+                        image[i1, j] += (
                             grown * down * (1 - right) + in_v * (1 - right) - in_u * down
                         )
-                        image[i + 1, j + 1] += grown * down * right + in_v * right + in_u * down
+                        image[i1, j1] += grown * down * right + in_v * right + in_u * down

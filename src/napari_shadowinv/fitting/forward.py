@@ -204,7 +204,15 @@ class Scene:
     ) -> None:
         k, psi, counts, beam, frame = shot
         back = self._spread_back(k, np.exp(unknowns.gains[k]) * pull)
-        pulls = self.rays.gradient(psi, counts, beam, back, frame)
+        pulls = self.rays.gradient(
+            psi,
+            counts,
+            beam,
+            back,
+            frame,
+            of_beam=bool(self.beam_modes),
+            of_frame=k > 0 and bool(self.free_frames.any()),
+        )
         slope.potentials[:] += self.strengths[k][:, None, None] * pulls.potential
         of_shape += pulls.beam * self.beams[k]
         slope.frames[k] += pulls.frame

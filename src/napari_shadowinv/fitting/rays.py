@@ -148,6 +148,9 @@ class RayModel:
         beam: FloatArray,
         pull: FloatArray,
         frame: FloatArray | None = None,
+        *,
+        of_beam: bool = True,
+        of_frame: bool = True,
     ) -> Pulls:
         """Return the derivatives of ``(pull * image(…)).sum()`` at fixed `counts`.
 
@@ -157,14 +160,16 @@ class RayModel:
             As for `image`.
         pull : ndarray
             Weight of each pixel, with the shape `seen`.
+        of_beam, of_frame : bool, default True
+            Whether those of the beam and of the frame are wanted; else they are zero.
         """
-        coefficients = np.zeros((_BANDS, *self.shape))
-        of_beam, of_frame = np.zeros(beam.shape), np.zeros((_BANDS, 6))
-        guarded = np.pad(pull, _GUARD)
+        found = Pulls(np.zeros((_BANDS, *self.shape)), np.zeros(beam.shape), np.zeros((_BANDS, 6)))
+        rest = found.potential, found.beam, of_beam, found.frame, of_frame
         self._in_bands(
-            kernels.gather, potential, counts, beam, frame, guarded, coefficients, of_beam, of_frame
+            kernels.gather, potential, counts, beam, frame, np.pad(pull, _GUARD), *rest
         )
-        return Pulls(coefficients.sum(axis=0), of_beam, self._about_middle(of_frame.sum(axis=0)))
+        about_middle = self._about_middle(found.frame.sum(axis=0))
+        return Pulls(found.potential.sum(axis=0), found.beam, about_middle)
 
     def change(
         self,
@@ -220,7 +225,7 @@ class RayModel:
         counts: IntArray,
         beam: FloatArray,
         frame: FloatArray | None,
-        *rest: FloatArray,
+        *rest: FloatArray | bool,
     ) -> None:
         seen = self._to_pixels(at_rest() if frame is None else frame)
         threads = available_threads(self.threads)
