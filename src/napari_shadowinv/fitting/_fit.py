@@ -143,7 +143,8 @@ def fit(
         fiducials=fiducials,
         options=options,
     )
-    scene = replace(given.scene, smoothness=np.full(len(fields), options.smoothness or 0.0))
+    known = (options.smoothness or 0.0, 0.0)
+    scene = replace(given.scene, smoothness=np.tile(known, (len(fields), 1)))
     steps = 0
 
     def tell(stage: str, objective: float) -> None:
@@ -306,8 +307,8 @@ def _result(
         edge = np.concatenate([potential[0], potential[-1], potential[:, 0], potential[:, -1]])
         displacement = scene.rays.displacement(unknowns.potentials[m])[:, :height, :width]
         error = None if errors is None else errors[m]
-        smoothness = float(scene.smoothness[m])
-        fields.append(FittedField(name, potential - edge.mean(), displacement, error, smoothness))
+        smooth = (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1]))
+        fields.append(FittedField(name, potential - edge.mean(), displacement, error, smooth))
     found = np.stack([field.displacement for field in fields])
     uncertainty = float("nan")
     if errors is not None:

@@ -11,10 +11,11 @@ from scipy.fft import dctn, idctn
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.minimise import minimise
+from napari_shadowinv.fitting.priors import POWERS
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 
-__all__ = ["Preconditioner", "binned", "coarser", "descend", "finer"]
+__all__ = ["Preconditioner", "binned", "coarser", "descend", "finer", "smoothness_in_pixels"]
 
 _DESCENTS = 3  # with fixed numbers of rays each
 _FEW = 10  # steps, after which the numbers of rays still fit
@@ -35,6 +36,9 @@ class Preconditioner:
             # An image's change by a weak potential is its Laplacian.
             each = weights.mean() * (KNOT * squares) ** 2 * seen
             data += each[..., None, None] * np.outer(strengths, strengths)
+        of_data = np.moveaxis(np.diagonal(data, axis1=2, axis2=3), -1, 0)
+        rough = prior.of_rough.sum(axis=1)
+        self._kept = np.divide(of_data, of_data + rough, out=np.ones_like(rough), where=rough > 0)
         held = np.moveaxis(prior.of_potentials(), 0, -1)
         matrix = data + held[..., None] * np.eye(held.shape[-1])
         self._potentials = np.linalg.inv(np.linalg.cholesky(matrix))
@@ -49,6 +53,11 @@ class Preconditioner:
         moved = 0.02 * pixels[:, None] * np.array([1, arm, arm, 1, arm, arm]) ** 2
         self._frames = np.where(scene.free_frames, 1 / np.sqrt(moved + prior.frame_weights), 0.0)
         self._frames[0] = 0
+
+    def damped(self, unknowns: Unknowns) -> Unknowns:
+        """Return unknowns without the finest waves, which knots further apart leave behind."""
+        waves = dctn(unknowns.potentials, axes=(1, 2), norm="ortho") * self._kept
+        return unknowns._replace(potentials=idctn(waves, axes=(1, 2), norm="ortho"))
 
     def times(self, scaled: Unknowns) -> Unknowns:
         """Return S times scaled unknowns: their change."""
@@ -106,7 +115,7 @@ def descend(
     steps : int
     """
     scales = Preconditioner(scene)
-    unknowns, steps, value = start, 0, np.inf
+    unknowns, steps, value = scales.damped(start), 0, np.inf
     for _ in range(_DESCENTS):
         counts, base = scene.ray_counts(unknowns), unknowns
 
@@ -156,13 +165,18 @@ def coarser(scene: Scene, factor: int) -> Scene:
         beams=binned(scene.beams, factor) / factor**2,
         psf=[_narrower(width, factor) for width in scene.psf],
         # What is held against a potential is the same in all pixels.
-        smoothness=scene.smoothness / factor**2,
+        smoothness=scene.smoothness * smoothness_in_pixels(factor),
         tie=scene.tie * factor**4,
         decay=scene.decay / factor,
         pad=scene.pad // factor,
         fiducials=None if fiducials is None else Fiducials(*(part / factor for part in fiducials)),
         bin=scene.bin * factor,
     )
+
+
+def smoothness_in_pixels(factor: int) -> FloatArray:
+    """Return what λ and κ are multiplied by in larger pixels."""
+    return np.array([float(factor) ** (6 - 2 * power) for power in POWERS])
 
 
 def _narrower(width: float | FloatArray, factor: int) -> float:

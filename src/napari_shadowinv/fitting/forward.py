@@ -40,7 +40,7 @@ class Scene:
     psf : sequence of float or ndarray
         Standard deviation in px of each image's point spread, or its kernel.
     smoothness, tie, decay, beam_modes, fiducials
-        See `Prior`.
+        See `Prior`; smoothness has the shape (M, 2).
     pad : int
         Width in px of the strip around the image from which rays may enter.
     free_gains : bool

@@ -108,7 +108,7 @@ def measured(
         strengths=matrix,
         beams=np.pad(beams / units[:, None, None], around, mode="edge"),
         psf=_checked_psf(psf, count, size),
-        smoothness=np.full(matrix.shape[1], 1.0),
+        smoothness=np.zeros((matrix.shape[1], 2)),
         pad=pad,
         tie=_FREE_TIE if free else 30.0,
         decay=(options.decay_length or pad) if free else np.inf,

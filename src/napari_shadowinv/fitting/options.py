@@ -30,8 +30,8 @@ class FitOptions(BaseModel):
         gt=0,
         title="Smoothness",
         description=(
-            "Weight λ of the squared fourth derivatives of each field's potential (px). Default: "
-            "found from the data, for each field."
+            "Weight of the squared fourth derivatives of each field's potential (px). Default: "
+            "those of fourth and sixth derivatives are found from the data, for each field."
         ),
     )
     boundary: Literal["fading", "free"] = Field(

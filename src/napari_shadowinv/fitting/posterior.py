@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.fft import dctn
 from scipy.linalg import eigh_tridiagonal
 
 from napari_shadowinv._typing import FloatArray, IntArray
@@ -27,6 +28,8 @@ __all__ = ["Posterior"]
 
 _TOLERANCE, _MOST_STEPS = 0.05, 60
 _PROBES, _LANCZOS = 4, 25
+_LEAST_DETERMINED = 1e-3  # coefficients
+_OVERSHOOT, _MOST_CHANGE = 1.7, 15.0  # of λ in a step; it would approach its end too slowly
 
 
 class Posterior:
@@ -54,30 +57,37 @@ class Posterior:
         self._scales = Preconditioner(scene)
         self._after_step = after_step or (lambda: None)
 
-    def likely_smoothness(self) -> FloatArray:
-        """Return the λ of each field for which it is as rough as the data make it, shape (M,).
+    def likely_smoothness(self) -> tuple[FloatArray, float]:
+        """Return λ and κ nearer to the likeliest, shape (M, 2), and by how much they have changed.
 
-        λ |∇⁴φ|² is the number of coefficients that the data determine.
+        Each holds as much against the field as there are coefficients that the data determine and
+        it would. The change is the logarithm's, weighted with that number.
         """
-        prior = self._scene.prior
-        rough = prior.roughness(self._unknowns)
-        found = np.empty(len(rough))
-        for m in range(len(rough)):
-            signs = self._rng.choice([-1.0, 1.0], self._scene.rays.shape)
+        prior, smoothness = self._scene.prior, self._scene.smoothness
+        fields = np.arange(len(smoothness))
+        determined, energy = np.empty(smoothness.shape), np.empty(smoothness.shape)
+        for m in fields:
+            each, whole = prior.of_rough[m], prior.of_rough[m].sum(axis=0)
+            signs = self._rng.choice([-1.0, 1.0], whole.shape)
             slope = self._unknowns.zeros()
             slope.potentials[m] = prior.root_of_smoothness(m, signs)
-            right = self._scales.turned(slope).flat()
-            determined = signs.size - product(right, self._solved(right))
-            found[m] = max(determined, 1.0) / max(rough[m], 1e-300)
-        return found
+            solved = self._scales.times(self._unknowns.like(self._solved(slope)))
+            left = np.sqrt(whole) * signs * dctn(solved.potentials[m], norm="ortho")
+            shares = np.divide(each, whole, out=np.zeros_like(each), where=whole > 0)
+            determined[m] = np.maximum((shares * (1 - left)).sum(axis=(1, 2)), _LEAST_DETERMINED)
+            waves = dctn(self._unknowns.potentials[m], norm="ortho")
+            energy[m] = (each * waves**2).sum(axis=(1, 2))
+        ratio = np.clip(determined / np.maximum(energy, 1e-300), 1 / _MOST_CHANGE, _MOST_CHANGE)
+        change = np.log(ratio) * _OVERSHOOT
+        weights = determined / determined.sum(axis=1, keepdims=True)
+        return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
 
     def drawn(self) -> Unknowns:
         """Return a random change of the unknowns, as large as the data leave possible."""
         noise = self._rng.normal(size=self._scene.images.shape)
         slope = self._scene.pulled(self._unknowns, self._counts, noise)
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
-        found = self._solved(self._scales.turned(slope).flat())
-        return self._scales.times(self._unknowns.like(found))
+        return self._scales.times(self._unknowns.like(self._solved(slope)))
 
     def log_volume(self) -> float:
         """Return half the logarithm of the Hessian's determinant in the cosines' scales.
@@ -99,7 +109,9 @@ class Posterior:
         turned = self._scene.hessian_times(self._unknowns, self._counts, change)
         return self._scales.turned(turned).flat()
 
-    def _solved(self, right: FloatArray) -> FloatArray:
+    def _solved(self, slope: Unknowns) -> FloatArray:
+        """The scaled change of the unknowns that undoes a slope."""
+        right = self._scales.turned(slope).flat()
         return solve(self._times, right, tolerance=_TOLERANCE, iterations=_MOST_STEPS)
 
     def _lanczos(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:

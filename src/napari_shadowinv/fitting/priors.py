@@ -1,8 +1,9 @@
 """What is known of potentials, beam, gains and frames before an image is looked at: `Prior`.
 
-    ½ Σ_m λ_m |∇⁴φ_m|² + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²) + ½ Σ (θ_ij / s_ij)² + ½ Σ (d(x_k) - d_k)²/σ_k²
+    ½ Σ_m (λ_m |∇⁴φ_m|² + κ_m |∇⁶φ_m|²) + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²) + ½ Σ (θ_ij / s_ij)² + ½ Σ (d(x_k) - d_k)²/σ_k²
 
-and the same for gains and frames. All of it is quadratic.
+and the same for gains and frames. All of it is quadratic. Of a smooth object the data make λ
+small and κ large, of one with kinks the other way round.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from napari_shadowinv.fitting._ray_kernels import spline_tables
 from napari_shadowinv.fitting.rays import KNOT, RayModel, at_rest
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 
-__all__ = ["Prior"]
+__all__ = ["POWERS", "Prior"]
+
+POWERS = (4, 6)  # of the wave number squared: |∇⁴φ|² and |∇⁶φ|²
 
 _GAIN_WEIGHT = 1.0  # 1 / s² of their logarithm
 _BEAM_SPREAD = 0.3  # of the first cosines of its logarithm
@@ -35,8 +38,8 @@ class Prior:
         The rays of all images.
     strengths : ndarray, shape (M,)
         Displacement in the first image by each field's displacement.
-    smoothness : ndarray, shape (M,)
-        λ of each field.
+    smoothness : ndarray, shape (M, 2)
+        λ and κ of each field.
     tie, decay : float
         µ, and the length ℓ in px over which potentials fade in the pad.
     beam_modes : int
@@ -73,7 +76,7 @@ class Prior:
     def times(self, change: Unknowns) -> Unknowns:
         """Return the terms' Hessian times a change."""
         waves = dctn(change.potentials, axes=(1, 2), norm="ortho")
-        waves *= self.smoothness[:, None, None] * (KNOT * self.wave_numbers**2) ** 2
+        waves *= self.of_rough.sum(axis=1)
         slope = idctn(waves, axes=(1, 2), norm="ortho")
         steps_y, steps_x = self._steps(change.potentials)
         slope -= self.tie * np.diff(steps_y, axis=1, prepend=0, append=0)
@@ -112,13 +115,14 @@ class Prior:
 
     def root_of_smoothness(self, field: int, values: FloatArray) -> FloatArray:
         """Return the root of what is held against rough coefficients, times values per cosine."""
-        waves = np.sqrt(self.smoothness[field]) * KNOT * self.wave_numbers**2 * values
+        waves = np.sqrt(self.of_rough[field].sum(axis=0)) * values
         return np.asarray(idctn(waves, norm="ortho"))
 
-    def roughness(self, unknowns: Unknowns) -> FloatArray:
-        """Return |∇⁴φ|² of each field."""
-        waves = dctn(unknowns.potentials, axes=(1, 2), norm="ortho")
-        return np.asarray(((KNOT * self.wave_numbers**2 * waves) ** 2).sum(axis=(1, 2)))
+    @cached_property
+    def of_rough(self) -> FloatArray:
+        """What each of λ and κ holds against each field's cosines, shape (M, 2, …)."""
+        powers = np.stack([self.wave_numbers**power for power in POWERS])
+        return KNOT**2 * self.smoothness[:, :, None, None] * powers
 
     @cached_property
     def wave_numbers(self) -> FloatArray:
@@ -132,7 +136,7 @@ class Prior:
         lowest = (np.pi / (max(self.rays.shape) * KNOT)) ** 2 + (0.2 / self.decay) ** 2
         # A fifth of the coefficients or so lies in the pad.
         tied = self.tie * (0.2 * squares + lowest)
-        return KNOT**2 * (self.smoothness[:, None, None] * squares**4 + tied)
+        return self.of_rough.sum(axis=1) + KNOT**2 * tied
 
     @cached_property
     def beam_weights(self) -> FloatArray:

@@ -40,15 +40,15 @@ class FittedField:
         Displacement in px, axis order (y, x).
     uncertainty : ndarray, shape (2, H, W), or None
         Standard deviation of the displacement in px that the noise leaves, if it was asked for.
-    smoothness : float
-        The weight λ of its squared fourth derivatives.
+    smoothness : tuple of float
+        The weights λ and κ of its squared fourth and sixth derivatives (px).
     """
 
     name: str
     potential: FloatArray
     displacement: FloatArray
     uncertainty: FloatArray | None
-    smoothness: float
+    smoothness: tuple[float, float]
 
 
 @dataclass(frozen=True)

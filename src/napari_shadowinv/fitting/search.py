@@ -9,21 +9,22 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import coarser, descend, finer
+from napari_shadowinv.fitting.descent import coarser, descend, finer, smoothness_in_pixels
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Unknowns
 
-__all__ = ["Found", "Start", "refined", "search", "splines_of"]
+__all__ = ["Found", "Start", "refined", "search", "with_likely_smoothness"]
 
 Tell = Callable[[str, float], None]
 
 _MIDDLE = 2  # pixels in which starts are compared and λ is found
-_FIRST_SMOOTHNESS, _COARSE_SMOOTHNESS = 100.0, 3.0
+_FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
+_COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
 _COARSE_STEPS, _COARSE_GAIN = 60, 3.0
 _COARSE_SPACING = 1 / 3
-_ROUNDS, _SETTLED = 3, 0.25  # of λ; and by what share it may still change
+_ROUNDS, _SETTLED = 6, 0.25  # of λ and κ; and by what share they may still change
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
 
@@ -55,7 +56,7 @@ class Found:
         return float(np.sqrt((difference**2).mean())) / max(size, 1e-12)
 
 
-def splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
+def _splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
     """Return coefficients of a potential given at the recorded image's pixels, about."""
     rays = scene.rays
     lines = ((KNOT * (np.arange(n) - 1.0) - rays.pad) * scene.bin - 0.5 for n in rays.shape)
@@ -69,7 +70,7 @@ def search(scene: Scene, starts: Sequence[Start], tell: Tell) -> list[Found]:
     """Descend from each start to pixels of two; return what differs, best first."""
     rough = replace(
         scene,
-        smoothness=_COARSE_SMOOTHNESS * _FIRST_SMOOTHNESS * np.ones_like(scene.smoothness),
+        smoothness=_COARSE_SMOOTHNESS * np.tile(_FIRST_SMOOTHNESS, (len(scene.smoothness), 1)),
         spacing=_COARSE_SPACING,
     )
     ends: list[Found] = []
@@ -92,7 +93,7 @@ def _descended(scene: Scene, start: Start, tell: Tell) -> Found:
         if unknowns is None:
             unknowns = stage.nothing()
             if start.potential is not None:
-                unknowns.potentials[0] = splines_of(stage, start.potential)
+                unknowns.potentials[0] = _splines_of(stage, start.potential)
         else:
             for _ in range(int(np.log2(before // factor))):
                 unknowns = finer(unknowns)
@@ -116,11 +117,12 @@ def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
 def with_likely_smoothness(
     scene: Scene, found: Found, rng: np.random.Generator, tell: Tell
 ) -> tuple[Scene, Found]:
-    """Find λ and the unknowns that belong to it, in pixels of two; λ for the scene's own."""
-    given = scene.smoothness.copy()
-    smoothness = np.where(given > 0, given, _FIRST_SMOOTHNESS)
-    unknowns = found.unknowns
-    for k in range(_ROUNDS):
+    """Find λ and κ, unless they are given, and the unknowns that belong to them."""
+    given = bool(scene.smoothness.any())
+    smoothness, unknowns = scene.smoothness, found.unknowns
+    if not given:
+        smoothness = np.tile(_FIRST_SMOOTHNESS, (len(smoothness), 1))
+    for _ in range(_ROUNDS):
         middle = coarser(replace(scene, smoothness=smoothness, spacing=_COARSE_SPACING), _MIDDLE)
         unknowns, value, _ = descend(
             middle,
@@ -129,12 +131,11 @@ def with_likely_smoothness(
             least_gain=_COARSE_GAIN,
             after_step=lambda now: tell("smoothness", now),
         )
-        if (given > 0).all():
+        if given:
             break
         posterior = Posterior(middle, unknowns, rng, lambda: tell("smoothness", value))  # noqa: B023
-        likely = posterior.likely_smoothness() * _MIDDLE**2
-        change = np.abs(np.log(likely / smoothness)).max()
-        smoothness = likely
+        likely, change = posterior.likely_smoothness()
+        smoothness = likely / smoothness_in_pixels(_MIDDLE)
         if change < _SETTLED:
             break
     end = replace(found, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns))
