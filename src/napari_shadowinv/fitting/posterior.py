@@ -26,7 +26,7 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 
 __all__ = ["Posterior"]
 
-_TOLERANCE, _MOST_STEPS = 0.05, 60
+_ROUGHLY, _CLOSELY, _MOST_STEPS = 0.05, 0.01, 200
 _PROBES, _LANCZOS = 4, 25
 _LEAST_DETERMINED = 1e-3  # coefficients
 _OVERSHOOT, _MOST_CHANGE = 1.7, 15.0  # of λ in a step; it would approach its end too slowly
@@ -71,7 +71,7 @@ class Posterior:
             signs = self._rng.choice([-1.0, 1.0], whole.shape)
             slope = self._unknowns.zeros()
             slope.potentials[m] = prior.root_of_smoothness(m, signs)
-            solved = self._scales.times(self._unknowns.like(self._solved(slope)))
+            solved = self._scales.times(self._unknowns.like(self._solved(slope, _ROUGHLY)))
             left = np.sqrt(whole) * signs * dctn(solved.potentials[m], norm="ortho")
             shares = np.divide(each, whole, out=np.zeros_like(each), where=whole > 0)
             determined[m] = np.maximum((shares * (1 - left)).sum(axis=(1, 2)), _LEAST_DETERMINED)
@@ -87,7 +87,8 @@ class Posterior:
         noise = self._rng.normal(size=self._scene.images.shape)
         slope = self._scene.pulled(self._unknowns, self._counts, noise)
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
-        return self._scales.times(self._unknowns.like(self._solved(slope)))
+        # The longest waves, which the noise moves most, are the last to be found.
+        return self._scales.times(self._unknowns.like(self._solved(slope, _CLOSELY)))
 
     def log_volume(self) -> float:
         """Return half the logarithm of the Hessian's determinant in the cosines' scales.
@@ -109,10 +110,10 @@ class Posterior:
         turned = self._scene.hessian_times(self._unknowns, self._counts, change)
         return self._scales.turned(turned).flat()
 
-    def _solved(self, slope: Unknowns) -> FloatArray:
+    def _solved(self, slope: Unknowns, tolerance: float) -> FloatArray:
         """The scaled change of the unknowns that undoes a slope."""
         right = self._scales.turned(slope).flat()
-        return solve(self._times, right, tolerance=_TOLERANCE, iterations=_MOST_STEPS)
+        return solve(self._times, right, tolerance=tolerance, iterations=_MOST_STEPS)
 
     def _lanczos(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Diagonal and off-diagonal of the Hessian in the space of its first powers."""

@@ -25,6 +25,9 @@ _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
 _COARSE_STEPS, _COARSE_GAIN = 60, 3.0
 _COARSE_SPACING = 1 / 3
 _ROUNDS, _SETTLED = 6, 0.25  # of λ and κ; and by what share they may still change
+# An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
+# off where it is sharpest.
+_HELD = 0.1  # of them
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
 
@@ -138,6 +141,16 @@ def with_likely_smoothness(
         smoothness = likely / smoothness_in_pixels(_MIDDLE)
         if change < _SETTLED:
             break
+    if not given:
+        smoothness = _HELD * smoothness
+        middle = coarser(replace(scene, smoothness=smoothness, spacing=_COARSE_SPACING), _MIDDLE)
+        unknowns, value, _ = descend(
+            middle,
+            unknowns,
+            iterations=_COARSE_STEPS,
+            least_gain=_COARSE_GAIN,
+            after_step=lambda now: tell("smoothness", now),
+        )
     end = replace(found, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns))
     return replace(scene, smoothness=smoothness), end
 
