@@ -1,6 +1,7 @@
 from ._napari.layers import add_inversion
 from ._system.progress import Progress
 from .errors import FileFormatError, InputError, InversionCancelled
+from .fitting import Fit, FitOptions, fit
 from .inversion import Inversion, Report, invert, plan_sites
 from .inversion.error_bars import Uncertainty, uncertainty
 from .io import Radiograph, read, write
@@ -17,6 +18,8 @@ __version__: str
 
 __all__ = [
     "FileFormatError",
+    "Fit",
+    "FitOptions",
     "InputError",
     "Inversion",
     "InversionCancelled",
@@ -30,6 +33,7 @@ __all__ = [
     "Uncertainty",
     "__version__",
     "add_inversion",
+    "fit",
     "invert",
     "invert_stack",
     "plan_sites",

@@ -162,12 +162,12 @@ def fit(
         basins = _basins(scene, best, found[1:], tell)
     with _timed("full size", seconds):
         fine = replace(scene, spacing=options.spacing)
-        unknowns, value, taken = refined(fine, best, iterations=options.max_iterations, tell=tell)
+        unknowns, value, taken = refined(fine, best, iterations=options.steps, tell=tell)
     with _timed("samples", seconds):
         errors = _errors(scene, best, given, options, rng, tell)
     return _result(
         given, fine, unknowns, fields, setups, options, basins, errors,
-        FitReport(value, taken, taken < options.max_iterations, seconds, float("nan")),
+        FitReport(value, taken, taken < options.steps, seconds, float("nan")),
     )  # fmt: skip
 
 
@@ -197,10 +197,10 @@ def _starts(given: Measured, start: ArrayLike | None, tell: Any) -> list[Start]:
         return starts
     weakest = int(np.argmin(np.abs(scene.strengths[:, 0])))
     tell("transport", float("nan"))
-    potential = _transported(given, weakest)
-    if potential is None:
+    transported = _transported(given, weakest)
+    if transported is None:
         return starts
-    potential = gaussian_filter(potential, _ROUNDED) / scene.strengths[weakest, 0]
+    potential = gaussian_filter(transported, _ROUNDED) / scene.strengths[weakest, 0]
     if not given.single:
         return [*starts, Start("transport", ((2, 2.0), (2, 1.0)), potential)]
     return starts + [
@@ -238,9 +238,7 @@ def _reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
     return replace(scene, weights=np.where(scene.weights > 0, weights, 0.0))
 
 
-def _basins(
-    scene: Scene, best: Found, others: Sequence[Found], tell: Any
-) -> tuple[Basin, ...]:
+def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tuple[Basin, ...]:
     """The best answer and others, with the same λ and without blur."""
     middle = replace(coarser(scene, _MIDDLE), spacing=1 / 3)
     found = []
@@ -279,7 +277,7 @@ def _errors(
     variance = np.asarray(squares) / options.samples
     smooth = gaussian_filter(variance, (0, 0, _SMOOTHED_ERRORS, _SMOOTHED_ERRORS))
     height, width = given.size
-    return np.sqrt(smooth[..., :height, :width])
+    return np.asarray(np.sqrt(smooth[..., :height, :width]))
 
 
 def _result(
@@ -313,14 +311,14 @@ def _result(
     uncertainty = float("nan")
     if errors is not None:
         size = (found**2).mean(axis=(1, 2, 3))
-        uncertainty = float(np.sqrt(((errors**2).mean(axis=(1, 2, 3)) / np.maximum(size, 1e-12)).max()))
+        uncertainty = float(
+            np.sqrt(((errors**2).mean(axis=(1, 2, 3)) / np.maximum(size, 1e-12)).max())
+        )
     folded = max(
         float((jacobian_determinant(moved) < 0).mean())
         for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, found)
     )
-    others = [
-        (basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]
-    ]
+    others = [(basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]]
     verdict, explanation = judged(
         chi2=chi2,
         names=_names(setups, len(data)),

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from napari_shadowinv._typing import FloatArray, IntArray
+from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.geometry._kernel import njit
 
 __all__ = ["KNOT", "MOST_RAYS", "deposit", "gather", "push", "spline_tables"]
@@ -83,7 +83,7 @@ def _land(
     frame: FloatArray,
     steepness: float,
     size: tuple[int, int],
-    pixels: IntArray,
+    pixels: AnyArray,
     shares: FloatArray,
 ) -> None:
     """The pixel at or before each ray of a row, and the share of the next one, with its slope."""
@@ -149,8 +149,16 @@ def deposit(
                     _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
                     _land(
-                        slopes, m, y, x, KNOT / m, frame, steepness, (height, width),
-                        pixels, shares,
+                        slopes,
+                        m,
+                        y,
+                        x,
+                        KNOT / m,
+                        frame,
+                        steepness,
+                        (height, width),
+                        pixels,
+                        shares,
                     )
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     for b in range(m):
@@ -242,8 +250,16 @@ def gather(
                     _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
                     _land(
-                        slopes, m, y, x, KNOT / m, frame, steepness, size,
-                        pixels, shares,
+                        slopes,
+                        m,
+                        y,
+                        x,
+                        KNOT / m,
+                        frame,
+                        steepness,
+                        size,
+                        pixels,
+                        shares,
                     )
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     for b in range(m):
@@ -310,8 +326,16 @@ def push(
                     _slopes_of_row(change, row, column, tables, a, n, m, moves)
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
                     _land(
-                        slopes, m, y, x, KNOT / m, frame, steepness, (height, width),
-                        pixels, shares,
+                        slopes,
+                        m,
+                        y,
+                        x,
+                        KNOT / m,
+                        frame,
+                        steepness,
+                        (height, width),
+                        pixels,
+                        shares,
                     )
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     _flux_of_row(beam_change, row, column, a, n, m, more)
@@ -322,20 +346,25 @@ def push(
                         landed_y = y - slopes[0, b]
                         landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
                         in_v = (
-                            frame_change[0] + frame_change[1] * landed_y
+                            frame_change[0]
+                            + frame_change[1] * landed_y
                             + frame_change[2] * landed_x
-                            - frame[1] * moves[0, b] - frame[2] * moves[1, b]
+                            - frame[1] * moves[0, b]
+                            - frame[2] * moves[1, b]
                         )
                         in_u = (
-                            frame_change[3] + frame_change[4] * landed_y
+                            frame_change[3]
+                            + frame_change[4] * landed_y
                             + frame_change[5] * landed_x
-                            - frame[4] * moves[0, b] - frame[5] * moves[1, b]
+                            - frame[4] * moves[0, b]
+                            - frame[5] * moves[1, b]
                         )
                         in_v *= flux[b] * shares[2, b]
                         in_u *= flux[b] * shares[3, b]
                         grown = more[b]
                         image[i, j] += (
-                            grown * (1 - down) * (1 - right) - in_v * (1 - right)
+                            grown * (1 - down) * (1 - right)
+                            - in_v * (1 - right)
                             - in_u * (1 - down)
                         )
                         image[i, j1] += (

@@ -79,7 +79,6 @@ class Preconditioner:
             self._frames * slope.frames,
         )
 
-
     def log_size(self) -> float:
         """Return log |det S| plus half the logarithm of what the prior's determinant is, about."""
         beam, frames = self._beam[self._beam > 0], self._frames[self._frames > 0]

@@ -108,7 +108,7 @@ class Scene:
 
     def potentials(self, unknowns: Unknowns) -> FloatArray:
         """Return the coefficients of each image's own potential, shape (L, …)."""
-        return np.einsum("lm,myx->lyx", self.strengths, unknowns.potentials)
+        return np.asarray(np.einsum("lm,myx->lyx", self.strengths, unknowns.potentials))
 
     def ray_counts(self, unknowns: Unknowns) -> list[IntArray]:
         """Return how many rays each cell of each image needs; see `RayModel.ray_counts`."""
@@ -236,11 +236,11 @@ class Scene:
 
     def _modes(self, beam: FloatArray) -> FloatArray:
         along_y, along_x = self._cosines
-        return np.einsum("iy,ix->yx", along_y, np.einsum("ij,jx->ix", beam, along_x))
+        return np.asarray(np.einsum("iy,ix->yx", along_y, np.einsum("ij,jx->ix", beam, along_x)))
 
     def _of_modes(self, shape: FloatArray) -> FloatArray:
         along_y, along_x = self._cosines
-        return np.einsum("iy,yj->ij", along_y, np.einsum("yx,jx->yj", shape, along_x))
+        return np.asarray(np.einsum("iy,yj->ij", along_y, np.einsum("yx,jx->yj", shape, along_x)))
 
     def _beam_shape(self, unknowns: Unknowns) -> FloatArray:
         return np.exp(self._modes(unknowns.beam))
@@ -276,4 +276,4 @@ def _reach(width: float | FloatArray) -> int:
     """How far a point is spread, px."""
     if isinstance(width, float):
         return int(_SIGMAS * width + 0.5)
-    return max(width.shape) // 2
+    return int(max(width.shape)) // 2

@@ -98,9 +98,9 @@ def measured(
 
     fill = [(0, 0), *((0, -side % _BLOCK) for side in (height, width))]
     size = height + fill[1][1], width + fill[2][1]
-    free = options.boundary == "free"
+    free = options.edge == "free"
     usual = max(16, 8 * round(_FREE_SHARE * min(height, width) / 8)) if free else 16
-    pad = options.margin or usual
+    pad = options.strip or usual
     around = [(0, 0), *((pad, pad + filled) for _, filled in fill[1:])]
     scene = Scene(
         images=np.pad(scaled, fill),
@@ -111,7 +111,7 @@ def measured(
         smoothness=np.zeros((matrix.shape[1], 2)),
         pad=pad,
         tie=_FREE_TIE if free else 30.0,
-        decay=(options.decay_length or pad) if free else np.inf,
+        decay=(options.fade_length or pad) if free else np.inf,
         beam_modes=options.beam_modes if unknown else 0,
         free_gains=free_gains or unknown,
         free_frames=_ALIGNED[options.align],
@@ -160,9 +160,9 @@ def strengths_of(setups: Sequence[Setup] | None, fields: Sequence[str], count: i
         ratio = setup.object_pixel_size / first.object_pixel_size
         if abs(ratio - 1) > _SAME:
             raise InputError(
-                f"image {k + 1} has pixels of {setup.object_pixel_size * 1e6:.6g} µm at the object, "
-                f"the first of {first.object_pixel_size * 1e6:.6g} µm: bring all images to the same "
-                "pixels first"
+                f"image {k + 1} has pixels of {setup.object_pixel_size * 1e6:.6g} µm at the "
+                f"object, the first of {first.object_pixel_size * 1e6:.6g} µm: bring all images "
+                "to the same pixels first"
             )
     one = np.ones((2, 4, 4))
     return np.array(
@@ -230,7 +230,7 @@ def _checked_images(images: ArrayLike) -> FloatArray:
         )
     if min(data.shape[1:]) < _SMALLEST_SIDE:
         raise InputError(
-            f"images have shape {data.shape[1:]}: expected at least {_SMALLEST_SIDE} pixels each way"
+            f"images have shape {data.shape[1:]}: expected {_SMALLEST_SIDE} pixels or more each way"
         )
     return data
 
@@ -253,7 +253,9 @@ def _checked_mask(mask: ArrayLike | None, data: FloatArray) -> BoolArray:
         )
     for k, plane in enumerate(used):
         if plane.mean() < 0.05:
-            raise InputError(f"image {k + 1} has {plane.mean():.1%} of its pixels in use: unmask some")
+            raise InputError(
+                f"image {k + 1} has {plane.mean():.1%} of its pixels in use: unmask some"
+            )
         if not data[k][plane].mean() > 0:
             raise InputError(f"image {k + 1} has no flux: expected a beam; check its background")
     return used
@@ -269,7 +271,7 @@ def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
         )
     if not matrix[0].all():
         raise InputError(
-            f"strengths of the first image are {matrix[0].tolist()}: expected all fields to act in it"
+            f"strengths of the first image are {matrix[0].tolist()}: all fields must act in it"
         )
     if matrix.shape[1] > 1 and np.linalg.matrix_rank(matrix, tol=0.02) < matrix.shape[1]:
         raise InputError(
@@ -277,7 +279,7 @@ def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
             "strengths that differ between the fields; give more energies or one field"
         )
     # All in units of the first image's.
-    return matrix / matrix[0]
+    return np.asarray(matrix / matrix[0])
 
 
 def _refuse_what_one_image_cannot_tell(
@@ -298,7 +300,9 @@ def _checked_gains(gains: ArrayLike | str, count: int) -> tuple[bool, FloatArray
         return gains == "free", np.ones(count)
     factors = np.array(gains, dtype=np.float64)
     if factors.shape != (count,) or not (np.isfinite(factors) & (factors > 0)).all():
-        raise InputError(f"gains are {gains}: expected a positive number for each of {count} images")
+        raise InputError(
+            f"gains are {gains}: expected a positive number for each of {count} images"
+        )
     return False, factors
 
 
@@ -307,7 +311,7 @@ def _checked_source(source: Any, data: FloatArray, used: BoolArray) -> FloatArra
         if source not in (None, "unknown"):
             raise InputError(f"source is {source!r}: expected an array, None or 'unknown'")
         levels = [image[use].mean() for image, use in zip(data, used, strict=True)]
-        return np.ones(data.shape) * np.array(levels)[:, None, None]
+        return np.asarray(np.ones(data.shape) * np.array(levels)[:, None, None])
     beams = np.array(source, dtype=np.float64)
     if beams.shape not in (data.shape, data.shape[1:]):
         raise InputError(
@@ -329,10 +333,10 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
         if (data[used] < 0).any():
             raise InputError("images have negative pixels, so they are no counts: give the noise")
         means = np.stack([uniform_filter(plane, _SMOOTHED) for plane in np.where(used, data, 0)])
-        return np.sqrt(np.maximum(means, _LEAST_COUNTS))
+        return np.asarray(np.sqrt(np.maximum(means, _LEAST_COUNTS)))
     if noise is None:
         levels = [estimated_noise(plane, use) for plane, use in zip(data, used, strict=True)]
-        return np.ones(data.shape) * np.array(levels)[:, None, None]
+        return np.asarray(np.ones(data.shape) * np.array(levels)[:, None, None])
     sigma = np.array(noise, dtype=np.float64)
     if not np.isfinite(sigma).all() or sigma.min() <= 0:
         raise InputError("noise is not positive everywhere: expected standard deviations")
@@ -358,7 +362,9 @@ def _checked_psf(psf: Any, count: int, size: tuple[int, int]) -> list[float | Fl
             raise InputError(f"psf is {one}: expected a standard deviation in px or a kernel")
         if values.ndim == 0:
             if float(values) > min(size) / 8:
-                raise InputError(f"psf is {float(values):g} px: expected less than an eighth of a side")
+                raise InputError(
+                    f"psf is {float(values):g} px: expected less than an eighth of a side"
+                )
             found.append(float(values))
             continue
         if values.ndim != 2 or not all(side % 2 for side in values.shape) or not values.sum() > 0:

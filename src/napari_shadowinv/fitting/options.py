@@ -19,7 +19,7 @@ class FitOptions(BaseModel):
 
     Examples
     --------
-    >>> FitOptions(align="shift").boundary
+    >>> FitOptions(align="shift").edge
     'fading'
     """
 
@@ -34,7 +34,7 @@ class FitOptions(BaseModel):
             "those of fourth and sixth derivatives are found from the data, for each field."
         ),
     )
-    boundary: Literal["fading", "free"] = Field(
+    edge: Literal["fading", "free"] = Field(
         default="fading",
         title="Field at the edge",
         description=(
@@ -42,22 +42,22 @@ class FitOptions(BaseModel):
             "'free': it goes on beyond the edge, where its potential decays."
         ),
     )
-    margin: int | None = Field(
+    strip: int | None = Field(
         default=None,
         ge=16,
         multiple_of=8,
         title="Strip around the image (px)",
         description=(
             "Width of the strip beyond the edge from which rays may enter. Default: 16, or with a "
-            "free boundary a tenth of the shorter side."
+            "free edge a tenth of the shorter side."
         ),
     )
-    decay_length: float | None = Field(
+    fade_length: float | None = Field(
         default=None,
         gt=0,
         title="Decay length of the field (px)",
         description=(
-            "Free boundary only: length over which the potential decays beyond the edge. Default: "
+            "Free edge only: length over which the potential decays beyond the edge. Default: "
             "the width of the strip."
         ),
     )
@@ -90,7 +90,7 @@ class FitOptions(BaseModel):
         title="Spacing of rays (px)",
         description="Largest distance between the landing points of neighbouring rays.",
     )
-    max_iterations: int = Field(
+    steps: int = Field(
         default=100,
         ge=1,
         title="Steps at full size",

@@ -64,9 +64,8 @@ class Posterior:
         it would. The change is the logarithm's, weighted with that number.
         """
         prior, smoothness = self._scene.prior, self._scene.smoothness
-        fields = np.arange(len(smoothness))
         determined, energy = np.empty(smoothness.shape), np.empty(smoothness.shape)
-        for m in fields:
+        for m in range(len(smoothness)):
             each, whole = prior.of_rough[m], prior.of_rough[m].sum(axis=0)
             signs = self._rng.choice([-1.0, 1.0], whole.shape)
             slope = self._unknowns.zeros()

@@ -1,6 +1,7 @@
 """What is known of potentials, beam, gains and frames before an image is looked at: `Prior`.
 
-    ½ Σ_m (λ_m |∇⁴φ_m|² + κ_m |∇⁶φ_m|²) + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²) + ½ Σ (θ_ij / s_ij)² + ½ Σ (d(x_k) - d_k)²/σ_k²
+    ½ Σ_m (λ_m |∇⁴φ_m|² + κ_m |∇⁶φ_m|²) + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²)
+    + ½ Σ (θ_ij / s_ij)² + ½ Σ |d(x_k) - d_k|² / σ_k²
 
 and the same for gains and frames. All of it is quadratic. Of a smooth object the data make λ
 small and κ large, of one with kinks the other way round.
@@ -136,7 +137,7 @@ class Prior:
         lowest = (np.pi / (max(self.rays.shape) * KNOT)) ** 2 + (0.2 / self.decay) ** 2
         # A fifth of the coefficients or so lies in the pad.
         tied = self.tie * (0.2 * squares + lowest)
-        return self.of_rough.sum(axis=1) + KNOT**2 * tied
+        return np.asarray(self.of_rough.sum(axis=1) + KNOT**2 * tied)
 
     @cached_property
     def beam_weights(self) -> FloatArray:
@@ -177,7 +178,7 @@ class Prior:
 
     @cached_property
     def _splines_there(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """Rows and columns of the coefficients around each fiducial; displacement by each, (y, x)."""
+        """Rows and columns of coefficients around each fiducial; displacement by each, (y, x)."""
         assert self.fiducials is not None
         place = (self.fiducials.places + self.rays.pad) / KNOT
         cell = np.floor(place).astype(np.int64)
@@ -192,7 +193,7 @@ class Prior:
     def _displacements_there(self, potentials: FloatArray) -> FloatArray:
         rows, columns, tables = self._splines_there
         total = np.einsum("m,myx->yx", self.strengths, potentials)
-        return np.einsum("ncij,nij->nc", tables, total[rows, columns])
+        return np.asarray(np.einsum("ncij,nij->nc", tables, total[rows, columns]))
 
     def _add_there(self, potentials: FloatArray, pulls: FloatArray) -> None:
         rows, columns, tables = self._splines_there

@@ -111,7 +111,7 @@ class RayModel:
         most = np.maximum(most[:, :, 1:], most[:, :, :-1])
         wanted = np.ceil(KNOT * np.maximum(most, 0.5) / self.spacing).astype(np.int64)
         # Rays at rest shall not land on the kinks of their shares.
-        return np.minimum(wanted + (wanted % 4 == 2), MOST_RAYS)
+        return np.asarray(np.minimum(wanted + (wanted % 4 == 2), MOST_RAYS))
 
     def image(
         self,
@@ -165,9 +165,7 @@ class RayModel:
         """
         found = Pulls(np.zeros((_BANDS, *self.shape)), np.zeros(beam.shape), np.zeros((_BANDS, 6)))
         rest = found.potential, found.beam, of_beam, found.frame, of_frame
-        self._in_bands(
-            kernels.gather, potential, counts, beam, frame, np.pad(pull, _GUARD), *rest
-        )
+        self._in_bands(kernels.gather, potential, counts, beam, frame, np.pad(pull, _GUARD), *rest)
         about_middle = self._about_middle(found.frame.sum(axis=0))
         return Pulls(found.potential.sum(axis=0), found.beam, about_middle)
 

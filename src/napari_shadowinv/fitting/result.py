@@ -8,8 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.options import FitOptions
 from napari_shadowinv.fitting.verdict import Verdict
@@ -205,7 +203,11 @@ class Fit:
             one = one.drop_vars([name for name in one.data_vars if not _belongs(name, field.name)])
             if field.uncertainty is not None:
                 told = label("px", "Standard deviation of the displacement")
-                one["displacement_uncertainty"] = (one["displacement"].dims, field.uncertainty, told)
+                one["displacement_uncertainty"] = (
+                    one["displacement"].dims,
+                    field.uncertainty,
+                    told,
+                )
             attrs = one.attrs
             if len(self.fields) > 1:
                 one = one.rename({name: f"{name}_{field.name}" for name in one.data_vars})
@@ -228,7 +230,9 @@ class Fit:
         for name, (values, units, text) in lines.items():
             merged[name] = (("image",), values, label(units, text))
         merged["strength"] = (
-            ("image", "field"), self.strengths, label("1", "Displacement relative to image 1")
+            ("image", "field"),
+            self.strengths,
+            label("1", "Displacement relative to image 1"),
         )
         merged["field"] = ("field", [field.name for field in self.fields])
         return merged

@@ -151,7 +151,9 @@ def with_likely_smoothness(
             least_gain=_COARSE_GAIN,
             after_step=lambda now: tell("smoothness", now),
         )
-    end = replace(found, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns))
+    end = replace(
+        found, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns)
+    )
     return replace(scene, smoothness=smoothness), end
 
 

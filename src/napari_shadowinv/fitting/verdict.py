@@ -61,12 +61,14 @@ def judged(
     uncertainty : float
         R.m.s. standard deviation of the displacement as a share of it; NaN if it is not known.
     """
-    worst = [f"{name} ({value:.2g})" for name, value in zip(names, chi2, strict=True) if value > _MISFIT]
+    worst = [
+        f"{name} ({value:.2g})" for name, value in zip(names, chi2, strict=True) if value > _MISFIT
+    ]
     if worst:
         return Verdict.MISFIT, (
-            f"the forward model does not explain {', '.join(worst)}: χ² should be 1. The object may "
-            "have changed between images; or energies, noise, source or point spread are not as "
-            "given"
+            f"the forward model does not explain {', '.join(worst)}: χ² should be 1. The object "
+            "may have changed between images; or energies, noise, source or point spread are not "
+            "as given"
         )
     if single and beam_unknown:
         return Verdict.AMBIGUOUS, (
@@ -75,19 +77,20 @@ def judged(
         )
     if single and folded > _FOLDED:
         return Verdict.AMBIGUOUS, (
-            f"rays cross over {folded:.0%} of the image, and one image does not tell which came from "
-            "where: the field may be wrong though the image is explained; take another energy"
+            f"rays cross over {folded:.0%} of the image, and one image does not tell which came "
+            "from where: the field may be wrong though the image is explained; take another energy"
         )
     rivals = [away for worse, away in others if worse < _AS_GOOD and away > _OTHER_FIELD]
     if rivals:
         return Verdict.SEVERAL, (
-            f"{len(rivals) + 1} different fields explain the data about as well; they differ by up "
-            f"to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is known"
+            f"{len(rivals) + 1} different fields explain the data about as well; they differ by "
+            f"up to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is "
+            "known"
         )
     if uncertainty > _OPEN:
         return Verdict.UNCERTAIN, (
-            f"the noise leaves {uncertainty:.0%} of the displacement open (r.m.s.): average shots, or "
-            "take images at energies that differ more"
+            f"the noise leaves {uncertainty:.0%} of the displacement open (r.m.s.): average "
+            "shots, or take images at energies that differ more"
         )
     several = "one image" if single else f"{len(chi2)} images"
     return Verdict.DETERMINED, (
