@@ -105,6 +105,7 @@ def nearly_all_masked() -> FloatArray:
         ({"noise": "gauss"}, "noise is 'gauss': expected 'poisson', standard deviations or None"),
         ({"noise": 0}, "noise is not positive everywhere"),
         ({"noise": np.full(SIZE, np.nan)}, "noise is not positive everywhere"),
+        ({"noise": []}, "noise is not positive everywhere"),
         ({"noise": np.ones(3)}, r"noise has shape \(3,\): expected one number, one an image"),
         ({"noise": "poisson", "images": with_pixel(-1)}, "negative pixels, so they are no counts"),
         ({"psf": [1.0, 2.0, 3.0]}, "psf has 3 entries: expected one, or one for each of 2"),
@@ -112,6 +113,16 @@ def nearly_all_masked() -> FloatArray:
         ({"psf": 9.0}, "psf is 9 px: expected less than an eighth of a side"),
         ({"psf": np.ones((3, 4))}, r"psf has shape \(3, 4\): expected a kernel with odd sides"),
         ({"psf": np.zeros((3, 3))}, r"psf has shape \(3, 3\)"),
+        ({"psf": "wide"}, "psf is 'wide': expected numbers"),
+        ({"psf": [[1.0, 2.0, 3.0]] * 2}, r"psf has shape \(2, 3\): expected a kernel"),
+        ({"psf": [1.0, "wide"]}, "psf is 'wide': expected numbers"),
+        ({"strengths": "strong"}, "strengths is 'strong': expected numbers"),
+        ({"strengths": [[1, 2], [3]]}, r"strengths is \[\[1, 2\], \[3\]\]: expected numbers"),
+        ({"source": [[1, 2], [3]]}, "source is .*: expected numbers"),
+        ({"noise": [0.1, "little"]}, "noise is .*: expected numbers"),
+        ({"fiducials": [[1, 2, 3], [4]]}, "fiducials is .*: expected numbers"),
+        ({"mask": [[True], [True, False]]}, "mask is .*: expected numbers"),
+        ({"gains": [1, None, "x"]}, "gains is .*: expected numbers"),
         ({"gains": "some"}, "gains are 'some': expected 'known', 'free' or a number an image"),
         ({"gains": [1, -2]}, r"gains are \[1, -2\]: expected a positive number for each of 2"),
         ({"gains": [1, 1, 1]}, "expected a positive number for each of 2 images"),
@@ -217,6 +228,14 @@ def test_kernels_have_the_sum_one_and_each_image_may_have_its_own() -> None:
     assert given(psf=0.7).scene.psf == [0.7, 0.7]
 
 
+def test_one_kernel_is_for_all_images_and_kernels_may_differ_in_size() -> None:
+    for kernel in (np.ones((3, 5)), [[1, 1, 1]] * 5):
+        made = given(psf=kernel)
+        assert [np.shape(one) for one in made.scene.psf] == [np.shape(kernel)] * 2
+    made = given(psf=[np.ones((3, 3)), np.ones((5, 5))])
+    assert [np.shape(one) for one in made.scene.psf] == [(3, 3), (5, 5)]
+
+
 @pytest.mark.parametrize(
     ("align", "free"), [("none", 0), ("shift", 2), ("affine", 6)]
 )
@@ -225,7 +244,7 @@ def test_alignment_frees_the_numbers_of_a_frame(align: Any, free: int) -> None:
 
 
 def test_a_free_edge_has_a_wider_strip_and_fades() -> None:
-    stack = np.ones((1, 200, 240))
+    stack = np.ones((1, 240, 280))
     free = given(images=stack, strengths=[1], options=FitOptions(edge="free"))
     assert free.scene.pad == 24  # a tenth of the shorter side in blocks
     assert free.scene.decay == 24
