@@ -43,7 +43,9 @@ def places(scene: Scene) -> tuple[FloatArray, FloatArray]:
 def bump(scene: Scene, slope: float, width: float = 8.0) -> Unknowns:
     unknowns = scene.nothing()
     y, x = places(scene)
-    unknowns.potentials[0] = -slope * width**2 * np.exp(-((y - 24) ** 2 + (x - 30) ** 2) / 2 / width**2)
+    unknowns.potentials[0] = (
+        -slope * width**2 * np.exp(-((y - 24) ** 2 + (x - 30) ** 2) / 2 / width**2)
+    )
     unknowns.potentials[0] /= scene.bin**2
     return unknowns
 
@@ -91,9 +93,7 @@ def test_finer_pixels_double_the_displacement(scene: Scene) -> None:
 
 def test_binned_adds_blocks() -> None:
     planes = np.arange(32.0).reshape(1, 4, 8)
-    np.testing.assert_array_equal(
-        binned(planes, 2)[0], [[18, 26, 34, 42], [82, 90, 98, 106]]
-    )
+    np.testing.assert_array_equal(binned(planes, 2)[0], [[18, 26, 34, 42], [82, 90, 98, 106]])
     assert binned(planes, 4).sum() == planes.sum()
 
 

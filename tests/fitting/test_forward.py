@@ -143,8 +143,7 @@ def test_pushed_is_the_change_of_residuals(scene: Scene) -> None:
     change = random_like(unknowns, 2)
     step = 1e-6
     ahead, behind = (
-        scene.model(unknowns.plus(unknowns.like(s * change.flat())), counts)
-        for s in (step, -step)
+        scene.model(unknowns.plus(unknowns.like(s * change.flat())), counts) for s in (step, -step)
     )
     expected = np.sqrt(scene.weights) * (ahead - behind) / (2 * step)
     found = scene.pushed(unknowns, counts, change)

@@ -236,9 +236,7 @@ def test_one_kernel_is_for_all_images_and_kernels_may_differ_in_size() -> None:
     assert [np.shape(one) for one in made.scene.psf] == [(3, 3), (5, 5)]
 
 
-@pytest.mark.parametrize(
-    ("align", "free"), [("none", 0), ("shift", 2), ("affine", 6)]
-)
+@pytest.mark.parametrize(("align", "free"), [("none", 0), ("shift", 2), ("affine", 6)])
 def test_alignment_frees_the_numbers_of_a_frame(align: Any, free: int) -> None:
     assert given(options=FitOptions(align=align)).scene.free_frames.sum() == free
 
@@ -274,9 +272,7 @@ def test_strengths_follow_from_momenta_and_velocities() -> None:
 def test_strengths_grow_with_the_distance_over_which_rays_drift() -> None:
     """Displacement at the object: angle × drift / magnification."""
     near = protons(10, pixel_size=None, detector_pixel_size=42e-6)
-    far = protons(
-        10, object_image_distance=0.4, pixel_size=None, detector_pixel_size=2e-6 * 41
-    )
+    far = protons(10, object_image_distance=0.4, pixel_size=None, detector_pixel_size=2e-6 * 41)
     assert near.object_pixel_size == pytest.approx(far.object_pixel_size)
     expected = (0.4 / 41) / (0.2 / 21)
     np.testing.assert_allclose(strengths_of([near, far], ("B",), 2)[:, 0], [1, expected])

@@ -178,5 +178,7 @@ def test_met_fiducials_pull_at_nothing(prior: Prior) -> None:
     tilted = nothing(prior)
     tilted.potentials[0] = -0.7 * y + 0.2 * x
     met = replace(prior, fiducials=known._replace(displacements=np.full((2, 2), [0.7, -0.2])))
-    with_them, without = (one.value_and_slope(tilted)[1] for one in (met, replace(prior, fiducials=None)))
+    with_them, without = (
+        one.value_and_slope(tilted)[1] for one in (met, replace(prior, fiducials=None))
+    )
     np.testing.assert_allclose(with_them.potentials, without.potentials, atol=1e-9)

@@ -81,9 +81,7 @@ def test_noise_that_leaves_much_open_is_told() -> None:
 
 def test_the_gravest_doubt_comes_first() -> None:
     """Images that are not explained, then one image, then other fields, then noise."""
-    all_of_them = (
-        GOOD | ALONE | {"beam_unknown": True, "others": [(0.0, 0.5)], "uncertainty": 0.5}
-    )
+    all_of_them = GOOD | ALONE | {"beam_unknown": True, "others": [(0.0, 0.5)], "uncertainty": 0.5}
     assert judged(**all_of_them | {"chi2": np.array([9.0])})[0] is Verdict.MISFIT
     assert judged(**all_of_them)[0] is Verdict.AMBIGUOUS
     assert judged(**all_of_them | {"beam_unknown": False})[0] is Verdict.SEVERAL
