@@ -94,9 +94,11 @@ class Posterior:
 
         By stochastic Lanczos quadrature.
         """
-        # What is fixed has no scale, and no part in the volume.
+        # What is fixed has no scale, and no part in the volume; nor what nothing holds.
         ones = self._unknowns.like(np.ones(self._unknowns.flat().size))
         moved = self._scales.times(ones)._replace(potentials=ones.potentials)
+        if np.isinf(self._scene.decay):
+            moved.potentials[:, 0, 0] = 0
         free = moved.flat() != 0
         size = int(free.sum())
         total = 0.0
