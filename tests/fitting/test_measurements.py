@@ -305,9 +305,9 @@ def test_a_source_blurs_by_its_size_behind_the_object_and_the_detector_by_its_ow
 
 @pytest.mark.parametrize("length", [-1e-6, np.nan, np.inf])
 def test_lengths_that_are_none_are_refused(length: float) -> None:
-    with pytest.raises(InputError, match="source_size is .*: expected a length in m"):
+    with pytest.raises(InputError, match=r"source_size is .*: expected a length in m"):
         point_spread(protons(10), source_size=length)
-    with pytest.raises(InputError, match="resolution is .*: expected a length in m"):
+    with pytest.raises(InputError, match=r"resolution is .*: expected a length in m"):
         point_spread(protons(10), resolution=length)
 
 

@@ -46,6 +46,12 @@ def dense_hessian(scene: Scene, unknowns: Unknowns) -> tuple[FloatArray, FloatAr
     return matrix, np.flatnonzero(np.diag(matrix))
 
 
+def half_log_determinant(matrix: FloatArray) -> float:
+    """Without what nothing holds: fixed unknowns, and the potential's constant."""
+    values = np.linalg.eigvalsh(matrix)
+    return float(np.log(values[values > 1e-9 * values.max()]).sum() / 2)
+
+
 @pytest.fixture(scope="module")
 def tiny() -> tuple[Scene, Unknowns, FloatArray, FloatArray]:
     scene = weak_scene((12, 16), (30.0, 100.0))
@@ -62,7 +68,7 @@ def test_samples_have_the_inverse_hessian_as_covariance(
     scene, unknowns, matrix, free = tiny
     posterior = Posterior(scene, unknowns, np.random.default_rng(0))
     samples = np.stack([posterior.drawn().flat() for _ in range(DRAWS)])
-    covariance = np.linalg.inv(matrix[np.ix_(free, free)])
+    covariance = np.linalg.pinv(matrix[np.ix_(free, free)], rcond=1e-10, hermitian=True)
     tolerance = 4 * np.sqrt(2 / DRAWS)
     # What a measurement reads: displacements, gains, frames; not the potential's free constant.
     size = unknowns.potentials.size
@@ -109,17 +115,17 @@ def test_the_log_volume_falls_by_that_of_better_data(
     tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
 ) -> None:
     """Half the change of log det H as the data improve, within the scatter of the probes."""
-    scene, unknowns, matrix, free = tiny
+    scene, unknowns, matrix, _ = tiny
     better = replace(scene, weights=16 * scene.weights)
     dense, _ = dense_hessian(better, unknowns)
-    exact = [np.linalg.slogdet(m[np.ix_(free, free)])[1] / 2 for m in (matrix, dense)]
+    exact = [half_log_determinant(one) for one in (matrix, dense)]
     found = [
         np.mean(
             [Posterior(one, unknowns, np.random.default_rng(seed)).log_volume() for seed in (4, 5)]
         )
         for one in (scene, better)
     ]
-    assert found[1] - found[0] == pytest.approx(exact[1] - exact[0], rel=0.15)
+    assert found[1] - found[0] == pytest.approx(exact[1] - exact[0], rel=0.1)
 
 
 @pytest.mark.parametrize("true", [30.0, 300.0])
