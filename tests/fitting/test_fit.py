@@ -15,13 +15,13 @@ from napari_shadowinv.fitting.measurements import strengths_of
 from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.physics.setup import ProtonSetup
 
-SIZE = (56, 64)
+SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
 NOISE = 0.03
 PLAIN = FitOptions(samples=0, threads=1)
-RING_AND_SPOT = together(bump(3.2, 5, (25, 37)), bump(-1.6, 5.5, (34, 22)))
+RING_AND_SPOT = together(bump(3.2, 4.5, (20, 32)), bump(-1.6, 5, (30, 19)))
 """Rays cross around a ring, and behind a spot."""
-WEAK = bump(0.4, 8, (26, 33))
+WEAK = bump(0.4, 8, (22, 29))
 
 
 def shots_of(displacement: Displacement, **changes: Any) -> list[FloatArray]:
@@ -115,7 +115,7 @@ def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
 
 
 def test_three_energies_tell_a_magnetic_field_from_an_electric_one() -> None:
-    magnetic, electric = bump(1.2, 7, (27, 37)), bump(-0.8, 6, (33, 26))
+    magnetic, electric = bump(1.2, 6, (22, 32)), bump(-0.8, 5.5, (28, 23))
     lengths = {"source_object_distance": 0.01, "object_image_distance": 0.2, "pixel_size": 1e-6}
     setups = [ProtonSetup(energy=energy, **lengths) for energy in (5, 14.7, 40)]
     images = [
@@ -161,7 +161,7 @@ def test_an_object_that_has_moved_between_the_images_is_told(
 
 def test_energies_that_hardly_differ_tell_no_more_than_one_image() -> None:
     """Where rays cross over much of the image, that is too little."""
-    strong = bump(5, 9, (27, 31))
+    strong = bump(4.5, 8, (23, 27))
     images = [counted(lambda y, x: s * strong(y, x), SIZE) for s in (1, 0.97)]  # noqa: B023
     options = FitOptions(samples=0, steps=10, threads=1)
     result = fit(noisy(images, NOISE), strengths=[1, 0.97], noise=NOISE, options=options)
@@ -172,7 +172,7 @@ def test_energies_that_hardly_differ_tell_no_more_than_one_image() -> None:
 
 def test_a_start_at_the_truth_is_taken() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)
-    y, x = np.indices(SIZE) - np.array([26, 33])[:, None, None]
+    y, x = np.indices(SIZE) - np.array([22, 29])[:, None, None]
     truth = 0.4 * 8**2 * np.exp(-(y**2 + x**2) / 2 / 8**2)
     result = fit(image, noise=0.02, start=truth, options=PLAIN)
     assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04

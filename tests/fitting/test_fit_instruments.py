@@ -114,17 +114,23 @@ def test_sides_may_be_odd_and_unlike() -> None:
 
 
 def test_units_of_the_images_do_not_matter(shots: list[FloatArray]) -> None:
+    """Not even by rounding, if one is a power of two of the other."""
     images = noisy(shots, NOISE)
-    one = fitted(images)
-    thousand = fitted(1000 * images, noise=1000 * NOISE)
-    assert distance(thousand.fields[0].displacement, one.fields[0].displacement) < 1e-3
-    np.testing.assert_allclose(thousand.chi2, one.chi2, rtol=1e-3)
-    assert thousand.reprojection.mean() == pytest.approx(1000 * one.reprojection.mean(), rel=1e-3)
+    options = FitOptions(samples=0, steps=5, threads=1)
+    one, other = (
+        fit(unit * images, strengths=STRENGTHS, noise=unit * NOISE, options=options)
+        for unit in (1, 1024)
+    )
+    np.testing.assert_array_equal(one.fields[0].displacement, other.fields[0].displacement)
+    np.testing.assert_array_equal(one.chi2, other.chi2)
+    np.testing.assert_array_equal(1024 * one.reprojection, other.reprojection)
 
 
 def test_noise_that_nobody_tells_is_found_in_the_images(shots: list[FloatArray]) -> None:
+    """Folds of an object that fills the image look like some of it."""
     result = fitted(noisy(shots, NOISE), noise=None)
-    np.testing.assert_allclose(result.chi2, 1, atol=0.3)
+    assert (0.6 < result.chi2).all()
+    assert (result.chi2 < 1.2).all()
     assert error(result) < 0.03
 
 
@@ -182,5 +188,5 @@ def test_each_step_is_told_with_its_stage_and_objective() -> None:
     messages = " ".join(one.message for one in told)
     for stage in ("from near", "transport", "smoothness", "full size", "samples"):
         assert f"{stage}, objective" in messages
-    steps = [one.done for one in told]
+    steps = [one.step for one in told]
     assert steps == sorted(steps)
