@@ -22,6 +22,8 @@ from napari_shadowinv.fitting.options import FitOptions
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
+    MIDDLE,
+    MIDDLE_SPACING,
     Found,
     Start,
     refined,
@@ -44,7 +46,6 @@ _SHARES_OF_TRANSPORT = (1.0, 1.4, 1.9, 2.4)  # past caustics, transport is too w
 _ROUNDED = 8.0  # px
 _TRANSPORT_SITES = 10_000
 _SMOOTHED_ERRORS = 4.0  # px
-_MIDDLE = 2
 
 
 def fit(
@@ -161,8 +162,7 @@ def fit(
             scene = _reweighted(given, scene, best)
         basins = _basins(scene, best, found[1:], tell)
     with _timed("full size", seconds):
-        fine = replace(scene, spacing=options.spacing)
-        unknowns, value, taken = refined(fine, best, iterations=options.steps, tell=tell)
+        fine, unknowns, value, taken = refined(scene, best, options, tell)
     with _timed("samples", seconds):
         errors = _errors(scene, best, given, options, rng, tell)
     return _result(
@@ -240,7 +240,7 @@ def _reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
 
 def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tuple[Basin, ...]:
     """The best answer and others, with the same λ and without blur."""
-    middle = replace(coarser(scene, _MIDDLE), spacing=1 / 3)
+    middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
     found = []
     for one in (best, *others[:3]):
         unknowns, value, _ = descend(
@@ -267,7 +267,7 @@ def _errors(
     """Standard deviation of each field's displacement in px, (M, 2, H, W)."""
     if options.samples < 2:
         return None
-    middle = replace(coarser(scene, _MIDDLE), spacing=1 / 3)
+    middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
     posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", best.value))
     squares: FloatArray | float = 0.0
     for _ in range(options.samples):
@@ -314,10 +314,11 @@ def _result(
         uncertainty = float(
             np.sqrt(((errors**2).mean(axis=(1, 2, 3)) / np.maximum(size, 1e-12)).max())
         )
-    folded = max(
-        float((jacobian_determinant(moved) < 0).mean())
-        for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, found)
-    )
+    jacobians = [
+        jacobian_determinant(moved) for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, found)
+    ]
+    jacobian = max(jacobians, key=lambda each: int((each < 0).sum()))
+    folded = float((jacobian < 0).mean())
     others = [(basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]]
     verdict, explanation = judged(
         chi2=chi2,
@@ -325,6 +326,7 @@ def _result(
         others=others,
         single=given.single,
         beam_unknown=scene.beam_modes > 0,
+        jacobian=jacobian,
         folded=folded,
         uncertainty=uncertainty,
     )

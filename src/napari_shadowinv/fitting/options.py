@@ -83,12 +83,15 @@ class FitOptions(BaseModel):
         title="Samples",
         description="Random fields from which the error bars are made; 0 for none.",
     )
-    spacing: float = Field(
-        default=0.25,
-        gt=0.05,
+    spacing: float | None = Field(
+        default=None,
+        ge=0.05,
         le=0.5,
         title="Spacing of rays (px)",
-        description="Largest distance between the landing points of neighbouring rays.",
+        description=(
+            "Largest distance between the landing points of neighbouring rays. Default: 0.25, and "
+            "0.15 if bright lines need it."
+        ),
     )
     steps: int = Field(
         default=100,

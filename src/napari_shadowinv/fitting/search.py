@@ -11,19 +11,29 @@ from scipy.ndimage import map_coordinates
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.descent import coarser, descend, finer, smoothness_in_pixels
 from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.options import FitOptions
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Unknowns
 
-__all__ = ["Found", "Start", "refined", "search", "with_likely_smoothness"]
+__all__ = [
+    "MIDDLE",
+    "MIDDLE_SPACING",
+    "Found",
+    "Start",
+    "refined",
+    "search",
+    "with_likely_smoothness",
+]
 
 Tell = Callable[[str, float], None]
 
-_MIDDLE = 2  # pixels in which starts are compared and λ is found
+MIDDLE = 2  # pixels in which starts are compared and λ is found
 _FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
 _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
 _COARSE_STEPS, _COARSE_GAIN = 60, 3.0
-_COARSE_SPACING = 1 / 3
+_COARSE_SPACING, MIDDLE_SPACING = 1 / 3, 0.25
+_SPACINGS, _EXPLAINED = (0.25, 0.15), 1.05  # px, and the χ² for which the first is dense enough
 _ROUNDS, _SETTLED = 6, 0.25  # of λ and κ; and by what share they may still change
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
@@ -45,7 +55,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Found:
-    """Where a descent has ended, in pixels of `_MIDDLE`."""
+    """Where a descent has ended, in pixels of `MIDDLE`."""
 
     start: str
     unknowns: Unknowns
@@ -126,7 +136,7 @@ def with_likely_smoothness(
     if not given:
         smoothness = np.tile(_FIRST_SMOOTHNESS, (len(smoothness), 1))
     for _ in range(_ROUNDS):
-        middle = coarser(replace(scene, smoothness=smoothness, spacing=_COARSE_SPACING), _MIDDLE)
+        middle = coarser(replace(scene, smoothness=smoothness, spacing=MIDDLE_SPACING), MIDDLE)
         unknowns, value, _ = descend(
             middle,
             unknowns,
@@ -138,12 +148,12 @@ def with_likely_smoothness(
             break
         posterior = Posterior(middle, unknowns, rng, lambda: tell("smoothness", value))  # noqa: B023
         likely, change = posterior.likely_smoothness()
-        smoothness = likely / smoothness_in_pixels(_MIDDLE)
+        smoothness = likely / smoothness_in_pixels(MIDDLE)
         if change < _SETTLED:
             break
     if not given:
         smoothness = _HELD * smoothness
-        middle = coarser(replace(scene, smoothness=smoothness, spacing=_COARSE_SPACING), _MIDDLE)
+        middle = coarser(replace(scene, smoothness=smoothness, spacing=MIDDLE_SPACING), MIDDLE)
         unknowns, value, _ = descend(
             middle,
             unknowns,
@@ -158,14 +168,22 @@ def with_likely_smoothness(
 
 
 def refined(
-    scene: Scene, found: Found, *, iterations: int, tell: Tell
-) -> tuple[Unknowns, float, int]:
-    """Descend with the pixels as recorded."""
-    unknowns = finer(found.unknowns)
-    return descend(
-        scene,
-        unknowns,
-        iterations=iterations,
-        least_gain=1.0,
-        after_step=lambda now: tell("full size", now),
-    )
+    scene: Scene, found: Found, options: FitOptions, tell: Tell
+) -> tuple[Scene, Unknowns, float, int]:
+    """Descend with the pixels as recorded, with rays as dense as the data need."""
+    unknowns, value, steps = finer(found.unknowns), np.inf, 0
+    spacings = _SPACINGS if options.spacing is None else (options.spacing,)
+    for spacing in spacings:
+        scene = replace(scene, spacing=spacing)
+        unknowns, value, taken = descend(
+            scene,
+            unknowns,
+            iterations=options.steps // len(spacings),
+            least_gain=1.0,
+            after_step=lambda now: tell("full size", now),
+        )
+        steps += taken
+        chi2 = scene.chi2(unknowns, scene.ray_counts(unknowns))
+        if chi2.max() < _EXPLAINED:
+            break
+    return scene, unknowns, value, steps

@@ -16,6 +16,9 @@ from napari_shadowinv._typing import FloatArray
 __all__ = ["Verdict", "judged"]
 
 _FOLDED = 0.15  # of the pixels, in one image
+# A fold that was found is deep; an answer that only should have one is squeezed flat there. The
+# ratio is 3 to 10 for fields that come out well, 0 to 0.7 for those that do not.
+_SQUEEZED, _FLAT, _MEETING, _DEEP = 0.01, 0.1, 0.2, 2.0
 _MISFIT = 1.3  # χ²
 _AS_GOOD = 0.03  # of the objective
 _OTHER_FIELD = 0.05  # of the displacement, r.m.s.
@@ -39,6 +42,7 @@ def judged(
     others: Sequence[tuple[float, float]],
     single: bool,
     beam_unknown: bool,
+    jacobian: FloatArray,
     folded: float,
     uncertainty: float,
 ) -> tuple[Verdict, str]:
@@ -56,6 +60,8 @@ def judged(
         Whether there is one image only, or several with the same information.
     beam_unknown : bool
         Whether the beam is fitted, too.
+    jacobian : ndarray, shape (H, W)
+        Determinant of the map to the image where it is folded most.
     folded : float
         Share of the pixels whose rays have crossed others, in the image where it is largest.
     uncertainty : float
@@ -80,6 +86,12 @@ def judged(
             f"rays cross over {folded:.0%} of the image, and one image does not tell which came "
             "from where: the field may be wrong though the image is explained; take another energy"
         )
+    if single and _is_squeezed(jacobian):
+        return Verdict.AMBIGUOUS, (
+            "rays meet or cross, and one image does not tell whether they have: the same bright "
+            "lines come from a weaker field without folds and from a stronger one with them; take "
+            "another energy"
+        )
     rivals = [away for worse, away in others if worse < _AS_GOOD and away > _OTHER_FIELD]
     if rivals:
         return Verdict.SEVERAL, (
@@ -97,3 +109,9 @@ def judged(
         f"all starts lead to one field, which explains {several} to the noise (χ² "
         f"{np.min(chi2):.2f} to {np.max(chi2):.2f})"
     )
+
+
+def _is_squeezed(jacobian: FloatArray) -> bool:
+    """Whether rays nearly meet over much of an image without clearly crossing."""
+    deep, flat = (jacobian < -_FLAT).sum(), (np.abs(jacobian) < _FLAT).sum()
+    return bool((jacobian < _MEETING).mean() > _SQUEEZED and deep < _DEEP * flat)
