@@ -18,7 +18,8 @@ from napari_shadowinv.physics.setup import ProtonSetup
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
 NOISE = 0.03
-PLAIN = FitOptions(samples=0, threads=1)
+PLAIN = FitOptions(samples=0, steps=30, spacing=0.25, threads=1)
+HASTY = FitOptions(samples=0, steps=5, spacing=0.25, threads=1)
 RING_AND_SPOT = together(bump(3.2, 4.5, (20, 32)), bump(-1.6, 5, (30, 19)))
 """Rays cross around a ring, and behind a spot."""
 WEAK = bump(0.4, 8, (22, 29))
@@ -66,9 +67,7 @@ def test_the_error_bars_are_as_large_as_the_error(found: Fit) -> None:
     assert found.report.uncertainty == pytest.approx(told / size)
 
 
-def test_the_parts_of_a_result_belong_together(
-    found: Fit, folded_shots: list[FloatArray]
-) -> None:
+def test_the_parts_of_a_result_belong_together(found: Fit, folded_shots: list[FloatArray]) -> None:
     (field,) = found.fields
     data = noisy(folded_shots, NOISE)
     np.testing.assert_allclose(found.images, data, rtol=1e-12)
@@ -90,9 +89,7 @@ def test_strong_rays_first_or_weak_ones_makes_no_difference(
     found: Fit, folded_shots: list[FloatArray]
 ) -> None:
     """The field is that of the first image."""
-    turned = fit(
-        noisy(folded_shots, NOISE)[::-1], strengths=[0.6, 1], noise=NOISE, options=PLAIN
-    )
+    turned = fit(noisy(folded_shots, NOISE)[::-1], strengths=[0.6, 1], noise=NOISE, options=PLAIN)
     one, other = found.fields[0].displacement, turned.fields[0].displacement / 0.6
     assert distance(other, one) < 0.02
 
@@ -106,7 +103,7 @@ def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
         strengths=STRENGTHS,
         source="unknown",
         noise=NOISE,
-        options=FitOptions(samples=0, beam_modes=4, threads=1),
+        options=PLAIN.model_copy(update={"beam_modes": 4}),
     )
     assert distance(result.fields[0].displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.05
     assert result.verdict is Verdict.DETERMINED
@@ -140,7 +137,7 @@ def test_one_image_tells_a_weak_field() -> None:
 
 def test_one_image_does_not_tell_an_unknown_beam_from_the_field() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)
-    options = FitOptions(samples=0, ambiguous=True, beam_modes=4, steps=10, threads=1)
+    options = HASTY.model_copy(update={"ambiguous": True, "beam_modes": 4})
     result = fit(image, source="unknown", noise=0.02, options=options)
     assert result.verdict is Verdict.AMBIGUOUS
     assert result.chi2[0] < 1.3
@@ -150,9 +147,8 @@ def test_an_object_that_has_moved_between_the_images_is_told(
     folded_shots: list[FloatArray],
 ) -> None:
     moved = counted(lambda y, x: 0.6 * RING_AND_SPOT(y - 3, x), SIZE)
-    options = FitOptions(samples=0, steps=10, threads=1)
     result = fit(
-        noisy([folded_shots[0], moved], NOISE), strengths=STRENGTHS, noise=NOISE, options=options
+        noisy([folded_shots[0], moved], NOISE), strengths=STRENGTHS, noise=NOISE, options=HASTY
     )
     assert result.verdict is Verdict.MISFIT
     assert "image 2" in result.explanation
@@ -163,8 +159,7 @@ def test_energies_that_hardly_differ_tell_no_more_than_one_image() -> None:
     """Where rays cross over much of the image, that is too little."""
     strong = bump(4.5, 8, (23, 27))
     images = [counted(lambda y, x: s * strong(y, x), SIZE) for s in (1, 0.97)]  # noqa: B023
-    options = FitOptions(samples=0, steps=10, threads=1)
-    result = fit(noisy(images, NOISE), strengths=[1, 0.97], noise=NOISE, options=options)
+    result = fit(noisy(images, NOISE), strengths=[1, 0.97], noise=NOISE, options=HASTY)
     assert result.folded > 0.15
     assert result.verdict in (Verdict.AMBIGUOUS, Verdict.MISFIT)
     assert result.verdict is Verdict.MISFIT or "one image" in result.explanation

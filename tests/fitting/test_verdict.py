@@ -15,6 +15,7 @@ GOOD: dict[str, Any] = {
     "others": [],
     "single": False,
     "beam_unknown": False,
+    "jacobian": np.ones((20, 20)),
     "folded": 0.3,
     "uncertainty": 0.02,
 }
@@ -57,6 +58,26 @@ def test_one_image_tells_few_folds_and_not_many(folded: float, expected: Verdict
     assert verdict is expected
     assert ("40%" in why) == (expected is Verdict.AMBIGUOUS)
     assert "one image" in why
+
+
+@pytest.mark.parametrize(
+    ("meeting", "crossed", "expected"),
+    [
+        (0, 0, Verdict.DETERMINED),  # rays stay apart
+        (20, 0, Verdict.AMBIGUOUS),  # they meet, and nowhere have they crossed
+        (20, 10, Verdict.AMBIGUOUS),
+        (5, 30, Verdict.DETERMINED),  # they clearly cross
+    ],
+)
+def test_one_image_tells_rays_that_clearly_cross_and_not_those_that_nearly_meet(
+    meeting: int, crossed: int, expected: Verdict
+) -> None:
+    jacobian = np.ones(400)
+    jacobian[:meeting] = 0.02
+    jacobian[meeting : meeting + crossed] = -0.8
+    changes = {"jacobian": jacobian.reshape(20, 20), "folded": crossed / 400}
+    assert judged(**GOOD | ALONE | changes)[0] is expected
+    assert judged(**GOOD | changes)[0] is Verdict.DETERMINED  # several images tell
 
 
 def test_several_fields_that_explain_as_well_are_told() -> None:
