@@ -53,7 +53,7 @@ def test_two_energies_tell_a_field_whose_rays_cross(found: Fit) -> None:
     assert found.folded > 0.05
     assert found.verdict is Verdict.DETERMINED
     assert "2 images" in found.explanation
-    assert (0.85 < found.chi2).all()
+    assert (found.chi2 > 0.85).all()
     assert (found.chi2 < 1.15).all()
 
 
@@ -91,7 +91,7 @@ def test_strong_rays_first_or_weak_ones_makes_no_difference(
     """The field is that of the first image."""
     turned = fit(noisy(folded_shots, NOISE)[::-1], strengths=[0.6, 1], noise=NOISE, options=PLAIN)
     one, other = found.fields[0].displacement, turned.fields[0].displacement / 0.6
-    assert distance(other, one) < 0.02
+    assert distance(other, one) < 0.04
 
 
 def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
@@ -103,7 +103,7 @@ def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
         strengths=STRENGTHS,
         source="unknown",
         noise=NOISE,
-        options=PLAIN.model_copy(update={"beam_modes": 4}),
+        options=FitOptions(samples=0, beam_modes=4, threads=1),
     )
     assert distance(result.fields[0].displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.05
     assert result.verdict is Verdict.DETERMINED
