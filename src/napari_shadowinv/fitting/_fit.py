@@ -45,7 +45,7 @@ _FROM_FIELD = ((4, 1.0), (2, 1.0))
 _SHARES_OF_TRANSPORT = (1.0, 1.4, 1.9, 2.4)  # past caustics, transport is too weak
 _ROUNDED = 8.0  # px
 _TRANSPORT_SITES = 10_000
-_SMOOTHED_ERRORS = 4.0  # px
+_SMOOTHED_ERRORS, _SPACING_OF_SAMPLES = 4.0, 1 / 3  # px
 
 
 def fit(
@@ -242,14 +242,16 @@ def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tu
     """The best answer and others, with the same λ and without blur."""
     middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
     found = []
-    for one in (best, *others[:3]):
-        unknowns, value, _ = descend(
-            middle,
-            one.unknowns,
-            iterations=60,
-            least_gain=3.0,
-            after_step=lambda now: tell("other starts", now),
-        )
+    for one in (best, *others[:2]):
+        unknowns, value = one.unknowns, one.value
+        if one is not best:
+            unknowns, value, _ = descend(
+                middle,
+                unknowns,
+                iterations=60,
+                least_gain=3.0,
+                after_step=lambda now: tell("other starts", now),
+            )
         chi2 = middle.chi2(unknowns, middle.ray_counts(unknowns)).mean()
         displacement = 2 * np.stack([middle.rays.displacement(p) for p in unknowns.potentials])
         end = replace(one, unknowns=unknowns, value=value, displacement=displacement)
@@ -267,7 +269,7 @@ def _errors(
     """Standard deviation of each field's displacement in px, (M, 2, H, W)."""
     if options.samples < 2:
         return None
-    middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+    middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
     posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", best.value))
     squares: FloatArray | float = 0.0
     for _ in range(options.samples):

@@ -77,7 +77,7 @@ class FitOptions(BaseModel):
         description="With an unknown source: how many cosines its logarithm has along each axis.",
     )
     samples: int = Field(
-        default=8,
+        default=6,
         ge=0,
         le=1000,
         title="Samples",

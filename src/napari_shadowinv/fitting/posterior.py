@@ -26,7 +26,7 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 
 __all__ = ["Posterior"]
 
-_ROUGHLY, _CLOSELY, _MOST_STEPS = 0.05, 0.01, 200
+_ROUGHLY, _CLOSELY, _MOST_STEPS = 0.05, 0.02, 150
 _PROBES, _LANCZOS = 4, 25
 _LEAST_DETERMINED = 1e-3  # coefficients
 _OVERSHOOT, _MOST_CHANGE = 1.7, 15.0  # of λ in a step; it would approach its end too slowly

@@ -32,9 +32,10 @@ MIDDLE = 2  # pixels in which starts are compared and λ is found
 _FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
 _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
 _COARSE_STEPS, _COARSE_GAIN = 60, 3.0
+_HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
 _COARSE_SPACING, MIDDLE_SPACING = 1 / 3, 0.25
 _SPACINGS, _EXPLAINED = (0.25, 0.15), 1.05  # px, and the χ² for which the first is dense enough
-_ROUNDS, _SETTLED = 6, 0.25  # of λ and κ; and by what share they may still change
+_ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share they may still change
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
 _HELD = 0.1  # of them
@@ -55,12 +56,13 @@ class Start:
 
 @dataclass(frozen=True)
 class Found:
-    """Where a descent has ended, in pixels of `MIDDLE`."""
+    """Where a descent has ended, in pixels that are `bin` wide."""
 
     start: str
     unknowns: Unknowns
     value: float
     displacement: FloatArray  # of all fields in the first image, px of the recorded image
+    bin: int = 2
 
     def distance(self, other: Found) -> float:
         """Return how far another displacement is from this one, relative to it (r.m.s.)."""
@@ -80,46 +82,62 @@ def _splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
 
 
 def search(scene: Scene, starts: Sequence[Start], tell: Tell) -> list[Found]:
-    """Descend from each start to pixels of two; return what differs, best first."""
+    """Descend from each start to pixels of two; return what differs, best first.
+
+    Of the starts that have come to the same stage before the last, those go on that are best.
+    """
     rough = replace(
         scene,
         smoothness=_COARSE_SMOOTHNESS * np.tile(_FIRST_SMOOTHNESS, (len(scene.smoothness), 1)),
         spacing=_COARSE_SPACING,
     )
-    ends: list[Found] = []
+    halfway: dict[tuple[int, float], list[Found]] = {}
+    ends = []
     for start in starts:
-        end = _descended(rough, start, tell)
-        ends.append(end)
-    ends.sort(key=lambda end: end.value)
-    different: list[Found] = []
-    for end in ends:
-        if all(kept.distance(end) > _SAME_FIELD for kept in different):
-            different.append(end)
-    return different
-
-
-def _descended(scene: Scene, start: Start, tell: Tell) -> Found:
-    unknowns: Unknowns | None = None
-    value, before = np.inf, 0
-    for factor, blur in start.stages:
-        stage = replace(coarser(scene, factor), blur=blur)
-        if unknowns is None:
-            unknowns = stage.nothing()
-            if start.potential is not None:
-                unknowns.potentials[0] = _splines_of(stage, start.potential)
+        *before, last = start.stages
+        found = _begun(coarser(rough, start.stages[0][0]), start)
+        for stage in before:
+            found = _descended(rough, found, stage, tell)
+        if before:
+            halfway.setdefault(before[-1], []).append(found)
         else:
-            for _ in range(int(np.log2(before // factor))):
-                unknowns = finer(unknowns)
-        before = factor
-        unknowns, value, _ = descend(
-            stage,
-            unknowns,
-            iterations=_COARSE_STEPS,
-            least_gain=_COARSE_GAIN,
-            after_step=lambda now: tell(start.name, now),
-        )
-    assert unknowns is not None
-    return Found(start.name, unknowns, value, _displacement(stage, unknowns))
+            ends.append(_descended(rough, found, last, tell))
+    for rivals in halfway.values():
+        for found in _different(rivals)[:_CONTINUED]:
+            ends.append(_descended(rough, found, starts[0].stages[-1], tell))
+    return _different(ends)
+
+
+def _different(found: list[Found]) -> list[Found]:
+    """Those that differ and are not hopeless, best first."""
+    kept: list[Found] = []
+    for one in sorted(found, key=lambda each: each.value):
+        if all(other.distance(one) > _SAME_FIELD for other in kept):
+            kept.append(one)
+    return [one for one in kept if one.value < _HOPELESS * kept[0].value]
+
+
+def _begun(scene: Scene, start: Start) -> Found:
+    unknowns = scene.nothing()
+    if start.potential is not None:
+        unknowns.potentials[0] = _splines_of(scene, start.potential)
+    return Found(start.name, unknowns, np.inf, _displacement(scene, unknowns), scene.bin)
+
+
+def _descended(scene: Scene, found: Found, stage: tuple[int, float], tell: Tell) -> Found:
+    factor, blur = stage
+    now = replace(coarser(scene, factor), blur=blur)
+    unknowns = found.unknowns
+    for _ in range(int(np.log2(found.bin // factor))):
+        unknowns = finer(unknowns)
+    unknowns, value, _ = descend(
+        now,
+        unknowns,
+        iterations=_COARSE_STEPS,
+        least_gain=_COARSE_GAIN,
+        after_step=lambda now: tell(found.start, now),
+    )
+    return Found(found.start, unknowns, value, _displacement(now, unknowns), factor)
 
 
 def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
@@ -140,7 +158,7 @@ def with_likely_smoothness(
         unknowns, value, _ = descend(
             middle,
             unknowns,
-            iterations=_COARSE_STEPS,
+            iterations=_ROUND_STEPS,
             least_gain=_COARSE_GAIN,
             after_step=lambda now: tell("smoothness", now),
         )
