@@ -174,3 +174,19 @@ def test_a_start_at_the_truth_is_taken() -> None:
     for wrong in (truth[1:], np.full(SIZE, np.nan)):
         with pytest.raises(InputError, match="start has shape"):
             fit(image, noise=0.02, start=wrong, options=PLAIN)
+
+
+def test_a_fit_that_runs_out_of_steps_says_so() -> None:
+    image = noisy([counted(WEAK, SIZE)], 0.02)[0]
+    for steps in (1, 3, 100):
+        result = fit(image, noise=0.02, options=FitOptions(samples=0, steps=steps, threads=1))
+        assert result.report.converged == (steps == 100)
+        assert 1 <= result.report.iterations <= steps
+
+
+def test_a_shot_without_the_object_is_one_more_image() -> None:
+    """Its strength is zero: an image of the beam."""
+    images = noisy([counted(WEAK, SIZE), np.ones(SIZE)], 0.02)
+    result = fit(images, strengths=[1, 0], noise=0.02, options=PLAIN)
+    assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
+    assert result.verdict is Verdict.DETERMINED
