@@ -157,12 +157,12 @@ def test_an_object_that_has_moved_between_the_images_is_told(
 
 def test_energies_that_hardly_differ_tell_no_more_than_one_image() -> None:
     """Where rays cross over much of the image, that is too little."""
-    strong = bump(4.5, 8, (23, 27))
+    strong = bump(3.2, 8, (23, 27))
     images = [counted(lambda y, x: s * strong(y, x), SIZE) for s in (1, 0.97)]  # noqa: B023
-    result = fit(noisy(images, NOISE), strengths=[1, 0.97], noise=NOISE, options=HASTY)
+    result = fit(noisy(images, 0.1), strengths=[1, 0.97], noise=0.1, options=PLAIN)
     assert result.folded > 0.15
-    assert result.verdict in (Verdict.AMBIGUOUS, Verdict.MISFIT)
-    assert result.verdict is Verdict.MISFIT or "one image" in result.explanation
+    assert result.verdict is Verdict.AMBIGUOUS
+    assert "one image does not tell" in result.explanation
 
 
 def test_a_start_at_the_truth_is_taken() -> None:
