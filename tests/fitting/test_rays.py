@@ -2,118 +2,258 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.rays import KNOT, RayModel
+from napari_shadowinv.fitting.rays import KNOT, Pulls, RayModel, at_rest
 from napari_shadowinv.physics.forward import synthetic_image
 
-SHAPE = (40, 53)
-PAD = 8
+SIZE = (40, 54)
+WEAK, FOLDED = 8.0, 60.0
+
+
+def model_of(
+    size: tuple[int, int] = SIZE, *, spacing: float = 0.25, threads: int | None = None
+) -> RayModel:
+    return RayModel(size, pad=8, spacing=spacing, threads=threads)
 
 
 def places(model: RayModel) -> tuple[FloatArray, FloatArray]:
-    """Where the coefficients' splines have their middles, in px from the image's corner."""
-    y, x = (KNOT * (np.arange(n, dtype=float) - 1) - model.pad for n in model.shape)
-    return np.meshgrid(y, x, indexing="ij")
+    """Middles of the coefficients' splines, px from the middle of the first pixel."""
+    y, x = (KNOT * (np.arange(n) - 1.0) - model.pad - 0.5 for n in model.shape)
+    return tuple(np.meshgrid(y, x, indexing="ij"))  # type: ignore[return-value]
 
 
 def wavy(model: RayModel, strength: float) -> FloatArray:
     """A smooth potential that fades at the edge."""
     y, x = places(model)
     bump = np.exp(-((y - 18) ** 2 + (x - 27) ** 2) / 2 / 7**2)
-    return strength * bump * np.cos((y + 2 * x) / 9)
+    return np.asarray(strength * bump * np.cos((y + 2 * x) / 9))
 
 
-@pytest.fixture
-def model() -> RayModel:
-    y, x = np.indices(SHAPE)
-    return RayModel(1 + 0.3 * np.cos(y / 9) * np.sin(x / 11), PAD)
+def uneven() -> FloatArray:
+    y, x = np.indices(SIZE)
+    return np.asarray(1 + 0.3 * np.cos(y / 9) * np.sin(x / 11))
 
 
-def test_nothing_in_the_way_changes_nothing(model: RayModel) -> None:
-    flat = RayModel(np.ones(SHAPE), PAD)
+def turned() -> FloatArray:
+    """A frame that shifts, turns and stretches by little."""
+    return np.array([0.3, 1.01, -0.02, -0.7, 0.03, 0.98])
+
+
+def slope_along(function: Callable[[float], FloatArray], pull: FloatArray, step: float) -> float:
+    return float((pull * (function(step) - function(-step))).sum() / (2 * step))
+
+
+def test_a_beam_meets_nothing_and_stays_as_it_is() -> None:
+    """But for the little that pixels share at their edges, which a uniform beam does not show."""
+    model, beam = model_of(), uneven()
     still = np.zeros(model.shape)
-    np.testing.assert_allclose(flat.image(still, flat.ray_counts(still)), 1, rtol=1e-12)
-    # A beam that varies is blurred within a pixel, by a third of one.
-    image = model.image(still, model.ray_counts(still))
-    np.testing.assert_allclose(image[1:-1, 1:-1], model.source[1:-1, 1:-1], rtol=2e-3)
+    counts = model.ray_counts(still)
+    flat = model.image(still, counts, model.around(np.ones(SIZE)))
+    np.testing.assert_allclose(flat, 1, rtol=1e-12)
+    image = model.image(still, counts, model.around(beam))
+    np.testing.assert_allclose(image, beam, rtol=1e-3)
+
+
+def test_around_continues_the_edge_and_keeps_the_image() -> None:
+    model, beam = model_of(), uneven()
+    around = model.around(beam)
+    assert around.shape == tuple(KNOT * n for n in model.cells)
+    np.testing.assert_array_equal(around[8:48, 8:62], beam)
+    np.testing.assert_array_equal(around[0, 8:62], beam[0])
+    np.testing.assert_array_equal(around[8:48, -1], beam[:, -1])
+
+
+def test_flux_is_conserved_where_nothing_reaches_the_edge() -> None:
+    model = model_of()
+    y, x = places(model)
+    inside = np.maximum(1 - ((y - 20) / 14) ** 2 - ((x - 26) / 18) ** 2, 0)
+    potential = 15 * inside**3 * np.cos(y / 2)
+    image = model.image(potential, model.ray_counts(potential), model.around(np.ones(SIZE)))
+    assert image.max() > 2
+    assert image.sum() == pytest.approx(image.size, rel=1e-12)
 
 
 @pytest.mark.parametrize("curvature", [0.1, -0.3, 2.2])
 def test_a_lens_magnifies_also_beyond_its_focus(curvature: float) -> None:
     """Splines hold a paraboloid exactly; behind it the beam is 1 / (1 - curvature)² as bright."""
-    model = RayModel(np.ones((24, 24)), 40)
+    model = RayModel((24, 24), 40, spacing=0.05)
     y, x = places(model)
-    bowl = curvature * ((y - 12) ** 2 + (x - 12) ** 2) / 2
-    image = model.image(bowl, model.ray_counts(bowl, 0.05))
-    np.testing.assert_allclose(image, (1 - curvature) ** -2, rtol=2e-3)
+    bowl = curvature * ((y - 11.5) ** 2 + (x - 11.5) ** 2) / 2
+    image = model.image(bowl, model.ray_counts(bowl), model.around(np.ones((24, 24))))
+    np.testing.assert_allclose(image, (1 - curvature) ** -2, rtol=0.01)
+    assert image.mean() == pytest.approx((1 - curvature) ** -2, rel=1e-3)
     offset = np.indices((24, 24)) - 11.5
     np.testing.assert_allclose(model.displacement(bowl), -curvature * offset, atol=1e-12)
 
 
-@pytest.mark.parametrize("strength", [8.0, 60.0])
+@pytest.mark.parametrize(("strength", "tolerance"), [(WEAK, 0.01), (FOLDED, 0.08)])
 def test_it_agrees_with_the_exact_deposit_of_triangles_also_where_rays_cross(
-    model: RayModel, strength: float
+    strength: float, tolerance: float
 ) -> None:
+    model, beam = model_of(spacing=0.1), uneven()
     potential = wavy(model, strength)
-    image = model.image(potential, model.ray_counts(potential, 0.1))
-    expected = synthetic_image(model.displacement(potential), model.source)
-    folded = expected.max() > 4
-    assert folded == (strength > 20)
-    # The triangles bend at pixels only.
+    image = model.image(potential, model.ray_counts(potential), model.around(beam))
+    expected = synthetic_image(model.displacement(potential), beam, rays_per_pixel=64)
+    assert (expected.max() > 4) == (strength == FOLDED)
     difference = (image - expected)[2:-2, 2:-2]
-    assert np.sqrt((difference**2).mean()) < (0.08 if folded else 0.01)
+    assert np.sqrt((difference**2).mean()) < tolerance
 
 
-def test_flux_is_conserved_where_nothing_reaches_the_edge() -> None:
-    model = RayModel(np.ones(SHAPE), PAD)
-    y, x = places(model)
-    inside = np.maximum(1 - ((y - 20) / 14) ** 2 - ((x - 26) / 18) ** 2, 0)
-    potential = 15 * inside**3 * np.cos(y / 2)
-    image = model.image(potential, model.ray_counts(potential))
-    assert image.max() > 2
-    assert image.sum() == pytest.approx(image.size, rel=1e-12)
+def test_rays_that_start_beyond_the_edge_arrive() -> None:
+    """A uniform shift brings the strip's flux into the image."""
+    model = model_of()
+    beam = np.zeros(tuple(KNOT * n for n in model.cells))
+    beam[:8] = 3.0
+    y, _ = places(model)
+    image = model.image(-5 * y, model.ray_counts(y), beam)
+    np.testing.assert_allclose(image[:4], 3, rtol=1e-12)
+    np.testing.assert_allclose(image[6:], 0, atol=1e-12)
+    np.testing.assert_allclose(image[:6].sum(axis=0), 15, rtol=1e-12)
 
 
-@pytest.mark.parametrize("strength", [8.0, 60.0])
-def test_the_gradient_is_that_of_the_image(model: RayModel, strength: float) -> None:
-    rng = np.random.default_rng(0)
-    potential, pull = wavy(model, strength), rng.normal(size=SHAPE)
-    counts = model.ray_counts(potential, 0.4)
-    gradient = model.gradient(potential, counts, pull)
-    step = 1e-6
-    for _ in range(3):
-        way = rng.normal(size=model.shape)
-        ahead, behind = (model.image(potential + s * way, counts) for s in (step, -step))
-        slope = (pull * (ahead - behind)).sum() / (2 * step)
-        assert (gradient * way).sum() == pytest.approx(slope, rel=1e-5)
+def test_beyond_the_image_lies_what_a_larger_detector_would_see() -> None:
+    larger = RayModel(SIZE, 8, beyond=3)
+    potential, beam = wavy(larger, FOLDED), larger.around(uneven())
+    counts = larger.ray_counts(potential)
+    image = larger.image(potential, counts, beam)
+    assert image.shape == larger.seen == (46, 60)
+    np.testing.assert_allclose(
+        image[3:-3, 3:-3], model_of().image(potential, counts, beam), rtol=1e-12, atol=1e-12
+    )
 
 
-def test_rays_land_as_densely_as_asked(model: RayModel) -> None:
-    """Neighbouring rays start 2 / n px apart and are spread by the stretch of their cell."""
-    potential = wavy(model, 60)
-    for spacing in (0.5, 0.2):
-        counts = model.ray_counts(potential, spacing)
-        assert counts.shape == model.cells
-        landed = np.indices(SHAPE) + model.displacement(potential)
-        apart = max(np.abs(np.diff(landed, axis=axis)).max() for axis in (1, 2))
-        inner = counts[PAD // KNOT : -PAD // KNOT, PAD // KNOT : -PAD // KNOT]
-        assert KNOT / inner.max() * apart <= spacing * KNOT
-    assert (model.ray_counts(np.zeros(model.shape), 0.25) == KNOT / 0.25).all()
-
-
-def test_threads_do_not_change_a_bit(model: RayModel) -> None:
-    potential = wavy(model, 60)
+def test_a_detector_shifted_by_whole_pixels_sees_the_image_shifted() -> None:
+    model = model_of()
+    potential, beam = wavy(model, FOLDED), model.around(uneven())
     counts = model.ray_counts(potential)
-    pull = np.random.default_rng(1).normal(size=SHAPE)
-    alone = RayModel(model.source, PAD, threads=1)
+    frame = at_rest()
+    frame[[0, 3]] = 2, -3
+    image = model.image(potential, counts, beam)
+    shifted = model.image(potential, counts, beam, frame)
+    np.testing.assert_allclose(shifted[2:, :-3], image[:-2, 3:], atol=1e-11)
+
+
+def test_a_frame_turns_about_the_middle_of_the_image() -> None:
+    """A magnified detector sees a spot's distance from the middle magnified."""
+    model = model_of()
+    y, x = np.indices(tuple(KNOT * n for n in model.cells)) - model.pad
+    beam = np.exp(-((y - 27) ** 2 + (x - 36) ** 2) / 2 / 2**2)
+    still = np.zeros(model.shape)
+    frame = np.array([0, 1.2, 0, 0, 0, 0.7])
+    image = model.image(still, model.ray_counts(still), beam, frame)
+    rows, columns = np.indices(SIZE)
+    middle = (image * rows).sum() / image.sum(), (image * columns).sum() / image.sum()
+    assert middle[0] == pytest.approx(19.5 + 1.2 * (27 - 19.5), abs=0.01)
+    assert middle[1] == pytest.approx(26.5 + 0.7 * (36 - 26.5), abs=0.01)
+
+
+@pytest.mark.parametrize("strength", [WEAK, FOLDED])
+@pytest.mark.parametrize("part", ["potential", "beam", "frame"])
+def test_gradient_and_change_are_those_of_the_image(strength: float, part: str) -> None:
+    rng = np.random.default_rng(0)
+    model = model_of(spacing=0.4)
+    potential, beam, frame = wavy(model, strength), model.around(uneven()), turned()
+    pull, counts = rng.normal(size=SIZE), model.ray_counts(potential)
+    none = Pulls(np.zeros(model.shape), np.zeros(beam.shape), np.zeros(6))
+    gradient = model.gradient(potential, counts, beam, pull, frame)
+    for _ in range(3):
+        way = rng.normal(size=getattr(none, part).shape)
+        # A turn moves rays at the edge by many pixels.
+        way = way / 20 if part == "frame" else way
+        by = none._replace(**{part: way})
+
+        def image(step: float) -> FloatArray:
+            return model.image(
+                potential + step * by.potential,  # noqa: B023
+                counts,
+                beam + step * by.beam,  # noqa: B023
+                frame + step * by.frame,  # noqa: B023
+            )
+
+        slope = slope_along(image, pull, 1e-6)
+        pushed = float((pull * model.change(potential, counts, beam, by, frame)).sum())
+        pulled = float((getattr(gradient, part) * way).sum())
+        assert pulled == pytest.approx(slope, rel=2e-5)
+        assert pushed == pytest.approx(slope, rel=2e-5)
+
+
+def test_gradient_and_change_are_transposes_of_each_other() -> None:
+    rng = np.random.default_rng(1)
+    model = RayModel(SIZE, 8, beyond=3)
+    potential, beam, frame = wavy(model, FOLDED), model.around(uneven()), turned()
+    counts = model.ray_counts(potential)
+    pull = rng.normal(size=model.seen)
+    pulls = model.gradient(potential, counts, beam, pull, frame)
+    by = Pulls(*(rng.normal(size=part.shape) for part in pulls))
+    pushed = (pull * model.change(potential, counts, beam, by, frame)).sum()
+    pulled = [float((a * b).sum()) for a, b in zip(pulls, by, strict=True)]
+    assert abs(pushed - sum(pulled)) < 1e-12 * sum(map(abs, pulled))
+
+
+def test_what_is_not_wanted_of_a_gradient_is_zero_and_the_rest_the_same() -> None:
+    model = model_of()
+    potential, beam = wavy(model, FOLDED), model.around(uneven())
+    counts, pull = model.ray_counts(potential), np.random.default_rng(2).normal(size=SIZE)
+    whole = model.gradient(potential, counts, beam, pull)
+    less = model.gradient(potential, counts, beam, pull, of_beam=False, of_frame=False)
+    assert whole.beam.any()
+    assert whole.frame.any()
+    assert not less.beam.any()
+    assert not less.frame.any()
+    np.testing.assert_allclose(less.potential, whole.potential, rtol=1e-12, atol=1e-12)
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    alone = model_of((80, 96), threads=1)
+    potential = wavy(alone, FOLDED)
+    beam = alone.around(np.random.default_rng(3).uniform(0.5, 1.5, (80, 96)))
+    counts, pull = alone.ray_counts(potential), np.random.default_rng(4).normal(size=(80, 96))
+    assert (counts[0] * counts[1]).sum() > 100_000  # enough for threads
+    image = alone.image(potential, counts, beam, turned())
+    pulls = alone.gradient(potential, counts, beam, pull, turned())
+    change = alone.change(potential, counts, beam, pulls, turned())
     for threads in (2, 3):
-        several = RayModel(model.source, PAD, threads=threads)
+        several = model_of((80, 96), threads=threads)
+        np.testing.assert_array_equal(several.image(potential, counts, beam, turned()), image)
+        again = several.gradient(potential, counts, beam, pull, turned())
+        for one, other in zip(pulls, again, strict=True):
+            np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(
-            several.image(potential, counts), alone.image(potential, counts)
+            several.change(potential, counts, beam, pulls, turned()), change
         )
-        np.testing.assert_array_equal(
-            several.gradient(potential, counts, pull), alone.gradient(potential, counts, pull)
+
+
+def test_displacement_is_minus_the_slope_of_the_values() -> None:
+    """Differences of a smooth potential a pixel to each side, which err in the fourth order."""
+    model = model_of((60, 70))
+    y, x = places(model)
+    potential = 40 * np.cos(y / 12) * np.sin(x / 15 + 1)
+    values, displacement = model.values(potential), model.displacement(potential)
+    assert values.shape == (60, 70)
+    for axis in (0, 1):
+        v = np.moveaxis(values, axis, 0)
+        slope = (8 * (v[3:-1] - v[1:-3]) - (v[4:] - v[:-4])) / 12
+        np.testing.assert_allclose(
+            np.moveaxis(displacement[axis], axis, 0)[2:-2], -slope, atol=2e-3
         )
+
+
+def test_rays_land_as_densely_as_asked() -> None:
+    """Neighbouring rays start 2 / n px apart and are spread by the stretch of their cell."""
+    for spacing in (0.5, 0.25):
+        model = model_of(spacing=spacing)
+        assert (model.ray_counts(np.zeros(model.shape)) == KNOT / spacing).all()
+        potential = wavy(model, FOLDED)
+        counts = model.ray_counts(potential)
+        assert counts.shape == (2, *model.cells)
+        landed = np.indices(SIZE) + model.displacement(potential)
+        inside = counts[:, 4:24, 4:31]
+        for along in (0, 1):
+            stretched = np.abs(np.diff(landed, axis=1 + along)).max(axis=0)
+            y, x = np.indices(stretched.shape) // KNOT
+            assert (KNOT / inside[along, y, x] * stretched <= 1.3 * spacing).all()

@@ -162,12 +162,12 @@ def fit(
             scene = _reweighted(given, scene, best)
         basins = _basins(scene, best, found[1:], tell)
     with _timed("full size", seconds):
-        fine, unknowns, value, taken = refined(scene, best, options, tell)
+        fine, unknowns, value, taken, ended = refined(scene, best, options, tell)
     with _timed("samples", seconds):
         errors = _errors(scene, best, given, options, rng, tell)
     return _result(
         given, fine, unknowns, fields, setups, options, basins, errors,
-        FitReport(value, taken, taken < options.steps, seconds, float("nan")),
+        FitReport(value, taken, ended, seconds, float("nan")),
     )  # fmt: skip
 
 
@@ -195,7 +195,8 @@ def _starts(given: Measured, start: ArrayLike | None, tell: Any) -> list[Start]:
     starts.append(Start("from near", _FROM_NEAR))
     if scene.strengths.shape[1] > 1 or scene.beam_modes:
         return starts
-    weakest = int(np.argmin(np.abs(scene.strengths[:, 0])))
+    sizes = np.abs(scene.strengths[:, 0])  # zero where the object does not deflect: a blank shot
+    weakest = int(np.argmin(np.where(sizes > 0, sizes, np.inf)))
     tell("transport", float("nan"))
     transported = _transported(given, weakest)
     if transported is None:

@@ -81,8 +81,8 @@ class Preconditioner:
 
     def log_size(self) -> float:
         """Return log |det S| plus half the logarithm of what the prior's determinant is, about."""
-        beam, frames = self._beam[self._beam > 0], self._frames[self._frames > 0]
-        return -self._log_ratio + float(np.log(beam).sum() + np.log(frames).sum())
+        others = np.concatenate([part.ravel() for part in (self._beam, self._gains, self._frames)])
+        return -self._log_ratio + float(np.log(others[others > 0]).sum())
 
 
 def descend(

@@ -119,7 +119,7 @@ def measured(
         threads=options.threads,
     )
     spread = np.linalg.norm(matrix, axis=1)
-    single = count == 1 or spread.max() < _SAME_STRENGTH * spread.min()
+    single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
     return Measured(scene, (height, width), units, isinstance(noise, str), single)
 
 
@@ -235,11 +235,19 @@ def _checked_images(images: ArrayLike) -> FloatArray:
     return data
 
 
+def _numbers(name: str, values: ArrayLike) -> FloatArray:
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        text = " ".join(repr(values).split())
+        raise InputError(f"{name} is {text:.60}: expected numbers, as many in each row") from error
+
+
 def _checked_mask(mask: ArrayLike | None, data: FloatArray) -> BoolArray:
     if mask is None:
         used = np.ones(data.shape, bool)
     else:
-        used = np.asarray(mask, dtype=bool)
+        used = _numbers("mask", mask) != 0
         if used.shape not in (data.shape, data.shape[1:]):
             raise InputError(
                 f"mask has shape {used.shape}: expected {data.shape[1:]} or {data.shape}, like the "
@@ -262,7 +270,7 @@ def _checked_mask(mask: ArrayLike | None, data: FloatArray) -> BoolArray:
 
 
 def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
-    matrix = np.array(strengths, dtype=np.float64)
+    matrix = _numbers("strengths", strengths)
     matrix = matrix[:, None] if matrix.ndim == 1 else matrix
     if matrix.ndim != 2 or len(matrix) != count or not np.isfinite(matrix).all():
         raise InputError(
@@ -298,7 +306,7 @@ def _checked_gains(gains: ArrayLike | str, count: int) -> tuple[bool, FloatArray
         if gains not in ("known", "free"):
             raise InputError(f"gains are {gains!r}: expected 'known', 'free' or a number an image")
         return gains == "free", np.ones(count)
-    factors = np.array(gains, dtype=np.float64)
+    factors = _numbers("gains", gains)
     if factors.shape != (count,) or not (np.isfinite(factors) & (factors > 0)).all():
         raise InputError(
             f"gains are {gains}: expected a positive number for each of {count} images"
@@ -312,7 +320,7 @@ def _checked_source(source: Any, data: FloatArray, used: BoolArray) -> FloatArra
             raise InputError(f"source is {source!r}: expected an array, None or 'unknown'")
         levels = [image[use].mean() for image, use in zip(data, used, strict=True)]
         return np.asarray(np.ones(data.shape) * np.array(levels)[:, None, None])
-    beams = np.array(source, dtype=np.float64)
+    beams = _numbers("source", source)
     if beams.shape not in (data.shape, data.shape[1:]):
         raise InputError(
             f"source has shape {beams.shape}: expected {data.shape[1:]} or {data.shape}, like the "
@@ -337,8 +345,8 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
     if noise is None:
         levels = [estimated_noise(plane, use) for plane, use in zip(data, used, strict=True)]
         return np.asarray(np.ones(data.shape) * np.array(levels)[:, None, None])
-    sigma = np.array(noise, dtype=np.float64)
-    if not np.isfinite(sigma).all() or sigma.min() <= 0:
+    sigma = _numbers("noise", noise)
+    if not sigma.size or not np.isfinite(sigma).all() or sigma.min() <= 0:
         raise InputError("noise is not positive everywhere: expected standard deviations")
     if sigma.shape == (len(data),):
         sigma = sigma[:, None, None]
@@ -351,14 +359,17 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
 
 
 def _checked_psf(psf: Any, count: int, size: tuple[int, int]) -> list[float | FloatArray]:
-    kernel = np.ndim(psf) == 2
-    each = [psf] * count if kernel or np.ndim(psf) == 0 else list(psf)
+    try:
+        alone = np.array(psf, dtype=np.float64).ndim in (0, 2)
+    except (TypeError, ValueError):  # widths and kernels, or kernels of several sizes
+        alone = not isinstance(psf, Sequence) or isinstance(psf, str)
+    each = [psf] * count if alone else list(psf)
     if len(each) != count:
         raise InputError(f"psf has {len(each)} entries: expected one, or one for each of {count}")
     found: list[float | FloatArray] = []
     for one in each:
-        values = np.array(one, dtype=np.float64)
-        if not np.isfinite(values).all() or values.min() < 0:
+        values = _numbers("psf", one)
+        if not values.size or not np.isfinite(values).all() or values.min() < 0:
             raise InputError(f"psf is {one}: expected a standard deviation in px or a kernel")
         if values.ndim == 0:
             if float(values) > min(size) / 8:
@@ -376,7 +387,7 @@ def _checked_psf(psf: Any, count: int, size: tuple[int, int]) -> list[float | Fl
 def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fiducials | None:
     if fiducials is None:
         return None
-    table = np.array(fiducials, dtype=np.float64)
+    table = _numbers("fiducials", fiducials)
     if table.ndim != 2 or table.shape[1] != 5 or not np.isfinite(table).all():
         raise InputError(
             f"fiducials have shape {table.shape}: expected rows of y, x, dy, dx, σ in px"

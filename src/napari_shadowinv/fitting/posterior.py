@@ -94,10 +94,16 @@ class Posterior:
 
         By stochastic Lanczos quadrature.
         """
-        size = self._unknowns.flat().size
+        # What is fixed has no scale, and no part in the volume; nor what nothing holds.
+        ones = self._unknowns.like(np.ones(self._unknowns.flat().size))
+        moved = self._scales.times(ones)._replace(potentials=ones.potentials)
+        if np.isinf(self._scene.decay):
+            moved.potentials[:, 0, 0] = 0
+        free = moved.flat() != 0
+        size = int(free.sum())
         total = 0.0
         for _ in range(_PROBES):
-            signs = self._rng.choice([-1.0, 1.0], size)
+            signs = free * self._rng.choice([-1.0, 1.0], free.size)
             diagonal, beside = self._lanczos(signs / np.sqrt(size))
             values, vectors = eigh_tridiagonal(diagonal, beside)
             total += size * float((vectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())

@@ -187,21 +187,25 @@ def with_likely_smoothness(
 
 def refined(
     scene: Scene, found: Found, options: FitOptions, tell: Tell
-) -> tuple[Scene, Unknowns, float, int]:
-    """Descend with the pixels as recorded, with rays as dense as the data need."""
-    unknowns, value, steps = finer(found.unknowns), np.inf, 0
+) -> tuple[Scene, Unknowns, float, int, bool]:
+    """Descend with the pixels as recorded, with rays as dense as the data need.
+
+    Tells the number of steps, and whether they ended before the most that were allowed.
+    """
+    unknowns, value, steps, ended = finer(found.unknowns), np.inf, 0, False
     spacings = _SPACINGS if options.spacing is None else (options.spacing,)
+    most = -(-options.steps // len(spacings))
     for spacing in spacings:
-        scene = replace(scene, spacing=spacing)
+        scene, allowed = replace(scene, spacing=spacing), min(most, options.steps - steps)
         unknowns, value, taken = descend(
             scene,
             unknowns,
-            iterations=options.steps // len(spacings),
+            iterations=allowed,
             least_gain=1.0,
             after_step=lambda now: tell("full size", now),
         )
-        steps += taken
+        steps, ended = steps + taken, taken < allowed
         chi2 = scene.chi2(unknowns, scene.ray_counts(unknowns))
-        if chi2.max() < _EXPLAINED:
+        if chi2.max() < _EXPLAINED or steps == options.steps:
             break
-    return scene, unknowns, value, steps
+    return scene, unknowns, value, steps, ended

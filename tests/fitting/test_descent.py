@@ -1,0 +1,191 @@
+"""The same scene in larger pixels, the same unknowns in smaller ones, and steps downhill."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.descent import binned, coarser, descend, finer
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.rays import KNOT
+from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+
+SIZE, PAD = (48, 64), 16
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene(
+        images=np.ones((2, *SIZE)),
+        weights=np.full((2, *SIZE), 400.0),
+        strengths=np.array([[1.0], [0.6]]),
+        beams=np.ones((2, SIZE[0] + 2 * PAD, SIZE[1] + 2 * PAD)),
+        psf=[0.0, 0.0],
+        smoothness=np.array([[20.0, 300.0]]),
+        decay=25.0,
+        pad=PAD,
+        spacing=1 / 3,
+        threads=1,
+    )
+
+
+def places(scene: Scene) -> tuple[FloatArray, FloatArray]:
+    """Middles of the splines, recorded px from the image's corner."""
+    rays = scene.rays
+    lines = (scene.bin * (KNOT * (np.arange(n) - 1.0) - rays.pad) for n in rays.shape)
+    return tuple(np.meshgrid(*lines, indexing="ij"))  # type: ignore[return-value]
+
+
+def bump(scene: Scene, slope: float, width: float = 8.0) -> Unknowns:
+    unknowns = scene.nothing()
+    y, x = places(scene)
+    unknowns.potentials[0] = (
+        -slope * width**2 * np.exp(-((y - 24) ** 2 + (x - 30) ** 2) / 2 / width**2)
+    )
+    unknowns.potentials[0] /= scene.bin**2
+    return unknowns
+
+
+def test_finer_pixels_change_no_potential(scene: Scene) -> None:
+    """Coefficients twice as dense hold the same spline: at all points, to rounding."""
+    coarse = coarser(scene, 2)
+    unknowns = coarse.nothing()
+    unknowns.potentials[:] = np.random.default_rng(0).normal(size=unknowns.potentials.shape)
+    unknowns.frames[1] = [0.4, 1.01, -0.01, -0.3, 0.02, 0.98]
+    fine = finer(unknowns)
+    assert fine.potentials.shape == (1, *scene.rays.shape)
+    # The middle of a coarse pixel is the corner of four fine ones: read both at knots instead.
+    before = at_knots(unknowns.potentials[0])
+    np.testing.assert_allclose(at_knots(fine.potentials[0])[::2, ::2], 4 * before, atol=1e-12)
+    np.testing.assert_allclose(fine.frames[1], [0.8, 1.01, -0.01, -0.6, 0.02, 0.98])
+
+
+def at_knots(coefficients: FloatArray) -> FloatArray:
+    """A cubic spline where its pieces meet."""
+    for _ in range(2):
+        coefficients = (coefficients[:-2] + 4 * coefficients[1:-1] + coefficients[2:]).T / 6
+    return coefficients
+
+
+def test_finer_pixels_make_the_same_image(scene: Scene) -> None:
+    coarse = replace(coarser(scene, 2), spacing=0.1)
+    fine = replace(scene, spacing=0.2)
+    unknowns = bump(coarse, 2.0)
+    made = coarse.model(unknowns, coarse.ray_counts(unknowns))
+    twice = finer(unknowns)
+    binned_image = binned(fine.model(twice, fine.ray_counts(twice)), 2) / 4
+    assert made.max() > 2
+    np.testing.assert_allclose(made, binned_image, atol=0.03)
+
+
+def test_finer_pixels_double_the_displacement(scene: Scene) -> None:
+    coarse = coarser(scene, 2)
+    unknowns = bump(coarse, 1.0)
+    once = coarse.rays.displacement(unknowns.potentials[0])
+    twice = scene.rays.displacement(finer(unknowns).potentials[0])
+    middles = (twice[:, ::2, ::2] + twice[:, 1::2, 1::2]) / 2
+    np.testing.assert_allclose(middles, 2 * once, atol=0.03)
+
+
+def test_binned_adds_blocks() -> None:
+    planes = np.arange(32.0).reshape(1, 4, 8)
+    np.testing.assert_array_equal(binned(planes, 2)[0], [[18, 26, 34, 42], [82, 90, 98, 106]])
+    assert binned(planes, 4).sum() == planes.sum()
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_larger_pixels_keep_the_information_of_an_image(scene: Scene, factor: int) -> None:
+    """χ² of a constant misfit, Σ misfit²/σ²: a mean of n pixels has σ²/n."""
+    rng = np.random.default_rng(1)
+    weights = rng.uniform(380, 420, scene.weights.shape)
+    brighter = replace(scene, images=np.full_like(scene.images, 1.07), weights=weights)
+    coarse = coarser(brighter, factor)
+    for one in (brighter, coarse):
+        nothing = one.nothing()
+        misfit = one.chi2(nothing, one.ray_counts(nothing)) * one.weights[0].size
+        np.testing.assert_allclose(misfit, 0.07**2 * 400 * weights[0].size, rtol=0.01)
+    assert coarse.images.shape == (2, SIZE[0] // factor, SIZE[1] // factor)
+    assert coarse.bin == factor
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_larger_pixels_hold_as_much_against_a_potential(scene: Scene, factor: int) -> None:
+    """Each of λ, κ, strip and fading, for one field at the knots of each."""
+    none = np.zeros((1, 2))
+    for smoothness, tie, decay in (
+        (np.array([[1.0, 0.0]]), 0.0, np.inf),
+        (np.array([[0.0, 1.0]]), 0.0, np.inf),
+        (none, 30.0, np.inf),
+        (none, 30.0, 3.0),
+    ):
+        one = replace(scene, smoothness=smoothness, tie=tie, decay=decay)
+        fine, coarse = (
+            each.prior.value_and_slope(bump(each, 1.0))[0] for each in (one, coarser(one, factor))
+        )
+        assert fine > 0
+        assert coarse == pytest.approx(fine, rel=0.15 * factor), (smoothness, tie, decay)
+
+
+def test_pixels_less_than_half_used_are_left_out(scene: Scene) -> None:
+    weights = scene.weights.copy()
+    weights[0, 0, 0:3] = 0  # two of the first four pixels, one of the next
+    weights[0, 1, 0] = 0
+    images = np.where(weights > 0, scene.images, np.nan)
+    images[0, 0, 3] = 2.0
+    coarse = coarser(replace(scene, images=images, weights=weights), 2)
+    assert coarse.weights[0, 0, 0] == 0
+    assert coarse.weights[0, 0, 1] == pytest.approx(3 * 400)
+    assert coarse.images[0, 0, 1] == pytest.approx(4 / 3)
+    assert coarse.weights[0, 5, 5] == pytest.approx(4 * 400)
+    assert np.isfinite(coarse.images).all()
+
+
+def test_point_spreads_are_narrower_in_larger_pixels(scene: Scene) -> None:
+    dot = np.zeros((21, 21))
+    dot[10, 10] = 1
+    kernel = gaussian_filter(dot, 2.0)
+    coarse = coarser(replace(scene, psf=[1.5, kernel]), 2)
+    assert coarse.psf[0] == 0.75
+    assert coarse.psf[1] == pytest.approx(1.0, rel=0.01)
+    moved = coarser(replace(scene, psf=[1.5, np.roll(kernel, 2, axis=0)]), 2)
+    assert moved.psf[1] == pytest.approx(coarse.psf[1], rel=1e-6)
+
+
+def test_fiducials_are_scaled_with_the_pixels(scene: Scene) -> None:
+    known = Fiducials(np.array([[8.0, 12.0]]), np.array([[1.0, -2.0]]), np.array([0.5]))
+    coarse = coarser(replace(scene, fiducials=known), 4)
+    assert coarse.fiducials is not None
+    np.testing.assert_array_equal(coarse.fiducials.places, [[2, 3]])
+    np.testing.assert_array_equal(coarse.fiducials.displacements, [[0.25, -0.5]])
+    np.testing.assert_array_equal(coarse.fiducials.errors, [0.125])
+
+
+def test_pixels_as_they_are_are_the_scene_itself(scene: Scene) -> None:
+    assert coarser(scene, 1) is scene
+
+
+def test_descending_finds_the_field_that_made_the_images(scene: Scene) -> None:
+    truth = bump(scene, 0.6)
+    made = scene.model(truth, scene.ray_counts(truth))
+    told: list[float] = []
+    given = replace(scene, images=made, smoothness=np.array([[1.0, 0.0]]))
+    found, value, steps = descend(
+        given, scene.nothing(), iterations=200, least_gain=0.05, after_step=told.append
+    )
+    expected = scene.rays.displacement(truth.potentials[0])
+    error = scene.rays.displacement(found.potentials[0]) - expected
+    assert np.linalg.norm(error) < 0.05 * np.linalg.norm(expected)
+    assert len(told) == steps
+    assert told[-1] == pytest.approx(value)
+    at_start, _ = given.value_and_gradient(scene.nothing(), given.ray_counts(scene.nothing()))
+    assert value < 0.01 * at_start
+
+
+def test_descending_takes_no_more_steps_than_allowed(scene: Scene) -> None:
+    truth = bump(scene, 1.0)
+    given = replace(scene, images=scene.model(truth, scene.ray_counts(truth)))
+    assert descend(given, scene.nothing(), iterations=4, least_gain=0)[2] <= 4

@@ -1,0 +1,192 @@
+"""Fields from images that were made without the package, by exact formulae of the fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from shots import Displacement, bump, counted, distance, noisy, on_pixels, together
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting import Fit, FitOptions, fit
+from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.fitting.verdict import Verdict
+from napari_shadowinv.physics.setup import ProtonSetup
+
+SIZE = (48, 56)
+STRENGTHS = [1, 0.6]
+NOISE = 0.03
+PLAIN = FitOptions(samples=0, steps=30, spacing=0.25, threads=1)
+HASTY = FitOptions(samples=0, steps=5, spacing=0.25, threads=1)
+RING_AND_SPOT = together(bump(3.2, 4.5, (20, 32)), bump(-1.6, 5, (30, 19)))
+"""Rays cross around a ring, and behind a spot."""
+WEAK = bump(0.4, 8, (22, 29))
+
+
+def shots_of(displacement: Displacement, **changes: Any) -> list[FloatArray]:
+    return [
+        counted(lambda y, x: strength * displacement(y, x), SIZE, **changes)  # noqa: B023
+        for strength in STRENGTHS
+    ]
+
+
+@pytest.fixture(scope="module")
+def folded_shots() -> list[FloatArray]:
+    return shots_of(RING_AND_SPOT)
+
+
+@pytest.fixture(scope="module")
+def found(folded_shots: list[FloatArray]) -> Fit:
+    return fit(
+        noisy(folded_shots, NOISE),
+        strengths=STRENGTHS,
+        noise=NOISE,
+        options=FitOptions(samples=4, threads=1),
+    )
+
+
+def test_two_energies_tell_a_field_whose_rays_cross(found: Fit) -> None:
+    (field,) = found.fields
+    assert distance(field.displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.03
+    assert found.folded > 0.05
+    assert found.verdict is Verdict.DETERMINED
+    assert "2 images" in found.explanation
+    assert (found.chi2 > 0.85).all()
+    assert (found.chi2 < 1.15).all()
+
+
+def test_the_error_bars_are_as_large_as_the_error(found: Fit) -> None:
+    (field,) = found.fields
+    assert field.uncertainty is not None
+    error = field.displacement - on_pixels(RING_AND_SPOT, SIZE)
+    told = np.sqrt((field.uncertainty**2).mean())
+    assert 1 / 3 < told / np.sqrt((error**2).mean()) < 3
+    size = np.sqrt((field.displacement**2).mean())
+    assert found.report.uncertainty == pytest.approx(told / size)
+
+
+def test_the_parts_of_a_result_belong_together(found: Fit, folded_shots: list[FloatArray]) -> None:
+    (field,) = found.fields
+    data = noisy(folded_shots, NOISE)
+    np.testing.assert_allclose(found.images, data, rtol=1e-12)
+    np.testing.assert_allclose(found.residual, data - found.reprojection, atol=1e-12)
+    np.testing.assert_allclose(found.chi2, (found.residual**2).mean(axis=(1, 2)) / NOISE**2)
+    assert found.mask.all()
+    slope = np.stack(np.gradient(field.potential))[:, 5:-5, 5:-5]
+    assert distance(-slope, field.displacement[:, 5:-5, 5:-5]) < 0.06
+    edge = [field.potential[k] for k in (0, -1)] + [field.potential[:, k] for k in (0, -1)]
+    assert np.concatenate(edge).mean() == pytest.approx(0, abs=1e-9)
+    best, *others = found.basins
+    assert best.distance == 0
+    assert all(best.objective <= other.objective for other in others)
+    np.testing.assert_allclose(found.strengths, [[1], [0.6]])
+    assert found.report.seconds.keys() >= {"starts", "smoothness", "full size", "samples"}
+
+
+def test_strong_rays_first_or_weak_ones_makes_no_difference(
+    found: Fit, folded_shots: list[FloatArray]
+) -> None:
+    """The field is that of the first image."""
+    turned = fit(noisy(folded_shots, NOISE)[::-1], strengths=[0.6, 1], noise=NOISE, options=PLAIN)
+    one, other = found.fields[0].displacement, turned.fields[0].displacement / 0.6
+    assert distance(other, one) < 0.04
+
+
+def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
+    def beam(y: FloatArray, x: FloatArray) -> FloatArray:
+        return np.asarray(1 + 0.2 * np.cos(y / 15) * np.sin(x / 18))
+
+    result = fit(
+        noisy(shots_of(RING_AND_SPOT, beam=beam), NOISE),
+        strengths=STRENGTHS,
+        source="unknown",
+        noise=NOISE,
+        options=FitOptions(samples=0, beam_modes=4, threads=1),
+    )
+    assert distance(result.fields[0].displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.05
+    assert result.verdict is Verdict.DETERMINED
+    error = result.source / beam(*np.indices(SIZE).astype(float)) - 1
+    assert np.sqrt((error**2).mean()) < 0.02
+
+
+def test_three_energies_tell_a_magnetic_field_from_an_electric_one() -> None:
+    magnetic, electric = bump(1.2, 6, (22, 32)), bump(-0.8, 5.5, (28, 23))
+    lengths = {"source_object_distance": 0.01, "object_image_distance": 0.2, "pixel_size": 1e-6}
+    setups = [ProtonSetup(energy=energy, **lengths) for energy in (5, 14.7, 40)]
+    images = [
+        counted(lambda y, x: b * magnetic(y, x) + e * electric(y, x), SIZE)  # noqa: B023
+        for b, e in strengths_of(setups, ("B", "E"), 3)
+    ]
+    result = fit(noisy(images, 0.02), setups=setups, fields=("B", "E"), noise=0.02, options=PLAIN)
+    assert [field.name for field in result.fields] == ["B", "E"]
+    assert distance(result.fields[0].displacement, on_pixels(magnetic, SIZE)) < 0.06
+    assert distance(result.fields[1].displacement, on_pixels(electric, SIZE)) < 0.12
+    assert result.setups == tuple(setups)
+
+
+def test_one_image_tells_a_weak_field() -> None:
+    image = noisy([counted(WEAK, SIZE)], 0.02)[0]
+    result = fit(image, noise=0.02, options=PLAIN)
+    assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
+    assert result.verdict is Verdict.DETERMINED
+    assert result.folded == 0
+    assert result.images.shape == (1, *SIZE)
+
+
+def test_one_image_does_not_tell_an_unknown_beam_from_the_field() -> None:
+    image = noisy([counted(WEAK, SIZE)], 0.02)
+    options = HASTY.model_copy(update={"ambiguous": True, "beam_modes": 4})
+    result = fit(image, source="unknown", noise=0.02, options=options)
+    assert result.verdict is Verdict.AMBIGUOUS
+    assert result.chi2[0] < 1.3
+
+
+def test_an_object_that_has_moved_between_the_images_is_told(
+    folded_shots: list[FloatArray],
+) -> None:
+    moved = counted(lambda y, x: 0.6 * RING_AND_SPOT(y - 3, x), SIZE)
+    result = fit(
+        noisy([folded_shots[0], moved], NOISE), strengths=STRENGTHS, noise=NOISE, options=HASTY
+    )
+    assert result.verdict is Verdict.MISFIT
+    assert "image 2" in result.explanation
+    assert result.chi2[1] > 2
+
+
+def test_energies_that_hardly_differ_tell_no_more_than_one_image() -> None:
+    """Where rays cross over much of the image, that is too little."""
+    strong = bump(3.2, 8, (23, 27))
+    images = [counted(lambda y, x: s * strong(y, x), SIZE) for s in (1, 0.97)]  # noqa: B023
+    result = fit(noisy(images, 0.1), strengths=[1, 0.97], noise=0.1, options=PLAIN)
+    assert result.folded > 0.15
+    assert result.verdict is Verdict.AMBIGUOUS
+    assert "one image does not tell" in result.explanation
+
+
+def test_a_start_at_the_truth_is_taken() -> None:
+    image = noisy([counted(WEAK, SIZE)], 0.02)
+    y, x = np.indices(SIZE) - np.array([22, 29])[:, None, None]
+    truth = 0.4 * 8**2 * np.exp(-(y**2 + x**2) / 2 / 8**2)
+    result = fit(image, noise=0.02, start=truth, options=PLAIN)
+    assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
+    for wrong in (truth[1:], np.full(SIZE, np.nan)):
+        with pytest.raises(InputError, match="start has shape"):
+            fit(image, noise=0.02, start=wrong, options=PLAIN)
+
+
+def test_a_fit_that_runs_out_of_steps_says_so() -> None:
+    image = noisy([counted(WEAK, SIZE)], 0.02)[0]
+    for steps in (1, 3, 100):
+        result = fit(image, noise=0.02, options=FitOptions(samples=0, steps=steps, threads=1))
+        assert result.report.converged == (steps == 100)
+        assert 1 <= result.report.iterations <= steps
+
+
+def test_a_shot_without_the_object_is_one_more_image() -> None:
+    """Its strength is zero: an image of the beam."""
+    images = noisy([counted(WEAK, SIZE), np.ones(SIZE)], 0.02)
+    result = fit(images, strengths=[1, 0], noise=0.02, options=PLAIN)
+    assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
+    assert result.verdict is Verdict.DETERMINED

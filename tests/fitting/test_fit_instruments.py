@@ -1,0 +1,199 @@
+"""Fits of images with blur, dead pixels, shifts, unknown gains and counts; and of any shape."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from shots import bump, counted, distance, noisy, on_pixels, together
+
+from napari_shadowinv._system.progress import Progress
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.fitting import Fit, FitOptions, fit
+from napari_shadowinv.fitting.verdict import Verdict
+
+SIZE = (48, 56)
+STRENGTHS = [1, 0.6]
+NOISE = 0.03
+RING = bump(3.0, 5.5, (23, 29), tall=1.2)
+
+
+def shot(number: int, size: tuple[int, int] = SIZE, **changes: Any) -> FloatArray:
+    return counted(lambda y, x: STRENGTHS[number] * RING(y, x), size, **changes)
+
+
+@pytest.fixture(scope="module")
+def shots() -> list[FloatArray]:
+    return [shot(0), shot(1)]
+
+
+def fitted(images: Any, align: Any = "none", threads: int = 1, **given: Any) -> Fit:
+    options = FitOptions(samples=0, steps=30, spacing=0.25, threads=threads, align=align)
+    given = {"strengths": STRENGTHS, "noise": NOISE} | given
+    return fit(images, options=options, **given)
+
+
+def error(result: Fit) -> float:
+    (field,) = result.fields
+    height, width = field.potential.shape
+    return distance(field.displacement, on_pixels(RING, (height, width)))
+
+
+def test_a_known_point_spread_is_undone() -> None:
+    images = noisy([shot(0, blur=1.5), shot(1, blur=1.5)], NOISE)
+    result = fitted(images, psf=1.5)
+    assert error(result) < 0.05
+    assert (result.chi2 < 1.2).all()
+    assert result.verdict is Verdict.DETERMINED
+    told_nothing = fitted(images, psf=0.0)
+    assert error(told_nothing) > 2 * error(result)
+
+
+def test_dead_pixels_are_left_out(shots: list[FloatArray]) -> None:
+    images = noisy(shots, NOISE)
+    mask = np.random.default_rng(3).random(images.shape) > 0.05
+    mask[:, 30:34, 10:20] = False
+    images[~mask] = np.nan
+    result = fitted(images, mask=mask)
+    assert error(result) < 0.06
+    np.testing.assert_array_equal(result.mask, mask)
+    assert not result.residual[~mask].any()
+    assert np.isfinite(result.reprojection).all()
+    used = [(plane[use] ** 2).mean() for plane, use in zip(result.residual, mask, strict=True)]
+    np.testing.assert_allclose(result.chi2, np.array(used) / NOISE**2)
+
+
+@pytest.mark.parametrize("shift", [(0.3, -0.4), (1.2, -2.0)])
+def test_a_shifted_image_is_brought_back(
+    shots: list[FloatArray], shift: tuple[float, float]
+) -> None:
+    frame = (shift[0], 1, 0, shift[1], 0, 1)
+    result = fitted(noisy([shots[0], shot(1, frame=frame)], NOISE), align="shift")
+    np.testing.assert_allclose(result.frames[1], frame, atol=0.1)
+    np.testing.assert_array_equal(result.frames[0], [0, 1, 0, 0, 0, 1])
+    assert error(result) < 0.04
+
+
+def test_a_turned_and_magnified_image_is_brought_back() -> None:
+    """Two objects apart tell how one image is turned, which a round one does not."""
+    pair = together(bump(3.0, 4.5, (18, 36)), bump(-1.4, 5, (31, 17)))
+    frame = (0.5, 1.03, 0.03, -0.6, -0.02, 0.97)
+    images = [
+        counted(pair, SIZE),
+        counted(lambda y, x: 0.6 * pair(y, x), SIZE, frame=frame),
+    ]
+    result = fitted(noisy(images, NOISE), align="affine")
+    np.testing.assert_allclose(result.frames[1][[0, 3]], [0.5, -0.6], atol=0.1)
+    np.testing.assert_allclose(
+        result.frames[1][[1, 2, 4, 5]], [1.03, 0.03, -0.02, 0.97], atol=0.015
+    )
+    assert distance(result.fields[0].displacement, on_pixels(pair, SIZE)) < 0.05
+
+
+def test_unknown_gains_are_found(shots: list[FloatArray]) -> None:
+    images = noisy([shots[0], 1.2 * shots[1]], NOISE)
+    source = np.ones(SIZE)
+    result = fitted(images, gains="free", source=source)
+    assert result.gains[1] / result.gains[0] == pytest.approx(1.2, rel=0.005)
+    assert error(result) < 0.04
+    np.testing.assert_allclose(result.source, result.gains[:, None, None] * np.ones(SIZE))
+    told = fitted(images, gains=[1, 1.2], source=source)
+    assert error(told) < 0.04
+
+
+def test_counts_are_weighted_by_what_is_expected(shots: list[FloatArray]) -> None:
+    rng = np.random.default_rng(5)
+    counts = [rng.poisson(400 * plane) for plane in shots]
+    result = fitted(counts, noise="poisson")
+    assert error(result) < 0.03
+    np.testing.assert_allclose(result.chi2, 1, atol=0.12)
+    # In the units of what was counted.
+    assert result.reprojection.mean() == pytest.approx(np.mean(counts), rel=0.02)
+
+
+def test_sides_may_be_odd_and_unlike() -> None:
+    size = (47, 61)
+    result = fitted(noisy([shot(0, size), shot(1, size)], NOISE))
+    assert result.fields[0].displacement.shape == (2, *size)
+    assert error(result) < 0.03
+
+
+def test_units_of_the_images_do_not_matter(shots: list[FloatArray]) -> None:
+    """Not even by rounding, if one is a power of two of the other."""
+    images = noisy(shots, NOISE)
+    options = FitOptions(samples=0, steps=5, spacing=0.25, threads=1)
+    one, other = (
+        fit(unit * images, strengths=STRENGTHS, noise=unit * NOISE, options=options)
+        for unit in (1, 1024)
+    )
+    np.testing.assert_array_equal(one.fields[0].displacement, other.fields[0].displacement)
+    np.testing.assert_array_equal(one.chi2, other.chi2)
+    np.testing.assert_array_equal(1024 * one.reprojection, other.reprojection)
+
+
+def test_noise_that_nobody_tells_is_found_in_the_images(shots: list[FloatArray]) -> None:
+    """Folds of an object that fills the image look like some of it."""
+    result = fitted(noisy(shots, NOISE), noise=None)
+    assert (result.chi2 > 0.6).all()
+    assert (result.chi2 < 1.2).all()
+    assert error(result) < 0.03
+
+
+def test_fiducials_hold_the_field_where_noise_does_not() -> None:
+    """A mesh of 25 crossings, known to 0.03 px, against an image with 30 % noise."""
+    weak = bump(0.4, 7, (23, 29))
+    image = noisy([counted(weak, SIZE)], 0.3)
+    truth = on_pixels(weak, SIZE)
+    rows, columns = np.meshgrid([7, 15, 23, 31, 39], [13, 21, 29, 37, 45], indexing="ij")
+    places = rows.ravel(), columns.ravel()
+    known = truth[:, *places] + np.random.default_rng(6).normal(0, 0.03, (2, 25))
+    fiducials = np.column_stack([*places, *known, np.full(25, 0.03)])
+    found = [
+        fitted(image, strengths=None, noise=0.3, fiducials=table).fields[0].displacement
+        for table in (None, fiducials)
+    ]
+    missed = [np.sqrt(((one[:, *places] - known) ** 2).mean()) for one in found]
+    assert missed[1] < 0.06 < missed[0]
+    assert distance(found[1], truth) < 0.5 * distance(found[0], truth)
+
+
+def test_neither_threads_nor_a_second_time_change_a_bit(shots: list[FloatArray]) -> None:
+    images = noisy(shots, NOISE)
+    runs = []
+    for threads in (1, 3):
+        options = FitOptions(samples=2, steps=5, spacing=0.25, threads=threads, seed=3)
+        runs.append(fit(images, strengths=STRENGTHS, noise=NOISE, options=options))
+    first, second = runs
+    np.testing.assert_array_equal(first.fields[0].displacement, second.fields[0].displacement)
+    assert first.fields[0].uncertainty is not None
+    np.testing.assert_array_equal(first.fields[0].uncertainty, second.fields[0].uncertainty)
+    np.testing.assert_array_equal(first.reprojection, second.reprojection)
+    assert first.explanation == second.explanation
+
+
+@pytest.mark.parametrize("after", [1, 20])
+def test_a_fit_ends_at_once_when_asked(shots: list[FloatArray], after: int) -> None:
+    asked = 0
+
+    def should_stop() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked >= after
+
+    with pytest.raises(InversionCancelled):
+        fit(noisy(shots, NOISE), strengths=STRENGTHS, noise=NOISE, should_stop=should_stop)
+    assert asked == after
+
+
+def test_each_step_is_told_with_its_stage_and_objective() -> None:
+    told: list[Progress] = []
+    image = noisy([counted(bump(0.4, 7, (23, 29)), SIZE)], NOISE)
+    options = FitOptions(samples=2, steps=10, spacing=0.25, threads=1)
+    fit(image, noise=NOISE, options=options, on_progress=told.append)
+    messages = " ".join(one.message for one in told)
+    for stage in ("from near", "transport", "smoothness", "full size", "samples"):
+        assert f"{stage}, objective" in messages
+    steps = [one.step for one in told]
+    assert steps == sorted(steps)

@@ -1,0 +1,252 @@
+"""A scene's objective and its derivatives, with everything switched on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.forward import Scene, blurred
+from napari_shadowinv.fitting.rays import KNOT, at_rest
+from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+
+SIZE, PAD = (32, 40), 8
+KERNEL = np.array([[0.0, 0.1, 0.0], [0.2, 0.4, 0.1], [0.0, 0.15, 0.05]])
+
+
+def waves(shape: tuple[int, int], phase: float) -> FloatArray:
+    y, x = np.indices(shape)
+    return np.asarray(np.cos(y / 5 + phase) * np.sin(x / 7 - phase))
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Two images by two fields, with all that may be unknown."""
+    rng = np.random.default_rng(0)
+    weights = rng.uniform(100, 900, (2, *SIZE))
+    weights[:, 10:14, 20:30] = 0
+    beams = 1 + 0.2 * np.stack(
+        [waves((SIZE[0] + 2 * PAD, SIZE[1] + 2 * PAD), phase) for phase in (0, 1)]
+    )
+    return Scene(
+        images=rng.uniform(0.5, 1.5, (2, *SIZE)),
+        weights=weights,
+        strengths=np.array([[1.0, 1.0], [0.6, 0.35]]),
+        beams=beams,
+        psf=[0.8, KERNEL],
+        smoothness=np.array([[3.0, 20.0], [5.0, 1.0]]),
+        decay=20.0,
+        pad=PAD,
+        beam_modes=4,
+        free_gains=True,
+        free_frames=np.ones(6, bool),
+        fiducials=Fiducials(
+            np.array([[9.3, 11.2], [20.0, 30.5]]),
+            np.array([[0.3, -0.2], [1.0, 0.4]]),
+            np.array([0.1, 0.3]),
+        ),
+        blur=0.7,
+        spacing=1 / 3,
+        threads=1,
+    )
+
+
+def some(scene: Scene) -> Unknowns:
+    """An object, a beam, gains and frames."""
+    unknowns = scene.nothing()
+    y, x = (KNOT * (np.arange(n) - 1.0) - PAD for n in scene.rays.shape)
+    bump = np.exp(-((y[:, None] - 14) ** 2 + (x - 22) ** 2) / 2 / 5**2)
+    unknowns.potentials[0] = -18 * bump
+    unknowns.potentials[1] = 9 * bump * np.cos(x / 3)
+    unknowns.beam[0, 1], unknowns.beam[2, 1] = 0.1, -0.05
+    unknowns.gains[:] = 0.1, -0.2
+    unknowns.frames[1] = [0.4, 1.01, -0.01, -0.3, 0.02, 0.98]
+    return unknowns
+
+
+def random_like(unknowns: Unknowns, seed: int) -> Unknowns:
+    rng = np.random.default_rng(seed)
+    change = unknowns.like(rng.normal(size=unknowns.flat().size))
+    # Turns move rays at the edge by many pixels.
+    return change._replace(frames=change.frames / 20)
+
+
+def along(first: Unknowns, second: Unknowns) -> float:
+    return float(first.flat() @ second.flat())
+
+
+def only(part: str, change: Unknowns) -> Unknowns:
+    return change if part == "all" else change.zeros()._replace(**{part: getattr(change, part)})
+
+
+@pytest.mark.parametrize("part", ["potentials", "beam", "gains", "frames", "all"])
+def test_the_gradient_is_that_of_the_value(scene: Scene, part: str) -> None:
+    unknowns = some(scene)
+    counts = scene.ray_counts(unknowns)
+    _, slope = scene.value_and_gradient(unknowns, counts)
+    change = random_like(unknowns, 1)
+    # Of the first image the frame is fixed, of the beam the mean and the finest cosines.
+    change.frames[0] = 0
+    change.beam[scene.prior.beam_weights == 0] = 0
+    change = only(part, change)
+    step = 1e-6
+    ahead, behind = (
+        scene.value_and_gradient(unknowns.plus(unknowns.like(s * change.flat())), counts)[0]
+        for s in (step, -step)
+    )
+    assert along(slope, change) == pytest.approx((ahead - behind) / 2 / step, rel=1e-4)
+
+
+def test_the_value_is_half_of_what_the_residuals_and_the_prior_add_up_to(scene: Scene) -> None:
+    sharp = replace(scene, blur=0.0)
+    unknowns = some(sharp)
+    counts = sharp.ray_counts(unknowns)
+    misfit = (sharp.model(unknowns, counts) - sharp.images) ** 2 * sharp.weights
+    value, _ = sharp.value_and_gradient(unknowns, counts)
+    prior, _ = sharp.prior.value_and_slope(unknowns)
+    assert value == pytest.approx(misfit.sum() / 2 + prior, rel=1e-12)
+    used = (sharp.weights > 0).sum(axis=(1, 2))
+    np.testing.assert_allclose(sharp.chi2(unknowns, counts), misfit.sum(axis=(1, 2)) / used)
+
+
+def test_what_is_not_free_has_no_slope(scene: Scene) -> None:
+    fixed = replace(
+        scene,
+        free_gains=False,
+        free_frames=np.array([True, False, False] * 2),
+        fiducials=None,
+    )
+    unknowns = some(fixed)
+    _, slope = fixed.value_and_gradient(unknowns, fixed.ray_counts(unknowns))
+    assert not slope.gains.any()
+    assert not slope.frames[0].any()
+    np.testing.assert_array_equal(slope.frames[1] != 0, fixed.free_frames)
+    assert slope.beam[0, 0] == 0  # the mean is for the gains to tell
+    assert slope.beam[0, 1] != 0
+
+
+def test_masked_pixels_do_not_matter(scene: Scene) -> None:
+    unknowns = some(scene)
+    counts = scene.ray_counts(unknowns)
+    spoilt = replace(scene, images=np.where(scene.weights > 0, scene.images, 1e6))
+    value, slope = scene.value_and_gradient(unknowns, counts)
+    other, slope_there = spoilt.value_and_gradient(unknowns, counts)
+    assert other == value
+    np.testing.assert_array_equal(slope_there.flat(), slope.flat())
+
+
+def test_pushed_is_the_change_of_residuals(scene: Scene) -> None:
+    unknowns = some(scene)
+    counts = scene.ray_counts(unknowns)
+    change = random_like(unknowns, 2)
+    step = 1e-6
+    ahead, behind = (
+        scene.model(unknowns.plus(unknowns.like(s * change.flat())), counts) for s in (step, -step)
+    )
+    expected = np.sqrt(scene.weights) * (ahead - behind) / (2 * step)
+    found = scene.pushed(unknowns, counts, change)
+    assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
+
+
+def test_pulled_is_the_transpose_of_pushed(scene: Scene) -> None:
+    unknowns = some(scene)
+    counts = scene.ray_counts(unknowns)
+    change = random_like(unknowns, 3)
+    change.frames[0] = 0
+    change.beam[scene.prior.beam_weights == 0] = 0
+    residuals = np.random.default_rng(4).normal(size=scene.images.shape)
+    pushed = scene.pushed(unknowns, counts, change) * residuals
+    pulled = scene.pulled(unknowns, counts, residuals)
+    assert abs(pushed.sum() - along(pulled, change)) < 1e-12 * np.abs(pushed).sum()
+
+
+def test_the_hessian_is_symmetric_and_positive(scene: Scene) -> None:
+    unknowns = some(scene)
+    counts = scene.ray_counts(unknowns)
+    one, other = random_like(unknowns, 5), random_like(unknowns, 6)
+    of_one, of_other = (scene.hessian_times(unknowns, counts, way) for way in (one, other))
+    size = np.sqrt(along(one, of_one) * along(other, of_other))
+    assert abs(along(other, of_one) - along(one, of_other)) < 1e-12 * size
+    assert along(one, of_one) > 0
+
+
+def test_the_hessian_is_the_change_of_the_gradient_where_images_are_explained(
+    scene: Scene,
+) -> None:
+    sharp = replace(scene, blur=0.0)
+    unknowns = some(sharp)
+    counts = sharp.ray_counts(unknowns)
+    explained = replace(sharp, images=sharp.model(unknowns, counts))
+    change = random_like(unknowns, 7)
+    change.frames[0] = 0
+    change.beam[scene.prior.beam_weights == 0] = 0
+    step = 1e-6
+    (_, ahead), (_, behind) = (
+        explained.value_and_gradient(unknowns.plus(unknowns.like(s * change.flat())), counts)
+        for s in (step, -step)
+    )
+    expected = (ahead.flat() - behind.flat()) / (2 * step)
+    found = explained.hessian_times(unknowns, counts, change).flat()
+    assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
+
+
+def test_an_image_is_made_by_the_sum_of_the_fields_at_its_strengths(scene: Scene) -> None:
+    unknowns = some(scene)
+    first, second = unknowns.potentials
+    np.testing.assert_allclose(
+        scene.potentials(unknowns), [first + second, 0.6 * first + 0.35 * second]
+    )
+
+
+def test_nothing_in_the_way_leaves_the_beams(scene: Scene) -> None:
+    plain = replace(scene, psf=[0.0, 0.0])
+    nothing = plain.nothing()
+    made = plain.model(nothing, plain.ray_counts(nothing))
+    np.testing.assert_allclose(made, plain.beam(nothing), rtol=3e-3)
+    inside = slice(PAD, -PAD)
+    np.testing.assert_array_equal(plain.beam(nothing), plain.beams[:, inside, inside])
+    np.testing.assert_array_equal(nothing.frames, [at_rest()] * 2)
+
+
+def test_gains_and_beam_multiply_the_image(scene: Scene) -> None:
+    unknowns = scene.nothing()
+    counts = scene.ray_counts(unknowns)
+    plain = scene.model(unknowns, counts)
+    unknowns.gains[1], unknowns.beam[0, 0] = np.log(1.5), np.log(1.2)
+    made = scene.model(unknowns, counts)
+    np.testing.assert_allclose(made[0], 1.2 * plain[0], rtol=1e-12)
+    np.testing.assert_allclose(made[1], 1.8 * plain[1], rtol=1e-12)
+
+
+def test_a_kernel_of_a_gaussian_spreads_as_the_gaussian(scene: Scene) -> None:
+    place = np.arange(-5, 6)
+    line = np.exp(-(place**2) / 2 / 1.2**2)
+    kernel = np.outer(line, line) / line.sum() ** 2
+    unknowns = some(scene)
+    counts = scene.ray_counts(unknowns)
+    gaussian, given = (
+        replace(scene, psf=[psf, psf]).model(unknowns, counts) for psf in (1.2, kernel)
+    )
+    np.testing.assert_allclose(given, gaussian, atol=1e-4)
+
+
+def test_a_kernel_is_the_image_of_a_point(scene: Scene) -> None:
+    """Not its mirror image."""
+    beams = np.zeros_like(scene.beams)
+    beams[:, PAD + 15, PAD + 20] = 1.0
+    dot = replace(scene, beams=beams, beam_modes=0, spacing=0.1)
+    nothing = dot.nothing()
+    made = dot.model(nothing, dot.ray_counts(nothing))[1]
+    np.testing.assert_allclose(made[14:17, 19:22], KERNEL, atol=0.02)
+
+
+def test_blur_keeps_the_sum_and_has_the_width() -> None:
+    dot = np.zeros((41, 41))
+    dot[20, 20] = 1
+    spread = blurred(dot, 2.0)
+    offset = np.arange(41) - 20
+    assert spread.sum() == pytest.approx(1)
+    assert (spread.sum(axis=0) * offset**2).sum() == pytest.approx(4, rel=0.02)
+    assert blurred(dot, 0.0) is dot

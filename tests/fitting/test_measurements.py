@@ -1,0 +1,330 @@
+"""What is given to a fit: what is refused and why, and what is made of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import constants
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting.measurements import (
+    Measured,
+    estimated_noise,
+    measured,
+    point_spread,
+    strengths_of,
+)
+from napari_shadowinv.fitting.options import FitOptions
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+SIZE = (40, 51)
+
+
+def images(count: int = 2) -> FloatArray:
+    return np.random.default_rng(0).normal(5, 0.1, (count, *SIZE))
+
+
+def given(**changes: Any) -> Measured:
+    """Two images with strengths, and what a test changes about them."""
+    usual: dict[str, Any] = {
+        "images": images(),
+        "strengths": [1, 0.6],
+        "setups": None,
+        "fields": ("B",),
+        "source": None,
+        "noise": 0.1,
+        "psf": 0.0,
+        "mask": None,
+        "gains": "known",
+        "fiducials": None,
+        "options": FitOptions(),
+    }
+    usual |= changes
+    return measured(usual.pop("images"), **usual)
+
+
+def protons(energy: float, **changes: Any) -> ProtonSetup:
+    known = {"source_object_distance": 0.01, "object_image_distance": 0.2, "pixel_size": 2e-6}
+    return ProtonSetup(energy=energy, **known | changes)
+
+
+def with_pixel(value: float) -> FloatArray:
+    stack = images()
+    stack[1, 3, 4] = value
+    return stack
+
+
+def nearly_all_masked() -> FloatArray:
+    mask = np.ones((2, *SIZE), bool)
+    mask[1, 1:] = False
+    return mask
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"images": [[1, 2], [3]]}, "images are no stack of numbers: expected planes"),
+        ({"images": "film.tif"}, "images are no stack of numbers"),
+        ({"images": np.ones(40)}, r"images have shape \(40,\): expected \(images, height, width\)"),
+        ({"images": np.ones((0, 40, 40))}, r"images have shape \(0, 40, 40\)"),
+        ({"images": np.ones((2, 40, 20))}, r"shape \(40, 20\): expected 32 pixels or more"),
+        ({"images": with_pixel(np.nan)}, "1 pixels that are NaN or infinite.*: mask them"),
+        ({"images": with_pixel(np.inf)}, "1 pixels that are NaN or infinite"),
+        ({"images": np.zeros((2, *SIZE))}, "image 1 has no flux: expected a beam"),
+        ({"mask": np.ones((51, 40))}, r"mask has shape \(51, 40\): expected \(40, 51\)"),
+        ({"mask": nearly_all_masked()}, r"image 2 has 2.5% of its pixels in use: unmask some"),
+        ({"strengths": [1, 0.6, 0.3]}, r"strengths have shape \(3, 1\).* each of 2 images"),
+        ({"strengths": [1, np.nan]}, "strengths have shape.*: expected a finite number"),
+        ({"strengths": [0, 1]}, r"strengths of the first image are \[0.0\]: all fields must act"),
+        ({"strengths": [[1, 1], [0.5, 0.5]]}, "2 fields cannot be told apart by images"),
+        ({"strengths": None}, "2 images and neither strengths nor setups: give"),
+        ({"setups": [protons(3), protons(15)]}, "both strengths and setups, expected one of them"),
+        (
+            {"strengths": None, "setups": [protons(3)]},
+            "received 2 images and 1 setups: expected one each",
+        ),
+        (
+            {"strengths": None, "setups": [protons(3), protons(15, pixel_size=3e-6)]},
+            "image 2 has pixels of 3 µm at the object, the first of 2 µm: bring all",
+        ),
+        (
+            {"strengths": None, "setups": [protons(3)] * 2, "fields": ("B", "C")},
+            r"fields are \['B', 'C'\]: expected some of B, E, plasma, phase",
+        ),
+        (
+            {"strengths": None, "setups": [protons(3)] * 2, "fields": ("B", "B")},
+            r"fields are \['B', 'B'\]",
+        ),
+        ({"source": "unkown"}, "source is 'unkown': expected an array, None or 'unknown'"),
+        ({"source": np.ones((40, 50))}, r"source has shape \(40, 50\): expected \(40, 51\)"),
+        ({"source": -np.ones(SIZE)}, "source has pixels that are negative or not finite"),
+        ({"source": np.full(SIZE, np.nan)}, "source has pixels that are negative or not finite"),
+        ({"noise": "gauss"}, "noise is 'gauss': expected 'poisson', standard deviations or None"),
+        ({"noise": 0}, "noise is not positive everywhere"),
+        ({"noise": np.full(SIZE, np.nan)}, "noise is not positive everywhere"),
+        ({"noise": []}, "noise is not positive everywhere"),
+        ({"noise": np.ones(3)}, r"noise has shape \(3,\): expected one number, one an image"),
+        ({"noise": "poisson", "images": with_pixel(-1)}, "negative pixels, so they are no counts"),
+        ({"psf": [1.0, 2.0, 3.0]}, "psf has 3 entries: expected one, or one for each of 2"),
+        ({"psf": -1.0}, "psf is -1.0: expected a standard deviation in px or a kernel"),
+        ({"psf": 9.0}, "psf is 9 px: expected less than an eighth of a side"),
+        ({"psf": np.ones((3, 4))}, r"psf has shape \(3, 4\): expected a kernel with odd sides"),
+        ({"psf": np.zeros((3, 3))}, r"psf has shape \(3, 3\)"),
+        ({"psf": "wide"}, "psf is 'wide': expected numbers"),
+        ({"psf": [[1.0, 2.0, 3.0]] * 2}, r"psf has shape \(2, 3\): expected a kernel"),
+        ({"psf": [1.0, "wide"]}, "psf is 'wide': expected numbers"),
+        ({"strengths": "strong"}, "strengths is 'strong': expected numbers"),
+        ({"strengths": [[1, 2], [3]]}, r"strengths is \[\[1, 2\], \[3\]\]: expected numbers"),
+        ({"source": [[1, 2], [3]]}, "source is .*: expected numbers"),
+        ({"noise": [0.1, "little"]}, "noise is .*: expected numbers"),
+        ({"fiducials": [[1, 2, 3], [4]]}, "fiducials is .*: expected numbers"),
+        ({"mask": [[True], [True, False]]}, "mask is .*: expected numbers"),
+        ({"gains": [1, None, "x"]}, "gains is .*: expected numbers"),
+        ({"gains": "some"}, "gains are 'some': expected 'known', 'free' or a number an image"),
+        ({"gains": [1, -2]}, r"gains are \[1, -2\]: expected a positive number for each of 2"),
+        ({"gains": [1, 1, 1]}, "expected a positive number for each of 2 images"),
+        ({"fiducials": np.ones((2, 4))}, r"fiducials have shape \(2, 4\): expected rows of y, x"),
+        ({"fiducials": [[45, 5, 0, 0, 1]]}, "fiducials lie outside the image or have no positive"),
+        ({"fiducials": [[5, 5, 0, 0, 0]]}, "fiducials lie outside the image or have no positive"),
+        ({"images": images(1), "strengths": [1], "source": "unknown"}, "one image and an unknown"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_a_sentence(changes: Any, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as refused:
+        given(**changes)
+    assert "\n" not in str(refused.value)
+
+
+def test_one_image_and_an_unknown_source_are_taken_if_asked_for() -> None:
+    alone = given(
+        images=images(1)[0],
+        strengths=None,
+        source="unknown",
+        options=FitOptions(ambiguous=True, beam_modes=5),
+    )
+    assert alone.single
+    assert alone.scene.beam_modes == 5
+    assert alone.scene.free_gains
+
+
+def test_a_known_source_leaves_no_beam_to_be_found() -> None:
+    known = given(source=np.ones(SIZE))
+    assert known.scene.beam_modes == 0
+    assert not known.scene.free_gains
+
+
+@pytest.mark.parametrize(("second", "single"), [(1.0, True), (0.95, True), (0.8, False)])
+def test_images_at_nearly_one_energy_are_one_image(second: float, single: bool) -> None:
+    assert given(strengths=[1, second]).single is single
+
+
+def test_images_are_in_units_of_their_beams() -> None:
+    source = np.random.default_rng(1).uniform(3, 5, SIZE)
+    made = given(source=source, gains=[1, 2], noise=[0.1, 0.3])
+    pad = made.scene.pad
+    np.testing.assert_allclose(made.units, [source.mean(), 2 * source.mean()])
+    for k, stack in enumerate(images()):
+        np.testing.assert_allclose(made.scene.images[k, :40, :51] * made.units[k], stack)
+        beam = made.scene.beams[k, pad : pad + 40, pad : pad + 51]
+        np.testing.assert_allclose(beam * made.units[k], (1 + k) * source)
+        noise = made.units[k] / np.sqrt(made.scene.weights[k, :40, :51])
+        np.testing.assert_allclose(noise, (0.1, 0.3)[k])
+
+
+def test_without_a_source_the_beam_is_uniform_with_the_mean_of_each_image() -> None:
+    stack = images() * np.array([1, 3])[:, None, None]
+    made = given(images=stack)
+    np.testing.assert_allclose(made.units, stack.mean(axis=(1, 2)))
+    np.testing.assert_allclose(made.scene.beams, 1)
+
+
+def test_pixels_that_fill_up_blocks_and_masked_ones_do_not_count() -> None:
+    mask = np.ones(SIZE, bool)
+    mask[5, 6:9] = False
+    stack = images()
+    stack[:, ~mask] = np.nan
+    made = given(images=stack, mask=mask)
+    assert made.size == SIZE
+    assert made.scene.images.shape == (2, 40, 56)
+    np.testing.assert_array_equal(made.scene.weights[0, :40, :51] > 0, mask)
+    assert not made.scene.weights[:, :, 51:].any()
+    assert np.isfinite(made.scene.images).all()
+
+
+def test_strengths_are_relative_to_the_first_image() -> None:
+    made = given(strengths=[[2, 4], [1, 3]])
+    np.testing.assert_allclose(made.scene.strengths, [[1, 1], [0.5, 0.75]])
+
+
+def test_counts_vary_by_their_root() -> None:
+    counts = np.random.default_rng(2).poisson(100, (2, *SIZE))
+    made = given(images=counts, noise="poisson")
+    assert made.counted
+    noise = made.units[:, None, None] / np.sqrt(made.scene.weights[:, :, :51])
+    np.testing.assert_allclose(noise, 10, rtol=0.1)
+
+
+def test_noise_beyond_what_the_model_can_explain_is_not_believed() -> None:
+    made = given(noise=1e-9)
+    np.testing.assert_allclose(made.scene.weights[:, :, :51], 1 / 0.005**2)
+
+
+def test_fiducials_count_from_the_corner() -> None:
+    made = given(fiducials=[[3, 4, 0.5, -1, 0.2]])
+    known = made.scene.fiducials
+    assert known is not None
+    np.testing.assert_array_equal(known.places, [[3.5, 4.5]])
+    np.testing.assert_array_equal(known.displacements, [[0.5, -1]])
+    np.testing.assert_array_equal(known.errors, [0.2])
+
+
+def test_kernels_have_the_sum_one_and_each_image_may_have_its_own() -> None:
+    made = given(psf=[1.5, np.full((3, 5), 2.0)])
+    assert made.scene.psf[0] == 1.5
+    np.testing.assert_allclose(made.scene.psf[1], np.full((3, 5), 1 / 15))
+    assert given(psf=0.7).scene.psf == [0.7, 0.7]
+
+
+def test_one_kernel_is_for_all_images_and_kernels_may_differ_in_size() -> None:
+    for kernel in (np.ones((3, 5)), [[1, 1, 1]] * 5):
+        made = given(psf=kernel)
+        assert [np.shape(one) for one in made.scene.psf] == [np.shape(kernel)] * 2
+    made = given(psf=[np.ones((3, 3)), np.ones((5, 5))])
+    assert [np.shape(one) for one in made.scene.psf] == [(3, 3), (5, 5)]
+
+
+@pytest.mark.parametrize(("align", "free"), [("none", 0), ("shift", 2), ("affine", 6)])
+def test_alignment_frees_the_numbers_of_a_frame(align: Any, free: int) -> None:
+    assert given(options=FitOptions(align=align)).scene.free_frames.sum() == free
+
+
+def test_a_free_edge_has_a_wider_strip_and_fades() -> None:
+    stack = np.ones((1, 240, 280))
+    free = given(images=stack, strengths=[1], options=FitOptions(edge="free"))
+    assert free.scene.pad == 24  # a tenth of the shorter side in blocks
+    assert free.scene.decay == 24
+    fading = given(images=stack, strengths=[1])
+    assert fading.scene.pad == 16
+    assert fading.scene.decay == np.inf
+    own = given(options=FitOptions(edge="free", strip=40, fade_length=9.0))
+    assert (own.scene.pad, own.scene.decay) == (40, 9)
+
+
+def momentum_and_velocity(energy: float) -> tuple[float, float]:
+    """Of a proton with a kinetic energy in MeV: p c in MeV, and β."""
+    rest = constants.m_p * constants.c**2 / constants.e / 1e6
+    momentum = np.sqrt((energy + rest) ** 2 - rest**2)
+    return momentum, momentum / (energy + rest)
+
+
+def test_strengths_follow_from_momenta_and_velocities() -> None:
+    """A magnetic field deflects by 1 / p, an electric one by 1 / pβ."""
+    energies = (3.0, 14.7, 60.0)
+    found = strengths_of([protons(energy) for energy in energies], ("B", "E"), 3)
+    p, beta = np.transpose([momentum_and_velocity(energy) for energy in energies])
+    np.testing.assert_allclose(found[:, 0], p[0] / p, rtol=1e-9)
+    np.testing.assert_allclose(found[:, 1], (p * beta)[0] / (p * beta), rtol=1e-9)
+
+
+def test_strengths_grow_with_the_distance_over_which_rays_drift() -> None:
+    """Displacement at the object: angle × drift / magnification."""
+    near = protons(10, pixel_size=None, detector_pixel_size=42e-6)
+    far = protons(10, object_image_distance=0.4, pixel_size=None, detector_pixel_size=2e-6 * 41)
+    assert near.object_pixel_size == pytest.approx(far.object_pixel_size)
+    expected = (0.4 / 41) / (0.2 / 21)
+    np.testing.assert_allclose(strengths_of([near, far], ("B",), 2)[:, 0], [1, expected])
+
+
+def test_plasma_deflects_light_with_the_square_of_the_wavelength() -> None:
+    known = {"object_image_distance": 0.1, "pixel_size": 1e-6}
+    setups = [OpticalSetup(wavelength=length, **known) for length in (800e-9, 400e-9)]
+    np.testing.assert_allclose(strengths_of(setups, ("plasma",), 2)[:, 0], [1, 0.25])
+
+
+def test_fields_that_do_not_bend_the_beam_are_refused() -> None:
+    with pytest.raises(InputError, match="plasma"):
+        strengths_of([protons(3), protons(15)], ("plasma",), 2)
+
+
+def test_one_image_needs_no_setup() -> None:
+    np.testing.assert_array_equal(strengths_of(None, ("B",), 1), [[1]])
+
+
+def test_a_source_blurs_by_its_size_behind_the_object_and_the_detector_by_its_own() -> None:
+    """A source of size s is s L / l large at the detector; all is divided by M = 1 + L / l."""
+    setup = protons(10)  # l = 1 cm, L = 20 cm, M = 21, 2 µm at the object
+    assert point_spread(setup, source_size=10e-6) == pytest.approx(10 * 20 / 21 / 2)
+    assert point_spread(setup, resolution=84e-6) == pytest.approx(84 / 21 / 2)
+    both = point_spread(setup, 10e-6, 84e-6)
+    assert both == pytest.approx(np.hypot(10 * 20 / 21 / 2, 84 / 21 / 2))
+    assert point_spread(setup) == 0
+
+
+@pytest.mark.parametrize("length", [-1e-6, np.nan, np.inf])
+def test_lengths_that_are_none_are_refused(length: float) -> None:
+    with pytest.raises(InputError, match=r"source_size is .*: expected a length in m"):
+        point_spread(protons(10), source_size=length)
+    with pytest.raises(InputError, match=r"resolution is .*: expected a length in m"):
+        point_spread(protons(10), resolution=length)
+
+
+def test_noise_is_estimated_beside_structure_and_dead_pixels() -> None:
+    y, x = np.indices((100, 120))
+    structure = 3 + np.exp(-((y - 50) ** 2 + (x - 60) ** 2) / 2 / 8**2) + 0.02 * x
+    image = structure + np.random.default_rng(3).normal(0, 0.07, structure.shape)
+    used = np.ones(image.shape, bool)
+    assert estimated_noise(image, used) == pytest.approx(0.07, rel=0.05)
+    image[::7, ::5] = np.nan
+    used[::7, ::5] = False
+    assert estimated_noise(image, used) == pytest.approx(0.07, rel=0.05)
+    assert estimated_noise(image, np.zeros(image.shape, bool)) == 0
+
+
+def test_noise_that_nobody_tells_is_estimated() -> None:
+    stack = images() * np.array([1, 3])[:, None, None]
+    made = given(images=stack, noise=None)
+    noise = made.units[:, None] / np.sqrt(made.scene.weights[:, 0, :5])
+    np.testing.assert_allclose(noise / np.array([[0.1], [0.3]]), 1, atol=0.05)

@@ -1,0 +1,111 @@
+"""L-BFGS and conjugate gradients on problems with known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.minimise import minimise, product, solve
+
+
+def positive_definite(size: int, seed: int) -> FloatArray:
+    root = np.random.default_rng(seed).normal(size=(size, size))
+    return np.asarray(root @ root.T + np.eye(size))
+
+
+def rosenbrock(point: FloatArray) -> tuple[float, FloatArray]:
+    x, y = point
+    value = (1 - x) ** 2 + 100 * (y - x**2) ** 2
+    return value, np.array([-2 * (1 - x) - 400 * x * (y - x**2), 200 * (y - x**2)])
+
+
+def test_a_quadratic_has_its_minimum_where_the_gradient_vanishes() -> None:
+    matrix, right = positive_definite(30, 0), np.random.default_rng(1).normal(size=30)
+
+    def objective(point: FloatArray) -> tuple[float, FloatArray]:
+        return float(point @ matrix @ point / 2 - right @ point), matrix @ point - right
+
+    point, value, _ = minimise(objective, np.zeros(30), iterations=300, least_gain=1e-14)
+    exact = np.linalg.solve(matrix, right)
+    np.testing.assert_allclose(point, exact, atol=1e-5)
+    assert value == pytest.approx(-right @ exact / 2, rel=1e-10)
+
+
+def test_the_identity_is_solved_in_one_step() -> None:
+    goal = np.arange(5.0)
+
+    def objective(point: FloatArray) -> tuple[float, FloatArray]:
+        return float(((point - goal) ** 2).sum() / 2), point - goal
+
+    point, value, steps = minimise(objective, np.zeros(5), iterations=50, least_gain=1e-12)
+    np.testing.assert_allclose(point, goal, atol=1e-12)
+    assert steps == 1
+    assert value == pytest.approx(0, abs=1e-20)
+
+
+def test_a_curved_valley_is_followed_to_its_end() -> None:
+    point, value, steps = minimise(
+        rosenbrock, np.array([-1.2, 1.0]), iterations=200, least_gain=1e-15
+    )
+    np.testing.assert_allclose(point, 1, atol=1e-5)
+    assert value < 1e-10
+    assert steps < 80
+
+
+def test_the_value_falls_with_each_step_that_is_told() -> None:
+    told: list[tuple[int, float]] = []
+    _, value, steps = minimise(
+        rosenbrock,
+        np.array([-1.2, 1.0]),
+        iterations=200,
+        least_gain=1e-15,
+        after_step=lambda step, now: told.append((step, now)),
+    )
+    assert [step for step, _ in told] == list(range(1, steps + 1))
+    values = [now for _, now in told]
+    assert values == sorted(values, reverse=True)
+    assert values[-1] == value
+
+
+def test_it_ends_after_the_most_steps_or_where_little_is_gained() -> None:
+    start = np.array([-1.2, 1.0])
+    assert minimise(rosenbrock, start, iterations=7, least_gain=0)[2] == 7
+    _, value, steps = minimise(rosenbrock, start, iterations=200, least_gain=0.5)
+    assert steps < 30
+    assert value < rosenbrock(start)[0]
+
+
+def test_a_start_at_the_minimum_stays() -> None:
+    point, value, steps = minimise(rosenbrock, np.ones(2), iterations=10, least_gain=1e-12)
+    np.testing.assert_array_equal(point, 1)
+    assert (value, steps) == (0, 0)
+
+
+def test_conjugate_gradients_solve_what_elimination_solves() -> None:
+    matrix, right = positive_definite(40, 2), np.random.default_rng(3).normal(size=40)
+    found = solve(lambda v: matrix @ v, right, tolerance=1e-12, iterations=400)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), atol=1e-8)
+
+
+def test_conjugate_gradients_end_at_the_tolerance() -> None:
+    matrix, right = positive_definite(40, 4), np.random.default_rng(5).normal(size=40)
+    steps: list[int] = []
+    found = solve(
+        lambda v: matrix @ v, right, tolerance=0.05, iterations=400, after_step=steps.append
+    )
+    left = np.linalg.norm(matrix @ found - right) / np.linalg.norm(right)
+    assert 1e-4 < left <= 0.05 * 1.001
+    assert steps == list(range(1, len(steps) + 1))
+    solve(lambda v: matrix @ v, right, tolerance=0, iterations=3, after_step=steps.append)
+    assert steps[-3:] == [1, 2, 3]
+
+
+def test_nothing_on_the_right_gives_nothing() -> None:
+    np.testing.assert_array_equal(
+        solve(lambda v: v, np.zeros(4), tolerance=0.1, iterations=5), np.zeros(4)
+    )
+
+
+def test_product_is_the_scalar_product() -> None:
+    assert product(np.array([1.0, 2, 3]), np.array([4.0, -5, 6])) == 12

@@ -1,0 +1,161 @@
+"""What the data leave open, against dense matrices of a tiny problem."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.fft import idctn
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.descent import descend
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.fitting.rays import KNOT
+from napari_shadowinv.fitting.unknowns import Unknowns
+
+DRAWS = 160
+
+
+def weak_scene(size: tuple[int, int], smoothness: tuple[float, float]) -> Scene:
+    pad = 4
+    return Scene(
+        images=np.ones((2, *size)),
+        weights=np.full((2, *size), 400.0),
+        strengths=np.array([[1.0], [0.6]]),
+        beams=np.ones((2, size[0] + 2 * pad, size[1] + 2 * pad)),
+        psf=[0.0, 0.0],
+        smoothness=np.array([smoothness]),
+        pad=pad,
+        beam_modes=2,
+        free_gains=True,
+        free_frames=np.array([True, False, False] * 2),
+        threads=1,
+    )
+
+
+def dense_hessian(scene: Scene, unknowns: Unknowns) -> tuple[FloatArray, FloatArray]:
+    """Column by column; and which unknowns are free."""
+    counts = scene.ray_counts(unknowns)
+    columns = [
+        scene.hessian_times(unknowns, counts, unknowns.like(unit)).flat()
+        for unit in np.eye(unknowns.flat().size)
+    ]
+    matrix = np.stack(columns, axis=1)
+    return matrix, np.flatnonzero(np.diag(matrix))
+
+
+def half_log_determinant(matrix: FloatArray) -> float:
+    """Without what nothing holds: fixed unknowns, and the potential's constant."""
+    values = np.linalg.eigvalsh(matrix)
+    return float(np.log(values[values > 1e-9 * values.max()]).sum() / 2)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> tuple[Scene, Unknowns, FloatArray, FloatArray]:
+    scene = weak_scene((12, 16), (30.0, 100.0))
+    unknowns = scene.nothing()
+    y, x = np.indices(scene.rays.shape)
+    unknowns.potentials[0] = 2 * np.exp(-((y - 6) ** 2 + (x - 7) ** 2) / 6)
+    return scene, unknowns, *dense_hessian(scene, unknowns)
+
+
+def test_samples_have_the_inverse_hessian_as_covariance(
+    tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
+) -> None:
+    """Along any way v, v·sample is normal with the variance v·H⁻¹v."""
+    scene, unknowns, matrix, free = tiny
+    posterior = Posterior(scene, unknowns, np.random.default_rng(0))
+    samples = np.stack([posterior.drawn().flat() for _ in range(DRAWS)])
+    covariance = np.linalg.pinv(matrix[np.ix_(free, free)], rcond=1e-10, hermitian=True)
+    tolerance = 4 * np.sqrt(2 / DRAWS)
+    # What a measurement reads: displacements, gains, frames; not the potential's free constant.
+    size = unknowns.potentials.size
+    place = np.arange(size).reshape(scene.rays.shape)
+    ways = []
+    for row, column in ((4, 4), (6, 7), (8, 9)):
+        way = np.zeros(unknowns.flat().size)
+        way[place[row, column + 1]], way[place[row, column - 1]] = 1, -1
+        ways.append(way)
+    ways.append(np.zeros(unknowns.flat().size))
+    ways[-1][place[6, 7]], ways[-1][place[6, 8]], ways[-1][place[6, 6]] = 2, -1, -1
+    for part in ("beam", "gains", "frames"):
+        like = unknowns.zeros()
+        getattr(like, part)[-1, ...] = 1
+        ways.append(like.flat())
+    for way in ways:
+        expected = way[free] @ covariance @ way[free]
+        found = ((samples @ way) ** 2).mean()
+        assert found == pytest.approx(expected, rel=tolerance)
+
+
+def test_what_is_known_does_not_vary(
+    tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
+) -> None:
+    scene, unknowns, _, _ = tiny
+    drawn = Posterior(scene, unknowns, np.random.default_rng(1)).drawn()
+    assert not drawn.frames[0].any()
+    np.testing.assert_array_equal(drawn.frames[1] != 0, scene.free_frames)
+    assert drawn.beam[0, 0] == 0
+
+
+def test_the_same_seed_draws_the_same_samples(
+    tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
+) -> None:
+    scene, unknowns, _, _ = tiny
+    one, other, third = (
+        Posterior(scene, unknowns, np.random.default_rng(seed)).drawn().flat() for seed in (2, 2, 3)
+    )
+    np.testing.assert_array_equal(one, other)
+    assert (one != third).any()
+
+
+def test_the_log_volume_falls_by_that_of_better_data(
+    tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
+) -> None:
+    """Half the change of log det H as the data improve, within the scatter of the probes."""
+    scene, unknowns, matrix, _ = tiny
+    better = replace(scene, weights=16 * scene.weights)
+    dense, _ = dense_hessian(better, unknowns)
+    exact = [half_log_determinant(one) for one in (matrix, dense)]
+    found = [
+        np.mean(
+            [Posterior(one, unknowns, np.random.default_rng(seed)).log_volume() for seed in (4, 5)]
+        )
+        for one in (scene, better)
+    ]
+    assert found[1] - found[0] == pytest.approx(exact[1] - exact[0], rel=0.1)
+
+
+@pytest.mark.parametrize("true", [30.0, 300.0])
+def test_the_likeliest_smoothness_is_that_of_the_field(true: float) -> None:
+    """A field drawn from the prior, images with noise: λ comes back within a factor of two."""
+    scene = replace(
+        weak_scene((48, 48), (true, 0.0)),
+        beam_modes=0,
+        free_gains=False,
+        free_frames=np.zeros(6, bool),
+        spacing=1 / 3,
+        tie=1e-3,
+    )
+    rng = np.random.default_rng(5)
+    truth = scene.nothing()
+    whole = scene.prior.of_rough[0].sum(axis=0)
+    waves = np.divide(1, np.sqrt(whole), out=np.zeros_like(whole), where=whole > 0)
+    # Of the longest waves, which neither images nor λ tell much about, little.
+    waves *= scene.prior.wave_numbers > (1.5 * np.pi / (KNOT * max(whole.shape))) ** 2
+    truth.potentials[0] = idctn(waves * rng.normal(size=whole.shape), norm="ortho")
+    made = scene.model(truth, scene.ray_counts(truth))
+    noisy = made + rng.normal(0, 0.05, made.shape)
+    # From far off; κ has no part in such a field.
+    smoothness = np.array([[2000.0, 0.0]])
+    unknowns = scene.nothing()
+    for _ in range(5):
+        now = replace(scene, images=noisy, smoothness=smoothness)
+        unknowns, _, _ = descend(now, unknowns, iterations=100, least_gain=0.5)
+        likely, change = Posterior(now, unknowns, rng).likely_smoothness()
+        smoothness = likely * [1, 0]
+        if change < 0.1:
+            break
+    assert 0.5 < smoothness[0, 0] / true < 2
