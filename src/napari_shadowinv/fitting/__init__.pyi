@@ -1,4 +1,4 @@
-from ._fit import fit
+from ._fit import compare, fit
 from .measurements import FIELDS, point_spread
 from .options import FitOptions
 from .result import Basin, Fit, FitReport, FittedField
@@ -12,6 +12,7 @@ __all__ = [
     "FitReport",
     "FittedField",
     "Verdict",
+    "compare",
     "fit",
     "point_spread",
 ]

@@ -1,4 +1,4 @@
-"""The forward model fitted to images: `fit`, `compare`."""
+"""The forward model fitted to images: `fit`, and choices of fields compared: `compare`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["fit"]
+__all__ = ["compare", "fit"]
 
 _FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
 _FROM_NEAR = ((2, 4.0), (2, 2.0), (2, 1.0))
@@ -164,11 +164,49 @@ def fit(
     with _timed("full size", seconds):
         fine, unknowns, value, taken, ended = refined(scene, best, options, tell)
     with _timed("samples", seconds):
-        errors = _errors(scene, best, given, options, rng, tell)
-    return _result(
-        given, fine, unknowns, fields, setups, options, basins, errors,
-        FitReport(value, taken, ended, seconds, float("nan")),
-    )  # fmt: skip
+        middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
+        posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", value))
+        errors = _errors(scene, posterior, given.size, options.samples)
+        evidence = posterior.log_evidence() if options.evidence else float("nan")
+    found_by = FitReport(value, taken, ended, seconds, float("nan"), evidence)
+    return _result(given, fine, unknowns, fields, setups, options, basins, errors, found_by)
+
+
+def compare(
+    images: ArrayLike,
+    *,
+    choices: Sequence[Sequence[str]] = (("B",), ("E",), ("B", "E")),
+    options: FitOptions | None = None,
+    **keywords: Any,
+) -> tuple[Fit, ...]:
+    """Fit several choices of fields to the same images, to see which explains them.
+
+    Parameters
+    ----------
+    images, options, **keywords
+        As for `fit`, with `setups`.
+    choices : sequence of sequence of str, default B alone, E alone, both
+        What may deflect.
+
+    Returns
+    -------
+    tuple of Fit
+        One for each choice, the likeliest first: by ``report.log_evidence``, in which more
+        fields have to be worth it. A difference of 10 decides.
+
+    Raises
+    ------
+    InputError
+        As `fit`, and if no setups are given.
+    """
+    if keywords.get("setups") is None or "fields" in keywords or "strengths" in keywords:
+        raise InputError(
+            "comparing fields needs the setup of each image, and neither fields nor strengths: "
+            "how much each field displaces follows from the setups"
+        )
+    asked = (options or FitOptions()).model_copy(update={"evidence": True})
+    fits = [fit(images, fields=choice, options=asked, **keywords) for choice in choices]
+    return tuple(sorted(fits, key=lambda each: -each.report.log_evidence))
 
 
 @contextmanager
@@ -265,21 +303,17 @@ def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tu
 
 
 def _errors(
-    scene: Scene, best: Found, given: Measured, options: FitOptions, rng: Any, tell: Any
+    scene: Scene, posterior: Posterior, size: tuple[int, int], samples: int
 ) -> FloatArray | None:
     """Standard deviation of each field's displacement in px, (M, 2, H, W)."""
-    if options.samples < 2:
+    if samples < 2:
         return None
-    middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
-    posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", best.value))
-    squares: FloatArray | float = 0.0
-    for _ in range(options.samples):
+    height, width = size
+    squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
+    for _ in range(samples):
         change = finer(posterior.drawn())
-        drawn = np.stack([scene.rays.displacement(p) for p in change.potentials])
-        squares = squares + drawn**2
-    variance = np.asarray(squares) / options.samples
-    smooth = gaussian_filter(variance, (0, 0, _SMOOTHED_ERRORS, _SMOOTHED_ERRORS))
-    height, width = given.size
+        squares += np.stack([scene.rays.displacement(p) for p in change.potentials]) ** 2
+    smooth = gaussian_filter(squares / samples, (0, 0, _SMOOTHED_ERRORS, _SMOOTHED_ERRORS))
     return np.asarray(np.sqrt(smooth[..., :height, :width]))
 
 

@@ -83,6 +83,14 @@ class FitOptions(BaseModel):
         title="Samples",
         description="Random fields from which the error bars are made; 0 for none.",
     )
+    evidence: bool = Field(
+        default=False,
+        title="Evidence",
+        description=(
+            "Work out how likely the choice of fields makes the data, to compare choices; takes "
+            "as long as some samples."
+        ),
+    )
     spacing: float | None = Field(
         default=None,
         ge=0.05,

@@ -109,6 +109,11 @@ class Posterior:
             total += size * float((vectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
         return total / _PROBES / 2 - self._scales.log_size()
 
+    def log_evidence(self) -> float:
+        """Return the logarithm of how likely the model makes the data, but for a constant."""
+        value, _ = self._scene.value_and_gradient(self._unknowns, self._counts)
+        return -value - self.log_volume()
+
     def _times(self, flat: FloatArray) -> FloatArray:
         self._after_step()
         change = self._scales.times(self._unknowns.like(flat))
