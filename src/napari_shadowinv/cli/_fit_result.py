@@ -134,7 +134,9 @@ def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
     if fit.folded:
         rows.append(("crossed rays", f"{fit.folded:.1%} of the pixels"))
     if not fit.report.converged:
-        rows.append(("warning", f"not converged in {fit.report.iterations} steps: allow more (--steps)"))
+        rows.append(
+            ("warning", f"not converged in {fit.report.iterations} steps: allow more (--steps)")
+        )
     stages = ", ".join(f"{stage} {value:.2f}" for stage, value in fit.report.seconds.items())
     return [*rows, ("time", f"{sum(fit.report.seconds.values()):.2f} s ({stages})")]
 

@@ -23,14 +23,14 @@ _CONFIG = ConfigDict(frozen=True, extra="forbid")
 
 def _noise(value: Any) -> Any:
     if value != "poisson" and not _is_number(str(value)):
-        raise ValueError("noise is 'poisson' or the standard deviation in a pixel")
+        raise ValueError("expected 'poisson' or the standard deviation in a pixel")
     return value if value == "poisson" else float(value)
 
 
 def _strength(value: Any) -> Any:
     parts = str(value).split()
     if not parts or not all(map(_is_number, parts)):
-        raise ValueError("strength is a number, or one for each field with spaces between them")
+        raise ValueError("expected a number, or one for each field with spaces between them")
     return tuple(map(float, parts))
 
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting import FIELDS, Fit, FittedField, Verdict
+from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.units import ShownField, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._drawing import (
@@ -18,6 +19,7 @@ from napari_shadowinv.plotting._drawing import (
     draw_intensity,
     draw_potential,
     intensity_limits,
+    outline_caustics,
 )
 from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Grid, Panel
 
@@ -37,7 +39,8 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     For each image: the beam unless it is uniform, the image, its re-projection, and the residual
     in units of the noise's r.m.s. standard deviation. Below for each field: its potential where
     there is room, the field with arrows, the standard deviation that the noise leaves, and
-    profiles along the dashed lines on the field.
+    profiles along the dashed lines on the field. White outlines are where rays have crossed in
+    any image.
 
     Parameters
     ----------
@@ -138,6 +141,7 @@ def _draw_fitted(
             draw_potential(panel, field.potential, fit.setups[0] if fit.setups else None)
         elif what == "field":
             draw_field(panel, shown, title)
+            outline_caustics(panel, _crossed(fit))
         elif what == "error" and error is not None:
             limits = 0.0, float(error.magnitude.max()) or 1.0
             label = f"σ of {shown.symbol} ({error.unit})"
@@ -146,6 +150,13 @@ def _draw_fitted(
             draw_cuts(panel, shown, _magnitude_error(fit, field))
     for panel in panels[len(wanted) :]:
         panel.axes.remove()
+
+
+def _crossed(fit: Fit) -> BoolArray:
+    """Where rays have crossed others, in any image."""
+    found = np.stack([field.displacement for field in fit.fields])
+    moved = np.einsum("lm,mcyx->lcyx", fit.strengths, found)
+    return np.asarray(np.any([jacobian_determinant(one) < 0 for one in moved], axis=0))
 
 
 def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
@@ -157,6 +168,7 @@ def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
     pixels = along / np.maximum(length, 1e-12)
     shown, _ = _shown(fit, field)
     strongest = shown.peak
+    # Displacements become fields by a factor.
     return np.asarray(pixels * shown.magnitude[strongest] / max(length[strongest], 1e-12))
 
 
