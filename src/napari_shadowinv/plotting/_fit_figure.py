@@ -130,8 +130,7 @@ def _draw_fitted(
     error: ShownField | None,
 ) -> None:
     """Fill a row of panels with a field; the potential comes first if there is room for it."""
-    several = len(fit.fields) > 1
-    title = f"{shown.name} ({field.name})" if several else shown.name
+    title = shown.name if len(fit.fields) == 1 else f"{field.name}: {shown.symbol}"
     wanted = ["potential", "field", "error", "cuts"]
     if error is None:
         wanted.remove("error")
