@@ -14,6 +14,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.fitting import Fit, Verdict
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.plotting import (
     comparison_figure,
     fit_figure,
@@ -239,9 +240,8 @@ def test_fields_and_error_bars_of_a_fit_are_in_si(
     error = np.hypot(*proton_setup.path_integrated_b(field.uncertainty)) * 1e6
     np.testing.assert_allclose(shown[7].images[0].get_array(), error)
     # The band of the cut along x, at the peak: the error along the field.
-    row, column = np.unravel_index(
-        np.argmax(np.hypot(*field.displacement)), field.displacement.shape[1:]
-    )
+    (in_si,) = shown_fields([field.displacement], proton_setup)
+    row, column = in_si.peak
     direction = field.displacement[:, row, column] / np.hypot(*field.displacement[:, row, column])
     expected = np.hypot(*(direction * field.uncertainty[:, row, column]))
     expected *= proton_setup.path_integrated_b([[0.0], [1.0]])[0, 0] * -1e6
