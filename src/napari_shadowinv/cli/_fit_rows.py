@@ -17,6 +17,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from napari_shadowinv._system.safety import small_text
 from napari_shadowinv._system.validation import nearest, validated
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.formats import SITES
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid")
 
@@ -157,7 +158,7 @@ def _known(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _is_table(path: Path) -> bool:
     """Whether a file is a table with names of columns, and no image as numbers."""
-    if path.suffix.lower() != ".csv":
+    if path.suffix.lower() not in SITES.suffixes:
         return False
     lines = _lines(path)
     return bool(lines) and not any(map(_is_number, _cells(lines[0])))

@@ -12,7 +12,9 @@ import numpy as np
 from napari_shadowinv.cli._inputs import read_shot, setup_from
 from napari_shadowinv.cli._terminal import interrupted
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup import OpticalSetup, setup_from_dict
+from napari_shadowinv.fitting import FIELDS, point_spread
+from napari_shadowinv.physics.projection import default_deflector
+from napari_shadowinv.physics.setup import setup_from_dict
 from napari_shadowinv.pipeline import gathered
 from napari_shadowinv.preprocessing import Recipe
 
@@ -144,14 +146,14 @@ def fields_for(text: str | None, setups: Sequence[Setup] | None) -> list[str]:
     """Names of the fields that are asked for, or the one that usually bends such beams."""
     if text is not None:
         return [name.strip() for name in text.split(",") if name.strip()]
-    if not setups or not isinstance(setups[0], OpticalSetup):
+    if not setups:
         return ["B"]
-    if len({getattr(setup, "wavelength", None) for setup in setups}) > 1:
-        raise InputError(
-            "the wavelengths differ and no field was named: choose --fields plasma or --fields "
-            "phase"
-        )
-    return ["phase"]
+    names = {deflector: name for name, deflector in FIELDS.items()}
+    try:
+        (usual,) = {names[default_deflector(setups[0], setup)] for setup in setups}
+    except InputError as error:
+        raise InputError(f"{error}; name it with --fields, of {', '.join(FIELDS)}") from error
+    return [usual]
 
 
 def _read(
@@ -186,8 +188,6 @@ def _setup(row: ShotRow, shot: Radiograph) -> Setup | None:
 def _spread(
     row: ShotRow, setup: Setup | None, source_size: float | None, resolution: float | None
 ) -> float:
-    from napari_shadowinv.fitting import point_spread
-
     if source_size is None and resolution is None:
         return row.psf or 0.0
     if row.psf is not None:
