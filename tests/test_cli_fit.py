@@ -256,6 +256,8 @@ def test_known_displacements_come_from_a_table(given: dict[str, Any]) -> None:
     Path("mesh.csv").write_text("x;y;dx;dy;sigma\n20;10;0.5;-0.25;0.1\n30;12;0.4;0;0.2\n")
     assert shadowinv("fit", "a.tif", "--fiducials", "mesh.csv").exit_code == 0
     assert given["fiducials"] == [(10, 20, -0.25, 0.5, 0.1), (12, 30, 0, 0.4, 0.2)]
+    origin = json.loads(fit_in("a_fit.shadowinv")[1].attrs["fiducials"])
+    assert origin == {"file": "mesh.csv", "sha256": sha256("mesh.csv")}
 
 
 def test_light_is_bent_by_a_refractive_index_unless_said_otherwise(given: dict[str, Any]) -> None:
@@ -367,6 +369,14 @@ def test_forward_takes_the_field_of_a_fit(make_fit: Callable[..., Fit]) -> None:
     assert shadowinv("forward", "fit.shadowinv", "--out", "seen.npy").exit_code == 0
     expected = synthetic_image(fit.fields[0].displacement, fit.source[0])
     np.testing.assert_array_equal(np.load("seen.npy"), expected)
+
+
+def test_a_damaged_fit_is_told_in_a_sentence(
+    refused: Callable[..., None], make_fit: Callable[..., Fit]
+) -> None:
+    write("fit.shadowinv", make_fit().to_dataset().assign_attrs(verdict="perhaps"))
+    for command in ("forward", "info"):
+        refused(command, "fit.shadowinv", names=("fit.shadowinv is damaged", "perhaps"))
 
 
 def test_forward_asks_which_of_two_fields(

@@ -135,7 +135,7 @@ def fit(
         options=chosen,
         quiet=quiet,
     )
-    _fit_result.write_fit(found, shots, result, figure, overwrite)
+    _fit_result.write_fit(found, shots, result, figure, overwrite, fiducials)
     if not quiet:
         say(_fit_result.fit_table(found, shots, [result, figure]))
     _fit_result.alarm_unless_determined(found, result)

@@ -52,14 +52,21 @@ def fitted(
     return replace(found, setups=shots.setups or ())
 
 
-def write_fit(fit: Fit, shots: FitShots, out: Path, report: Path, overwrite: bool) -> None:
-    """Write a fit and its figure, both or none of them."""
+def write_fit(
+    fit: Fit, shots: FitShots, out: Path, report: Path, overwrite: bool, fiducials: Path | None
+) -> None:
+    """Write a fit and its figure, both or none of them; tell which files it was made from."""
     from napari_shadowinv.cli._outputs import write_both
-    from napari_shadowinv.io.files import text_of
+    from napari_shadowinv.io.files import sha256, text_of
     from napari_shadowinv.plotting import fit_figure
+    from napari_shadowinv.preprocessing import Origin
 
     title = ", ".join(text_of(row.file.name) for row in shots.rows)
-    dataset = fit.to_dataset(attributes={"origins": shots.origins()})
+    told = {"origins": shots.origins()}
+    if fiducials is not None:
+        table = Origin(file=text_of(fiducials.name), sha256=sha256(fiducials))
+        told["fiducials"] = table.model_dump_json(exclude_none=True)
+    dataset = fit.to_dataset(attributes=told)
     write_both(dataset, fit_figure(fit, title=title), out, report, overwrite)
 
 

@@ -88,7 +88,8 @@ class FitShots:
             if row.source == "unknown":
                 one["source"] = "unknown"
             steps = [step.model_dump(mode="json") for step in made.recipe.steps]
-            told.append({**one, "steps": steps, "psf": spread, "noise": row.noise})
+            known = row.model_dump(include={"noise", "gain"}, exclude_none=True)
+            told.append({**one, "steps": steps, "psf": spread, **known})
         return json.dumps(told)
 
     def _source(self) -> Any:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli._tables import setup_text
 from napari_shadowinv.errors import FileFormatError, InputError
 
@@ -50,6 +51,7 @@ def field_from(path: Path, variable: str | None = None) -> Field:
     raise _no_field(path, f"a {kind.upper()} picture")
 
 
+@refusing_damage
 def _fitted(path: Path, dataset: xarray.Dataset) -> Field:
     """The only field of a fit, with the beam of its first image."""
     from napari_shadowinv.fitting import Fit
