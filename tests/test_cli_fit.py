@@ -379,6 +379,11 @@ def test_a_damaged_fit_is_told_in_a_sentence(
         refused(command, "fit.shadowinv", names=("fit.shadowinv is damaged", "perhaps"))
 
 
+def test_rerun_refuses_a_fit(refused: Callable[..., None], make_fit: Callable[..., Fit]) -> None:
+    write("fit.shadowinv", make_fit())
+    refused("rerun", "fit.shadowinv", names=("fit.shadowinv is a fit", "shadowinv fit"))
+
+
 def test_forward_asks_which_of_two_fields(
     refused: Callable[..., None], make_fit: Callable[..., Fit]
 ) -> None:

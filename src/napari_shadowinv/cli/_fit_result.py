@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -127,7 +128,7 @@ def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
         ("setup", setup_text(fit.setups[0] if fit.setups else None)),
         *[(f"field {field.name}", _field_text(fit, field)) for field in fit.fields],
     ]
-    if fit.report.uncertainty == fit.report.uncertainty:
+    if not math.isnan(fit.report.uncertainty):
         rows.append(("error bars", f"{fit.report.uncertainty:.2%} of the displacement (r.m.s.)"))
     best, *others = fit.basins
     rows += [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -69,14 +70,7 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     letters = int(grid.figure_size[0] * _LETTERS)
     heading = title and textwrap.shorten(title, int(letters * 0.7), placeholder=" …")
     header, footer = _header(fit, letters), _footer(fit, [one for one, _ in shown], letters)
-    grid = Grid(
-        rows + len(shown),
-        columns,
-        width,
-        height,
-        foot=0.12 + 0.18 * len(footer),
-        head=0.52 + 0.18 * len(header),
-    )
+    grid = replace(grid, foot=0.12 + 0.18 * len(footer), head=0.52 + 0.18 * len(header))
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), heading)
         for k in range(count):
@@ -183,7 +177,7 @@ def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
 
 def _footer(fit: Fit, shown: list[ShownField], letters: int) -> list[tuple[str, str]]:
     facts = [field.peak_text for field in shown]
-    if fit.report.uncertainty == fit.report.uncertainty:
+    if not np.isnan(fit.report.uncertainty):
         facts.append(f"error bars {fit.report.uncertainty:.2%} of the displacement (r.m.s.)")
     facts.append(f"gains {', '.join(f'{gain:.3g}' for gain in fit.gains)}")
     if fit.folded:
