@@ -28,8 +28,7 @@ class Field:
 
 def field_from(path: Path, variable: str | None = None) -> Field:
     """Displacement from a result, or from an array of px or px²."""
-    from napari_shadowinv.fitting.result import is_fit
-    from napari_shadowinv.inversion.labels import setup_from_dataset
+    from napari_shadowinv.inversion.labels import is_fit, setup_from_dataset
     from napari_shadowinv.io import read_dataset, read_radiograph
     from napari_shadowinv.io.formats import kind_of
     from napari_shadowinv.io.hdf5 import read_hdf5

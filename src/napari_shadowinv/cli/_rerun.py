@@ -14,8 +14,8 @@ from napari_shadowinv.cli._inputs import read_shot
 from napari_shadowinv.cli._outputs import protect
 from napari_shadowinv.cli._terminal import inverted
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.fitting.result import is_fit
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion.labels import is_fit
 from napari_shadowinv.io import read_dataset
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,15 +14,13 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.options import FitOptions
 from napari_shadowinv.fitting.verdict import Verdict
-from napari_shadowinv.inversion.labels import dataset_from_field, label
+from napari_shadowinv.inversion.labels import FIT_FORMAT, dataset_from_field, label
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["FORMAT", "Basin", "Fit", "FitReport", "FittedField", "is_fit"]
-
-FORMAT = "shadowinv fit"
+__all__ = ["Basin", "Fit", "FitReport", "FittedField"]
 
 _IMAGES = ("image", "y", "x")
 # Variables beside those of the fields: dimensions, units, long name.
@@ -218,7 +216,7 @@ class Fit:
         known = self.setups if setups is None else setups
         setup = known[0] if known else None
         history = {
-            "format": FORMAT,
+            "format": FIT_FORMAT,
             "options": self.options.model_dump_json(),
             "report": json.dumps(dataclasses.asdict(self.report)),
             "verdict": self.verdict.value,
@@ -324,11 +322,6 @@ class Fit:
             "basin_distance": np.array([basin.distance for basin in self.basins]),
             "basin_displacement": np.stack([basin.displacement for basin in self.basins]),
         }
-
-
-def is_fit(attributes: Mapping[Any, Any]) -> bool:
-    """Tell whether the attributes of a dataset are those of a fit."""
-    return attributes.get("format") == FORMAT
 
 
 def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArray) -> FittedField:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting.result import is_fit
-from napari_shadowinv.inversion.labels import FORMAT
+from napari_shadowinv.inversion.labels import FORMAT, is_fit
 from napari_shadowinv.io.hdf5 import check_arrays, hdf5_in_memory
 
 if TYPE_CHECKING:

@@ -20,8 +20,7 @@ import numpy as np
 from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.fitting.result import is_fit
-from napari_shadowinv.inversion.labels import FORMAT, dataset_from_field, setup_from_dataset
+from napari_shadowinv.inversion.labels import FORMAT, dataset_from_field, is_fit, setup_from_dataset
 from napari_shadowinv.io.dataset import require
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
 from napari_shadowinv.preprocessing import Provenance
