@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from napari_shadowinv.fitting import Basin, Fit, FitOptions, FitReport, FittedField, Verdict
 from napari_shadowinv.inversion import Inversion, Report
 from napari_shadowinv.inversion.trust import image_residual
 from napari_shadowinv.options import InversionOptions
@@ -67,6 +68,63 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         report=Report(**{**facts, **report}),  # type: ignore[arg-type]
         options=InversionOptions(n_sites=17, tolerance=1e-3, seed=5, negative="clip"),
     )
+
+
+def fit_exactly(
+    shape: tuple[int, int] = (48, 64),
+    names: tuple[str, ...] = ("B",),
+    strengths: tuple[float, ...] = (1.0, 1.7),
+    **changes: object,
+) -> Fit:
+    """Fit of images of a blob, as if it had been found exactly."""
+    rng = np.random.default_rng(3)
+    height, width = shape
+    count = len(strengths)
+    blob = gaussian_blob(shape, 12.0, 0.15 * min(shape), (0.4 * height, 0.6 * width))
+    matrix = np.array([[one ** (m + 1) for m in range(len(names))] for one in strengths])
+    moved = [row.sum() * blob.displacement for row in matrix]
+    made = np.stack([3 * synthetic_image(displacement) for displacement in moved])
+    residual = rng.normal(0, 0.05, made.shape)
+    mask = np.ones(made.shape, bool)
+    mask[0, :4, :6] = False
+    residual[~mask] = 0
+    found = {
+        "images": made + residual,
+        "mask": mask,
+        "strengths": matrix,
+        "fields": tuple(
+            FittedField(
+                name,
+                blob.potential,
+                blob.displacement,
+                rng.uniform(0.01, 0.03, (2, *shape)),
+                (1 / 3, 2.0),
+            )
+            for name in names
+        ),
+        "source": np.full(made.shape, 3.0),
+        "gains": np.linspace(1, 1.1, count),
+        "frames": rng.normal(0, 0.1, (count, 6)),
+        "reprojection": made,
+        "residual": residual,
+        "chi2": np.array([(one[use] ** 2).mean() for one, use in zip(residual, mask, strict=True)])
+        / 0.05**2,
+        "basins": tuple(
+            Basin(start, value, 1.01, away, rng.normal(size=(len(names), 2, 24, 32)))
+            for start, value, away in (("from far", 100 / 3, 0.0), ("from near", 40.0, 0.3))
+        ),
+        "folded": 0.1,
+        "verdict": Verdict.DETERMINED,
+        "explanation": "all starts lead to one field, which explains 2 images to the noise",
+        "report": FitReport(100 / 3, 12, True, {"starts": 0.5, "full size": 1.5}, 0.02),
+        "options": FitOptions(align="shift", threads=2),
+    }
+    return Fit(**{**found, **changes})  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="session")
+def make_fit() -> Callable[..., Fit]:
+    return fit_exactly
 
 
 @pytest.fixture(scope="session")

@@ -1,3 +1,4 @@
+import dataclasses
 import sys
 from collections.abc import Callable
 from itertools import combinations
@@ -10,11 +11,20 @@ import pytest
 from matplotlib.figure import Figure
 
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.fitting import Fit, Verdict
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
+from napari_shadowinv.physics.units import shown_fields
+from napari_shadowinv.plotting import (
+    comparison_figure,
+    fit_figure,
+    report_figure,
+    save_figure,
+)
 
 Make = Callable[..., Inversion]
+
+MakeFit = Callable[..., Fit]
 
 SHAPES = [(60, 60), (58, 72), (30, 120), (120, 30)]
 
@@ -152,3 +162,122 @@ def test_no_window_system_is_touched(inversion: Inversion) -> None:
     before = "matplotlib.pyplot" in sys.modules
     report_figure(inversion)
     assert ("matplotlib.pyplot" in sys.modules) == before
+
+
+# Fits
+
+
+def setups_of(proton_setup: ProtonSetup, count: int) -> tuple[ProtonSetup, ...]:
+    return tuple(proton_setup.model_copy(update={"energy": 3.0 + k}) for k in range(count))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("names", [("B",), ("B", "E")])
+def test_no_panel_of_a_fit_touches_another(
+    make_fit: MakeFit,
+    proton_setup: ProtonSetup,
+    shape: tuple[int, int],
+    count: int,
+    names: tuple[str, ...],
+) -> None:
+    fit = make_fit(
+        shape,
+        names,
+        (1.0, 1.2, 1.4, 1.6, 1.8)[:count],
+        setups=setups_of(proton_setup, count),
+        verdict=Verdict.MISFIT,
+        explanation="a long explanation " * 20,
+    )
+    figure = fit_figure(fit, title=", ".join(["some_shot_of_the_night.tif"] * count))
+    figure.canvas.draw()
+    boxes = [axes.get_tightbbox() for axes in panels(figure)]
+    texts = [text.get_window_extent() for text in figure.texts]
+    page = figure.bbox
+    for box in boxes + texts:
+        assert page.x0 <= box.x0
+        assert box.x1 <= page.x1
+        assert page.y0 <= box.y0
+        assert box.y1 <= page.y1
+    for first, second in combinations(boxes + texts, 2):
+        assert not first.overlaps(second)
+    assert len(figure.axes) == len(panels(figure))  # no panel is empty
+
+
+def test_a_fit_shows_each_image_its_explanation_and_the_field(
+    make_fit: MakeFit, proton_setup: ProtonSetup
+) -> None:
+    fit = make_fit(setups=setups_of(proton_setup, 2))
+    shown = titles(fit_figure(fit))
+    assert shown == [
+        "Image 1: 3 MeV proton", "Re-projection", f"Residual: χ² {fit.chi2[0]:.3g}",
+        "Image 2: 4 MeV proton", "Re-projection", f"Residual: χ² {fit.chi2[1]:.3g}",
+        "Path-integrated field", "Standard deviation", "Cuts through the peak",
+    ]  # fmt: skip
+    # A beam that is not uniform comes first, and leaves room for the potential.
+    beam = np.linspace(2, 4, fit.source.size).reshape(fit.source.shape)
+    shown = titles(fit_figure(dataclasses.replace(fit, source=beam)))
+    assert (shown[0], shown[4], shown[8]) == ("Beam", "Beam", "Deflection potential")
+
+
+def test_residuals_of_a_fit_are_in_units_of_the_noise(make_fit: MakeFit) -> None:
+    fit = make_fit()
+    for k, index in enumerate((2, 5)):
+        residual = np.asarray(panels(fit_figure(fit))[index].images[0].get_array())
+        # The noise of `make_fit` is 0.05 everywhere.
+        np.testing.assert_allclose(residual, fit.residual[k] / 0.05)
+
+
+def test_fields_and_error_bars_of_a_fit_are_in_si(
+    make_fit: MakeFit, proton_setup: ProtonSetup
+) -> None:
+    fit = make_fit(names=("B", "E"), setups=(proton_setup, proton_setup))
+    shown = panels(fit_figure(fit))
+    labels = [axes.child_axes[0].get_ylabel() for axes in shown[6:8] + shown[9:11]]
+    assert labels == ["|∫B×dz| (µT·m)", "σ of |∫B×dz| (µT·m)", "|∫E dz| (kV)", "σ of |∫E dz| (kV)"]
+    field = fit.fields[0]
+    assert field.uncertainty is not None
+    error = np.hypot(*proton_setup.path_integrated_b(field.uncertainty)) * 1e6
+    np.testing.assert_allclose(shown[7].images[0].get_array(), error)
+    # The band of the cut along x, at the peak: the error along the field.
+    (in_si,) = shown_fields([field.displacement], proton_setup)
+    row, column = in_si.peak
+    direction = field.displacement[:, row, column] / np.hypot(*field.displacement[:, row, column])
+    expected = np.hypot(*(direction * field.uncertainty[:, row, column]))
+    expected *= proton_setup.path_integrated_b([[0.0], [1.0]])[0, 0] * -1e6
+    band = shown[8].collections[0].get_paths()[0].vertices
+    place = column * proton_setup.object_pixel_size * 1e6
+    heights = band[np.isclose(band[:, 0], place)][:, 1]
+    assert np.ptp(heights) / 2 == pytest.approx(expected)
+
+
+def test_the_verdict_of_a_fit_is_on_top_in_its_colour(make_fit: MakeFit) -> None:
+    good = make_fit()
+    bad = dataclasses.replace(good, verdict=Verdict.SEVERAL, explanation="two fields explain it")
+    colours = []
+    for fit in (good, bad):
+        (line,) = [
+            text
+            for text in fit_figure(fit, title="Shot").texts
+            if text.get_text().startswith(fit.verdict.upper())
+        ]
+        assert fit.explanation in line.get_text()
+        colours.append(line.get_color())
+    assert colours == ["#1b6e3c", "#b00020"]
+
+
+def test_a_fit_without_error_bars_or_misfit_is_no_error(make_fit: MakeFit) -> None:
+    fit = make_fit()
+    calm = tuple(
+        dataclasses.replace(
+            field,
+            potential=0 * field.potential,
+            displacement=0 * field.displacement,
+            uncertainty=None,
+        )
+        for field in fit.fields
+    )
+    still = dataclasses.replace(fit, fields=calm, residual=0 * fit.residual, chi2=0 * fit.chi2)
+    figure = fit_figure(still)
+    figure.canvas.draw()
+    assert titles(figure)[-3:] == ["Deflection potential", "Displacement", "Cuts through the peak"]

@@ -64,7 +64,7 @@ def write_pages(app: Sphinx, config: Config) -> None:
 
 
 def parameters_page() -> str:
-    from napari_shadowinv import InversionOptions
+    from napari_shadowinv import FitOptions, InversionOptions
     from napari_shadowinv.physics.setup import SETUPS
     from napari_shadowinv.preprocessing import ESTIMATES, STEPS, MeasuredSource
 
@@ -91,6 +91,10 @@ def parameters_page() -> str:
         "In napari under *Options*; in Python the arguments of "
         "{py:class}`~napari_shadowinv.InversionOptions`.",
         table_of(InversionOptions.model_fields),
+        "## Fit options",
+        "On the command line flags of `shadowinv fit`; in Python the arguments of "
+        "{py:class}`~napari_shadowinv.FitOptions`.",
+        table_of(FitOptions.model_fields),
     ]
     return "\n\n".join(parts) + "\n"
 

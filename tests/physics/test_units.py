@@ -28,3 +28,12 @@ def test_light_is_shown_by_its_deflection(optical_setup: OpticalSetup) -> None:
 
 def test_a_prefix_is_for_units_without_a_power() -> None:
     assert {"m", "rad", "T m", "V"} == PREFIXED_UNITS
+
+
+def test_what_deflects_is_shown_by_its_own_path_integral(proton_setup: ProtonSetup) -> None:
+    displacement = proton_setup.displacement_from_path_integrated_e(np.full((2, 3, 4), 3e3))
+    (field,) = shown_fields([displacement], proton_setup, "electric field")
+    assert (field.symbol, field.unit) == ("|∫E dz|", "kV")
+    np.testing.assert_allclose(field.vectors, 3)
+    (usual,) = shown_fields([displacement], proton_setup, "magnetic field")
+    assert usual.symbol == "|∫B×dz|"

@@ -1,7 +1,8 @@
 """Arguments and options that commands share, each with its name and help.
 
 Those of steps, estimates of the source and options are made from the models: `takes_recipe` gives
-them to a command, and `recipe_of` makes a recipe of those that were given.
+them to a command, and `recipe_of` makes a recipe of those that were given. `takes_fit` and
+`fit_choices_of` do the same for a fit.
 """
 
 from __future__ import annotations
@@ -9,22 +10,26 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
+from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from typer import Argument, Option
 
 from napari_shadowinv._system.validation import nearest, validated
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting import FitOptions
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing import ESTIMATES, STEPS, Recipe, Step
+from napari_shadowinv.preprocessing import ESTIMATES, FILTERS, STEPS, HotPixelFilter, Recipe, Step
 
 _STEPS = "Steps before the inversion, in this order"
 _ESTIMATES = "Source estimated from the image (docs/sources.md)"
 _OPTIONS = "Options of the inversion"
+_FIT_STEPS = "Steps before the fit, in this order"
+_FIT_OPTIONS = "Options of the fit"
 
 ImageFile = Annotated[
     Path, Argument(help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.", show_default=False)
@@ -111,6 +116,8 @@ def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
     kinds = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
     if get_origin(annotation) is Literal:
         return str, "|".join(get_args(annotation))
+    if kinds == [bool]:
+        return bool, None
     if len(kinds) == 1 and kinds[0] in (int, float):
         unit = re.search(r"\((.*)\)$", field.title or "")
         return kinds[0], unit[1].upper() if unit else None
@@ -130,12 +137,29 @@ def _step_flag(step: type[Step], parameter: str) -> str:
     return step.name() if parameter == step.primary else f"{step.name()}-{parameter}"
 
 
-def _all_flags() -> dict[str, inspect.Parameter]:
-    flags = [
-        _flag(_step_flag(step, name), field, _STEPS, _step_help(step, name, field))
-        for step in STEPS.values()
+Flags = list[tuple[str, inspect.Parameter]]
+
+
+def _step_flags(steps: Iterable[type[Step]], panel: str) -> Flags:
+    return [
+        _flag(_step_flag(step, name), field, panel, _step_help(step, name, field))
+        for step in steps
         for name, field in step.parameters().items()
     ]
+
+
+def _option_flags(model: type[BaseModel], usual: str) -> Flags:
+    """Flags of a model's fields, in the panel that a field asks for or the usual one."""
+    flags = []
+    for name, field in model.model_fields.items():
+        extra = field.json_schema_extra
+        panel = extra.get("panel", usual) if isinstance(extra, dict) else usual
+        flags.append(_flag(name.replace("_", "-"), field, str(panel), _with_default(field)))
+    return flags
+
+
+def _recipe_flags() -> Flags:
+    flags = _step_flags(STEPS.values(), _STEPS)
     method = FieldInfo(annotation=str | None, title="Source")
     told = f"How to estimate the undisturbed beam: {', '.join(ESTIMATES)}."
     flags.append(_flag("source-from", method, _ESTIMATES, told))
@@ -144,16 +168,19 @@ def _all_flags() -> dict[str, inspect.Parameter]:
         told = " ".join(f"For {key}: {_lower(_with_default(one))}" for key, one in users.items())
         field = next(iter(users.values()))
         flags.append(_flag(f"source-{name.replace('_', '-')}", field, _ESTIMATES, told))
-    for name, field in InversionOptions.model_fields.items():
-        extra = field.json_schema_extra
-        panel = extra.get("panel", _OPTIONS) if isinstance(extra, dict) else _OPTIONS
-        flags.append(_flag(name.replace("_", "-"), field, str(panel), _with_default(field)))
-    return dict(flags)
+    return flags + _option_flags(InversionOptions, _OPTIONS)
+
+
+def _fit_flags() -> Flags:
+    # Filters that blur or flatten would change what the forward model is fitted to.
+    kept = [one for name, one in STEPS.items() if name not in FILTERS or one is HotPixelFilter]
+    return _step_flags(kept, _FIT_STEPS) + _option_flags(FitOptions, _FIT_OPTIONS)
 
 
 def _with_default(field: FieldInfo) -> str:
     told = str(field.description)
-    return told if field.default is None else f"{told} Default: {_shown(field)}."
+    shows_default = field.default is not None and field.default is not False
+    return f"{told} Default: {_shown(field)}." if shows_default else told
 
 
 def _users(parameter: str) -> dict[str, Any]:
@@ -178,9 +205,19 @@ def _lower(text: str) -> str:
 
 def takes_recipe(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command, which takes `flags`, one for each parameter of a recipe."""
+    return _with_flags(command, dict(_recipe_flags()))
+
+
+def takes_fit(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command, which takes `flags`, one for each step and option of a fit."""
+    return _with_flags(command, dict(_fit_flags()))
+
+
+def _with_flags(
+    command: Callable[..., None], made: Mapping[str, inspect.Parameter]
+) -> Callable[..., None]:
     signature = inspect.signature(command, eval_str=True)
     own = [one for one in signature.parameters.values() if one.name != "flags"]
-    made = _all_flags()
 
     @functools.wraps(command)
     def with_flags(**given: Any) -> None:
@@ -206,6 +243,14 @@ def recipe_of(
     steps, source = _steps(flags, base.steps), _estimate(flags, base)
     made = validated(InversionOptions, chosen, where)
     return base.model_copy(update={"steps": steps, "source": source, "options": made})
+
+
+def fit_choices_of(
+    flags: Mapping[str, Any], options: Mapping[str, Any], where: str = "options"
+) -> tuple[tuple[Step, ...], FitOptions]:
+    """Steps and options that flags ask for; `options` are those of a file, named `where`."""
+    chosen = {name: flags[name] for name in FitOptions.model_fields if name in flags}
+    return _steps(flags, ()), validated(FitOptions, {**options, **chosen}, where)
 
 
 def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...]:

@@ -6,10 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli._tables import setup_text
 from napari_shadowinv.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
+    import xarray
+
     from napari_shadowinv._typing import AnyArray, FloatArray
     from napari_shadowinv.physics.setup import Deflector, Setup
 
@@ -25,7 +28,7 @@ class Field:
 
 def field_from(path: Path, variable: str | None = None) -> Field:
     """Displacement from a result, or from an array of px or px²."""
-    from napari_shadowinv.inversion.labels import setup_from_dataset
+    from napari_shadowinv.inversion.labels import is_fit, setup_from_dataset
     from napari_shadowinv.io import read_dataset, read_radiograph
     from napari_shadowinv.io.formats import kind_of
     from napari_shadowinv.io.hdf5 import read_hdf5
@@ -38,11 +41,28 @@ def field_from(path: Path, variable: str | None = None) -> Field:
         return Field(_displacement(path, read_radiograph(path, variable=variable).image))
     if kind in ("hdf5", "shadowinv"):
         dataset = read_dataset(path)
+        if is_fit(dataset.attrs):
+            return _fitted(path, dataset)
         source = dataset["source"].values if "source" in dataset else None
         return Field(dataset["displacement"].values, source, setup_from_dataset(dataset))
     if kind == "npy":
         return Field(_displacement(path, read_npy(path)))
     raise _no_field(path, f"a {kind.upper()} picture")
+
+
+@refusing_damage
+def _fitted(path: Path, dataset: xarray.Dataset) -> Field:
+    """The only field of a fit, with the beam of its first image."""
+    from napari_shadowinv.fitting import Fit
+
+    fit = Fit.from_dataset(dataset)
+    names = [field.name for field in fit.fields]
+    if len(names) > 1:
+        raise InputError(
+            f"{path} has the fields {', '.join(names)}: choose one with --variable "
+            f"displacement_{names[0]}"
+        )
+    return Field(fit.fields[0].displacement, fit.source[0], fit.setups[0] if fit.setups else None)
 
 
 def _displacement(path: Path, array: AnyArray) -> FloatArray:

@@ -121,9 +121,12 @@ def _array_rows(array: AnyArray) -> _tables.Rows:
 
 
 def _result_rows(dataset: xarray.Dataset) -> _tables.Rows:
+    from napari_shadowinv.cli._fit_result import fit_file_rows
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.labels import setup_from_dataset
+    from napari_shadowinv.inversion.labels import is_fit, setup_from_dataset
 
+    if is_fit(dataset.attrs):
+        return fit_file_rows(dataset)
     setup = setup_from_dataset(dataset)
     displacement = dataset["displacement"].values
     experiment = [

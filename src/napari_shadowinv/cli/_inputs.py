@@ -85,12 +85,14 @@ def setup_for(path: Path | None, shot: Radiograph, recipe: Recipe) -> Setup | No
     return setup_from(path, shot.metadata.get("geometry"))
 
 
-def setup_from(path: Path, known: Mapping[str, Any] | None = None) -> Setup:
-    """Setup from a file; what it leaves out is taken from what is `known` of the geometry."""
+def setup_from(
+    path: Path, known: Mapping[str, Any] | None = None, changes: Mapping[str, Any] | None = None
+) -> Setup:
+    """Setup from a file, with changes; what it leaves out is taken from what is `known`."""
     from napari_shadowinv.io import read_toml
     from napari_shadowinv.physics.setup import SETUPS, setup_from_dict
 
-    entries, known = read_toml(path), known or {}
+    entries, known = {**read_toml(path), **(changes or {})}, known or {}
     if "kind" in known and entries.get("kind", known["kind"]) != known["kind"]:
         known = {}
     elif known and "kind" not in known:

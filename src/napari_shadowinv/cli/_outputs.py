@@ -10,6 +10,9 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
 if TYPE_CHECKING:
+    import xarray
+    from matplotlib.figure import Figure
+
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Radiograph, Recipe
@@ -81,14 +84,22 @@ def make_folder(path: Path) -> None:
 def write_all(
     inversion: Inversion, shot: Radiograph, out: Path, report: Path, overwrite: bool
 ) -> None:
-    """Write result and figure, both or none of them."""
-    from napari_shadowinv.io import replacing, write
+    """Write result and figure of an inversion, both or none of them."""
     from napari_shadowinv.io.files import text_of
     from napari_shadowinv.plotting import report_figure
-    from napari_shadowinv.plotting._figures import DOTS_PER_INCH
 
     title = "" if shot.path is None else text_of(shot.path.name)
     figure = report_figure(inversion, inversion.setup, title=title)
+    write_both(inversion, figure, out, report, overwrite)
+
+
+def write_both(
+    result: Inversion | xarray.Dataset, figure: Figure, out: Path, report: Path, overwrite: bool
+) -> None:
+    """Write result and figure, both or none of them."""
+    from napari_shadowinv.io import replacing, write
+    from napari_shadowinv.plotting._figures import DOTS_PER_INCH
+
     with replacing(report, overwrite) as drawn:
         figure.savefig(drawn, dpi=DOTS_PER_INCH)
-        write(out, inversion, overwrite=overwrite)
+        write(out, result, overwrite=overwrite)

@@ -15,6 +15,7 @@ from napari_shadowinv.cli._outputs import protect
 from napari_shadowinv.cli._terminal import inverted
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion.labels import is_fit
 from napari_shadowinv.io import read_dataset
 
 if TYPE_CHECKING:
@@ -44,7 +45,13 @@ def made_again(
 
     Nothing that is read may be among `outputs`.
     """
-    before = Inversion.from_dataset(read_dataset(result))
+    dataset = read_dataset(result)
+    if is_fit(dataset.attrs):
+        raise InputError(
+            f"{result} is a fit, expected the result of an inversion: repeat the command "
+            "shadowinv fit to make it again"
+        )
+    before = Inversion.from_dataset(dataset)
     made = before.provenance
     if made is None:
         raise InputError(

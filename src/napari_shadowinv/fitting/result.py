@@ -8,20 +8,47 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from napari_shadowinv._typing import BoolArray, FloatArray
+import numpy as np
+
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.options import FitOptions
 from napari_shadowinv.fitting.verdict import Verdict
-from napari_shadowinv.inversion.labels import dataset_from_field, label
-from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.inversion.labels import FIT_FORMAT, dataset_from_field, label
+from napari_shadowinv.physics.setup import Setup, setup_from_dict
 
 if TYPE_CHECKING:
     import xarray
 
 __all__ = ["Basin", "Fit", "FitReport", "FittedField"]
 
-FORMAT = "shadowinv fit"
-
 _IMAGES = ("image", "y", "x")
+# Variables beside those of the fields: dimensions, units, long name.
+_VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "images": (_IMAGES, "flux/px²", "Image"),
+    "source": (_IMAGES, "flux/px²", "Undisturbed beam"),
+    "reprojection": (_IMAGES, "flux/px²", "Image as explained by the fields"),
+    "residual": (_IMAGES, "flux/px²", "Image minus re-projection"),
+    "mask": (_IMAGES, "1", "Pixels that were used"),
+    "chi2": (("image",), "1", "Mean squared residual over the noise"),
+    "gain": (("image",), "1", "Factor that the image is brighter by than given"),
+    "strength": (("image", "field"), "1", "Displacement relative to image 1"),
+    "frame": (("image", "frame_term"), "1", "How the image lies on image 1"),
+    "smoothness": (
+        ("field", "derivative"),
+        "1",
+        "Weights of each field's squared fourth and sixth derivatives",
+    ),
+    "basin_objective": (("basin",), "1", "Misfit and priors where a start has led"),
+    "basin_chi2": (("basin",), "1", "Mean squared residual over the noise of all images"),
+    "basin_distance": (("basin",), "1", "Distance from the best displacement, as a share of it"),
+    "basin_displacement": (
+        ("basin", "field", "component", "coarse_y", "coarse_x"),
+        "px",
+        "Displacement where a start has led, at every other pixel",
+    ),
+}
+_ATTRIBUTES = ("options", "report", "verdict", "explanation", "folded", "setups")
 
 
 @dataclass(frozen=True)
@@ -182,18 +209,19 @@ class Fit:
         xarray.Dataset
             Dimensions image, y, x and component ("y", "x"). Variables of each field end with its
             name, as in ``displacement_B``; those of the only field do not. Options, report,
-            verdict and setups are in the attributes.
+            verdict and setups are in the attributes; `from_dataset` finds all of the fit in it.
         """
         import xarray as xr
 
         known = self.setups if setups is None else setups
         setup = known[0] if known else None
         history = {
-            "format": FORMAT,
+            "format": FIT_FORMAT,
             "options": self.options.model_dump_json(),
             "report": json.dumps(dataclasses.asdict(self.report)),
             "verdict": self.verdict.value,
             "explanation": self.explanation,
+            "folded": self.folded,
             "fields": json.dumps([field.name for field in self.fields]),
             "setups": json.dumps([one.model_dump(mode="json") for one in known]),
         }
@@ -211,31 +239,105 @@ class Fit:
             attrs = one.attrs
             if len(self.fields) > 1:
                 one = one.rename({name: f"{name}_{field.name}" for name in one.data_vars})
-            merged = merged.merge(one)
+            merged = merged.assign_coords(one.coords).assign(one.data_vars)
             merged.attrs.update(attrs)
         merged.attrs.update(history | dict(attributes or {}))
-        planes = {
-            "image": (self.images, "flux/px²", "Image"),
-            "source": (self.source, "flux/px²", "Undisturbed beam"),
-            "reprojection": (self.reprojection, "flux/px²", "Image as explained by the fields"),
-            "residual": (self.residual, "flux/px²", "Image minus re-projection"),
-            "mask": (self.mask, "1", "Pixels that were used"),
-        }
-        lines = {
-            "chi2": (self.chi2, "1", "Mean squared residual over the noise"),
-            "gain": (self.gains, "1", "Factor that the image is brighter by than given"),
-        }
-        for name, (values, units, text) in planes.items():
-            merged[f"{name}s" if name == "image" else name] = (_IMAGES, values, label(units, text))
-        for name, (values, units, text) in lines.items():
-            merged[name] = (("image",), values, label(units, text))
-        merged["strength"] = (
-            ("image", "field"),
-            self.strengths,
-            label("1", "Displacement relative to image 1"),
-        )
         merged["field"] = ("field", [field.name for field in self.fields])
+        merged["basin"] = ("basin", [basin.start for basin in self.basins])
+        for name, values in self._arrays().items():
+            dims, units, text = _VARIABLES[name]
+            merged[name] = dims, values, label(units, text)
         return merged
+
+    @classmethod
+    def from_dataset(cls, dataset: xarray.Dataset) -> Fit:
+        """Rebuild a fit from what `to_dataset` returned.
+
+        Raises
+        ------
+        InputError
+            If a variable or attribute is missing.
+        """
+        missing = [name for name in (*_VARIABLES, "field", "basin") if name not in dataset]
+        missing += [name for name in _ATTRIBUTES if name not in dataset.attrs]
+        if missing:
+            raise InputError(
+                f"dataset has no {', '.join(map(repr, missing))}: expected the result of a fit"
+            )
+        arrays = {name: np.ascontiguousarray(dataset[name].values) for name in _VARIABLES}
+        attributes = dataset.attrs
+        content = json.loads(attributes["report"])
+        known = {field.name for field in dataclasses.fields(FitReport)}
+        names = [str(name) for name in dataset["field"].values]
+        fields = [
+            _field(dataset, name, f"_{name}" if len(names) > 1 else "", smoothness)
+            for name, smoothness in zip(names, arrays["smoothness"], strict=True)
+        ]
+        basins = [
+            Basin(str(start), float(objective), float(chi2), float(distance), displacement)
+            for start, objective, chi2, distance, displacement in zip(
+                dataset["basin"].values,
+                *(arrays[name] for name in _VARIABLES if name.startswith("basin_")),
+                strict=True,
+            )
+        ]
+        return cls(
+            images=arrays["images"],
+            mask=arrays["mask"],
+            strengths=arrays["strength"],
+            fields=tuple(fields),
+            source=arrays["source"],
+            gains=arrays["gain"],
+            frames=arrays["frame"],
+            reprojection=arrays["reprojection"],
+            residual=arrays["residual"],
+            chi2=arrays["chi2"],
+            basins=tuple(basins),
+            folded=float(attributes["folded"]),
+            verdict=Verdict(attributes["verdict"]),
+            explanation=str(attributes["explanation"]),
+            report=FitReport(**{name: content[name] for name in known & content.keys()}),
+            options=FitOptions.model_validate_json(attributes["options"]),
+            setups=tuple(
+                setup_from_dict(one, "the dataset's setups")
+                for one in json.loads(attributes["setups"])
+            ),
+        )
+
+    def _arrays(self) -> dict[str, AnyArray]:
+        """The values of `_VARIABLES`."""
+        return {
+            "images": self.images,
+            "source": self.source,
+            "reprojection": self.reprojection,
+            "residual": self.residual,
+            "mask": self.mask,
+            "chi2": self.chi2,
+            "gain": self.gains,
+            "strength": self.strengths,
+            "frame": self.frames,
+            "smoothness": np.array([field.smoothness for field in self.fields]),
+            "basin_objective": np.array([basin.objective for basin in self.basins]),
+            "basin_chi2": np.array([basin.chi2 for basin in self.basins]),
+            "basin_distance": np.array([basin.distance for basin in self.basins]),
+            "basin_displacement": np.stack([basin.displacement for basin in self.basins]),
+        }
+
+
+def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArray) -> FittedField:
+    potential, displacement, uncertainty = (
+        np.ascontiguousarray(dataset[variable + ending].values)
+        if variable + ending in dataset
+        else None
+        for variable in ("potential", "displacement", "displacement_uncertainty")
+    )
+    if potential is None or displacement is None:
+        raise InputError(
+            f"dataset has no potential or no displacement of the field {name!r}: expected the "
+            "result of a fit"
+        )
+    weights = float(smoothness[0]), float(smoothness[1])
+    return FittedField(name, potential, displacement, uncertainty, weights)
 
 
 _ASSUMES = {"path_integrated_b": "B", "path_integrated_e": "E"}

@@ -3,6 +3,7 @@
 - label a field, with units: `dataset_from_field`
 - the names, dimensions and units alone: `variable_labels`
 - the setup that a dataset was made with: `setup_from_dataset`
+- whether it is an inversion's or a fit's: `is_fit`
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup, SIField
 
 FORMAT = "shadowinv result"
+FIT_FORMAT = "shadowinv fit"
 
 _PLANE = ("y", "x")
 _VECTORS = ("component", "y", "x")
@@ -95,6 +97,11 @@ def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:
     if "setup" not in dataset.attrs:
         return None
     return setup_from_dict(json.loads(dataset.attrs["setup"]), "the dataset's setup")
+
+
+def is_fit(attributes: Mapping[Any, Any]) -> bool:
+    """Tell whether the attributes of a dataset are those of a fit."""
+    return bool(attributes.get("format") == FIT_FORMAT)
 
 
 def label(units: str, long_name: str) -> dict[str, str]:

@@ -39,6 +39,7 @@ class Format:
     named_reader: str = ""  # the same, of a path and the name of an array
     image_writer: str = ""  # of a path, an image and its pixel size (m) or None
     result_writer: str = ""  # of a path and a dataset
+    fit_writer: str = ""  # of a path and a fit's dataset
     is_scan: bool = False  # may it be a scan of film, whose grey levels fall with dose
 
     @property
@@ -95,7 +96,7 @@ PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader=
 RESULT = Format(
     "shadowinv", (".shadowinv",), ".shadowinv", _HDF5, test="pradformat:is_result",
     holds=("result",), reader="dataset:read_result", named_reader="hdf5:read_plane",
-    result_writer="dataset:write_result",
+    result_writer="dataset:write_result", fit_writer="dataset:write_result",
 )
 # The reader of all other HDF5 files: it says which array can be named.
 PRADFORMAT = Format(
@@ -128,7 +129,7 @@ def _suffixes(formats: Iterable[Format]) -> frozenset[str]:
     return frozenset(suffix for each in formats for suffix in each.suffixes)
 
 
-def _writers(kind: Literal["image_writer", "result_writer"]) -> dict[str, str]:
+def _writers(kind: Literal["image_writer", "result_writer", "fit_writer"]) -> dict[str, str]:
     found = {suffix: getattr(each, kind) for each in FORMATS for suffix in each.suffixes}
     return {suffix: writer for suffix, writer in found.items() if writer}
 
@@ -141,6 +142,7 @@ SCAN_SUFFIXES = _suffixes(each for each in FORMATS if each.is_scan)
 OPENED_BY_NAPARI = SCAN_SUFFIXES | {".npy", SITES.suffix}
 IMAGE_WRITERS = _writers("image_writer")  # by the ending
 RESULT_WRITERS = _writers("result_writer")
+FIT_WRITERS = _writers("fit_writer")
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
 
 _OTHERS = {

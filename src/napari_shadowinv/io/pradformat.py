@@ -20,7 +20,7 @@ import numpy as np
 from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import FORMAT, dataset_from_field, setup_from_dataset
+from napari_shadowinv.inversion.labels import FORMAT, dataset_from_field, is_fit, setup_from_dataset
 from napari_shadowinv.io.dataset import require
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
 from napari_shadowinv.preprocessing import Provenance
@@ -48,7 +48,8 @@ def is_result(path: Path) -> bool:
 
     if not h5py.is_hdf5(path):
         return False
-    return str(_root_attributes(path).get("format", "")).startswith(FORMAT)
+    attributes = _root_attributes(path)
+    return is_fit(attributes) or str(attributes.get("format", "")).startswith(FORMAT)
 
 
 @refusing_damage

@@ -9,12 +9,14 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.labels import is_fit
 from napari_shadowinv.io.files import check_output, replacing
-from napari_shadowinv.io.formats import IMAGE_WRITERS, RESULT_WRITERS, function
+from napari_shadowinv.io.formats import FIT_WRITERS, IMAGE_WRITERS, RESULT_WRITERS, function
 
 if TYPE_CHECKING:
     import xarray
 
+    from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.error_bars import Uncertainty
     from napari_shadowinv.physics.setup import Setup
@@ -24,7 +26,7 @@ __all__ = ["write"]
 
 def write(
     path: str | Path,
-    result: Inversion | Uncertainty | xarray.Dataset | AnyArray,
+    result: Inversion | Uncertainty | Fit | xarray.Dataset | AnyArray,
     *,
     setup: Setup | None = None,
     overwrite: bool = False,
@@ -35,12 +37,12 @@ def write(
     ----------
     path : str or Path
         For a result: ``.shadowinv`` for all of it, ``.h5`` for pradformat, ``.csv`` for the
-        sites. For an image: ``.tif`` (float32), ``.npy``, ``.png`` (16 bits, its largest
-        value white).
-    result : Inversion or Uncertainty or xarray.Dataset or ndarray of shape (H, W)
+        sites; for a fit ``.shadowinv``. For an image: ``.tif`` (float32), ``.npy``, ``.png``
+        (16 bits, its largest value white).
+    result : Inversion, Uncertainty, Fit, xarray.Dataset, or ndarray of shape (H, W)
         What to write.
     setup : Setup, optional
-        Adds SI units; pradformat needs it. A dataset brings its own.
+        Adds SI units; pradformat needs it. A dataset and a fit bring their own.
     overwrite : bool
         Whether an existing file may be replaced.
 
@@ -54,7 +56,8 @@ def write(
         If the file exists and must not be replaced, its folder cannot be written, or the
         ending names no format for this.
     InputError
-        If pradformat is asked for without the setup of a particle beam.
+        If pradformat is asked for without the setup of a particle beam, or a setup is given for
+        a fit.
 
     Examples
     --------
@@ -63,15 +66,33 @@ def write(
     >>> write(folder / "ones.tif", np.ones((3, 4))).name
     'ones.tif'
     """
-    suffixes = IMAGE_WRITERS if isinstance(result, np.ndarray) else RESULT_WRITERS
-    check_output(path, overwrite, suffixes=suffixes)
-    with replacing(path, overwrite) as temporary:
-        if isinstance(result, np.ndarray):
+    if isinstance(result, np.ndarray):
+        check_output(path, overwrite, suffixes=IMAGE_WRITERS)
+        with replacing(path, overwrite) as temporary:
             _write_image(temporary, result, setup)
-        else:
-            dataset = result if _is_dataset(result) else result.to_dataset(setup)
-            function(RESULT_WRITERS[temporary.suffix.lower()])(temporary, dataset)
+        return Path(path)
+    dataset = _dataset(result, setup)
+    writers = FIT_WRITERS if is_fit(dataset.attrs) else RESULT_WRITERS
+    check_output(path, overwrite, suffixes=writers)
+    with replacing(path, overwrite) as temporary:
+        function(writers[temporary.suffix.lower()])(temporary, dataset)
     return Path(path)
+
+
+def _dataset(
+    result: Inversion | Uncertainty | Fit | xarray.Dataset, setup: Setup | None
+) -> xarray.Dataset:
+    from napari_shadowinv.fitting import Fit
+
+    if _is_dataset(result):
+        return result
+    if not isinstance(result, Fit):
+        return result.to_dataset(setup)
+    if setup is not None:
+        raise InputError(
+            "received a setup for a fit, which has those of its images: give them to fit()"
+        )
+    return result.to_dataset()
 
 
 def _is_dataset(result: Any) -> TypeGuard[xarray.Dataset]:

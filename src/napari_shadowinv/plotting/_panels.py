@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
+ALARM_COLOUR, QUIET_COLOUR = "#b00020", "0.3"
 STYLE: Any = {
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
@@ -105,16 +106,20 @@ def choose_grid(
     shape: tuple[int, int], panels: int, *, foot: float = 0.0, title: bool = True
 ) -> Grid:
     """Choose the columns for which the page is closest to a slide's 16:10."""
-    aspect = shape[0] / shape[1]
-    # Panels of equal area, within limits that leave room for ticks on the short side.
-    width = float(np.clip(2.75 / np.sqrt(aspect), 1.2, 6.4))
-    height = float(np.clip(width * aspect, 1.2, 6.4))
+    width, height = panel_size(shape)
     grids = [
         Grid(panels // columns, columns, width, height, foot, head=0.4 if title else 0.05)
         for columns in range(1, panels + 1)
         if panels % columns == 0
     ]
     return min(grids, key=lambda g: abs(np.log(g.figure_size[0] / g.figure_size[1] / 1.6)))
+
+
+def panel_size(shape: tuple[int, int]) -> tuple[float, float]:
+    """Width and height in inches: panels of equal area, with room for ticks on the short side."""
+    aspect = shape[0] / shape[1]
+    width = float(np.clip(2.75 / np.sqrt(aspect), 1.2, 6.4))
+    return width, float(np.clip(width * aspect, 1.2, 6.4))
 
 
 def new_page(grid: Grid, scale: Scale, title: str | None) -> tuple[Figure, list[Panel]]:
@@ -129,6 +134,14 @@ def new_page(grid: Grid, scale: Scale, title: str | None) -> tuple[Figure, list[
         figure.text(0.2 / width, 1 - 0.26 / height, title, size=13, weight="bold", va="center")
     boxes = [grid.box(index) for index in range(grid.rows * grid.columns)]
     return figure, [Panel(figure.add_axes(box), scale, grid) for box in boxes]
+
+
+def write_header(figure: Figure, lines: list[tuple[str, str]], grid: Grid) -> None:
+    """Write lines, each with its colour, between the title and the panels."""
+    width, height = grid.figure_size
+    for number, (text, colour) in enumerate(lines):
+        y = 1 - (0.44 + 0.18 * number) / height
+        figure.text(0.2 / width, y, text, size=10, color=colour, va="top")
 
 
 def write_footer(figure: Figure, lines: list[tuple[str, str]], grid: Grid) -> None:
@@ -176,6 +189,12 @@ class Panel:
     def plot(self, values: FloatArray, **style: Any) -> None:
         """Plot a cut along an axis of the image."""
         self.axes.plot(np.arange(values.size) * self.scale.pixel, values, **style)
+
+    def band(self, values: FloatArray, error: FloatArray, colour: str) -> None:
+        """Fill what lies within a standard deviation of a cut."""
+        places = np.arange(values.size) * self.scale.pixel
+        edges = np.maximum(values - error, 0), values + error
+        self.axes.fill_between(places, *edges, color=colour, alpha=0.25, linewidth=0)
 
     def few_ticks(self) -> None:
         """Keep the tick labels apart on small panels."""

@@ -66,6 +66,8 @@ class BeamSetup(BaseModel):
         SIField("deflection_angle", "rad", "Deflection angle", is_vector=True),
     )
     main_field: ClassVar = MainField("deflection_angle", "Deflection angle", "|α|", ("αy", "αx"))
+    # What is shown instead where it is known that something else deflects.
+    other_fields: ClassVar[dict[str, MainField]] = {}
     deflectors: ClassVar[tuple[str, ...]]  # what can deflect the beam; see `angle_ratio`
     in_pradformat: ClassVar[bool] = False  # whether that format can describe the beam
 

@@ -86,6 +86,14 @@ class ProtonSetup(BeamSetup):
         ("∫By dz", "∫Bx dz"),
         arrows="∫B dz arrows",
     )
+    other_fields: ClassVar = {
+        "electric field": MainField(
+            "path_integrated_e",
+            "Path-integrated electric field",
+            "|∫E dz|",
+            ("∫Ey dz", "∫Ex dz"),
+        )
+    }
 
     kind: Literal["proton"] = Field(
         default="proton", title="Kind", description="Kind of probe: a beam of charged particles."

@@ -1,0 +1,225 @@
+"""What a fit is told about each image and each fiducial: rows of a table, or flags.
+
+- one image: `ShotRow`; all of them: `shot_rows`
+- known displacements: `fiducials_from`
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from napari_shadowinv._system.safety import small_text
+from napari_shadowinv._system.validation import nearest, validated
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.formats import SITES
+
+_CONFIG = ConfigDict(frozen=True, extra="forbid")
+
+
+def _noise(value: Any) -> Any:
+    if value != "poisson" and not _is_number(str(value)):
+        raise ValueError("expected 'poisson' or the standard deviation in a pixel")
+    return value if value == "poisson" else float(value)
+
+
+def _strength(value: Any) -> Any:
+    parts = str(value).split()
+    if not parts or not all(map(_is_number, parts)):
+        raise ValueError("expected a number, or one for each field with spaces between them")
+    return tuple(map(float, parts))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+class ShotRow(BaseModel):
+    """One image of a fit, and what is known about it."""
+
+    model_config = _CONFIG
+    file: Path = Field(title="Image", description="Its file.")
+    setup: Path | None = Field(
+        default=None, title="Setup", description="TOML file with the experimental geometry."
+    )
+    energy: float | None = Field(
+        default=None, gt=0, title="Energy", description="Energy in MeV, in place of the setup's."
+    )
+    strength: Annotated[tuple[float, ...], BeforeValidator(_strength)] | None = Field(
+        default=None,
+        title="Strength",
+        description="Displacement relative to the first image; with two fields '1 0.6'.",
+    )
+    gain: float | None = Field(
+        default=None,
+        gt=0,
+        title="Gain",
+        description="How many times brighter than the source the image is.",
+    )
+    psf: float | None = Field(
+        default=None,
+        ge=0,
+        title="Point spread",
+        description="Standard deviation in px, after --bin.",
+    )
+    mask: Path | None = Field(
+        default=None, title="Mask", description="Image of the same size, 0 at unusable pixels."
+    )
+    source: Literal["unknown"] | Path | None = Field(
+        default=None,
+        title="Source",
+        description="Image of the undisturbed beam, or unknown to fit a smooth one.",
+    )
+    noise: Annotated[Literal["poisson"] | float, BeforeValidator(_noise)] | None = Field(
+        default=None,
+        title="Noise",
+        description="poisson for counts, or the standard deviation in a pixel, after --bin.",
+    )
+
+    @property
+    def source_file(self) -> Path | None:
+        """The file of its source, if there is one."""
+        return self.source if isinstance(self.source, Path) else None
+
+    @property
+    def files(self) -> list[Path | None]:
+        """What is read for it."""
+        return [self.file, self.setup, self.mask, self.source_file]
+
+
+_FILES = ("file", "setup", "mask", "source")
+
+
+class _Fiducial(BaseModel):
+    model_config = _CONFIG
+    y: float
+    x: float
+    dy: float
+    dx: float
+    sigma: float = Field(gt=0, title="Standard deviation")
+
+
+def shot_rows(
+    images: Sequence[Path], shared: Mapping[str, Any], lists: Mapping[str, str | None]
+) -> list[ShotRow]:
+    """Describe the images of a fit.
+
+    Parameters
+    ----------
+    images : sequence of Path
+        Images, or one table with a row for each.
+    shared : mapping
+        What holds for all images that do not say otherwise, by the names of the columns.
+    lists : mapping of str to str
+        Numbers separated by commas, one for each image, by the names of the columns.
+    """
+    given = {name: text for name, text in lists.items() if text is not None}
+    if len(images) == 1 and _is_table(images[0]):
+        for name in given:
+            raise InputError(
+                f"received a list for each image, {given[name]}, beside the table {images[0]}: "
+                f"write it into its column '{name}'"
+            )
+        return _rows_of(images[0], ShotRow, shared)
+    columns = {name: [part.strip() for part in text.split(",")] for name, text in given.items()}
+    for name, parts in columns.items():
+        if len(parts) != len(images):
+            raise InputError(
+                f"received {len(images)} images and {len(parts)} values of {name} "
+                f"({given[name]}): expected one for each image, separated by commas"
+            )
+    return [
+        validated(
+            ShotRow,
+            _known({"file": image, **shared, **{name: columns[name][k] for name in columns}}),
+            str(image),
+        )
+        for k, image in enumerate(images)
+    ]
+
+
+def fiducials_from(path: Path) -> list[tuple[float, ...]]:
+    """Known displacements from a table: rows of y, x, dy, dx and their σ, in px."""
+    return [(one.y, one.x, one.dy, one.dx, one.sigma) for one in _rows_of(path, _Fiducial)]
+
+
+def _known(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _is_table(path: Path) -> bool:
+    """Whether a file is a table with names of columns, and no image as numbers."""
+    if path.suffix.lower() not in SITES.suffixes:
+        return False
+    lines = _lines(path)
+    return bool(lines) and not any(map(_is_number, _cells(lines[0])))
+
+
+def _lines(path: Path) -> list[str]:
+    text = small_text(path, "a table as comma-separated values", "utf-8-sig")
+    return [line for line in text.splitlines() if line.strip(" ,;\t") and line.strip()[0] != "#"]
+
+
+def _cells(line: str, delimiter: str = "") -> list[str]:
+    delimiter = delimiter or _delimiter(line)
+    (cells,) = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
+    return [cell.strip() for cell in cells]
+
+
+def _delimiter(header: str) -> str:
+    return ";" if ";" in header else ","
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def _rows_of(
+    path: Path, model: type[Model], shared: Mapping[str, Any] | None = None
+) -> list[Model]:
+    """Rows of a table as models; files that it names are looked for from its own folder."""
+    lines = _lines(path)
+    header = _cells(lines[0]) if lines else []
+    _check_header(path, header, model)
+    if len(lines) < 2:
+        raise InputError(f"{path} has no rows below its first line: expected one for each image")
+    rows = []
+    for number, line in enumerate(lines[1:], 1):
+        cells = _cells(line, _delimiter(lines[0]))
+        if len(cells) > len(header):
+            raise InputError(
+                f"{path}, row {number} has {len(cells)} values, expected {len(header)}: "
+                f"{', '.join(header)}"
+            )
+        told = {name: cell for name, cell in zip(header, cells, strict=False) if cell}
+        for name in told.keys() & set(_FILES):
+            if told[name] != "unknown":
+                told[name] = str(path.parent / told[name])
+        rows.append(validated(model, {**_known(shared or {}), **told}, f"{path}, row {number}"))
+    return rows
+
+
+def _check_header(path: Path, header: list[str], model: type[BaseModel]) -> None:
+    known = list(model.model_fields)
+    for name in header:
+        if name not in known:
+            meant = nearest(name.lower(), known)
+            hint = f"did you mean '{meant}'?" if meant else f"known are {', '.join(known)}"
+            raise InputError(f"{path} has a column '{name}': {hint}")
+    for one, other in pairwise(sorted(header)):
+        if one == other:
+            raise InputError(f"{path} has the column '{one}' twice: expected it once")
+    needed = [name for name, field in model.model_fields.items() if field.is_required()]
+    missing = [name for name in needed if name not in header]
+    if missing:
+        raise InputError(
+            f"{path} has no column '{missing[0]}': its first line must name {', '.join(needed)}"
+        )

@@ -1,0 +1,186 @@
+"""A fit on a page: its images and how they are explained, its fields, its verdict."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.fitting import FIELDS, Fit, FittedField, Verdict
+from napari_shadowinv.physics.forward import jacobian_determinant
+from napari_shadowinv.physics.units import ShownField, shown_fields
+from napari_shadowinv.plotting import _panels
+from napari_shadowinv.plotting._drawing import (
+    draw_cuts,
+    draw_differences,
+    draw_field,
+    draw_intensity,
+    draw_potential,
+    intensity_limits,
+    outline_caustics,
+)
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Grid, Panel
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_GOOD_COLOUR = "#1b6e3c"
+_MOST_ROWS = 3  # images that have a row each; more have a column each
+_UNIFORM = 1e-6
+_LARGEST_RESIDUAL = 20.0  # σ
+_LETTERS = 13  # in an inch of the header
+
+
+def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
+    """Show all of a fit on a page, with its verdict on top.
+
+    For each image: the beam unless it is uniform, the image, its re-projection, and the residual
+    in units of the noise's r.m.s. standard deviation. Below for each field: its potential where
+    there is room, the field with arrows, the standard deviation that the noise leaves, and
+    profiles along the dashed lines on the field. White outlines are where rays have crossed in
+    any image.
+
+    Parameters
+    ----------
+    fit : Fit
+        With its setups, which give axes in metres and fields in SI units; pixels without.
+    title : str, optional
+        A heading, such as the images' names.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
+    """
+    import matplotlib as mpl
+
+    setup = fit.setups[0] if fit.setups else None
+    count, *sides = fit.images.shape
+    shape = sides[0], sides[1]
+    kinds = _kinds(fit)
+    upright = count > _MOST_ROWS
+    columns = count if upright else len(kinds)
+    rows = len(kinds) if upright else count
+    shown = [_shown(fit, field) for field in fit.fields]
+    width, height = _panels.panel_size(shape)
+    grid = Grid(rows + len(shown), columns, width, height, foot=0.0, head=0.0)
+    letters = int(grid.figure_size[0] * _LETTERS)
+    heading = title and textwrap.shorten(title, int(letters * 0.7), placeholder=" …")
+    header, footer = _header(fit, letters), _footer(fit, [one for one, _ in shown], letters)
+    grid = replace(grid, foot=0.12 + 0.18 * len(footer), head=0.52 + 0.18 * len(header))
+    with mpl.rc_context(_panels.STYLE):
+        figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), heading)
+        for k in range(count):
+            for j, kind in enumerate(kinds):
+                place = j * columns + k if upright else k * columns + j
+                _draw_image(panels[place], fit, k, kind)
+        for m, (field, error) in enumerate(shown):
+            row = panels[(rows + m) * columns : (rows + m + 1) * columns]
+            _draw_fitted(row, fit, fit.fields[m], field, error)
+        _panels.write_header(figure, header, grid)
+        _panels.write_footer(figure, footer, grid)
+    return figure
+
+
+def _kinds(fit: Fit) -> tuple[str, ...]:
+    levels = fit.source.mean(axis=(1, 2), keepdims=True)
+    is_uniform = bool((np.abs(fit.source / levels - 1) < _UNIFORM).all())
+    usual = ("Image", "Re-projection", "Residual")
+    return usual if is_uniform else ("Beam", *usual)
+
+
+def _shown(fit: Fit, field: FittedField) -> tuple[ShownField, ShownField | None]:
+    """A field and its standard deviation, each in a handy unit."""
+    setup = fit.setups[0] if fit.setups else None
+    (shown,) = shown_fields([field.displacement], setup, FIELDS[field.name])
+    if field.uncertainty is None:
+        return shown, None
+    (error,) = shown_fields([field.uncertainty], setup, FIELDS[field.name])
+    return shown, error
+
+
+def _draw_image(panel: Panel, fit: Fit, k: int, kind: str) -> None:
+    mean = float(fit.source[k].mean())
+    if kind == "Residual":
+        used = fit.residual[k][fit.mask[k]]
+        noise = float(np.sqrt((used**2).mean() / fit.chi2[k])) if fit.chi2[k] > 0 else 1.0
+        title = f"Residual: χ² {fit.chi2[k]:.3g}"
+        draw_differences(panel, fit.residual[k] / noise, title, "Residual (σ)", _LARGEST_RESIDUAL)
+        return
+    plane = {"Beam": fit.source, "Image": fit.images, "Re-projection": fit.reprojection}[kind][k]
+    probe = f": {fit.setups[k].probe}" if fit.setups else ""
+    title = f"Image {k + 1}{probe}" if kind == "Image" else kind
+    draw_intensity(panel, plane / mean, title, intensity_limits(fit.images[k] / mean))
+
+
+def _draw_fitted(
+    panels: list[Panel],
+    fit: Fit,
+    field: FittedField,
+    shown: ShownField,
+    error: ShownField | None,
+) -> None:
+    """Fill a row of panels with a field; the potential comes first if there is room for it."""
+    title = shown.name if len(fit.fields) == 1 else f"{field.name}: {shown.symbol}"
+    wanted = ["potential", "field", "error", "cuts"]
+    if error is None:
+        wanted.remove("error")
+    wanted = wanted[-len(panels) :] if len(panels) < len(wanted) else wanted
+    for panel, what in zip(panels, wanted, strict=False):
+        if what == "potential":
+            draw_potential(panel, field.potential, fit.setups[0] if fit.setups else None)
+        elif what == "field":
+            draw_field(panel, shown, title)
+            outline_caustics(panel, _crossed(fit))
+        elif what == "error" and error is not None:
+            limits = 0.0, float(error.magnitude.max()) or 1.0
+            label = f"σ of {shown.symbol} ({error.unit})"
+            panel.show(error.magnitude, "Standard deviation", label, "cividis", limits)
+        else:
+            draw_cuts(panel, shown, _magnitude_error(fit, field))
+    for panel in panels[len(wanted) :]:
+        panel.axes.remove()
+
+
+def _crossed(fit: Fit) -> BoolArray:
+    """Where rays have crossed others, in any image."""
+    found = np.stack([field.displacement for field in fit.fields])
+    moved = np.einsum("lm,mcyx->lcyx", fit.strengths, found)
+    return np.asarray(np.any([jacobian_determinant(one) < 0 for one in moved], axis=0))
+
+
+def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
+    """Standard deviation of a field's magnitude in the unit in which it is shown."""
+    if field.uncertainty is None:
+        return None
+    length = np.sqrt((field.displacement**2).sum(axis=0))
+    along = np.sqrt(((field.displacement * field.uncertainty) ** 2).sum(axis=0))
+    pixels = along / np.maximum(length, 1e-12)
+    shown, _ = _shown(fit, field)
+    strongest = shown.peak
+    # Displacements become fields by a factor.
+    return np.asarray(pixels * shown.magnitude[strongest] / max(length[strongest], 1e-12))
+
+
+def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
+    """The verdict and why, each line with its colour."""
+    colour = _GOOD_COLOUR if fit.verdict is Verdict.DETERMINED else ALARM_COLOUR
+    told = f"{fit.verdict.upper()}: {fit.explanation}"
+    lines = [(line, colour) for line in textwrap.wrap(told, letters)]
+    if not fit.report.converged:
+        lines.append((f"⚠ not converged in {fit.report.iterations} steps", ALARM_COLOUR))
+    return lines
+
+
+def _footer(fit: Fit, shown: list[ShownField], letters: int) -> list[tuple[str, str]]:
+    facts = [field.peak_text for field in shown]
+    if not np.isnan(fit.report.uncertainty):
+        facts.append(f"error bars {fit.report.uncertainty:.2%} of the displacement (r.m.s.)")
+    facts.append(f"gains {', '.join(f'{gain:.3g}' for gain in fit.gains)}")
+    if fit.folded:
+        facts.append(f"rays cross over {fit.folded:.1%} of the image")
+    facts.append(f"{fit.report.iterations} steps in {sum(fit.report.seconds.values()):.1f} s")
+    return [(line, QUIET_COLOUR) for line in textwrap.wrap("  ·  ".join(facts), letters)]

@@ -1,0 +1,125 @@
+"""Fits in files: `Fit.to_dataset`, `Fit.from_dataset`, `write` and `read`."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.fitting import Fit, Verdict
+from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.io import read, write
+from napari_shadowinv.io.formats import kind_of
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+
+MakeFit = Callable[..., Fit]
+
+LIGHT = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=12e-6)
+
+
+def protons(energy: float) -> ProtonSetup:
+    return ProtonSetup(
+        energy=energy,
+        source_object_distance=1.3e-3,
+        object_image_distance=2e-2,
+        detector_pixel_size=1e-5 / 3,
+    )
+
+
+def assert_same(before: Any, after: Any, name: str = "fit") -> None:
+    assert type(before) is type(after), name
+    if isinstance(before, np.ndarray):
+        assert after.dtype == before.dtype, name
+        np.testing.assert_array_equal(after, before, err_msg=name)
+    elif isinstance(before, tuple):
+        assert len(before) == len(after), name
+        for number, (one, other) in enumerate(zip(before, after, strict=True)):
+            assert_same(one, other, f"{name}[{number}]")
+    elif dataclasses.is_dataclass(before):
+        for field in dataclasses.fields(before):
+            values = getattr(before, field.name), getattr(after, field.name)
+            assert_same(*values, f"{name}.{field.name}")
+    elif isinstance(before, float):
+        np.testing.assert_equal(after, before, err_msg=name)  # NaN is NaN
+    else:
+        assert before == after, name
+
+
+def read_back(path: Path, fit: Fit) -> xr.Dataset:
+    write(path, fit)
+    dataset = read(path)
+    assert isinstance(dataset, xr.Dataset)
+    return dataset
+
+
+@pytest.mark.parametrize("names", [("B",), ("B", "E")])
+@pytest.mark.parametrize("setups", [(), (protons(14.7), protons(1 / 3)), (LIGHT, LIGHT)])
+def test_file_gives_back_every_bit(
+    tmp_path: Path, make_fit: MakeFit, names: tuple[str, ...], setups: tuple[Any, ...]
+) -> None:
+    fit = make_fit(names=names, setups=setups)
+    dataset = read_back(tmp_path / "fit.shadowinv", fit)
+    assert_same(fit, Fit.from_dataset(dataset))
+    assert setup_from_dataset(dataset) == (setups[0] if setups else None)
+    xr.testing.assert_identical(
+        dataset.drop_attrs(deep=False), fit.to_dataset().drop_attrs(deep=False)
+    )
+
+
+def test_what_is_not_known_stays_so(tmp_path: Path, make_fit: MakeFit) -> None:
+    whole = make_fit(strengths=(1.0,), verdict=Verdict.AMBIGUOUS, explanation="cannot tell")
+    fields = tuple(dataclasses.replace(field, uncertainty=None) for field in whole.fields)
+    report = dataclasses.replace(whole.report, uncertainty=float("nan"))
+    fit = dataclasses.replace(whole, fields=fields, report=report)
+    again = Fit.from_dataset(read_back(tmp_path / "fit.shadowinv", fit))
+    assert_same(fit, again)
+    assert again.fields[0].uncertainty is None
+    assert again.verdict is Verdict.AMBIGUOUS
+
+
+def test_a_file_says_that_it_is_a_fit(tmp_path: Path, make_fit: MakeFit) -> None:
+    dataset = read_back(tmp_path / "fit.shadowinv", make_fit())
+    assert dataset.attrs["format"] == "shadowinv fit"
+    assert kind_of(tmp_path / "fit.shadowinv") == "shadowinv"
+    # Read, changed and written again it still is one.
+    write(tmp_path / "again.shadowinv", dataset)
+    again = read(tmp_path / "again.shadowinv")
+    assert isinstance(again, xr.Dataset)
+    assert_same(Fit.from_dataset(again), Fit.from_dataset(dataset))
+
+
+def test_every_variable_has_units_and_a_name(make_fit: MakeFit) -> None:
+    dataset = make_fit(names=("B", "E"), setups=(protons(14.7), protons(5.0))).to_dataset()
+    for name, variable in dataset.data_vars.items():
+        assert variable.attrs["units"], name
+        assert variable.attrs["long_name"], name
+    assert "path_integrated_b_B" in dataset
+    assert "path_integrated_b_E" not in dataset
+
+
+@pytest.mark.parametrize("ending", ["h5", "csv", "tif"])
+def test_other_formats_are_refused(tmp_path: Path, make_fit: MakeFit, ending: str) -> None:
+    with pytest.raises(FileFormatError, match=rf"ending is '.{ending}', expected one of .shadowi"):
+        write(tmp_path / f"fit.{ending}", make_fit())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_setup_beside_those_of_the_images_is_refused(tmp_path: Path, make_fit: MakeFit) -> None:
+    with pytest.raises(InputError, match="received a setup for a fit"):
+        write(tmp_path / "fit.shadowinv", make_fit(), setup=protons(3.0))
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_incomplete_dataset_is_refused(make_fit: MakeFit) -> None:
+    dataset = make_fit().to_dataset()
+    with pytest.raises(InputError, match="no 'gain': expected the result of a fit"):
+        Fit.from_dataset(dataset.drop_vars("gain"))
+    with pytest.raises(InputError, match="no displacement of the field 'B'"):
+        Fit.from_dataset(dataset.drop_vars("displacement"))
+    del dataset.attrs["verdict"]
+    with pytest.raises(InputError, match="no 'verdict'"):
+        Fit.from_dataset(dataset)
