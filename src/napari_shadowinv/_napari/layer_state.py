@@ -41,8 +41,9 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
 
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     setup = setup_from_dataset(dataset)
+    inverted = "report" in dataset.attrs and "verdict" not in dataset.attrs  # that of a fit
     result = Result(
-        Inversion.from_dataset(dataset) if "report" in dataset.attrs else dataset,
+        Inversion.from_dataset(dataset) if inverted else dataset,
         setup,
         {key: value for key, value in dataset.attrs.items() if key not in _OWN_ATTRIBUTES},
     )

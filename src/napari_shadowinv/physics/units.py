@@ -69,15 +69,18 @@ class ShownField:
         return f"{text} ({largest * 10.0**power / 1e-4:.3g} MG·µm)"
 
 
-def shown_fields(displacements: Collection[FloatArray], setup: Setup | None) -> list[ShownField]:
+def shown_fields(
+    displacements: Collection[FloatArray], setup: Setup | None, deflector: str | None = None
+) -> list[ShownField]:
     """Turn displacements in px into what an experimenter asks for, in one unit for all.
 
     That is the main field of the setup's kind: the path-integrated magnetic field of particles,
-    or the deflection angle of light; without a setup, the displacement in px.
+    or the electric one if that is the deflector, or the deflection angle of light; without a
+    setup, the displacement in px.
     """
     if setup is None:
         return [ShownField(d, "Displacement", "|d|", "px", ("dy", "dx")) for d in displacements]
-    main = setup.main_field
+    main = setup.field_of(deflector)
     (unit,) = (field.unit for field in setup.si_fields if field.name == main.name)
     fields = [setup.field_in_si(main.name, d) for d in displacements]
     factor, prefix = prefix_for(max(float(np.hypot(*field).max()) for field in fields))

@@ -155,6 +155,10 @@ class BeamSetup(BaseModel):
         made: FloatArray = getattr(self, method)(values)
         return made
 
+    def field_of(self, deflector: str | None) -> MainField:
+        """What is shown of a displacement by a deflector; the main field if it is not known."""
+        return self.main_field
+
     @classmethod
     def own_fields(cls) -> set[str]:
         """Names of the fields that only this kind has."""

@@ -25,6 +25,11 @@ _LIGHT_SPEED: float = constants.c
 _JOULES_PER_MEV = 1e6 * _ELEMENTARY_CHARGE
 
 
+_ELECTRIC = MainField(
+    "path_integrated_e", "Path-integrated field", "|∫E dz|", ("∫Ey dz", "∫Ex dz")
+)
+
+
 @dataclass(frozen=True)
 class Particle:
     """Rest mass in kg and charge in C, with its sign, of a species of beam particle."""
@@ -102,6 +107,9 @@ class ProtonSetup(BeamSetup):
     @property
     def probe(self) -> str:
         return f"{self.energy:g} MeV {self.species}"
+
+    def field_of(self, deflector: str | None) -> MainField:
+        return _ELECTRIC if deflector == "electric field" else self.main_field
 
     @classmethod
     def example(cls) -> Self:
