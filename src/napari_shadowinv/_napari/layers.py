@@ -66,7 +66,10 @@ KINDS = (
     Kind("field x", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
     Kind("field", "displacement", "{symbol} ({unit})", colormap="inferno", visible=True),
     Kind(
-        "uncertainty", "displacement_uncertainty", "σ of {symbol} ({unit})", colormap="magma",
+        "uncertainty",
+        "displacement_uncertainty",
+        "σ of {symbol} ({unit})",
+        colormap="magma",
         shown_of="shot",
     ),
     Kind("caustic", "caustic", "caustics", type="labels"),
@@ -183,8 +186,8 @@ def result_layers(
 
 def deflector_of(dataset: xarray.Dataset) -> str | None:
     """What deflects by the only field of a fit; None for other datasets."""
-    (*_, field) = json.loads(dataset.attrs.get("fields", "[]")) or [""]
-    return FIELDS.get(field)
+    fields = json.loads(dataset.attrs.get("fields", "[]"))
+    return FIELDS.get(fields[0]) if len(fields) == 1 else None
 
 
 def dataset_layers(
@@ -308,9 +311,7 @@ def _image(shown: _Shown, kind: Kind) -> Content:
             used = shown.plane("image")[shown.dataset["mask"].values]
             data = 100 * data / used.mean()
         plane = data if shown.shot is None else shown.plane("residual")
-        # A handful of pixels at a caustic must not blow it up.
-        limit = float(np.percentile(np.abs(_sample(plane)), _BRIGHTEST))
-        limits = -limit, limit
+        limits = symmetric_limits(plane)
     else:
         limits = shown.intensity_limits
     return data, words, {"colormap": kind.colormap, "contrast_limits": _opened(limits)}
@@ -437,6 +438,12 @@ def intensity_limits(image: AnyArray) -> Limits:
     mean = float(finite.mean())
     high = min(bright, _LARGEST_INTENSITY * mean) if mean > 0 else bright
     return _opened((0.0 if 0 <= dark < 0.3 * high else dark, high))
+
+
+def symmetric_limits(residual: AnyArray) -> Limits:
+    """Return limits around 0 that a handful of pixels at a caustic cannot blow up."""
+    limit = float(np.percentile(np.abs(_sample(residual)), _BRIGHTEST))
+    return _opened((-limit, limit))
 
 
 def _sample(plane: AnyArray) -> AnyArray:
