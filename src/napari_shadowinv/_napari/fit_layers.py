@@ -108,12 +108,16 @@ def _image_layers(fit: Fit, frame: Frame, name: str, with_source: bool) -> list[
             **frame.keywords(stacked=data.ndim == 3),
             **look,
         }
+        if data.ndim == 3:
+            keywords["axis_labels"] = ("image", "y", "x")
         return data, keywords, "image"
 
     grey = {"colormap": "gray", "contrast_limits": limits}
     red_blue = {"colormap": "RdBu_r", "contrast_limits": symmetric_limits(percent[0])}
     layers = [
-        described(_unstacked(fit.reprojection), "reprojection", "re-projection", "flux/px²", **grey),
+        described(
+            _unstacked(fit.reprojection), "reprojection", "re-projection", "flux/px²", **grey
+        ),
         described(_unstacked(percent), "residual", "residual (% of mean)", "%", **red_blue),
     ]
     if with_source:

@@ -168,7 +168,7 @@ class FitView(QWidget):
         )
         self._answers_row = labelled("Answer", self.answers)
         self.report = ReportTable()
-        column(self, self.curve, self.verdict, self._answers_row, self.report)
+        column(self, self.verdict, self._answers_row, self.curve, self.report)
         self._drawing = timer(self, _DRAW_EVERY, self._draw)
         self.answers.currentIndexChanged.connect(self._show_answer)
         panel.runner.started.connect(self._on_start)
@@ -261,8 +261,8 @@ def fit_rows(found: Fit, names: Sequence[str]) -> list[tuple[str, str]]:
         rows.append((f"Image {k + 1}", ", ".join(told)))
     report = found.report
     if np.isfinite(report.uncertainty):
-        rows.append(("Open", f"{report.uncertainty:.1%} of the displacement (r.m.s., by noise)"))
-    rows.append(("Crossed", f"rays over {found.folded:.1%} of the pixels"))
+        rows.append(("Error bars", f"{report.uncertainty:.1%} of the displacement (r.m.s.)"))
+    rows.append(("Rays cross", f"over {found.folded:.1%} of the pixels"))
     rows.append(("Converged", "yes" if report.converged else "NO"))
     rows.append(("Time", f"{sum(report.seconds.values()):.1f} s"))
     return rows

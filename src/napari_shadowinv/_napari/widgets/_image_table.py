@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
 from qtpy.QtGui import QColor
-from qtpy.QtWidgets import QHeaderView, QTableWidget, QTableWidgetItem, QWidget
+from qtpy.QtWidgets import QHeaderView, QSizePolicy, QTableWidget, QTableWidgetItem, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.widgets._fields import parsed, shown, unit_of_title
@@ -21,7 +22,7 @@ from napari_shadowinv.physics.setup import SETUPS, Setup
 _KEPT = "fit"  # what a layer's metadata keep of its rows
 _NAME, _BEAM, _GAIN, _PSF = range(4)
 _COLUMNS = {_GAIN: ("gain", "Gain", 1.0), _PSF: ("psf", "PSF σ (px)", 0.0)}
-_WIDTHS = {_BEAM: 74, _GAIN: 46, _PSF: 68}
+_WIDTHS = {_BEAM: 90, _GAIN: 44, _PSF: 72}
 _TALLEST = 8  # rows
 _PROBLEM = QColor(PROBLEM_STYLE.removeprefix("color: ").removesuffix(";"))
 _BEAM_FIELDS = {"proton": "energy", "optical": "wavelength"}
@@ -105,6 +106,7 @@ class ImageTable(QWidget):
         )
         self.table = QTableWidget(0, 4)
         self.table.verticalHeader().setVisible(False)
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
         self.table.setSelectionMode(QTableWidget.SelectionMode.NoSelection)
         self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.table.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
@@ -145,11 +147,12 @@ class ImageTable(QWidget):
             self.rows = [ImageRow(stack, plane) for plane in range(stack.data.shape[0])]
         else:
             self.rows = [ImageRow(layer) for layer in self._viewer.layers if self._is_image(layer)]
-        shape = self.rows[-1].layer.data.shape if self.rows else None
+        shapes = Counter(row.layer.data.shape for row in self.rows)
+        usual = max(shapes, key=lambda shape: shapes[shape], default=None)
         with QSignalBlocker(self.table):
             self.table.setRowCount(len(self.rows))
             for number, row in enumerate(self.rows):
-                use = row.kept().get("use", row.layer.data.shape == shape)
+                use = row.kept().get("use", row.layer.data.shape == usual)
                 item = QTableWidgetItem(row.name)
                 item.setFlags(Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsUserCheckable)
                 item.setCheckState(Qt.CheckState.Checked if use else Qt.CheckState.Unchecked)
@@ -157,12 +160,19 @@ class ImageTable(QWidget):
                 self.table.setItem(number, _NAME, item)
                 for at in (_BEAM, _GAIN, _PSF):
                     self.table.setItem(number, at, QTableWidgetItem())
-        height = sum(self.table.rowHeight(row) for row in range(min(len(self.rows), _TALLEST)))
-        frame = 2 * self.table.frameWidth()
-        self.table.setFixedHeight(
-            self.table.horizontalHeader().sizeHint().height() + height + frame
-        )
+        self._fit_height()
         self._on_use()
+
+    def _fit_height(self) -> None:
+        rows = sum(self.table.rowHeight(row) for row in range(min(len(self.rows), _TALLEST)))
+        header = self.table.horizontalHeader()
+        header.setFixedHeight(header.sizeHint().height())
+        self.table.setFixedHeight(header.height() + rows + 2 * self.table.frameWidth())
+
+    def showEvent(self, event: Any) -> None:
+        super().showEvent(event)
+        # Only now the rows have the heights of napari's style.
+        self._fit_height()
 
     def show_beams(self, kind: str, value: Any, gains_known: bool) -> None:
         """Fill the cells; the reference has the energy `value` of the setup that is shown."""

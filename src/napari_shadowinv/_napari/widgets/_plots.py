@@ -14,6 +14,10 @@ from napari_shadowinv._napari.widgets import _qt as qt
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 
 
+_CURVE_HEIGHT = 190
+_LEVEL = ("samples",)  # stages that leave the objective as it is
+
+
 class Plot(QtWidgets.QWidget):
     """A figure that is made when there is something to draw."""
 
@@ -40,9 +44,9 @@ class Plot(QtWidgets.QWidget):
             self._dress(axis)
         return axes
 
-    def add_legend(self, axis: Any, **keywords: Any) -> None:
+    def add_legend(self, axis: Any, size: int = 8, **keywords: Any) -> None:
         colours = {"labelcolor": self.ink, "facecolor": self.paper, "edgecolor": self.ink}
-        axis.legend(fontsize=8, **colours, **keywords)
+        axis.legend(fontsize=size, **colours, **keywords)
 
     def draw(self) -> None:
         self._canvas.draw_idle()
@@ -82,7 +86,8 @@ class ObjectiveCurve(Plot):
     """How the objective of a fit falls, step by step, with a colour for each stage."""
 
     def __init__(self) -> None:
-        super().__init__(height=170)
+        super().__init__(_CURVE_HEIGHT)
+        self.setMaximumHeight(_CURVE_HEIGHT)
         self._shown = 0
         self.setVisible(False)
 
@@ -90,8 +95,9 @@ class ObjectiveCurve(Plot):
         self._shown = 0
         self.setVisible(False)
 
-    def show_steps(self, steps: Sequence[tuple[str, float]]) -> None:
+    def show_steps(self, history: Sequence[tuple[str, float]]) -> None:
         """Draw stages and objectives, unless they are drawn already."""
+        steps = [step for step in history if step[0] not in _LEVEL]
         if len(steps) == self._shown:
             return
         self._shown = len(steps)
@@ -115,5 +121,5 @@ class ObjectiveCurve(Plot):
         axis.set_yscale("log")
         axis.set_ylabel("objective", color=self.ink, fontsize=8)
         axis.set_xlabel("step", color=self.ink, fontsize=8)
-        self.add_legend(axis, loc="upper right", handlelength=1.0)
+        self.add_legend(axis, 7, loc="upper right", handlelength=1.0, labelspacing=0.2)
         self.draw()

@@ -211,9 +211,6 @@ class FitImages(ToolPanel):
         else:
             known = {"setups": [self._setup_of(row, setup) for row in rows]}
             told = [one.probe for one in known["setups"]]
-        gains: Any = [self.images.gain(row) for row in rows]
-        if self.gains.state() == "free" or gains == [1.0] * len(rows):
-            gains = self.gains.state()
         keywords = {
             **known,
             "fields": tuple(self.fields.state().split(_BOTH)),
@@ -221,7 +218,7 @@ class FitImages(ToolPanel):
             "noise": self.noise.state() or None,
             "psf": [self.images.psf(row) for row in rows],
             "mask": self.masks.usable(first.layer),
-            "gains": gains,
+            "gains": self._chosen_gains(rows),
             "options": self.options.model(),
         }
         words = {
@@ -266,6 +263,13 @@ class FitImages(ToolPanel):
                     "all images must have the same; uncheck or crop the one that does not fit"
                 )
         return rows
+
+    def _chosen_gains(self, rows: list[ImageRow]) -> Any:
+        chosen = self.gains.state()
+        if chosen == "free":
+            return chosen
+        gains = [self.images.gain(row) for row in rows]
+        return chosen if gains == [1.0] * len(rows) else gains
 
     def _setup_of(self, row: ImageRow, setup: Setup) -> Setup:
         """The setup of an image: its own, or else that of the first, with the beam in its row."""

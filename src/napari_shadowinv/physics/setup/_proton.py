@@ -25,9 +25,7 @@ _LIGHT_SPEED: float = constants.c
 _JOULES_PER_MEV = 1e6 * _ELEMENTARY_CHARGE
 
 
-_ELECTRIC = MainField(
-    "path_integrated_e", "Path-integrated field", "|∫E dz|", ("∫Ey dz", "∫Ex dz")
-)
+_ELECTRIC = MainField("path_integrated_e", "Path-integrated field", "|∫E dz|", ("∫Ey dz", "∫Ex dz"))
 
 
 @dataclass(frozen=True)
