@@ -218,6 +218,32 @@ def test_an_unknown_beam_is_fitted_and_shown(window: Any, tool: Any, run: Any) -
     assert not [layer for layer in window.layers if role_of(layer) == "source"]
 
 
+def test_steps_are_done_to_all_images_first(window: Any, tool: Any, run: Any) -> None:
+    beam = 300 * np.ones(SHAPE) + np.arange(SHAPE[1])
+    tool.steps.add("bin")
+    tool.options.set_values({"samples": 0})
+    window.add_image(beam, name="beam", metadata=mark("source", ""))
+    tool.source.layers.layer = window.layers["beam"]
+    tool.source.picker.set_kind("layer")
+    window.add_labels(np.pad(np.ones((4, 6), np.uint8), ((0, 44), (0, 58))), name="mask")
+    tool.masks.layer = window.layers["mask"]
+    job = tool.request()
+    planes, keywords = job._prepared(lambda: False)
+    halved = np.stack(images()).reshape(2, 24, 2, 32, 2)
+    for got, whole in ((planes, halved), (keywords["source"][0], beam.reshape(24, 2, 32, 2))):
+        merged = whole.mean(axis=(-3, -1))
+        np.testing.assert_allclose((got / merged)[..., 4:, 6:], (got / merged)[..., -1, -1].max())
+    assert keywords["mask"].shape == (2, 24, 32)
+    assert not keywords["mask"][:, :2, :3].any()
+    found = run(tool)
+    assert found.setups[1].object_pixel_size == pytest.approx(3e-6)
+    field = layer_of(window, "field")
+    assert tuple(field.scale) == pytest.approx((3, 3))
+    assert tuple(field.translate) == pytest.approx((0.75, 0.75))
+    assert tuple(window.layers["6.0 MeV"].scale) == pytest.approx((1.5, 1.5))
+    assert "bin" in tool.view.report.texts()["Steps"].lower()
+
+
 def test_a_stack_has_a_row_for_each_plane(window: Any, open_widget: Any) -> None:
     stack = np.stack([*images(), images()[0]])
     layer = window.add_image(stack, name="run", metadata=mark("shot", "", SETUPS[0]))
@@ -310,7 +336,7 @@ def test_images_that_do_not_fit_are_refused(
 def test_a_fit_is_cancelled_at_once(window: Any, tool: Any, qtbot: Any, told: list[str]) -> None:
     tool.options.set_values({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.steps), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.history), timeout=PATIENCE)
     qtbot.waitUntil(lambda: "Fitting: " in tool.panel.status.text(), timeout=PATIENCE)
     assert "objective" in tool.panel.status.text()
     qtbot.waitUntil(tool.view.curve.isVisible, timeout=PATIENCE)
@@ -327,7 +353,7 @@ def test_a_fit_is_cancelled_at_once(window: Any, tool: Any, qtbot: Any, told: li
 def test_closing_the_dock_ends_the_fit(window: Any, tool: Any, qtbot: Any, told: list[str]) -> None:
     tool.options.set_values({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.steps), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.history), timeout=PATIENCE)
     window.window.remove_dock_widget(tool)
     tool.deleteLater()
     qtbot.waitUntil(

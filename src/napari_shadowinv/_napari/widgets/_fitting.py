@@ -26,9 +26,11 @@ from napari_shadowinv._napari.widgets._plots import ObjectiveCurve
 from napari_shadowinv._napari.widgets._qt import column, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_together
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import FIELDS, FitOptions, Verdict, fit
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
@@ -58,36 +60,74 @@ class FitJob:
     attributes: Mapping[str, str]
     layer: Any = None  # of the first image
     companions: tuple[Any, ...] = ()
-    steps: list[tuple[str, float]] = field(default_factory=list)  # stage and objective so far
+    recipe: Recipe = field(default_factory=Recipe)  # steps and setup, of the first image
+    history: list[tuple[str, float]] = field(default_factory=list)  # stage and objective so far
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FitAnswer:
         """Fit and describe the layers, all of it beside the window."""
         from napari_shadowinv._napari.fit_layers import fit_layers
-        from napari_shadowinv.pipeline._run import plane_of
 
         def heard(news: Progress) -> None:
             step = _STEP.match(news.message)
             if step:
-                self.steps.append((step["stage"], float(step["value"])))
+                self.history.append((step["stage"], float(step["value"])))
             on_progress(news)
 
-        planes = [
-            plane_of(image, f"'{name}'")
-            for image, name in zip(self.images, self.names, strict=True)
-        ]
-        keywords = dict(self.keywords)
-        source = keywords.get("source")
-        if source is not None and not isinstance(source, str):
-            keywords["source"] = np.asarray(source)
-        found = fit(np.stack(planes), **keywords, on_progress=heard, should_stop=should_stop)
+        images, keywords = self._prepared(should_stop)
+        found = fit(images, **keywords, on_progress=heard, should_stop=should_stop)
         described = fit_layers(
             found,
             self.frame,
             self.name,
-            with_source=isinstance(source, str),
+            with_source=isinstance(keywords["source"], str),
             attributes=self.attributes,
         )
         return FitAnswer(found, described)
+
+    def _prepared(self, should_stop: ShouldStop) -> tuple[FloatArray, dict[str, Any]]:
+        """Read the images and do the recipe's steps to them, and to what lies on them."""
+        from napari_shadowinv.pipeline._run import plane_of
+
+        keywords = dict(self.keywords)
+        planes = np.stack(
+            [
+                plane_of(image, f"'{name}'")
+                for image, name in zip(self.images, self.names, strict=True)
+            ]
+        )
+        source, mask, setups = (keywords[name] for name in ("source", "mask", "setups"))
+        measured = source is not None and not isinstance(source, str)
+        if measured:
+            keywords["source"] = source = np.asarray(source)
+        if not self.recipe.steps:
+            return planes, keywords
+        beams: Any = [None] * len(planes)
+        if measured:
+            _check_size("source", source, planes)
+            beams = np.broadcast_to(source, planes.shape)
+        shots = [
+            self.recipe.prepared(
+                Radiograph(image, source=beam, mask=mask, setup=setup), should_stop
+            )
+            for image, beam, setup in zip(
+                planes, beams, setups or [None] * len(planes), strict=True
+            )
+        ]
+        if measured:
+            keywords["source"] = np.stack([shot.source for shot in shots])  # type: ignore[misc]
+        if shots[0].mask is not None:
+            keywords["mask"] = np.stack([shot.mask for shot in shots])  # type: ignore[misc]
+        if setups is not None:
+            keywords["setups"] = [shot.setup for shot in shots]
+        return np.stack([shot.image for shot in shots]), keywords
+
+
+def _check_size(what: str, values: FloatArray, images: FloatArray) -> None:
+    if values.shape not in (images.shape, images.shape[1:]):
+        raise InputError(
+            f"the {what} has shape {values.shape}: expected {images.shape[1:]} or {images.shape}, "
+            "like the images"
+        )
 
 
 def refinement(layers: Sequence[Any], image: Any, psf: float) -> FitJob:
@@ -188,8 +228,8 @@ class FitView(QWidget):
         found = answer.fit
         if job.layer not in self._viewer.layers:
             show_warning(f"'{job.names[0]}' was deleted during its fit; the result is shown anyway")
-        elif found.setups:
-            place_together(self._viewer, job.layer, found.setups[0], job.companions)
+        elif job.recipe.setup is not None:
+            place_together(self._viewer, job.layer, job.recipe.setup, job.companions)
         self._tell(found)
         self.report.show_rows([*job.given, *fit_rows(found, job.names)])
         self._others.show([])
@@ -240,12 +280,12 @@ class FitView(QWidget):
     def _draw(self) -> None:
         job = self._panel.runner.tag
         if isinstance(job, FitJob):
-            self.curve.show_steps(list(job.steps))
+            self.curve.show_steps(list(job.history))
 
     def _on_end(self, outcome: Any) -> None:
         self._drawing.stop()
         if isinstance(outcome.tag, FitJob):
-            self.curve.show_steps(list(outcome.tag.steps))
+            self.curve.show_steps(list(outcome.tag.history))
 
 
 def fit_rows(found: Fit, names: Sequence[str]) -> list[tuple[str, str]]:

@@ -156,7 +156,7 @@ class ImageTable(QWidget):
                 item = QTableWidgetItem(row.name)
                 item.setFlags(Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsUserCheckable)
                 item.setCheckState(Qt.CheckState.Checked if use else Qt.CheckState.Unchecked)
-                item.setToolTip(f"<qt>{row.name}. Unchecked images are not used.</qt>")
+                item.setToolTip(f"<qt>{row.name}: {_setup_in_words(row)}.</qt>")
                 self.table.setItem(number, _NAME, item)
                 for at in (_BEAM, _GAIN, _PSF):
                     self.table.setItem(number, at, QTableWidgetItem())
@@ -283,6 +283,14 @@ class ImageTable(QWidget):
     def _is_image(self, layer: Any) -> bool:
         grey = kind_of(layer) == "image" and not getattr(layer, "rgb", False)
         return grey and layer.ndim == 2 and self._suits(layer)
+
+
+def _setup_in_words(row: ImageRow) -> str:
+    """Where the distances of its experiment come from."""
+    if row.setup is None or row.plane is not None:
+        return "with the setup below"
+    origin = about.setup_origin_of(row.layer)
+    return f"with a setup of its own ({row.setup.probe}{f', {origin}' if origin else ''})"
 
 
 _TIPS = {

@@ -14,7 +14,7 @@ from napari_shadowinv._napari.widgets import _qt as qt
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 
 
-_CURVE_HEIGHT = 190
+_CURVE_HEIGHT = 210
 _LEVEL = ("samples",)  # stages that leave the objective as it is
 
 
@@ -44,9 +44,9 @@ class Plot(QtWidgets.QWidget):
             self._dress(axis)
         return axes
 
-    def add_legend(self, axis: Any, size: int = 8, **keywords: Any) -> None:
+    def add_legend(self, holder: Any, size: int = 8, **keywords: Any) -> None:
         colours = {"labelcolor": self.ink, "facecolor": self.paper, "edgecolor": self.ink}
-        axis.legend(fontsize=size, **colours, **keywords)
+        holder.legend(fontsize=size, **colours, **keywords)
 
     def draw(self) -> None:
         self._canvas.draw_idle()
@@ -121,5 +121,5 @@ class ObjectiveCurve(Plot):
         axis.set_yscale("log")
         axis.set_ylabel("objective", color=self.ink, fontsize=8)
         axis.set_xlabel("step", color=self.ink, fontsize=8)
-        self.add_legend(axis, 7, loc="upper right", handlelength=1.0, labelspacing=0.2)
+        self.add_legend(self.figure, 7, loc="outside upper center", ncols=3, frameon=False)
         self.draw()

@@ -15,6 +15,7 @@ from napari_shadowinv._napari.widgets._image_table import ImageRow, ImageTable, 
 from napari_shadowinv._napari.widgets._inputs import OptionsForm, SetupPicker
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._results import LastResults, result_frame
+from napari_shadowinv._napari.widgets._steps import StepsSection
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import FIELDS, FitOptions
@@ -153,6 +154,7 @@ class FitImages(ToolPanel):
             "particles or photons.",
         )
         self.setup = SetupPicker()
+        self.steps = StepsSection()
         self.options = OptionsForm(FitOptions, {"smoothness": 1.0, "strip": 16, "threads": 1})
         self.view = FitView(self.viewer, self.panel)
         self.add(
@@ -163,6 +165,7 @@ class FitImages(ToolPanel):
             forms.labelled("Gains", self.gains),
             forms.labelled("Noise", self.noise),
             self.setup,
+            self.steps,
             forms.section("Options", self.options),
             self._last.keep_earlier,
             self.panel,
@@ -180,6 +183,7 @@ class FitImages(ToolPanel):
             self.source.changed,
             self.options.changed,
             self.setup.changed,
+            self.steps.changed,
             self.masks.changed,
             self.fields.currentIndexChanged,
             self.gains.currentIndexChanged,
@@ -194,6 +198,7 @@ class FitImages(ToolPanel):
             "fields": self.fields,
             "gains": self.gains,
             "noise": self.noise,
+            "steps": self.steps,
             "options": self.options,
             "painted_is_unusable": self.masks,
         }
@@ -204,9 +209,13 @@ class FitImages(ToolPanel):
         rows = self._rows()
         first = rows[0]
         setup = self.setup.setup()
+        recipe = Recipe(steps=self.steps.steps(), setup=setup)
         known: dict[str, Any]
         if setup is None:
-            known = {"strengths": [self.images.beam_value(row) for row in rows]}
+            known = {
+                "strengths": [self.images.beam_value(row) for row in rows],
+                "setups": None,
+            }
             told = [f"displaced by {strength:g}" for strength in known["strengths"]]
         else:
             known = {"setups": [self._setup_of(row, setup) for row in rows]}
@@ -226,11 +235,13 @@ class FitImages(ToolPanel):
             "source_origin": self.source.described,
             "mask_origin": self.masks.described(first.layer),
             "setup_origin": self.setup.origin,
+            "steps": "; ".join(step.described for step in recipe.steps),
         }
         given = [
             ("Source", self.source.described),
             ("Mask", words["mask_origin"]),
             ("Setup", self.setup.described),
+            ("Steps", words["steps"]),
         ]
         chosen = (*(row.layer for row in rows), self.masks.layer, self.source.layer)
         return FitJob(
@@ -238,11 +249,12 @@ class FitImages(ToolPanel):
             tuple(row.name for row in rows),
             keywords,
             f"{first.layer.name} fit",
-            result_frame(first.layer, Recipe(setup=setup)),
+            result_frame(first.layer, recipe),
             [(name, text) for name, text in given if text],
             {name: text for name, text in words.items() if text},
             first.layer,
             tuple(one for one in chosen if one is not None and one is not first.layer),
+            recipe,
         )
 
     def show_result(self, value: FitAnswer, request: FitJob) -> None:
