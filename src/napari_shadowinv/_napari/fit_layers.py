@@ -22,7 +22,7 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.fitting import FIELDS
 
 if TYPE_CHECKING:
-    from napari_shadowinv.fitting import Fit, FittedField
+    from napari_shadowinv.fitting import Basin, Fit, FittedField
     from napari_shadowinv.physics.setup import Setup
 
 # In another answer only what differs is of interest.
@@ -63,13 +63,18 @@ def answer_layers(fit: Fit, number: int, frame: Frame, name: str) -> list[FullLa
             xr.Dataset({"displacement": (("component", "y", "x"), displacement)}),
             setup_of_fit(fit),
             frame,
-            _titled(f"{name} {basin.start}", fit, field),
+            _titled(f"{name} {start_in_words(basin)}", fit, field),
             {},
             deflector=FIELDS[field.name],
         )
         kept = [layer for layer in described if role_of(layer[1]) in _COMPARED]
         layers += _parted(kept, m, field)
     return layers
+
+
+def start_in_words(basin: Basin) -> str:
+    """Return from where an answer was reached; the only field that is given is an inversion's."""
+    return "from the inversion" if basin.start == "given" else basin.start
 
 
 def setup_of_fit(fit: Fit) -> Setup | None:

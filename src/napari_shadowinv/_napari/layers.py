@@ -15,7 +15,6 @@ from napari_shadowinv._napari.layer_metadata import Result, mark, role_of
 from napari_shadowinv._napari.sites import Cells, power_cells, site_features
 from napari_shadowinv._napari.viewer_sync import keep_in_step
 from napari_shadowinv._typing import AnyArray, FloatArray
-from napari_shadowinv.fitting import FIELDS
 from napari_shadowinv.inversion.labels import VARIABLES
 from napari_shadowinv.physics.units import ShownField, shown_fields, shown_potential
 
@@ -186,6 +185,8 @@ def result_layers(
 
 def deflector_of(dataset: xarray.Dataset) -> str | None:
     """What deflects by the only field of a fit; None for other datasets."""
+    from napari_shadowinv.fitting import FIELDS
+
     fields = json.loads(dataset.attrs.get("fields", "[]"))
     return FIELDS.get(fields[0]) if len(fields) == 1 else None
 

@@ -413,7 +413,7 @@ def test_other_answers_are_shown_beside_the_best(
     answers = tool.view.answers
     assert answers.isVisible()
     assert answers.itemText(0).endswith("the best")
-    assert answers.itemText(1) == "from near: objective +2.0 %, field differs by 50%"
+    assert answers.itemText(1) == "from near: +2.0 %, 50% off"
     count = len(window.layers)
     answers.setCurrentIndex(1)
     qtbot.waitUntil(lambda: not tool.view._others.busy, timeout=PATIENCE)

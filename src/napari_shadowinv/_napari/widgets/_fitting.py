@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from napari.utils.notifications import show_warning
+from qtpy.QtCore import QSignalBlocker, Qt
 from qtpy.QtWidgets import QDoubleSpinBox, QPushButton, QWidget
 
+from napari_shadowinv._napari.fit_layers import answer_layers, fit_layers, start_in_words
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import result_of, role_of
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
@@ -65,7 +67,6 @@ class FitJob:
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FitAnswer:
         """Fit and describe the layers, all of it beside the window."""
-        from napari_shadowinv._napari.fit_layers import fit_layers
 
         def heard(news: Progress) -> None:
             step = _STEP.match(news.message)
@@ -251,19 +252,19 @@ class FitView(QWidget):
             show_warning(f"The fit's verdict is '{found.verdict.value}': {found.explanation}")
 
     def _fill_answers(self, found: Fit) -> None:
-        self.answers.blockSignals(True)
-        self.answers.clear()
-        best = found.basins[0].objective
-        for number, basin in enumerate(found.basins):
-            worse = f"objective {100 * (basin.objective / best - 1):+.1f} %"
-            text = f"{basin.start}: {worse}, field differs by {basin.distance:.0%}"
-            self.answers.addItem(text if number else f"{basin.start}: the best", number)
-        self.answers.blockSignals(False)
+        with QSignalBlocker(self.answers):
+            self.answers.clear()
+            best, *others = found.basins
+            self.answers.addItem(f"{start_in_words(best)}: the best", 0)
+            for number, basin in enumerate(others, 1):
+                worse = f"{100 * (basin.objective / best.objective - 1):+.1f} %"
+                start, away = start_in_words(basin), f"{basin.distance:.0%}"
+                self.answers.addItem(f"{start}: {worse}, {away} off", number)
+                full = f"objective {worse}, displacement {away} (r.m.s.) from the best"
+                self.answers.setItemData(number, f"{start}: {full}", Qt.ItemDataRole.ToolTipRole)
         self._answers_row.setVisible(len(found.basins) > 1)
 
     def _show_answer(self) -> None:
-        from napari_shadowinv._napari.fit_layers import answer_layers
-
         number = self.answers.currentData()
         if self._fit is None or self._job is None or number is None:
             return
@@ -273,8 +274,8 @@ class FitView(QWidget):
         self._others.show(described, select=False)
 
     def _on_start(self) -> None:
+        self.empty()
         if isinstance(self._panel.runner.tag, FitJob):
-            self.empty()
             self._drawing.start()
 
     def _draw(self) -> None:
@@ -292,7 +293,7 @@ def fit_rows(found: Fit, names: Sequence[str]) -> list[tuple[str, str]]:
     """How a fit went, in two columns of text."""
     rows = []
     for k, name in enumerate(names):
-        told = [name, *([found.setups[k].probe] if found.setups else []), f"χ² {found.chi2[k]:.2f}"]
+        told = [name, *([found.setups[k].probe] if found.setups else []), f"χ² {found.chi2[k]:.3g}"]
         if abs(found.gains[k] - 1) > 1e-6:
             told.append(f"gain {found.gains[k]:.3f}")
         shift = found.frames[k][[0, 3]]
