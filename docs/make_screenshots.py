@@ -1,4 +1,4 @@
-"""Make the pictures of napari's window that the README, docs/batch.md, docs/napari.md and the tutorials show.
+"""Make the pictures of napari's window that the README, pages of docs and the tutorials show.
 
     QT_API=pyqt6 xvfb-run -a -s "-screen 0 2560x1440x24" python docs/make_screenshots.py [NAME ...]
 

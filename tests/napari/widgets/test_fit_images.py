@@ -15,7 +15,14 @@ from qtpy.QtCore import Qt
 
 from napari_shadowinv import ProtonSetup, read
 from napari_shadowinv._napari.fit_layers import fit_layers
-from napari_shadowinv._napari.layer_metadata import mark, result_of, role_of, setup_of, unit_of
+from napari_shadowinv._napari.layer_metadata import (
+    keep_setup,
+    mark,
+    result_of,
+    role_of,
+    setup_of,
+    unit_of,
+)
 from napari_shadowinv._napari.widgets._fitting import FitAnswer
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitOptions, Verdict, fit
@@ -340,6 +347,37 @@ def test_a_mistake_is_one_sentence(
     (text,) = told
     assert text.lower().startswith(sentence.lower())
     assert tool.panel.status.text() == text
+
+
+def test_without_images_it_says_what_is_needed(
+    window: Any, open_widget: Callable[[str], Any], told: list[str]
+) -> None:
+    tool = open_widget("Fit several images")
+    tool.panel.button.click()
+    assert told[0].startswith("No images are checked, expected two or more")
+    (first,) = (window.add_image(one, name="a") for one in images()[:1])
+    tool.panel.button.click()
+    assert told[1].startswith("1 image is checked")
+    window.layers.remove(first)
+    assert texts(tool, 0) == []
+    tool.panel.button.click()
+    assert told[2] == told[0]
+
+
+def test_what_other_widgets_change_is_followed(window: Any, tool: Any, qtbot: Any) -> None:
+    tool.hide()
+    for layer, energy in zip(window.layers, (15.0, 7.0), strict=True):
+        keep_setup(layer, SETUPS[0].model_copy(update={"energy": energy}), "typed elsewhere")
+    tool.show()
+    qtbot.waitUntil(tool.isVisible, timeout=PATIENCE)
+    assert texts(tool, BEAM) == ["15", "7"]
+    assert [one.energy for one in tool.request().keywords["setups"]] == [15.0, 7.0]
+    assert tool.setup.origin == "typed elsewhere"
+
+
+def test_doubts_of_the_reader_are_told(window: Any, tool: Any) -> None:
+    window.layers[1].metadata = mark("shot", "", SETUPS[1], warnings=["it may be film"])
+    assert ("Warning", "'6.0 MeV': it may be film") in tool.request().given
 
 
 def test_images_that_do_not_fit_are_refused(

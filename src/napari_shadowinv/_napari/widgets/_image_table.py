@@ -171,8 +171,9 @@ class ImageTable(QWidget):
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
-        # Only now the rows have the heights of napari's style.
-        self._fit_height()
+        # Only now the rows have the heights of napari's style, and another widget may have
+        # changed a layer's setup.
+        self.fill()
 
     def show_beams(self, kind: str, value: Any, gains_known: bool) -> None:
         """Fill the cells; the reference has the energy `value` of the setup that is shown."""
@@ -295,5 +296,5 @@ def _setup_in_words(row: ImageRow) -> str:
 
 _TIPS = {
     "gain": "By how much the image is brighter than the source; 1 if it is as bright.",
-    "psf": "Standard deviation of the image's blur in pixels of the object plane; 0 for none.",
+    "psf": "Standard deviation of the image's blur, in pixels after the steps; 0 for none.",
 }

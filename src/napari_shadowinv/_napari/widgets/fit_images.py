@@ -119,6 +119,16 @@ class ChoiceBox(SteadyComboBox):
         self._wanted = self.currentData()
 
 
+def _warnings_of(rows: list[ImageRow]) -> list[tuple[str, str]]:
+    """What the readers of the images said against them, a line each."""
+    unique = {id(row.layer): row.layer for row in rows}.values()
+    return [
+        ("Warning", f"'{layer.name}': {text}")
+        for layer in unique
+        for text in layers.warnings_of(layer)
+    ]
+
+
 class FitImages(ToolPanel):
     """Choose images of one object at several energies, press Run."""
 
@@ -250,7 +260,7 @@ class FitImages(ToolPanel):
             keywords,
             f"{first.layer.name} fit",
             result_frame(first.layer, recipe),
-            [(name, text) for name, text in given if text],
+            [(name, text) for name, text in (*given, *_warnings_of(rows)) if text],
             {name: text for name, text in words.items() if text},
             first.layer,
             tuple(one for one in chosen if one is not None and one is not first.layer),
@@ -291,6 +301,14 @@ class FitImages(ToolPanel):
         return validated(SETUPS[setup.kind], values, f"the setup of '{row.name}'")
 
     # Controls that follow each other
+
+    def showEvent(self, event: Any) -> None:
+        super().showEvent(event)
+        # Another widget may have changed the setup of the first image.
+        row = self.images.reference
+        shown = self._shown_setup()
+        if self._ready and row is not None and row.setup not in (None, shown):
+            self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
 
     def _reference_layer(self) -> Any | None:
         row = self.images.reference
