@@ -505,7 +505,13 @@ def test_refine_starts_from_the_last_inversion(
     assert any("shot |∫B×dz|" in name for name in names), names
     refined = layer_of(window, "field", "refined")
     assert refined.data.shape == SHAPE
+    qtbot.waitUntil(lambda: not tool._refined.busy, timeout=PATIENCE)
+    assert refined.visible
+    # A new inversion is not hidden by what was made of the one before.
+    tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    assert not refined.visible
+    assert not tool.fit_view.verdict.isVisible()
 
 
 def test_a_saved_fit_comes_back_as_it_was(

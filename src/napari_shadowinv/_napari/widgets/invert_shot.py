@@ -22,7 +22,12 @@ from napari_shadowinv._napari.widgets._fitting import (
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._panels import LivePanel, ReportTable, RunPanel, report_rows
 from napari_shadowinv._napari.widgets._qt import notify_errors
-from napari_shadowinv._napari.widgets._results import Origins, place_together, result_frame
+from napari_shadowinv._napari.widgets._results import (
+    Origins,
+    ResultLayers,
+    place_together,
+    result_frame,
+)
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
@@ -177,6 +182,7 @@ class InvertShot(InversionInputs, LivePanel):
         self.cost, self._pace = forms.wrapping_label(), 1.0
         self.refining = Refining(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
+        self._refined = ResultLayers(self.viewer, self)
         self.report = ReportTable()
         crop = forms.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
         self.add(forms.labelled("Image", self.image), *self.beam, forms.labelled("Crop", crop))
@@ -234,7 +240,7 @@ class InvertShot(InversionInputs, LivePanel):
         if isinstance(request, FitJob):
             assert isinstance(value, FitAnswer)
             self.previewed.hide()
-            self.fit_view.show_result(request, value, self._last)
+            self._refined = self.fit_view.show_result(request, value, self._last)
         else:
             assert isinstance(value, _Answer)
             self._show_inversion(value, request)
@@ -254,6 +260,8 @@ class InvertShot(InversionInputs, LivePanel):
             return
         self.report.show_rows([*request.origins.rows(), *report_rows(value.inversion)])
         self._learn_pace(value.inversion)
+        # They refine an earlier result, and lie above the new one.
+        self._refined.hide()
         self.show_layers(image, value.described, preview=False)
 
     def on_change(self) -> None:
