@@ -1,4 +1,4 @@
-"""Make the pictures of napari's window that the README, docs/batch.md and the tutorials show.
+"""Make the pictures of napari's window that the README, pages of docs and the tutorials show.
 
     QT_API=pyqt6 xvfb-run -a -s "-screen 0 2560x1440x24" python docs/make_screenshots.py [NAME ...]
 
@@ -25,8 +25,10 @@ from qtpy.QtWidgets import QApplication
 
 import napari
 from napari_shadowinv import InversionOptions, add_inversion, invert
-from napari_shadowinv._napari.layer_metadata import setup_of
+from napari_shadowinv._napari.layer_metadata import mark, setup_of
 from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.projection import project
 
 HERE = Path(__file__).parent / "pictures"
 PLUGIN = "napari-shadowinv"
@@ -221,6 +223,22 @@ def night_window() -> None:
         photograph(viewer, "tutorial-night.png")
 
 
+def fit_window() -> None:
+    """Two films of one toroid: the widget, its verdict and the field."""
+    viewer = new_window("two energies", height=840)
+    setup = paper_setup()
+    truth = toroid((80, 80), setup, 90.0, 20e-6).displacement
+    for seed, energy in enumerate((14.7, 30.0)):
+        film = setup.model_copy(update={"energy": energy})
+        counts = np.random.default_rng(seed).poisson(1000 * project(truth, setup, film))
+        name, metadata = f"{energy:g} MeV", mark("shot", "counts", film)
+        viewer.add_image(counts.astype(float), name=name, metadata=metadata)
+    widget = open_widget(viewer, "Fit several images")
+    press_run(widget)
+    print(widget.view.verdict.text())
+    photograph(viewer, "napari-fit.png")
+
+
 def make_as_new_user(make: Callable[[], None]) -> None:
     """Make pictures with widgets that remember nothing, and change no settings of one's own."""
     with tempfile.TemporaryDirectory() as settings:
@@ -256,6 +274,7 @@ WINDOWS = {
     "proton": proton_windows,
     "source": source_windows,
     "night": night_window,
+    "fit": fit_window,
 }
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import numpy as np
 from napari_shadowinv._napari.frame import frame_for, matrix_of
 from napari_shadowinv._napari.layer_metadata import Result, role_of
 from napari_shadowinv._napari.layers import FullLayerData, result_layers
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.labels import is_fit, setup_from_dataset
 
 if TYPE_CHECKING:
     import xarray
@@ -41,8 +41,9 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
 
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     setup = setup_from_dataset(dataset)
+    inverted = "report" in dataset.attrs and not is_fit(dataset.attrs)
     result = Result(
-        Inversion.from_dataset(dataset) if "report" in dataset.attrs else dataset,
+        Inversion.from_dataset(dataset) if inverted else dataset,
         setup,
         {key: value for key, value in dataset.attrs.items() if key not in _OWN_ATTRIBUTES},
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,6 +31,7 @@ Limits = tuple[float, float]
 _CAUSTIC_COLOUR = "#5dff5d"
 _ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
 
+_OF_A_FIELD = ("displacement", "potential", "displacement_uncertainty")
 _ARROWS_ALONG = 28
 _SHORTEST_ARROW = 0.05
 _MOST_SITES_SHOWN = 200_000
@@ -62,6 +64,13 @@ KINDS = (
     Kind("field y", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
     Kind("field x", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
     Kind("field", "displacement", "{symbol} ({unit})", colormap="inferno", visible=True),
+    Kind(
+        "uncertainty",
+        "displacement_uncertainty",
+        "σ of {symbol} ({unit})",
+        colormap="magma",
+        shown_of="shot",
+    ),
     Kind("caustic", "caustic", "caustics", type="labels"),
     Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
     Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),
@@ -163,13 +172,23 @@ def result_layers(
     content = result.content
     facts = {"result": result, "made_from": dict(result.attributes)}
     if isinstance(content, xr.Dataset):
-        field = content[[name for name in ("displacement", "potential") if name in content]]
-        return dataset_layers(field, result.setup, frame, name, facts)
+        field = content[[variable for variable in _OF_A_FIELD if variable in content]]
+        return dataset_layers(
+            field, result.setup, frame, name, facts, deflector=deflector_of(content)
+        )
     dataset = xr.Dataset(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     )
     diagram = power_cells(content) if cells else None
     return dataset_layers(dataset, result.setup, frame, name, facts, cells=diagram)
+
+
+def deflector_of(dataset: xarray.Dataset) -> str | None:
+    """What deflects by the only field of a fit; None for other datasets."""
+    from napari_shadowinv.fitting import FIELDS
+
+    fields = json.loads(dataset.attrs.get("fields", "[]"))
+    return FIELDS.get(fields[0]) if len(fields) == 1 else None
 
 
 def dataset_layers(
@@ -180,9 +199,10 @@ def dataset_layers(
     facts: Mapping[str, Any],
     shot: int | None = None,
     cells: Cells | None = None,
+    deflector: str | None = None,
 ) -> list[FullLayerData]:
     """Describe the layers of a result, or of a stack in the units and contrast of one `shot`."""
-    shown = _Shown(dataset, setup, shot, cells)
+    shown = _Shown(dataset, setup, shot, cells, deflector)
     layers = []
     for kind in KINDS:
         if not shown.has(kind):
@@ -208,6 +228,7 @@ class _Shown:
     setup: Setup | None
     shot: int | None
     cells: Cells | None
+    deflector: str | None = None
 
     def has(self, kind: Kind) -> bool:
         if kind.shown_of == ("shot" if self.shot is not None else "stack"):
@@ -233,12 +254,17 @@ class _Shown:
 
     @cached_property
     def field(self) -> ShownField:
-        (field,) = shown_fields([self.plane("displacement")], self.setup)
+        (field,) = shown_fields([self.plane("displacement")], self.setup, self.deflector)
         return field
 
     @cached_property
     def magnitude(self) -> FloatArray:
         return self.field.magnitude
+
+    @property
+    def per_pixel(self) -> float:
+        """Strength of the field, in its unit, that displaces by 1 px."""
+        return _ratio(self.magnitude, np.hypot(*self.plane("displacement")))
 
     @cached_property
     def vectors(self) -> Any:
@@ -269,7 +295,12 @@ Content = tuple[Any, dict[str, str], dict[str, Any]]  # data, words of the title
 def _image(shown: _Shown, kind: Kind) -> Content:
     words: dict[str, str] = {}
     data = shown.dataset[kind.variable].data
-    if kind.variable == "displacement":
+    if kind.role == "uncertainty":
+        # Whatever the unit, a field is as long as its displacement, but for a factor.
+        data = shown.per_pixel * np.hypot(*shown.plane(kind.variable))
+        words = {"unit": shown.field.unit, "symbol": shown.field.symbol}
+        limits = 0.0, float(np.percentile(_sample(data), _BRIGHTEST))
+    elif kind.variable == "displacement":
         data, limits, words = _field(shown, kind.role)
     elif kind.role == "potential":
         plane = shown.plane("potential")
@@ -281,9 +312,7 @@ def _image(shown: _Shown, kind: Kind) -> Content:
             used = shown.plane("image")[shown.dataset["mask"].values]
             data = 100 * data / used.mean()
         plane = data if shown.shot is None else shown.plane("residual")
-        # A handful of pixels at a caustic must not blow it up.
-        limit = float(np.percentile(np.abs(_sample(plane)), _BRIGHTEST))
-        limits = -limit, limit
+        limits = symmetric_limits(plane)
     else:
         limits = shown.intensity_limits
     return data, words, {"colormap": kind.colormap, "contrast_limits": _opened(limits)}
@@ -410,6 +439,12 @@ def intensity_limits(image: AnyArray) -> Limits:
     mean = float(finite.mean())
     high = min(bright, _LARGEST_INTENSITY * mean) if mean > 0 else bright
     return _opened((0.0 if 0 <= dark < 0.3 * high else dark, high))
+
+
+def symmetric_limits(residual: AnyArray) -> Limits:
+    """Return limits around 0 that a handful of pixels at a caustic cannot blow up."""
+    limit = float(np.percentile(np.abs(_sample(residual)), _BRIGHTEST))
+    return _opened((-limit, limit))
 
 
 def _sample(plane: AnyArray) -> AnyArray:

@@ -70,7 +70,7 @@ class ShownField:
 
 
 def shown_fields(
-    displacements: Collection[FloatArray], setup: Setup | None, deflector: str = ""
+    displacements: Collection[FloatArray], setup: Setup | None, deflector: str | None = None
 ) -> list[ShownField]:
     """Turn displacements in px into what an experimenter asks for, in one unit for all.
 
@@ -80,7 +80,7 @@ def shown_fields(
     """
     if setup is None:
         return [ShownField(d, "Displacement", "|d|", "px", ("dy", "dx")) for d in displacements]
-    main = setup.other_fields.get(deflector, setup.main_field)
+    main = setup.other_fields.get(deflector or "", setup.main_field)
     (unit,) = (field.unit for field in setup.si_fields if field.name == main.name)
     fields = [setup.field_in_si(main.name, d) for d in displacements]
     factor, prefix = prefix_for(max(float(np.hypot(*field).max()) for field in fields))

@@ -30,7 +30,14 @@ from napari_shadowinv.preprocessing import polynomial_source
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
-NAMES = ("Invert shot", "Invert stack", "Estimate source", "Forward model", "Line profile")
+NAMES = (
+    "Invert shot",
+    "Invert stack",
+    "Fit several images",
+    "Estimate source",
+    "Forward model",
+    "Line profile",
+)
 
 
 @pytest.mark.parametrize("name", NAMES)

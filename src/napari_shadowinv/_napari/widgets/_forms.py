@@ -120,6 +120,7 @@ class ModelForm(QtWidgets.QWidget):
         self.editors: dict[str, Editor] = {}
         rows = QtWidgets.QFormLayout()
         rows.setContentsMargins(0, 0, 0, 0)
+        rows.setRowWrapPolicy(QtWidgets.QFormLayout.RowWrapPolicy.WrapLongRows)
         rows.setFieldGrowthPolicy(QtWidgets.QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
         whole = column(self)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+from pydantic import BaseModel
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QWidget
 
@@ -336,8 +338,14 @@ class SourcePicker(forms.RowPicker):
 
 
 class OptionsForm(forms.ModelForm):
-    def __init__(self) -> None:
-        super().__init__(InversionOptions, first={"n_sites": PREVIEW_SITES})
+    """The form of options, with buttons that load and save them."""
+
+    def __init__(
+        self,
+        model_class: type[BaseModel] = InversionOptions,
+        first: Mapping[str, Any] = MappingProxyType({"n_sites": PREVIEW_SITES}),
+    ) -> None:
+        super().__init__(model_class, first=first)
         self.files = forms.TomlButtons("options", self._to_save, self._take)
         self.layout().addWidget(self.files)
 
@@ -346,7 +354,7 @@ class OptionsForm(forms.ModelForm):
         return self.values()
 
     def _take(self, loaded: dict[str, object], path: str) -> None:
-        validated(InversionOptions, loaded, path)
+        validated(self._model_class, loaded, path)
         self.set_values(loaded)
 
 

@@ -90,7 +90,12 @@ def warnings_of(layer: Any) -> tuple[str, ...]:
     """What the reader of a grey image said against it, or that it looks like scanned film."""
     known = about.mark_of(layer)
     path = str(layer.source.path or "").lower()
-    if known or not path.endswith(tuple(SCAN_SUFFIXES)) or not isinstance(layer.data, np.ndarray):
+    # What else is known of a layer, such as a setup, may be the user's.
+    if (
+        about.role_of(layer)
+        or not path.endswith(tuple(SCAN_SUFFIXES))
+        or not isinstance(layer.data, np.ndarray)
+    ):
         return tuple(known.get("warnings", ()))
     return film_warnings(layer.data, None)
 

@@ -33,6 +33,7 @@ _STAGES = {
     "field": "Computing the field",
     "image": "Tracing the rays",
     "shots": "Inverting",
+    "fit": "Fitting",
 }
 _LOOK_EVERY = 500  # ms
 _SHOW_SECONDS_FROM = 2.0

@@ -11,7 +11,7 @@ from qtpy.QtCore import QObject, Signal
 from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, place
-from napari_shadowinv._napari.layer_metadata import role_of
+from napari_shadowinv._napari.layer_metadata import mark_of, role_of
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
 
@@ -153,6 +153,10 @@ class LastResults:
             "one of the same shot.</qt>"
         )
 
+    def of(self, shot: Any) -> list[Any]:
+        """The layers of the last result of a shot that are still in the viewer."""
+        return [layer for known, last in self._last if known == shot for layer in last.layers]
+
     def next_of(self, shot: Any) -> ResultLayers:
         """Return what shows the next result of a shot: an image layer, or a name."""
         results = ResultLayers(self._viewer, self._parent)
@@ -198,7 +202,8 @@ class Origins:
 
 
 def _role(keywords: dict[str, Any]) -> str:
-    return str(role_of(keywords))
+    """Its role; of a further field of the same result, with the name of that field."""
+    return f"{role_of(keywords)} {mark_of(keywords).get('part', '')}".strip()
 
 
 def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:

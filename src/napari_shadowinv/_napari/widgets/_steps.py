@@ -74,7 +74,7 @@ class StepsSection(QWidget):
         self.choice.addItem("add a step…")
         for name, kind in STEPS.items():
             self.choice.addItem(kind.title, name)
-        self.choice.setToolTip("<qt>Done to image, source and masks before the inversion.</qt>")
+        self.choice.setToolTip("<qt>Done to image, source and masks before all else.</qt>")
         self._list = QWidget()
         column(self._list)
         self.folded = forms.section("", self._list, forms.labelled("", self.choice))

@@ -12,10 +12,22 @@ from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, role_of
 from napari_shadowinv._napari.shots import loaded, radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
+from napari_shadowinv._napari.widgets._fitting import (
+    FitAnswer,
+    FitJob,
+    FitView,
+    Refining,
+    refinement,
+)
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._panels import LivePanel, ReportTable, RunPanel, report_rows
 from napari_shadowinv._napari.widgets._qt import notify_errors
-from napari_shadowinv._napari.widgets._results import Origins, place_together, result_frame
+from napari_shadowinv._napari.widgets._results import (
+    Origins,
+    ResultLayers,
+    place_together,
+    result_frame,
+)
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
@@ -168,10 +180,14 @@ class InvertShot(InversionInputs, LivePanel):
             f"<qt>Update the field after every change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
         self.cost, self._pace = forms.wrapping_label(), 1.0
+        self.refining = Refining(self.refine)
+        self.fit_view = FitView(self.viewer, self.panel)
+        self._refined = ResultLayers(self.viewer, self)
         self.report = ReportTable()
         crop = forms.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
         self.add(forms.labelled("Image", self.image), *self.beam, forms.labelled("Crop", crop))
         self.add(*self.how, self.live, self.keep_earlier, self.cost, self.panel, self.report)
+        self.add(self.refining, self.fit_view)
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
@@ -210,7 +226,26 @@ class InvertShot(InversionInputs, LivePanel):
             preview,
         )
 
-    def show_result(self, value: _Answer, request: _Request) -> None:
+    @notify_errors
+    def refine(self, psf: float) -> None:
+        """Fit the forward model to the last inversion's image, starting from its field."""
+        if self.panel.runner.running and not self._running_preview:
+            return
+        image = self.image.layer
+        job = refinement(self._last.of(image), image, psf)
+        self._running_preview = False
+        self.panel.run(job.run, job)
+
+    def show_result(self, value: _Answer | FitAnswer, request: _Request | FitJob) -> None:
+        if isinstance(request, FitJob):
+            assert isinstance(value, FitAnswer)
+            self.previewed.hide()
+            self._refined = self.fit_view.show_result(request, value, self._last)
+        else:
+            assert isinstance(value, _Answer)
+            self._show_inversion(value, request)
+
+    def _show_inversion(self, value: _Answer, request: _Request) -> None:
         image = request.image
         if image not in self.viewer.layers and not request.preview:
             show_warning(
@@ -225,6 +260,8 @@ class InvertShot(InversionInputs, LivePanel):
             return
         self.report.show_rows([*request.origins.rows(), *report_rows(value.inversion)])
         self._learn_pace(value.inversion)
+        # They refine an earlier result, and lie above the new one.
+        self._refined.hide()
         self.show_layers(image, value.described, preview=False)
 
     def on_change(self) -> None:
@@ -266,6 +303,7 @@ class InvertShot(InversionInputs, LivePanel):
     def _forget_report(self) -> None:
         """What was said of one image does not hold for another."""
         self.report.empty()
+        self.fit_view.empty()
         if not self.panel.runner.running:
             self.panel.say("")
 

@@ -20,6 +20,7 @@ from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
 from napari_shadowinv._napari.widgets._panels import WIDTH
+from napari_shadowinv._napari.widgets._plots import COLOURS, Plot
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
@@ -32,7 +33,6 @@ _STRAIGHT = ("line", "path")
 _PIXELS = "px"
 _WIDEST = 1e6
 _MOST_SAMPLES = 5000
-_COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 _LONGEST_NAME = 34
 
 
@@ -115,74 +115,30 @@ def _heading(profile: Profile) -> str:
     return f"{name}, {profile.averaged}" if profile.averaged else name
 
 
-class ProfilePlot(QtWidgets.QWidget):
+class ProfilePlot(Plot):
     """One plot for each unit, one above the other, with the distance in common."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self.setMinimumHeight(220)
-        self.setSizePolicy(
-            QtWidgets.QSizePolicy.Policy.Expanding, QtWidgets.QSizePolicy.Policy.Expanding
-        )
-        qt.column(self)
-        self.figure: Any = None
-        self._canvas: Any = None
+        super().__init__(height=220)
 
     def show_profiles(self, distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> None:
         """Draw profiles; none empties the plot."""
-        if self._canvas is None:
-            if not profiles:
-                return
-            self._make_canvas()
-        ink, paper = self._colours()
-        self.figure.clear()
-        self.figure.set_facecolor(paper)
+        if self.figure is None and not profiles:
+            return
         units = list(dict.fromkeys(profile.unit for profile in profiles))
-        axes = self.figure.subplots(max(len(units), 1), 1, sharex=True, squeeze=False)[:, 0]
+        axes = self.fresh_axes(max(len(units), 1))
         for axis, of_unit in zip(axes, units or [""], strict=True):
-            _dress(axis, ink, paper)
-            axis.set_ylabel(of_unit or "value", color=ink)
+            axis.set_ylabel(of_unit or "value", color=self.ink)
             for number, profile in enumerate(profiles):
                 if profile.unit == of_unit:
-                    colour, name = _COLOURS[number % len(_COLOURS)], profile.name
+                    colour, name = COLOURS[number % len(COLOURS)], profile.name
                     name = name if len(name) <= _LONGEST_NAME else f"…{name[1 - _LONGEST_NAME :]}"
                     axis.plot(distance, profile.values, color=colour, label=name)
             if profiles:
-                axis.legend(fontsize=8, labelcolor=ink, facecolor=paper, edgecolor=ink)
+                self.add_legend(axis)
         averaged = f", {profiles[0].averaged}" if profiles and profiles[0].averaged else ""
-        axes[-1].set_xlabel(f"distance ({unit}){averaged}", color=ink)
-        self._canvas.draw_idle()
-
-    def _make_canvas(self) -> None:
-        # Half a second to import: not before there is something to draw.
-        from matplotlib.backends.backend_qtagg import FigureCanvasQTAgg
-        from matplotlib.figure import Figure
-
-        self.figure = Figure(layout="constrained")
-        # It comes without types.
-        canvas: Any = FigureCanvasQTAgg
-        self._canvas = canvas(self.figure)
-        self._canvas.setMinimumSize(100, 100)
-        self.layout().addWidget(self._canvas)
-
-    def _colours(self) -> tuple[str, str]:
-        from napari.settings import get_settings
-        from napari.utils.theme import get_theme
-
-        try:
-            theme = get_theme(get_settings().appearance.theme)
-            return theme.text.as_hex(), theme.background.as_hex()
-        except (KeyError, AttributeError, ValueError):
-            palette = self.palette()
-            return palette.windowText().color().name(), palette.window().color().name()
-
-
-def _dress(axis: Any, ink: str, paper: str) -> None:
-    axis.set_facecolor(paper)
-    axis.tick_params(colors=ink, labelsize=8)
-    for spine in axis.spines.values():
-        spine.set_color(ink)
-    axis.grid(color=ink, alpha=0.15)
+        axes[-1].set_xlabel(f"distance ({unit}){averaged}", color=self.ink)
+        self.draw()
 
 
 class LineProfile(qt.Docked):
