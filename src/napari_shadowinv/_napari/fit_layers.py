@@ -42,7 +42,9 @@ def fit_layers(
     layers = _image_layers(fit, frame, name, with_source)
     for number, field in reversed(list(enumerate(fit.fields))):
         # A layer stands for its field: each can be saved, and projected, alone.
-        alone = replace(fit, fields=(field,), strengths=fit.strengths[:, number : number + 1])
+        one = slice(number, number + 1)
+        basins = (replace(b, displacement=b.displacement[one]) for b in fit.basins)
+        alone = replace(fit, fields=(field,), strengths=fit.strengths[:, one], basins=tuple(basins))
         content = alone.to_dataset(attributes=attributes)
         described = result_layers(
             Result(content, setup, dict(attributes or {})), frame, _titled(name, fit, field)

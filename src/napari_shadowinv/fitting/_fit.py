@@ -154,7 +154,7 @@ def fit(
         report("fit", steps, None, f"{stage}, objective {objective:.6g}")
 
     with _timed("starts", seconds):
-        starts = _starts(given, start, tell)
+        starts = _starts(given, start, tell, should_stop)
         found = search(scene, starts, tell)
     with _timed("smoothness", seconds):
         scene, best = with_likely_smoothness(scene, found[0], rng, tell)
@@ -216,7 +216,9 @@ def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
     seconds[stage] = time.perf_counter() - begun
 
 
-def _starts(given: Measured, start: ArrayLike | None, tell: Any) -> list[Start]:
+def _starts(
+    given: Measured, start: ArrayLike | None, tell: Any, should_stop: ShouldStop | None
+) -> list[Start]:
     """What to start from: nothing, a field that was given, what transport makes of an image."""
     scene = given.scene
     starts = []
@@ -236,7 +238,7 @@ def _starts(given: Measured, start: ArrayLike | None, tell: Any) -> list[Start]:
     sizes = np.abs(scene.strengths[:, 0])  # zero where the object does not deflect: a blank shot
     weakest = int(np.argmin(np.where(sizes > 0, sizes, np.inf)))
     tell("transport", float("nan"))
-    transported = _transported(given, weakest)
+    transported = _transported(given, weakest, should_stop)
     if transported is None:
         return starts
     potential = gaussian_filter(transported, _ROUNDED) / scene.strengths[weakest, 0]
@@ -248,7 +250,7 @@ def _starts(given: Measured, start: ArrayLike | None, tell: Any) -> list[Start]:
     ]
 
 
-def _transported(given: Measured, number: int) -> FloatArray | None:
+def _transported(given: Measured, number: int, should_stop: ShouldStop | None) -> FloatArray | None:
     """The potential that transport makes of an image; None if it makes none of it."""
     height, width = given.size
     scene = given.scene
@@ -263,7 +265,9 @@ def _transported(given: Measured, number: int) -> FloatArray | None:
         tolerance=0.05,
     )
     try:
-        return invert(image, source=beam, mask=used, options=options).potential
+        return invert(
+            image, source=beam, mask=used, options=options, should_stop=should_stop
+        ).potential
     except InputError:
         return None
 

@@ -97,8 +97,8 @@ class FitOptions(BaseModel):
         le=0.5,
         title="Spacing of rays (px)",
         description=(
-            "Largest distance between the landing points of neighbouring rays. Default: 0.25, and "
-            "0.15 if bright lines need it."
+            "Largest distance between the landing points of neighbouring rays. Default: 0.2, and "
+            "0.14 if bright lines need it."
         ),
     )
     steps: int = Field(

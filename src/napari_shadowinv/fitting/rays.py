@@ -23,7 +23,7 @@ from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
 
 __all__ = ["KNOT", "Pulls", "RayModel", "at_rest"]
 
-_SHARED = 1.5  # of the spacing: width around an edge between pixels where a ray counts in both
+_SHARED = 1.8  # of the spacing: width around an edge between pixels where a ray counts in both
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
 _GUARD = 2  # px around the detector, for rays that miss it
 _WORTH_A_THREAD = 20_000  # rays
