@@ -1,4 +1,4 @@
-"""Make the pictures that the README shows.
+"""Make the pictures that the README and the page on fits show.
 
     python docs/make_pictures.py [--data ../shared/data]
 
@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from napari_shadowinv import InversionOptions, invert, poisson_invert, read, synthetic_image
+from napari_shadowinv import InversionOptions, fit, invert, poisson_invert, read, synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
-from napari_shadowinv.plotting import comparison_figure, report_figure
+from napari_shadowinv.plotting import comparison_figure, fit_figure, report_figure
 
 HERE = Path(__file__).parent
 SHOT = "Image_20241017221829851.bmp"
@@ -58,11 +58,28 @@ def burner_picture(folder: Path) -> None:
     save_small(figure, HERE / "burner.png", 1300)
 
 
+def fit_picture() -> None:
+    """Two folded radiographs, and the field and the beam that explain both."""
+    low = paper_setup()
+    high = low.model_copy(update={"energy": 30.0})
+    truth = toroid((200, 200), low, 290.0, 30e-6).displacement
+    y, x = np.indices((200, 200))
+    beam = 1 + 0.25 * np.cos(y / 60) * np.sin(x / 45 + 1)
+    rng = np.random.default_rng(0)
+    images = [
+        synthetic_image(strength * truth, beam) + 0.05 * rng.normal(size=beam.shape)
+        for strength in (1, low.momentum / high.momentum)
+    ]
+    found = fit(images, setups=[low, high], source="unknown", noise=0.05)
+    save_small(fit_figure(found, title="Two energies, beam unknown"), HERE / "fit.png", 1300)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     default = HERE.parents[1] / "shared" / "data"
     parser.add_argument("--data", type=Path, default=default)
     toroid_picture()
+    fit_picture()
     folder = parser.parse_args().data / "burner" / "data"
     if folder.is_dir():
         burner_picture(folder)

@@ -102,7 +102,7 @@ class FitOptions(BaseModel):
         ),
     )
     steps: int = Field(
-        default=100,
+        default=120,
         ge=1,
         title="Steps at full size",
         description="Maximum number of steps with the pixels as recorded.",

@@ -31,7 +31,7 @@ Tell = Callable[[str, float], None]
 MIDDLE = 2  # pixels in which starts are compared and λ is found
 _FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
 _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
-_COARSE_STEPS, _COARSE_GAIN = 60, 3.0
+_COARSE_STEPS, _COARSE_GAIN, _FINE_GAIN = 60, 3.0, 2.0
 _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
 _COARSE_SPACING, MIDDLE_SPACING = 1 / 3, 0.25
 _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
@@ -201,7 +201,7 @@ def refined(
             scene,
             unknowns,
             iterations=allowed,
-            least_gain=1.0,
+            least_gain=_FINE_GAIN,
             after_step=lambda now: tell("full size", now),
         )
         steps, ended = steps + taken, taken < allowed
