@@ -1,8 +1,4 @@
-"""What the data leave open around the best unknowns, by the Gauss-Newton Hessian there.
-
-- how smooth the fields are, as the data tell: `likely_smoothness`
-- how well a choice of fields explains the data: `log_evidence`
-- unknowns that explain them as well as the best: `drawn_unknowns`
+"""What the data leave open around the best unknowns, by the Gauss-Newton Hessian: `Posterior`.
 
 References
 ----------

@@ -150,39 +150,35 @@ def with_likely_smoothness(
 ) -> tuple[Scene, Found]:
     """Find λ and κ, unless they are given, and the unknowns that belong to them."""
     given = bool(scene.smoothness.any())
-    smoothness, unknowns = scene.smoothness, found.unknowns
     if not given:
-        smoothness = np.tile(_FIRST_SMOOTHNESS, (len(smoothness), 1))
+        scene = replace(scene, smoothness=np.tile(_FIRST_SMOOTHNESS, (len(scene.smoothness), 1)))
+    found = _settled(scene, found, tell)
+    if given:
+        return scene, found
     for _ in range(_ROUNDS):
-        middle = coarser(replace(scene, smoothness=smoothness, spacing=MIDDLE_SPACING), MIDDLE)
-        unknowns, value, _ = descend(
-            middle,
-            unknowns,
-            iterations=_ROUND_STEPS,
-            least_gain=_COARSE_GAIN,
-            after_step=lambda now: tell("smoothness", now),
-        )
-        if given:
-            break
-        posterior = Posterior(middle, unknowns, rng, lambda: tell("smoothness", value))  # noqa: B023
+        middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+        value = found.value
+        posterior = Posterior(middle, found.unknowns, rng, lambda: tell("smoothness", value))  # noqa: B023
         likely, change = posterior.likely_smoothness()
-        smoothness = likely / smoothness_in_pixels(MIDDLE)
         if change < _SETTLED:
             break
-    if not given:
-        smoothness = _HELD * smoothness
-        middle = coarser(replace(scene, smoothness=smoothness, spacing=MIDDLE_SPACING), MIDDLE)
-        unknowns, value, _ = descend(
-            middle,
-            unknowns,
-            iterations=_COARSE_STEPS,
-            least_gain=_COARSE_GAIN,
-            after_step=lambda now: tell("smoothness", now),
-        )
-    end = replace(
-        found, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns)
+        scene = replace(scene, smoothness=likely / smoothness_in_pixels(MIDDLE))
+        found = _settled(scene, found, tell)
+    scene = replace(scene, smoothness=_HELD * likely / smoothness_in_pixels(MIDDLE))
+    return scene, _settled(scene, found, tell)
+
+
+def _settled(scene: Scene, found: Found, tell: Tell) -> Found:
+    """Where the descent ends with other λ and κ, in pixels of two and without blur."""
+    middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+    unknowns, value, _ = descend(
+        middle,
+        found.unknowns,
+        iterations=_ROUND_STEPS,
+        least_gain=_COARSE_GAIN,
+        after_step=lambda now: tell("smoothness", now),
     )
-    return replace(scene, smoothness=smoothness), end
+    return Found(found.start, unknowns, value, _displacement(middle, unknowns))
 
 
 def refined(
