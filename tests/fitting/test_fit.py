@@ -190,3 +190,23 @@ def test_a_shot_without_the_object_is_one_more_image() -> None:
     result = fit(images, strengths=[1, 0], noise=0.02, options=PLAIN)
     assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
     assert result.verdict is Verdict.DETERMINED
+
+
+@pytest.mark.parametrize("edge", ["fading", "free"])
+def test_an_object_that_the_edge_cuts_is_told(edge: Any) -> None:
+    """A converged answer that explains both images, and is off by a quarter and more."""
+    cut = bump(0.7, 8, (0, 30))
+    images = [counted(lambda y, x: s * cut(y, x), SIZE) for s in (1, 0.7)]  # noqa: B023
+    options = FitOptions(samples=0, edge=edge)
+    result = fit(noisy(images, 0.02), strengths=[1, 0.7], noise=0.02, options=options)
+    assert result.chi2.max() < 1.3
+    assert result.verdict is Verdict.EDGE
+    assert "larger field of view" in result.explanation
+
+
+def test_nothing_is_taken_twice() -> None:
+    one, other = noisy([counted(WEAK, SIZE), counted(WEAK, SIZE)], 0.02)
+    with pytest.raises(InputError, match="images 1 and 3 are the same"):
+        fit([one, other, 3 * one], strengths=[1, 0.9, 0.8], options=PLAIN)
+    with pytest.raises(InputError, match="the source is image 2 itself"):
+        fit([one, other], strengths=[1, 0.9], source=other, options=PLAIN)

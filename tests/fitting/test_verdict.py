@@ -18,6 +18,8 @@ GOOD: dict[str, Any] = {
     "jacobian": np.ones((20, 20)),
     "folded": 0.3,
     "uncertainty": 0.02,
+    "at_edge": 0.05,
+    "edge_is_free": False,
 }
 ALONE = {"chi2": np.array([1.0]), "names": ["image 1"], "single": True, "folded": 0.0}
 
@@ -30,7 +32,24 @@ def test_images_that_are_explained_in_one_way_determine_the_field() -> None:
 
 
 def test_unknown_error_bars_do_not_speak_against_a_field() -> None:
-    assert judged(**GOOD | {"uncertainty": float("nan")})[0] is Verdict.DETERMINED
+    verdict, why = judged(**GOOD | {"uncertainty": float("nan")})
+    assert verdict is Verdict.DETERMINED
+    assert "error bars were not" in why
+
+
+@pytest.mark.parametrize(
+    ("share", "free", "expected"),
+    [
+        (0.2, False, Verdict.DETERMINED),
+        (0.4, False, Verdict.EDGE),
+        (0.4, True, Verdict.DETERMINED),
+        (0.9, True, Verdict.EDGE),
+    ],
+)
+def test_a_field_that_the_edge_cuts_is_told(share: float, free: bool, expected: Verdict) -> None:
+    verdict, why = judged(**GOOD | {"at_edge": share, "edge_is_free": free})
+    assert verdict is expected
+    assert ("edge='free'" in why) == (expected is Verdict.EDGE and not free)
 
 
 def test_an_unknown_beam_is_determined_by_several_images() -> None:

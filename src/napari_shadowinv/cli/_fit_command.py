@@ -50,7 +50,7 @@ Columns: file, setup, energy, strength, gain, psf, mask, source, noise.
 
 [bold]Verdict[/bold]
 Whether the field may be believed is told with each result: "determined", "one of several",
-"one image cannot tell", "too uncertain" or "does not fit".
+"one image cannot tell", "too uncertain", "reaches the edge" or "does not fit".
 
 [bold]Exit codes[/bold]
 0 the field is determined; 2 invalid input, nothing written;

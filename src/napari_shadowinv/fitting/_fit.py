@@ -370,6 +370,8 @@ def _result(
         jacobian=jacobian,
         folded=folded,
         uncertainty=uncertainty,
+        at_edge=_share_at_edge(np.hypot(*found.sum(axis=0))),
+        edge_is_free=options.edge == "free",
     )
     return Fit(
         images=data,
@@ -390,6 +392,12 @@ def _result(
         options=options,
         setups=tuple(setups or ()),
     )
+
+
+def _share_at_edge(length: FloatArray) -> float:
+    """Largest value at an image's edge as a share of the largest anywhere."""
+    edge = max(side.max() for side in (length[0], length[-1], length[:, 0], length[:, -1]))
+    return float(edge / max(length.max(), 1e-12))
 
 
 def _names(setups: Sequence[Setup] | None, count: int) -> list[str]:

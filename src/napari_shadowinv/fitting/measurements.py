@@ -39,7 +39,7 @@ _NORMAL_MAD = 1.4826
 _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
 _LEAST_COUNTS = 1.0
 _SMOOTHED = 5  # px, over which counts are averaged for their first standard deviation
-_SAME = 1e-6
+_SAME = _ALIKE = 1e-6
 _FREE_SHARE = 0.1  # of the shorter side
 _FREE_TIE = 0.3
 
@@ -90,6 +90,7 @@ def measured(
     _refuse_what_one_image_cannot_tell(matrix, source, options)
     free_gains, factors = _checked_gains(gains, count)
     beams = factors[:, None, None] * _checked_source(source, data, used)
+    _refuse_what_is_given_twice(data, beams, used, matrix)
     unknown = isinstance(source, str)
     units = np.array([beam[use].mean() for beam, use in zip(beams, used, strict=True)])
     scaled = np.where(used, data / units[:, None, None], 0.0)
@@ -299,6 +300,31 @@ def _refuse_what_one_image_cannot_tell(
             "object; give the source or an image of another energy, or ask for one of the many "
             "answers (ambiguous=True, --ambiguous)"
         )
+
+
+def _refuse_what_is_given_twice(
+    data: FloatArray, beams: FloatArray, used: BoolArray, strengths: FloatArray
+) -> None:
+    for k, (image, beam, use) in enumerate(zip(data, beams, used, strict=True)):
+        if strengths[k].any() and _are_alike(image[use], beam[use]):
+            raise InputError(
+                f"the source is image {k + 1} itself, so that nothing would have deflected: give "
+                "an image of the beam without the object"
+            )
+        for other in range(k):
+            both = use & used[other]
+            if _are_alike(image[both], data[other][both]):
+                raise InputError(
+                    f"images {other + 1} and {k + 1} are the same: give each image once"
+                )
+
+
+def _are_alike(first: FloatArray, second: FloatArray) -> bool:
+    """Whether two images are the same but for a factor and rounding to 32 bits, and not flat."""
+    if not first.size or first.mean() <= 0 or second.mean() <= 0:
+        return False
+    ones, others = first / first.mean(), second / second.mean()
+    return bool(np.abs(ones - others).max() <= _ALIKE and np.ptp(ones) > 2 * _ALIKE)
 
 
 def _checked_gains(gains: ArrayLike | str, count: int) -> tuple[bool, FloatArray]:

@@ -23,6 +23,7 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 __all__ = ["Posterior"]
 
 _ROUGHLY, _CLOSELY, _MOST_STEPS = 0.05, 0.02, 150
+_BESIDE_BEAM, _MOST_BESIDE_BEAM = 0.002, 600  # what beam and field can trade is found last
 _PROBES, _LANCZOS = 4, 25
 _LEAST_DETERMINED = 1e-3  # coefficients
 _OVERSHOOT, _MOST_CHANGE = 1.7, 15.0  # of λ in a step; it would approach its end too slowly
@@ -83,7 +84,8 @@ class Posterior:
         slope = self._scene.pulled(self._unknowns, self._counts, noise)
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
         # The longest waves, which the noise moves most, are the last to be found.
-        return self._scales.times(self._unknowns.like(self._solved(slope, _CLOSELY)))
+        tolerance = _BESIDE_BEAM if self._scene.beam_modes else _CLOSELY
+        return self._scales.times(self._unknowns.like(self._solved(slope, tolerance)))
 
     def log_volume(self) -> float:
         """Return half the logarithm of the Hessian's determinant in the cosines' scales.
@@ -119,7 +121,8 @@ class Posterior:
     def _solved(self, slope: Unknowns, tolerance: float) -> FloatArray:
         """The scaled change of the unknowns that undoes a slope."""
         right = self._scales.turned(slope).flat()
-        return solve(self._times, right, tolerance=tolerance, iterations=_MOST_STEPS)
+        most = _MOST_BESIDE_BEAM if tolerance == _BESIDE_BEAM else _MOST_STEPS
+        return solve(self._times, right, tolerance=tolerance, iterations=most)
 
     def _lanczos(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Diagonal and off-diagonal of the Hessian in the space of its first powers."""
