@@ -122,24 +122,31 @@ def pixels() -> tuple[FloatArray, FloatArray]:
     return y, x
 
 
-def counted(fields: list[Field], strengths: FloatArray, beam: Beam | None) -> FloatArray:
+def counted(
+    fields: list[Field],
+    strengths: FloatArray,
+    beam: Beam | None,
+    size: tuple[int, int] = (SIDE, SIDE),
+    rays: int = RAYS,
+) -> FloatArray:
     """The image: rays counted where they land."""
     rng = np.random.default_rng(0)
-    counts = np.zeros(SIDE * SIDE)
-    cells = np.arange((SIDE + 2 * AROUND) * RAYS)
-    for row in range((SIDE + 2 * AROUND) * RAYS):
-        y = (row + rng.random(cells.size)) / RAYS - 0.5 - AROUND
-        x = (cells + rng.random(cells.size)) / RAYS - 0.5 - AROUND
+    height, width = size
+    counts = np.zeros(height * width)
+    cells = np.arange((width + 2 * AROUND) * rays)
+    for row in range((height + 2 * AROUND) * rays):
+        y = (row + rng.random(cells.size)) / rays - 0.5 - AROUND
+        x = (cells + rng.random(cells.size)) / rays - 0.5 - AROUND
         landed_y, landed_x = y.copy(), x.copy()
         for one, strength in zip(fields, strengths, strict=True):
             dy, dx = one(y, x)
             landed_y += strength * dy
             landed_x += strength * dx
         rows, columns = np.rint(landed_y).astype(int), np.rint(landed_x).astype(int)
-        inside = (rows >= 0) & (rows < SIDE) & (columns >= 0) & (columns < SIDE)
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         flux = None if beam is None else beam(y, x)[inside]
-        counts += np.bincount(rows[inside] * SIDE + columns[inside], flux, SIDE * SIDE)
-    return counts.reshape(SIDE, SIDE) / RAYS**2
+        counts += np.bincount(rows[inside] * width + columns[inside], flux, height * width)
+    return counts.reshape(size) / rays**2
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,21 @@ def _spe(path: Path) -> None:
     _camera(bytes(header))(path)
 
 
+def _cpsa(path: Path) -> None:
+    rng = np.random.default_rng(0)
+    content = np.array([-104, 8, 6, 0], "<i4").tobytes() + np.array([0.3, 0.5], "<f4").tobytes()
+    content += np.array([85, 75, 40, 2, 1000, 800], "<i4").tobytes()
+    for number in range(48):
+        row, column = divmod(number, 8)
+        hits = int(rng.integers(0, 40))
+        place = [3000 * column, -2400 * row, hits, 0, 0, 0, 55, column, row]
+        content += np.array([number + 1, *place], "<i4").tobytes()
+        content += rng.integers(500, 2000, hits).astype("<i2").tobytes()
+        content += rng.integers(0, 100, 3 * hits).astype("u1").tobytes()
+        content += rng.integers(0, 800, 2 * hits).astype("<i2").tobytes()
+    path.write_bytes(content + np.array(-1, "<i4").tobytes() + b"Scan")
+
+
 def _table(path: Path) -> None:
     np.savetxt(path, _shot(), header="energy = 14.7\npixel_size = 10 um", fmt="%d")
 
@@ -157,6 +172,7 @@ FORMATS: dict[str, Writer] = {
     "seven_three.mat": _hdf5,
     "shot.b16": _b16,
     "shot.spe": _spe,
+    "scan.cpsa": _cpsa,
     "shot.txt": _table,
     "pradreader.txt": _pradreader,
     "pradformat.h5": lambda path: _hdf5(path, object_type="radiograph"),
@@ -216,9 +232,9 @@ def read_whole(path: Path) -> None:
     """Read all that the package reads of a file."""
     from napari_shadowinv.cli._batch import status_tables
     from napari_shadowinv.cli._info import described
+    from napari_shadowinv.film import Calibration
     from napari_shadowinv.io import read, read_toml
     from napari_shadowinv.physics.setup import setup_from_dict
-    from napari_shadowinv.preprocessing.film import Calibration
 
     if path.suffix == ".toml":
         setup_from_dict(read_toml(path), str(path))

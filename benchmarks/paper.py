@@ -18,6 +18,7 @@ import numpy as np
 
 from napari_shadowinv import invert
 from paper_parts import page
+from paper_parts.beyond_caustics import figure_folded, folded_shots
 from paper_parts.drawing import STYLE
 from paper_parts.figures_method import figure_algorithm, figure_diagrams, walk_through
 from paper_parts.figures_structures import figure_structures, figure_wave
@@ -48,12 +49,14 @@ def make_everything(out: Path) -> str:
     figure_intensity(out / "paper-intensity.png")
     rows, onset = sweep(), caustic_onset()
     figure_sweep(rows, onset, out / "paper-sweep.png")
+    folded = folded_shots()
+    figure_folded(folded, onset, out / "paper-folded.png")
     found = structures()
     figure_structures(found, out / "paper-structures.png")
     wave = plasma_wave()
     figure_wave(wave, out / "paper-wakefield.png")
     minutes = (time.perf_counter() - start) / 60
-    return page.write(rows, onset, found, wave, len(walk.weights) - 1, minutes)
+    return page.write(rows, onset, folded, found, wave, len(walk.weights) - 1, minutes)
 
 
 if __name__ == "__main__":

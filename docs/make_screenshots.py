@@ -4,13 +4,15 @@
 
 NAME is a window below, such as `toroid` or `first`; all of them without one. Each picture shows
 the window as a new user sees it, 1280 pixels wide. The burner shadowgrams (see the README's
-credits) are looked for in the data folder and left out where they are absent.
+credits) and the films of the tutorial are looked for in the data folder and left out where they
+are absent.
 """
 
 from __future__ import annotations
 
 import argparse
 import re
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from make_film_pictures import pack_of_page
 from PIL import Image
 from qtpy.QtCore import QSettings
 from qtpy.QtWidgets import QApplication
@@ -239,6 +242,58 @@ def fit_window() -> None:
     photograph(viewer, "napari-fit.png")
 
 
+def film_window() -> None:
+    """A simulated film pack: the widget, the fluence at one film, and the spectrum of a region."""
+    sys.path.insert(0, str(HERE.parents[1] / "tests" / "film"))
+    from simulated_pack import simulate
+
+    with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
+        truth = simulate(Path("eight-films"))
+        viewer = new_window("film pack", height=840)
+        widget = open_widget(viewer, "Film pack")
+        widget.path.edit.setText(str(truth.pack))
+        press_run(widget)
+        viewer.dims.set_current_step(0, 4)
+        widget._draw_region()
+        height, width = truth.scene.shape
+        region = [[0.55 * height, 0.1 * width], [0.9 * height, 0.4 * width]]
+        widget.regions.layer.add_rectangles(region)
+        widget.regions.layer.mode = "pan_zoom"
+        viewer.layers.selection.active = widget.packs.layer
+        photograph(viewer, "napari-film.png")
+
+
+def real_film_windows(data: Path) -> None:
+    """Tutorial: the real pack, and the corners of a film on its scan."""
+    with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
+        folder = Path("shot-019")
+        folder.mkdir()
+        pack = pack_of_page(folder, data)
+        viewer = new_window("seventeen films", height=840)
+        widget = open_widget(viewer, "Film pack")
+        widget.path.edit.setText(str(pack))
+        press_run(widget)
+        viewer.dims.set_current_step(0, 6)
+        viewer.layers.selection.active = widget.packs.layer
+        photograph(viewer, "tutorial-film-run.png", close=False)
+        widget.show_corners.click()
+        settle()
+        photograph(viewer, "tutorial-film-corners.png")
+
+
+def two_energies_window() -> None:
+    """Tutorial: the sample at two energies, fitted with its beam."""
+    viewer = new_window("two energies instead of a reference beam", height=880)
+    viewer.open_sample(PLUGIN, "two_energies")
+    widget = open_widget(viewer, "Fit several images")
+    widget.source.picker.set_kind("unknown")
+    widget.noise.restore("poisson")
+    press_run(widget)
+    print(widget.view.verdict.text())
+    widget.area.verticalScrollBar().setValue(0)
+    photograph(viewer, "tutorial-two-energies.png")
+
+
 def make_as_new_user(make: Callable[[], None]) -> None:
     """Make pictures with widgets that remember nothing, and change no settings of one's own."""
     with tempfile.TemporaryDirectory() as settings:
@@ -255,17 +310,22 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help="windows; all of them without a name")
     parser.add_argument("--data", type=Path, default=HERE.parents[2] / "shared" / "data")
     options = parser.parse_args()
-    folder = options.data / "burner" / "data"
     HERE.mkdir(exist_ok=True)
+    burner, films = options.data / "burner" / "data", options.data / "rcf"
+    of_data = {
+        "burner": (frames(burner), lambda: stack_window(burner)),
+        "real-film": (films.is_dir(), lambda: real_film_windows(films)),
+    }
     for name, make in WINDOWS.items():
         if not options.names or name in options.names:
             make_as_new_user(make)
-    if options.names and "burner" not in options.names:
-        return
-    if frames(folder):
-        make_as_new_user(lambda: stack_window(folder))
-    else:
-        print(f"no burner shadowgrams in {folder}: their picture is left out")
+    for name, (there, make) in of_data.items():
+        if options.names and name not in options.names:
+            continue
+        if there:
+            make_as_new_user(make)
+        else:
+            print(f"no data for {name} in {options.data}: its pictures are left out")
 
 
 WINDOWS = {
@@ -275,6 +335,8 @@ WINDOWS = {
     "source": source_windows,
     "night": night_window,
     "fit": fit_window,
+    "film": film_window,
+    "two-energies": two_energies_window,
 }
 
 if __name__ == "__main__":

@@ -25,8 +25,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from napari_shadowinv import InversionOptions, Radiograph, invert
+from napari_shadowinv.film import Calibration, dose
 from napari_shadowinv.preprocessing import low_pass_source
-from napari_shadowinv.preprocessing.film import Calibration, dose
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("folder", type=Path, help="folder with the scans and the calibration")

@@ -26,6 +26,7 @@ ROOMS = (
     ("geometry",),
     ("physics",),
     ("preprocessing",),
+    ("film",),
     ("transport",),
     ("inversion",),
     ("fitting",),

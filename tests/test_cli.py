@@ -2,10 +2,8 @@ import json
 import os
 import platform
 import re
-import signal
 import subprocess
 import sys
-import textwrap
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -18,19 +16,19 @@ import pytest
 import tifffile
 import xarray as xr
 from scipy.io import savemat
-from typer.testing import CliRunner, Result
 
+from command_line import content, flat, interrupted, shadowinv
 from napari_shadowinv import __version__
 from napari_shadowinv import preprocessing as filters
 from napari_shadowinv import preprocessing as sources
 from napari_shadowinv._system.machine import physical_memory
-from napari_shadowinv.cli import _info, app
+from napari_shadowinv.cli import _info
 from napari_shadowinv.cli._flags import recipe_of
-from napari_shadowinv.cli._inputs import read_shot, setup_for
+from napari_shadowinv.cli._inputs import setup_for
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.inversion.compilation import code_folder
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.labels import PACK_FORMAT, setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import InversionOptions
@@ -38,6 +36,7 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.pipeline import gathered, read_recipe
+from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
     Bin,
@@ -61,18 +60,6 @@ source_object_distance = 0.01
 object_image_distance = 0.3
 pixel_size = 1e-5
 """
-
-
-def shadowinv(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def flat(text: str) -> str:
-    return " ".join(text.split())
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
 @pytest.fixture(autouse=True)
@@ -587,14 +574,14 @@ def test_geometry_in_a_text_image_is_used_and_shown(folder: Path) -> None:
     # What the file leaves out comes from the setup, with and without a kind.
     for entries in ("energy = 14.7\n", 'kind = "proton"\nenergy = 14.7\n'):
         (folder / "energy.toml").write_text(entries)
-        half = read_shot(Path("half.txt"), None, None)
+        half = read_part(Path("half.txt"), None, None)
         setup = setup_for(Path("energy.toml"), half, Recipe())
         assert isinstance(setup, ProtonSetup)
         assert (setup.energy, setup.object_image_distance) == (14.7, 0.3)
         assert setup.object_pixel_size == pytest.approx(1e-5)
     light = "wavelength = 5e-7\nsource_object_distance = inf\n"
     (folder / "light.toml").write_text(light)
-    seen = setup_for(Path("light.toml"), read_shot(Path("all.txt"), None, None), Recipe())
+    seen = setup_for(Path("light.toml"), read_part(Path("all.txt"), None, None), Recipe())
     assert isinstance(seen, OpticalSetup)
     assert (seen.object_image_distance, seen.magnification) == (0.3, 1)
 
@@ -959,6 +946,22 @@ def test_info_tells_what_is_inside(folder: Path) -> None:
     assert "channels 3" in text
 
 
+def test_the_result_of_a_film_pack_is_known_but_no_field(
+    folder: Path, refused: Callable[..., None]
+) -> None:
+    names = ("dose", "fluence", "usable")
+    planes = {name: (("layer", "y", "x"), np.ones((2, 5, 7), np.float32)) for name in names}
+    told = {"format": PACK_FORMAT, "package_version": "1.2", "warnings": '["film 2 is dark"]'}
+    pack = xr.Dataset(planes, {"energy": ("layer", [3.0, 5.5])}, told)
+    write("pack.shadowinv", pack)
+    xr.testing.assert_identical(read("pack.shadowinv"), pack)
+    text = flat(shadowinv("info", "pack.shadowinv").stdout)
+    assert "film pack of shadowinv 1.2" in text
+    assert "2 of 5 × 7 px" in text
+    assert "film 2 is dark" in text
+    refused("forward", "pack.shadowinv", names="pack.shadowinv is a film pack")
+
+
 def test_info_reports_the_installation() -> None:
     text = shadowinv("info", "--report").stdout
     told = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in text.splitlines())
@@ -1088,29 +1091,6 @@ def test_our_own_bug_is_not_blamed_on_the_user(shot: Path, monkeypatch: pytest.M
     monkeypatch.setattr("napari_shadowinv.pipeline._run.invert", broken)
     result = shadowinv("invert", shot)
     assert isinstance(result.exception, ValueError)
-
-
-def interrupted(folder: Path, preparation: str, arguments: list[str]) -> tuple[int, str]:
-    """Run the command in its own process, and press Ctrl-C when it has said "now"."""
-    script = textwrap.dedent(preparation) + "\nfrom napari_shadowinv.cli import app\napp()\n"
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, *arguments],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
-    try:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if "now" in line:
-                process.send_signal(signal.SIGINT)
-                break
-        _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    return process.returncode, errors
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")

@@ -1,12 +1,9 @@
 """The command `shadowinv fit`: what it reads, what it gives to `fit`, what it writes and tells."""
 
 import dataclasses
-import json
 import os
-import signal
-import subprocess
-import sys
-import textwrap
+import re
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,36 +12,25 @@ import numpy as np
 import pytest
 import tifffile
 import xarray as xr
-from typer.testing import CliRunner, Result
 
-from napari_shadowinv.cli import app
-from napari_shadowinv.cli._flags import fit_choices_of
-from napari_shadowinv.fitting import Fit, FitOptions, Verdict, point_spread
+from command_line import content, flat, interrupted, shadowinv
+from napari_shadowinv.cli._flags import fit_recipe_of
+from napari_shadowinv.fitting import Fit, FitOptions, LeaveOneOut, Verdict, point_spread
 from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.files import sha256
+from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
-from napari_shadowinv.preprocessing import Bin
+from napari_shadowinv.pipeline import read_recipe
+from napari_shadowinv.preprocessing import Bin, FitProvenance, Origin, Recipe, polynomial_source
 
 SHAPE = (48, 56)
 TRUTH = gaussian_blob(SHAPE, 25.0, 7.0, (22, 30)).displacement
 RATIO = 1.72  # of a 5 MeV proton's displacement to one's of 14.7 MeV
 LENGTHS = {"source_object_distance": 0.01, "object_image_distance": 0.3, "pixel_size": 1e-5}
 FIRST, SECOND = (ProtonSetup(energy=energy, **LENGTHS) for energy in (14.7, 5.0))
-
-
-def shadowinv(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def flat(text: str) -> str:
-    return " ".join(text.split())
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
 @pytest.fixture(autouse=True)
@@ -73,7 +59,7 @@ def given(monkeypatch: pytest.MonkeyPatch, make_fit: Callable[..., Fit]) -> dict
         strengths = (1.0, 1.7, 2.0, 3.0)[: len(arguments["images"])]
         return make_fit(strengths=strengths)
 
-    monkeypatch.setattr("napari_shadowinv.fitting.fit", fit)
+    monkeypatch.setattr("napari_shadowinv.pipeline._fit.fit", fit)
     return seen
 
 
@@ -97,6 +83,12 @@ def fit_in(path: str) -> tuple[Fit, xr.Dataset]:
     dataset = read(Path(path))
     assert isinstance(dataset, xr.Dataset)
     return Fit.from_dataset(dataset), dataset
+
+
+def provenance_in(path: str) -> FitProvenance:
+    made = fit_in(path)[0].provenance
+    assert made is not None
+    return made
 
 
 # What it finds and writes
@@ -133,9 +125,11 @@ def test_a_field_that_one_image_cannot_tell_is_written_with_an_exit_code_of_its_
     (line,) = result.stderr.splitlines()
     assert line.startswith("ONE IMAGE CANNOT TELL: a_fit.shadowinv was written, but one image")
     assert result.stdout == ""
-    fit, dataset = fit_in("a_fit.shadowinv")
+    fit, _ = fit_in("a_fit.shadowinv")
     assert fit.verdict is Verdict.AMBIGUOUS
-    assert json.loads(dataset.attrs["origins"])[0]["source"] == "unknown"
+    assert fit.provenance is not None
+    assert fit.provenance.recipe.fit is not None
+    assert fit.provenance.recipe.fit.beam == "unknown"
 
 
 def test_one_image_and_an_unknown_beam_need_to_be_asked_for(refused: Callable[..., None]) -> None:
@@ -145,34 +139,18 @@ def test_one_image_and_an_unknown_beam_need_to_be_asked_for(refused: Callable[..
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
 def test_ctrl_c_leaves_nothing(folder: Path) -> None:
     before = content(folder)
-    script = """
+    say_when = """
         import contextlib
-        from napari_shadowinv.cli import _fit_result, app
+        from napari_shadowinv.cli import _fit_result
 
         @contextlib.contextmanager
         def bars():
             yield lambda progress: print("now" if progress.stage == "fit" else "")
 
         _fit_result.progress_bars = bars
-        app()
     """
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(script), *PAIR],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
-    try:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if "now" in line:
-                process.send_signal(signal.SIGINT)
-                break
-        _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert (process.returncode, errors.strip()) == (130, "Cancelled")
+    code, errors = interrupted(folder, say_when, list(map(str, PAIR)))
+    assert (code, errors.strip()) == (130, "Cancelled")
     assert content(folder) == before
 
 
@@ -187,11 +165,11 @@ def test_images_setups_and_choices_reach_the_fit(given: dict[str, Any]) -> None:
     assert result.exit_code == 0, result.output
     np.testing.assert_array_equal(given["images"][1], tifffile.imread("b.tif"))
     assert given["setups"] == (FIRST, SECOND)
-    assert given["strengths"] is None
-    assert given["fields"] == ["B", "E"]
+    assert "strengths" not in given
+    assert given["fields"] == ("B", "E")
     assert (given["noise"], given["psf"], given["gains"]) == ("poisson", [1.5, 1.5], "free")
     assert given["options"] == FitOptions(align="shift", seed=3)
-    assert given["source"] is given["mask"] is given["fiducials"] is None
+    assert not {"source", "mask", "fiducials"} & given.keys()
 
 
 def test_a_table_describes_each_image(folder: Path, given: dict[str, Any]) -> None:
@@ -219,10 +197,16 @@ def test_a_table_describes_each_image(folder: Path, given: dict[str, Any]) -> No
     assert given["gains"] == (1.0, 1.2)
     np.testing.assert_array_equal(given["source"], np.full((2, *SHAPE), 900))
     np.testing.assert_array_equal(given["mask"], [mask > 0, np.ones(SHAPE, bool)])
-    origins = json.loads(fit_in("a_fit.shadowinv")[1].attrs["origins"])
-    assert [one["image"]["file"] for one in origins] == ["a.tif", "b.tif"]
-    assert origins[1]["image"]["sha256"] == sha256(night / "b.tif")
-    assert origins[0]["mask"]["file"] == "mask.tif"
+    made = provenance_in("a_fit.shadowinv")
+    assert [one.image.file for one in made.images] == ["a.tif", "b.tif"]
+    assert made.images[1].image.sha256 == sha256(night / "b.tif")
+    assert [one.mask for one in made.images] == [0, None]
+    (kept,) = made.masks
+    assert (kept.file, kept.sha256) == ("mask.tif", sha256(night / "mask.tif"))
+    np.testing.assert_array_equal(kept.mask(), mask > 0)
+    assert [one.psf for one in made.images] == [None, 0.5]
+    assert [one.gain for one in made.images] == [1.0, 1.2]
+    assert [one.setup for one in made.images] == [FIRST, SECOND]
 
 
 def test_a_table_of_numbers_is_an_image(given: dict[str, Any]) -> None:
@@ -248,16 +232,18 @@ def test_binning_sums_pixels_and_makes_those_of_the_setup_larger(given: dict[str
 def test_strengths_take_the_place_of_energies_and_units_are_kept(given: dict[str, Any]) -> None:
     assert shadowinv(*PAIR, "--strengths", "1 1,1.7 2.9", "--fields", "B,E").exit_code == 0
     assert given["strengths"] == ((1.0, 1.0), (1.7, 2.9))
-    assert given["setups"] is None
+    assert "setups" not in given
     assert fit_in("a_fit.shadowinv")[0].setups == (FIRST, SECOND)
 
 
 def test_known_displacements_come_from_a_table(given: dict[str, Any]) -> None:
     Path("mesh.csv").write_text("x;y;dx;dy;sigma\n20;10;0.5;-0.25;0.1\n30;12;0.4;0;0.2\n")
     assert shadowinv("fit", "a.tif", "--fiducials", "mesh.csv").exit_code == 0
-    assert given["fiducials"] == [(10, 20, -0.25, 0.5, 0.1), (12, 30, 0, 0.4, 0.2)]
-    origin = json.loads(fit_in("a_fit.shadowinv")[1].attrs["fiducials"])
-    assert origin == {"file": "mesh.csv", "sha256": sha256("mesh.csv")}
+    rows = ((10, 20, -0.25, 0.5, 0.1), (12, 30, 0, 0.4, 0.2))
+    np.testing.assert_array_equal(given["fiducials"], rows)
+    made = provenance_in("a_fit.shadowinv")
+    assert made.fiducials == Origin(file="mesh.csv", sha256=sha256("mesh.csv"))
+    assert made.fiducial_rows == rows
 
 
 def test_light_is_bent_by_a_refractive_index_unless_said_otherwise(given: dict[str, Any]) -> None:
@@ -265,7 +251,7 @@ def test_light_is_bent_by_a_refractive_index_unless_said_otherwise(given: dict[s
     for name, wavelength in (("one", "532e-9"), ("two", "1064e-9")):
         Path(f"{name}.toml").write_text(light + wavelength)
     assert shadowinv("fit", "a.tif", "--setup", "one.toml").exit_code == 0
-    assert given["fields"] == ["phase"]
+    assert given["fields"] == ("phase",)
     Path("shots.csv").write_text("file,setup\na.tif,one.toml\nb.tif,two.toml\n")
     result = shadowinv("fit", "shots.csv", "--overwrite")
     assert result.exit_code == 2
@@ -283,9 +269,9 @@ def test_every_option_of_a_fit_has_a_flag() -> None:
     for name in FitOptions.model_fields:
         assert f"--{name.replace('_', '-')}" in text
     flags = {"bin": 2, "ambiguous": True, "beam_modes": 4}
-    steps, options = fit_choices_of(flags, {})
-    assert steps == (Bin(factor=2),)
-    assert options == FitOptions(ambiguous=True, beam_modes=4)
+    recipe = fit_recipe_of(flags, Recipe(), {})
+    options = FitOptions(ambiguous=True, beam_modes=4)
+    assert recipe == Recipe(steps=(Bin(factor=2),), fit=FitChoices(options=options))
 
 
 # What it refuses
@@ -321,11 +307,15 @@ MISTAKES = {
     "fit a.tif b.tif --setup setup.toml": ("'energy' is missing",),
     "fit a.tif b.tif --strengths 1,two": ("b.tif: 'strength' is 'two'",),
     "fit a.tif small.tif --strengths 1,2": ("small.tif has shape (40, 40), a.tif (48, 56)",),
-    "fit a.tif --psf 1 --resolution 1e-5": ("point spread of 1 px", "--resolution"),
+    "fit a.tif --psf 1 --resolution 1e-5": ("point spread of 1 px", "resolution in m"),
     "fit a.tif --resolution 1e-5": ("no setup", "--psf"),
     "fit a.tif --source nothing.tif": ("nothing.tif does not exist",),
     "fit a.tif --source small.tif": ("a.tif: source has shape (40, 40)",),
-    "fit a.tif --out fit.h5": ("expected one of .shadowinv",),
+    "fit a.tif --out fit.csv": ("expected one of .h5", ".shadowinv"),
+    "fit a.tif --out fit.h5": ("pradformat", "needs a setup"),
+    "fit a.tif b.tif --energies 3,5 --setup setup.toml --fields B,E --out fit.h5": (
+        "holds one field, received B and E",
+    ),
     "fit a.tif --out setup.shadowinv --report setup.toml": (".toml", "expected one of"),
     "fit a.tif --edge soft": ("'edge' is 'soft'", "'fading' or 'free'"),
     "fit shots.csv --energies 3": ("column 'energy'",),
@@ -375,13 +365,8 @@ def test_a_damaged_fit_is_told_in_a_sentence(
     refused: Callable[..., None], make_fit: Callable[..., Fit]
 ) -> None:
     write("fit.shadowinv", make_fit().to_dataset().assign_attrs(verdict="perhaps"))
-    for command in ("forward", "info"):
+    for command in ("forward", "info", "rerun"):
         refused(command, "fit.shadowinv", names=("fit.shadowinv is damaged", "perhaps"))
-
-
-def test_rerun_refuses_a_fit(refused: Callable[..., None], make_fit: Callable[..., Fit]) -> None:
-    write("fit.shadowinv", make_fit())
-    refused("rerun", "fit.shadowinv", names=("fit.shadowinv is a fit", "shadowinv fit"))
 
 
 def test_forward_asks_which_of_two_fields(
@@ -403,3 +388,258 @@ def test_info_tells_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
     assert "warning 2 different fields explain the data" in told
     assert "other start from near: objective +20.00%, displacement 30.00% away" in told
     assert "gain 1.1, shifted by y" in told
+
+
+# Making it again
+
+
+def test_a_fit_is_made_again_bit_for_bit(folder: Path, refused: Callable[..., None]) -> None:
+    mask = np.full(SHAPE, 255, np.uint8)
+    mask[:9, :7] = 0
+    tifffile.imwrite("mask.tif", mask)
+    tifffile.imwrite("beam.tif", np.full(SHAPE, 1000, np.float32))
+    steps = ("--crop-y", "2:46", "--crop-x", "0:54", "--hot-pixels", 8)
+    known = ("--mask", "mask.tif", "--source", "beam.tif", "--psf", 0.3, "--noise", 20)
+    result = shadowinv(*PAIR, *steps, *known, "--samples", 2, "--steps", 5, "--gains", "1,1.01")
+    assert result.exit_code in (0, 3), result.output
+    # A mask whose pixels are kept need not be there any more.
+    Path("mask.tif").unlink()
+    Path("setup.toml").unlink()
+    again = shadowinv("rerun", "a_fit.shadowinv")
+    told = flat(again.stdout)
+    assert "changed nothing difference none: the same result, bit for bit" in told
+    first, second = fit_in("a_fit.shadowinv")[0], fit_in("a_fit_again.shadowinv")[0]
+    assert first.provenance is not None
+    assert second.provenance is not None
+    assert first.provenance.recipe == second.provenance.recipe
+    assert first.provenance.images == second.provenance.images
+    assert first.options == second.options
+    for one, other in zip(first.fields, second.fields, strict=True):
+        np.testing.assert_array_equal(one.uncertainty, other.uncertainty)
+
+    # Elsewhere, with an image that is not the same.
+    elsewhere = folder / "elsewhere"
+    elsewhere.mkdir()
+    for name in ("a.tif", "beam.tif"):
+        Path(name).rename(elsewhere / name)
+    tifffile.imwrite(elsewhere / "c.tif", tifffile.imread("b.tif") + np.float32(5))
+    where = ("--source", "elsewhere/beam.tif", "--overwrite")
+    refused("rerun", "a_fit.shadowinv", "--overwrite", names=("image 1 a.tif is not there",))
+    alone = ("rerun", "a_fit.shadowinv", "b.tif", "--overwrite")
+    refused(*alone, names=("received 1 images", "made from 2"))
+    moved = shadowinv("rerun", "a_fit.shadowinv", "elsewhere/a.tif", "elsewhere/c.tif", *where)
+    told = flat(moved.stdout)
+    assert "changed the image 2 c.tif differs from the b.tif used before" in told
+    assert "displacement differs by up to" in told
+    assert "nothing" not in told
+
+
+def test_a_fit_of_an_older_version_is_told(make_fit: Callable[..., Fit], folder: Path) -> None:
+    assert shadowinv("fit", "a.tif", "--bin", 1, "--samples", 0, "--steps", 1).exit_code in (0, 3)
+    fit, _ = fit_in("a_fit.shadowinv")
+    assert fit.provenance is not None
+    older = fit.provenance.model_copy(update={"version": "0.0.1"})
+    write(Path("old.shadowinv"), dataclasses.replace(fit, provenance=older))
+    told = flat(shadowinv("rerun", "old.shadowinv").stdout)
+    assert "changed made by version 0.0.1, now" in told
+    assert "the same result, bit for bit" in told
+
+
+def test_known_displacements_and_own_masks_are_taken_again() -> None:
+    rng = np.random.default_rng(3)
+    for name in ("one", "two"):  # too complex to be kept with the result
+        tifffile.imwrite(f"{name}.tif", (rng.random((400, 600)) > 0.15).astype(np.uint8))
+        tifffile.imwrite(f"image_{name}.tif", rng.normal(100, 1, (400, 600)).astype(np.float32))
+    lines = ["file,strength,mask", "image_one.tif,1,one.tif", "image_two.tif,2,two.tif"]
+    Path("shots.csv").write_text("\n".join(lines))
+    rows = ["y,x,dy,dx,sigma", *(f"{k % 30}.25,{k % 40}.5,0,0,10" for k in range(1000))]
+    Path("mesh.csv").write_text("\n".join(rows))
+    quick = ("--crop-y", "9:57", "--crop-x", "8:64", "--samples", 0, "--steps", 1)
+    result = shadowinv("fit", "shots.csv", "--fiducials", "mesh.csv", *quick)
+    assert result.exit_code in (0, 3), result.output
+    made = provenance_in("image_one_fit.shadowinv")
+    assert made.fiducial_rows is None
+    assert made.masks[1].pixels is None
+    assert "bit for bit" in shadowinv("rerun", "image_one_fit.shadowinv").stdout
+    Path("mesh.csv").write_text("\n".join(rows[:-1]))
+    told = flat(shadowinv("rerun", "image_one_fit.shadowinv", "--overwrite").stdout)
+    assert "changed the table of fiducials mesh.csv differs from the mesh.csv used before" in told
+    Path("two.tif").unlink()
+    missing = shadowinv("rerun", "image_one_fit.shadowinv", "--overwrite")
+    assert missing.exit_code == 2
+    assert "the mask two.tif is not there: name the file" in missing.stderr
+
+
+def test_a_fit_of_arrays_does_not_say_how_it_was_made(
+    refused: Callable[..., None], make_fit: Callable[..., Fit]
+) -> None:
+    write(Path("fit.shadowinv"), make_fit())
+    refused("rerun", "fit.shadowinv", names=("fit.shadowinv does not say how it was made",))
+
+
+# A recipe
+
+
+def test_a_recipe_that_was_saved_makes_the_same_fit(given: dict[str, Any]) -> None:
+    tifffile.imwrite("mask.tif", np.eye(*SHAPE, dtype=np.uint8) == 0)
+    chosen = ("--bin", 2, "--mask", "mask.tif", "--noise", "poisson", "--source", "unknown")
+    lengths = ("--source-size", 1e-5, "--samples", 0)
+    first = shadowinv(*PAIR, *chosen, *lengths, "--fields", "B,E", "--save-recipe", "r.toml")
+    assert first.exit_code == 0, first.output
+    before = dict(given)
+    recipe = read_recipe(Path("r.toml"))
+    assert recipe.fit == FitChoices(
+        fields=("B", "E"),
+        beam="unknown",
+        noise="poisson",
+        source_size=1e-5,
+        options=FitOptions(samples=0),
+    )
+    assert shadowinv(*PAIR, "--recipe", "r.toml", "--overwrite").exit_code == 0
+    assert before.keys() == given.keys()
+    for name in before.keys() - {"on_progress", "should_stop"}:
+        np.testing.assert_equal(given[name], before[name], err_msg=name)
+
+    # Flags override what it says.
+    own = ("--psf", 0.5, "--samples", 3, "--source", "a.tif", "--gains", "free", "--bin", 4)
+    changed = shadowinv(*PAIR, "--recipe", "r.toml", *own, "--overwrite")
+    assert changed.exit_code == 0, changed.output
+    assert given["psf"] == [0.5, 0.5]
+    assert given["options"] == FitOptions(samples=3)
+    assert given["source"].shape == (2, SHAPE[0] // 4, SHAPE[1] // 4)
+    assert (given["gains"], given["fields"]) == ("free", ("B", "E"))
+
+
+def test_the_setup_of_one_image_is_in_its_recipe(given: dict[str, Any]) -> None:
+    alone = ("fit", "a.tif", "--energies", 14.7, "--setup", "setup.toml")
+    assert shadowinv(*alone, "--save-recipe", "r.toml").exit_code == 0
+    assert read_recipe(Path("r.toml")).setup == FIRST
+    assert shadowinv("fit", "b.tif", "--recipe", "r.toml", "--energies", 5).exit_code == 0
+    assert given["setups"] == (SECOND,)
+    assert shadowinv(*PAIR, "--save-recipe", "both.toml", "--overwrite").exit_code == 0
+    assert read_recipe(Path("both.toml")).setup is None
+
+
+def test_the_source_can_be_estimated_by_the_recipe(given: dict[str, Any]) -> None:
+    Path("r.toml").write_text('[source]\nmethod = "polynomial"\ndegree = 1\n')
+    assert shadowinv("fit", "a.tif", "--recipe", "r.toml").exit_code == 0
+    expected = polynomial_source(tifffile.imread("a.tif").astype(float), degree=1)
+    np.testing.assert_array_equal(given["source"], expected[None])
+
+
+RECIPES = {
+    '[[steps]]\nstep = "low-pass"\n': ("low-pass", "what the forward model is fitted to"),
+    '[fit]\nbeam = "unknown"\n[source]\nmethod = "gaussian"\n': ("source and a fit with an unk",),
+    "[fit]\npsf = 1\nresolution = 1e-5\n": ("r.toml", "point spread of 1 px"),
+    "[fit]\nfield = 3\n": ("r.toml: unknown key 'fit.field', did you mean 'fields'?",),
+    "[fit.options]\nsamples = -2\n": ("r.toml: 'fit.options.samples' is -2",),
+}
+
+
+@pytest.mark.parametrize(("text", "names"), RECIPES.items(), ids=[n[0] for n in RECIPES.values()])
+def test_a_recipe_that_cannot_be_is_refused(
+    refused: Callable[..., None], text: str, names: tuple[str, ...]
+) -> None:
+    Path("r.toml").write_text(text)
+    refused("fit", "a.tif", "--recipe", "r.toml", names=names)
+
+
+def test_the_recipe_on_the_page_works(given: dict[str, Any]) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "fit.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    Path("page.toml").write_text(text, encoding="utf-8")
+    result = shadowinv(*PAIR, "--recipe", "page.toml")
+    assert result.exit_code == 0, result.output
+    assert (given["noise"], given["gains"]) == ("poisson", "free")
+    assert given["options"] == FitOptions(samples=10)
+    assert given["images"].shape == (2, 24, 28)
+    assert given["psf"][0] > 0
+    shown = tomllib.loads(text)["fit"].keys()
+    assert set(FitChoices.model_fields) - shown == {"psf"}
+
+
+# Choices of fields compared
+
+
+def test_fields_are_compared_and_the_likeliest_is_written() -> None:
+    quick = ("--noise", 20, "--samples", 0, "--steps", 5)
+    result = shadowinv(*PAIR, "--compare", *quick)
+    assert result.exit_code in (0, 3), result.output
+    told = flat(result.stdout)
+    # The displacements grow like those of a magnetic field: 1.72 times for momenta, 2.9 for E.
+    assert re.search(r"Comparison .* likeliest .* E [\d.]+, [\d.]+ -\d+\.\d does not fit", told)
+    fit, _ = fit_in("a_fit.shadowinv")
+    names = tuple(field.name for field in fit.fields)
+    assert "B" in names
+    assert re.search(f"verdict ─* *{', '.join(names)} [^a-z]* likeliest", told)
+    made = provenance_in("a_fit.shadowinv")
+    assert made.recipe.fit is not None
+    assert made.recipe.fit.fields == names
+    assert fit.options.evidence
+    own = shadowinv(*PAIR, "--compare", "--fields", "E", *quick, "--overwrite")
+    assert own.exit_code in (0, 3), own.output
+    assert [field.name for field in fit_in("a_fit.shadowinv")[0].fields] == ["E"]
+
+
+def test_what_cannot_be_compared_is_refused(refused: Callable[..., None]) -> None:
+    refused(*PAIR, "--compare", "--fields", "plasma", names=("plasma", "B; E; B,E"))
+    refused("fit", "a.tif", "b.tif", "--compare", "--strengths", "1,2", names=("needs the setup",))
+
+
+# Whether one static field explains the images
+
+
+def films() -> None:
+    """Four images, the last two of a stronger object, and a table that tells their energies."""
+    noise = np.random.default_rng(1)
+    energies = (5.0, 7.0, 14.7, 10.0)
+    for name, energy, factor in zip("abcd", energies, (1, 1, 1.4, 1), strict=True):
+        setup = FIRST.model_copy(update={"energy": energy})
+        strength = factor * SECOND.momentum / setup.momentum
+        image = 1000 * synthetic_image(1.5 * strength * TRUTH) + noise.normal(0, 20, SHAPE)
+        tifffile.imwrite(f"{name}.tif", image.astype(np.float32))
+    rows = [f"{name}.tif,{energy}" for name, energy in zip("abcd", energies, strict=True)]
+    Path("films.csv").write_text("\n".join(["file,energy", *rows]))
+
+
+FILMS = ("fit", "films.csv", "--setup", "setup.toml", "--noise", 20, "--samples", 2)
+
+
+def test_images_left_out_and_windows_are_told_drawn_and_written(folder: Path) -> None:
+    films()
+    before = set(content(folder))
+    result = shadowinv(*FILMS, "--spacing", 0.2, "--leave-one-out", "--window", 3)
+    assert result.exit_code == 3, result.output
+    told = flat(result.stdout)
+    for words in ("Left out", "c.tif 14.7", "not explained", "Windows", "1, 2, 4", "2, 4, 3"):
+        assert words in told
+    sentence = "the image at 14.7 MeV is not explained by one static field with the others"
+    assert f"NOT STATIC: a_fit.shadowinv was written, but {sentence}" in flat(result.stderr)
+    written = {f"a_fit{ending}.png" for ending in ("", "_left_out", "_windows")}
+    assert set(content(folder)) - before == written | {"a_fit.shadowinv"}
+    fit, dataset = fit_in("a_fit.shadowinv")
+    left_out = LeaveOneOut.from_dataset(dataset)
+    np.testing.assert_array_equal(left_out.explained, [True, True, False, True])
+    np.testing.assert_array_equal(left_out.images, fit.images)
+    assert dataset["window_displacement"].shape == (2, 2, *SHAPE)
+    np.testing.assert_allclose(dataset["window_energy"], [22 / 3, 31.7 / 3])
+    described = flat(shadowinv("info", "a_fit.shadowinv").stdout)
+    assert sentence in described
+    assert "window 2 images 2, 4, 3, χ²" in described
+
+
+STATIC_MISTAKES = {
+    "fit a.tif b.tif --strengths 1,2 --leave-one-out": ("received 2 images", "needs 3 or more"),
+    "fit a.tif b.tif --strengths 1,2 --window 3": ("received 2 images and windows of 3",),
+    "fit a.tif b.tif --window 2": ("neither strengths nor setups",),
+    "fit a.tif b.tif --strengths 1,2 --window 2 --out fit.h5": ("fit.h5", "no room"),
+    "fit a.tif b.tif --strengths 1,2 --window 2 --fiducials mesh.csv": ("--fiducials", "first"),
+}
+
+
+@pytest.mark.parametrize(("command", "names"), STATIC_MISTAKES.items(), ids=list(STATIC_MISTAKES))
+def test_what_cannot_be_left_out_or_put_into_windows_is_refused(
+    refused: Callable[..., None], command: str, names: tuple[str, ...]
+) -> None:
+    Path("mesh.csv").write_text("x,y,dx,dy,sigma\n20,10,0.5,-0.25,0.1\n")
+    refused(*command.split(), names=names)

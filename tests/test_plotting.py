@@ -11,15 +11,17 @@ import pytest
 from matplotlib.figure import Figure
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.fitting import Fit, Verdict
+from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut, Verdict
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.plotting import (
     comparison_figure,
     fit_figure,
+    left_out_figure,
     report_figure,
     save_figure,
+    windows_figure,
 )
 
 Make = Callable[..., Inversion]
@@ -37,17 +39,10 @@ def panels(figure: Figure) -> list[Any]:
     return [axes for axes in figure.axes if axes.get_title(loc="left")]
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("with_setup", [False, True])
-def test_no_panel_touches_another_or_leaves_the_page(
-    make_inversion: Make, shape: tuple[int, int], with_setup: bool, proton_setup: ProtonSetup
-) -> None:
-    inversion = make_inversion(shape, converged=False, warnings=("a long warning " * 20,))
-    figure = report_figure(inversion, proton_setup if with_setup else None, title="Shot 42")
+def assert_nothing_overlaps(figure: Figure) -> None:
     figure.canvas.draw()
     boxes = [axes.get_tightbbox() for axes in panels(figure)]
     texts = [text.get_window_extent() for text in figure.texts]
-    assert len(boxes) == 6
     page = figure.bbox
     for box in boxes + texts:
         assert page.x0 <= box.x0
@@ -56,6 +51,17 @@ def test_no_panel_touches_another_or_leaves_the_page(
         assert box.y1 <= page.y1
     for first, second in combinations(boxes + texts, 2):
         assert not first.overlaps(second)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("with_setup", [False, True])
+def test_no_panel_touches_another_or_leaves_the_page(
+    make_inversion: Make, shape: tuple[int, int], with_setup: bool, proton_setup: ProtonSetup
+) -> None:
+    inversion = make_inversion(shape, converged=False, warnings=("a long warning " * 20,))
+    figure = report_figure(inversion, proton_setup if with_setup else None, title="Shot 42")
+    assert len(panels(figure)) == 6
+    assert_nothing_overlaps(figure)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -190,17 +196,7 @@ def test_no_panel_of_a_fit_touches_another(
         explanation="a long explanation " * 20,
     )
     figure = fit_figure(fit, title=", ".join(["some_shot_of_the_night.tif"] * count))
-    figure.canvas.draw()
-    boxes = [axes.get_tightbbox() for axes in panels(figure)]
-    texts = [text.get_window_extent() for text in figure.texts]
-    page = figure.bbox
-    for box in boxes + texts:
-        assert page.x0 <= box.x0
-        assert box.x1 <= page.x1
-        assert page.y0 <= box.y0
-        assert box.y1 <= page.y1
-    for first, second in combinations(boxes + texts, 2):
-        assert not first.overlaps(second)
+    assert_nothing_overlaps(figure)
     assert len(figure.axes) == len(panels(figure))  # no panel is empty
 
 
@@ -281,3 +277,58 @@ def test_a_fit_without_error_bars_or_misfit_is_no_error(make_fit: MakeFit) -> No
     figure = fit_figure(still)
     figure.canvas.draw()
     assert titles(figure)[-3:] == ["Deflection potential", "Displacement", "Cuts through the peak"]
+
+
+def left_out_of(fit: Fit, limit: float) -> LeaveOneOut:
+    count = len(fit.images)
+    return LeaveOneOut(
+        images=fit.images,
+        mask=fit.mask,
+        predicted=fit.reprojection,
+        residual=fit.residual,
+        gains=fit.gains,
+        chi2=fit.chi2,
+        alone=fit.chi2,
+        limit=np.append(np.full(count - 1, 2.0), limit),
+        rms=fit.chi2,
+        explanation="a sentence",
+    )
+
+
+@pytest.mark.parametrize("count", [3, 7])
+def test_each_image_left_out_has_its_prediction_and_its_residual(
+    make_fit: MakeFit, proton_setup: ProtonSetup, count: int
+) -> None:
+    fit = make_fit(strengths=tuple(np.linspace(1, 2, count)))
+    found = left_out_of(fit, limit=0.5)
+    figure = left_out_figure(found, setups_of(proton_setup, count))
+    shown = titles(figure)
+    assert len(shown) == 3 * count
+    assert shown.count("Prediction") == count
+    for k in range(count):
+        place = shown.index(f"Image {k + 1}: {3 + k} MeV proton")
+        assert shown[place + 2].startswith(f"Residual: χ² {fit.chi2[k]:.3g}")
+        drawn = np.asarray(panels(figure)[place + 2].images[0].get_array())
+        np.testing.assert_allclose(drawn, fit.residual[k] / 0.05)
+    assert sum(title.endswith("not explained") for title in shown) == 1
+    assert "a sentence" in [text.get_text() for text in figure.texts]
+    assert_nothing_overlaps(figure)
+
+
+def test_fields_of_windows_are_side_by_side_on_one_scale(
+    make_fit: MakeFit, proton_setup: ProtonSetup
+) -> None:
+    setups = setups_of(proton_setup, 4)
+    fits = tuple(make_fit(setups=setups[w : w + 2]) for w in range(3))
+    windows = FitWindows(((0, 1), (1, 2), (2, 3)), fits, np.array([[1.0], [0.8], [0.5]]))
+    figure = windows_figure(windows)
+    shown = titles(figure)
+    assert [title.split(",")[0] for title in shown[:3]] == ["3.5 MeV", "4.5 MeV", "5.5 MeV"]
+    assert shown[3].startswith("Cut at")
+    limits = {panel.images[0].get_clim() for panel in panels(figure)[:3]}
+    assert len(limits) == 1
+    # The weakest images have the strongest field.
+    assert limits.pop()[1] == pytest.approx(
+        np.asarray(panels(figure)[2].images[0].get_array()).max()
+    )
+    assert_nothing_overlaps(figure)

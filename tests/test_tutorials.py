@@ -103,9 +103,78 @@ def test_the_recipe_of_the_first_shadowgram_repeats_its_report(
     assert f"{100 * found:.2f} %" in page
 
 
+def test_two_energies_have_the_numbers_of_their_page(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = text_of("two-energies.md")
+    names = run_blocks("two-energies.md")
+    *told, told_by_command = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
+    assert_same_but_for_rounding(capsys.readouterr().out, "".join(told))
+    assert names["found"].verdict == "determined"
+    assert names["one"].verdict == "does not fit"
+    assert names["error"](names["field"].displacement) < 1.2
+    assert names["beam"].std() / names["beam"].mean() == pytest.approx(0.1, abs=0.005)
+    assert names["ratio"].std() < 0.01
+    assert Path("two-energies.png").exists()
+    assert read("two-energies.shadowinv").attrs["verdict"] == "determined"
+
+    (setup,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    Path("setup.toml").write_text(setup, encoding="utf-8")
+    (line,) = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
+    result = CliRunner().invoke(app, shlex.split(line), env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    rows = [" ".join(row.split()) for row in result.output.splitlines()]
+    shown = [" ".join(row.split()) for row in told_by_command.splitlines()]
+    starts = {row.split(" ")[0] for row in shown}
+    rows = [row for row in rows if row.split(" ")[0] in starts]
+    assert_same_but_for_rounding("\n".join(rows), "\n".join(shown))
+    saved = read("14.7MeV_fit.shadowinv")
+    np.testing.assert_allclose(
+        saved.displacement, names["field"].displacement, atol=0.02, err_msg="command and Python"
+    )
+
+
+def test_the_film_pack_has_the_numbers_of_its_page(shared_data, tmp_path, monkeypatch):
+    data = shared_data / "rcf"
+    if not data.is_dir():
+        pytest.skip(f"no films at {data}")
+    monkeypatch.chdir(tmp_path)
+    for file in data.iterdir():
+        Path(file.name).symlink_to(file)
+    page = text_of("film-pack.md")
+    films, told, layers, *_ = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
+    (pack,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    Path("films.csv").write_text(films, encoding="utf-8")
+    Path("pack.toml").write_text(pack, encoding="utf-8")
+    line, *_ = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
+    result = CliRunner().invoke(app, shlex.split(line), env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    assert_same_but_for_rounding(result.output, told)
+    rows = Path("layers/layers.csv").read_text(encoding="utf-8").splitlines()
+    shown = layers.splitlines()
+    assert_same_but_for_rounding("\n".join([*rows[:3], "…", rows[-1]]), "\n".join(shown))
+
+    found = read("pack.shadowinv")
+    by_images = found["layer"].values[found["by_images"].values]
+    assert by_images.tolist() == list(range(1, 9)), "laid by what they show"
+    assert "Films 1 to 8 are laid by what they show" in page
+    assert np.abs(found["shift"].values).max() == pytest.approx(8.3, abs=0.1)
+    assert f"{float(found['peak'][-1]):.1f} MeV" in page
+    nominal = np.genfromtxt("RCF_Stack_Design.csv", delimiter=",", skip_header=2, max_rows=1)[1:]
+    assert np.abs(found["energy"].values / nominal - 1).max() < 0.05
+
+
+def assert_same_but_for_rounding(printed: str, shown: str) -> None:
+    """Compare words exactly, and numbers to 5 per cent or two units of the last digit shown."""
+    number = r"[-+]?\d+(?:\.\d+)?"
+    assert re.sub(number, "#", printed).split() == re.sub(number, "#", shown).split()
+    for here, there in zip(re.findall(number, printed), re.findall(number, shown), strict=True):
+        unit = 10.0 ** -len(there.partition(".")[2])
+        assert float(here) == pytest.approx(float(there), rel=0.05, abs=2 * unit)
+
+
 @pytest.mark.parametrize("page", sorted(FOLDER.glob("*.md")), ids=lambda page: page.stem)
 def test_the_pictures_and_pages_of_a_tutorial_exist(page):
-    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8"))
+    targets = re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text(encoding="utf-8"))
     assert targets
     for target in targets:
         assert (FOLDER / target).exists(), target

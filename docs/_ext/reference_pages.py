@@ -29,7 +29,7 @@ _SHAPES: dict[Any, str] = {Path: "PATH", int: "INTEGER", float: "NUMBER", str: "
 
 MODULES = {
     "preprocessing": "Recipes, steps, filters and source estimates",
-    "preprocessing.film": "Scans of film to dose",
+    "film": "Films, CR-39 and image plates",
     "pipeline": "From a recipe and a shot to a result",
     "physics.phantoms": "Test objects",
     "io": "Files",
@@ -65,6 +65,7 @@ def write_pages(app: Sphinx, config: Config) -> None:
 
 def parameters_page() -> str:
     from napari_shadowinv import FitOptions, InversionOptions
+    from napari_shadowinv.options import FitChoices
     from napari_shadowinv.physics.setup import SETUPS
     from napari_shadowinv.preprocessing import ESTIMATES, STEPS, MeasuredSource
 
@@ -91,6 +92,10 @@ def parameters_page() -> str:
         "In napari under *Options*; in Python the arguments of "
         "{py:class}`~napari_shadowinv.InversionOptions`.",
         table_of(InversionOptions.model_fields),
+        "## Fit choices",
+        "What a fit finds and what is known. In a recipe `[fit]`; on the command line flags of "
+        "`shadowinv fit`. See [](../fit.md).",
+        table_of({k: one for k, one in FitChoices.model_fields.items() if k != "options"}),
         "## Fit options",
         "On the command line flags of `shadowinv fit`; in Python the arguments of "
         "{py:class}`~napari_shadowinv.FitOptions`.",

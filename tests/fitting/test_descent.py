@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import binned, coarser, descend, finer
+from napari_shadowinv.fitting.descent import binned, coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
@@ -189,3 +189,37 @@ def test_descending_takes_no_more_steps_than_allowed(scene: Scene) -> None:
     truth = bump(scene, 1.0)
     given = replace(scene, images=scene.model(truth, scene.ray_counts(truth)))
     assert descend(given, scene.nothing(), iterations=4, least_gain=0)[2] <= 4
+
+
+def test_settling_reaches_where_a_long_descent_ends(scene: Scene) -> None:
+    truth = bump(scene, 1.5)
+    made = scene.model(truth, scene.ray_counts(truth))
+    noisy = made + np.random.default_rng(6).normal(0, 0.05, made.shape)
+    seen = replace(scene, images=noisy)
+    near = truth._replace(potentials=0.99 * truth.potentials)
+    before, _ = seen.value_and_gradient(near, seen.ray_counts(near))
+    found, value, steps, ended = settle(seen, near, steps=8, least_gain=0.1)
+    assert ended
+    assert steps < 8
+    again, _ = seen.value_and_gradient(found, seen.ray_counts(found))
+    assert value == again < before - 300
+    longer, less, _ = descend(seen, near, iterations=400, least_gain=1e-3)
+    assert value - less < 0.5
+    np.testing.assert_allclose(
+        seen.rays.displacement(found.potentials[0]),
+        seen.rays.displacement(longer.potentials[0]),
+        atol=0.03,
+    )
+
+
+def test_settling_goes_on_by_descent_where_its_own_steps_fail(scene: Scene) -> None:
+    """From a fold on the wrong side, steps of a linear model overshoot."""
+    truth = bump(scene, 2.0)
+    made = scene.model(truth, scene.ray_counts(truth))
+    far = truth._replace(potentials=-2 * truth.potentials)
+    seen = replace(scene, images=made)
+    before, _ = seen.value_and_gradient(far, seen.ray_counts(far))
+    _, value, steps, ended = settle(seen, far, steps=60, least_gain=1.0)
+    assert value < before / 3
+    assert steps <= 60
+    assert ended == (steps < 60)

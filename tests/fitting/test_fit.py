@@ -10,7 +10,7 @@ from shots import Displacement, bump, counted, distance, noisy, on_pixels, toget
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitOptions, fit
+from napari_shadowinv.fitting import Fit, FitOptions, compare, fit
 from napari_shadowinv.fitting.measurements import strengths_of
 from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.physics.setup import ProtonSetup
@@ -76,8 +76,9 @@ def test_the_parts_of_a_result_belong_together(found: Fit, folded_shots: list[Fl
     assert found.mask.all()
     slope = np.stack(np.gradient(field.potential))[:, 5:-5, 5:-5]
     assert distance(-slope, field.displacement[:, 5:-5, 5:-5]) < 0.06
-    edge = [field.potential[k] for k in (0, -1)] + [field.potential[:, k] for k in (0, -1)]
-    assert np.concatenate(edge).mean() == pytest.approx(0, abs=1e-9)
+    border = np.ones(field.potential.shape, bool)
+    border[1:-1, 1:-1] = False
+    assert field.potential[border].mean() == pytest.approx(0, abs=1e-9)
     best, *others = found.basins
     assert best.distance == 0
     assert all(best.objective <= other.objective for other in others)
@@ -181,7 +182,7 @@ def test_a_fit_that_runs_out_of_steps_says_so() -> None:
     for steps in (1, 3, 100):
         result = fit(image, noise=0.02, options=FitOptions(samples=0, steps=steps, threads=1))
         assert result.report.converged == (steps == 100)
-        assert 1 <= result.report.iterations <= steps
+        assert result.report.converged or result.report.iterations == steps
 
 
 def test_a_shot_without_the_object_is_one_more_image() -> None:
@@ -204,9 +205,45 @@ def test_an_object_that_the_edge_cuts_is_told(edge: Any) -> None:
     assert "larger field of view" in result.explanation
 
 
+def test_an_unknown_beam_does_not_hide_a_strong_field() -> None:
+    """Of 14.7 and 3 MeV; the beam has to be held until the field is found."""
+    size = (100, 100)
+
+    def beam(y: FloatArray, x: FloatArray) -> FloatArray:
+        v, u = y / 50 - 1, x / 50 - 1
+        return np.exp(0.25 * np.sin(1.9 * u + 0.4) * np.cos(1.4 * v - 0.5) + 0.12 * u)
+
+    ring = bump(2.3, 10, (45, 52))
+    strengths = [1, 2.23]
+    images = [counted(lambda y, x: s * ring(y, x), size, beam=beam) for s in strengths]  # noqa: B023
+    counts = [np.random.default_rng(k).poisson(400 * image) for k, image in enumerate(images)]
+    found = fit(counts, strengths=strengths, source="unknown", noise="poisson", options=PLAIN)
+    assert found.verdict is Verdict.DETERMINED
+    assert distance(found.fields[0].displacement, on_pixels(ring, size)) < 0.02
+
+
 def test_nothing_is_taken_twice() -> None:
     one, other = noisy([counted(WEAK, SIZE), counted(WEAK, SIZE)], 0.02)
-    with pytest.raises(InputError, match="images 1 and 3 are the same"):
+    with pytest.raises(InputError, match="image 1 and image 3 are the same"):
         fit([one, other, 3 * one], strengths=[1, 0.9, 0.8], options=PLAIN)
     with pytest.raises(InputError, match="the source is image 2 itself"):
         fit([one, other], strengths=[1, 0.9], source=other, options=PLAIN)
+
+
+def test_a_field_that_is_not_there_does_not_make_the_images_likelier() -> None:
+    """Images of B alone, at three energies: B before both, E far behind."""
+    setups = [
+        ProtonSetup(
+            source_object_distance=0.01, object_image_distance=0.3, pixel_size=2e-5, energy=energy
+        )
+        for energy in (5, 10, 20)
+    ]
+    weaker = [setups[0].momentum / setup.momentum for setup in setups]
+    images = [counted(lambda y, x: s * WEAK(y, x), SIZE) for s in weaker]  # noqa: B023
+    options = FitOptions(samples=0, spacing=0.25)
+    found = compare(noisy(images, NOISE), setups=setups, noise=NOISE, options=options)
+    assert [len(each.fields) for each in found] == [1, 2, 1]
+    assert found[0].fields[0].name == "B"
+    evidence = [each.report.log_evidence for each in found]
+    assert abs(evidence[1] - evidence[0]) < 10
+    assert evidence[2] < evidence[0] - 100

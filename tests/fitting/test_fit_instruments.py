@@ -51,6 +51,33 @@ def test_a_known_point_spread_is_undone() -> None:
     assert error(told_nothing) > 2 * error(result)
 
 
+def test_a_blur_that_was_not_told_is_noticed() -> None:
+    """It would pass for a weaker field, with a perfect χ²; one image is enough to see it."""
+    size = (80, 80)
+    ring = bump(1.9, 8, (40, 40))
+    for blur in (0.0, 2.0):
+        image = noisy([counted(ring, size, blur=blur)], 0.02)[0]
+        given = {"strengths": None, "noise": 0.02, "source": np.ones(size)}
+        blind, told = (fitted(image, psf=psf, **given) for psf in (0.0, blur))
+        assert blind.chi2.max() < 1.1
+        assert (blind.verdict is Verdict.MISFIT) == (blur > 0)
+        assert ("give the point spread" in blind.explanation) == (blur > 0)
+        assert told.verdict is Verdict.DETERMINED
+        truth = on_pixels(ring, size)
+        assert distance(told.fields[0].displacement, truth) < 0.03
+
+
+def test_one_folded_image_does_not_pass_for_an_answer() -> None:
+    """The field is 20 % wrong, and explains the image to the noise."""
+    size = (80, 80)
+    ring = bump(4.0, 8, (40, 40))
+    image = noisy([counted(ring, size, blur=1.5)], 0.05)[0]
+    given = {"strengths": None, "noise": 0.05, "source": np.ones(size)}
+    found = fitted(image, psf=1.5, **given)
+    assert found.chi2.max() < 1.1
+    assert found.verdict is Verdict.AMBIGUOUS
+
+
 def test_dead_pixels_are_left_out(shots: list[FloatArray]) -> None:
     images = noisy(shots, NOISE)
     mask = np.random.default_rng(3).random(images.shape) > 0.05
@@ -111,6 +138,19 @@ def test_counts_are_weighted_by_what_is_expected(shots: list[FloatArray]) -> Non
     np.testing.assert_allclose(result.chi2, 1, atol=0.12)
     # In the units of what was counted.
     assert result.reprojection.mean() == pytest.approx(np.mean(counts), rel=0.02)
+
+
+def test_answers_to_few_counts_are_compared_by_what_is_expected() -> None:
+    """As if the noise had been given; dim pixels count too much if weighted by their counts."""
+    size = (64, 64)
+    strong = bump(6.0, 6, (31, 31))
+    counts = np.random.default_rng(5).poisson(30 * counted(strong, size))
+    options = FitOptions(samples=0, steps=20, spacing=0.25, smoothness=200, ambiguous=True)
+    source = np.full(size, 30)
+    found = fit(counts, source=source, noise="poisson", options=options)
+    noise = np.sqrt(np.maximum(found.reprojection[0], 1))
+    told = fit(counts, source=source, noise=noise, options=options)
+    assert found.basins[0].objective == pytest.approx(told.basins[0].objective, rel=0.03)
 
 
 def test_sides_may_be_odd_and_unlike() -> None:

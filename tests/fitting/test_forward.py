@@ -141,12 +141,13 @@ def test_pushed_is_the_change_of_residuals(scene: Scene) -> None:
     unknowns = some(scene)
     counts = scene.ray_counts(unknowns)
     change = random_like(unknowns, 2)
+    change.frames[0] = 0
     step = 1e-6
     ahead, behind = (
         scene.model(unknowns.plus(unknowns.like(s * change.flat())), counts) for s in (step, -step)
     )
     expected = np.sqrt(scene.weights) * (ahead - behind) / (2 * step)
-    found = scene.pushed(unknowns, counts, change)
+    found = scene.linear(unknowns, counts).pushed(change)
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
 
 
@@ -157,8 +158,8 @@ def test_pulled_is_the_transpose_of_pushed(scene: Scene) -> None:
     change.frames[0] = 0
     change.beam[scene.prior.beam_weights == 0] = 0
     residuals = np.random.default_rng(4).normal(size=scene.images.shape)
-    pushed = scene.pushed(unknowns, counts, change) * residuals
-    pulled = scene.pulled(unknowns, counts, residuals)
+    pushed = scene.linear(unknowns, counts).pushed(change) * residuals
+    pulled = scene.linear(unknowns, counts).pulled(residuals)
     assert abs(pushed.sum() - along(pulled, change)) < 1e-12 * np.abs(pushed).sum()
 
 
@@ -166,7 +167,7 @@ def test_the_hessian_is_symmetric_and_positive(scene: Scene) -> None:
     unknowns = some(scene)
     counts = scene.ray_counts(unknowns)
     one, other = random_like(unknowns, 5), random_like(unknowns, 6)
-    of_one, of_other = (scene.hessian_times(unknowns, counts, way) for way in (one, other))
+    of_one, of_other = (scene.linear(unknowns, counts).hessian_times(way) for way in (one, other))
     size = np.sqrt(along(one, of_one) * along(other, of_other))
     assert abs(along(other, of_one) - along(one, of_other)) < 1e-12 * size
     assert along(one, of_one) > 0
@@ -188,7 +189,7 @@ def test_the_hessian_is_the_change_of_the_gradient_where_images_are_explained(
         for s in (step, -step)
     )
     expected = (ahead.flat() - behind.flat()) / (2 * step)
-    found = explained.hessian_times(unknowns, counts, change).flat()
+    found = explained.linear(unknowns, counts).hessian_times(change).flat()
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
 
 

@@ -17,7 +17,7 @@ from napari_shadowinv.fitting.measurements import (
     point_spread,
     strengths_of,
 )
-from napari_shadowinv.fitting.options import FitOptions
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 SIZE = (40, 51)
@@ -72,7 +72,7 @@ def nearly_all_masked() -> FloatArray:
         ({"images": np.ones((0, 40, 40))}, r"images have shape \(0, 40, 40\)"),
         ({"images": np.ones((2, 40, 20))}, r"shape \(40, 20\): expected 32 pixels or more"),
         ({"images": with_pixel(np.nan)}, "1 pixels that are NaN or infinite.*: mask them"),
-        ({"images": with_pixel(np.inf)}, "1 pixels that are NaN or infinite"),
+        ({"images": with_pixel(np.inf)}, "image 2 has 1 pixels that are NaN or infinite"),
         ({"images": np.zeros((2, *SIZE))}, "image 1 has no flux: expected a beam"),
         ({"mask": np.ones((51, 40))}, r"mask has shape \(51, 40\): expected \(40, 51\)"),
         ({"mask": nearly_all_masked()}, r"image 2 has 2.5% of its pixels in use: unmask some"),
@@ -151,9 +151,21 @@ def test_one_image_and_an_unknown_source_are_taken_if_asked_for() -> None:
 
 
 def test_a_known_source_leaves_no_beam_to_be_found() -> None:
-    known = given(source=np.ones(SIZE))
+    known = given(source=np.full(SIZE, 4.0))
     assert known.scene.beam_modes == 0
     assert not known.scene.free_gains
+
+
+def test_a_source_in_other_units_is_refused_unless_gains_are_free() -> None:
+    """Or given: a tenth as bright, and what is found later comes on top of ten."""
+    source = np.full(SIZE, images()[0].mean() / 10)
+    with pytest.raises(InputError, match="image 1 is 10 times as bright as its source"):
+        given(source=source)
+    free = given(source=source, gains="free")
+    expected = images().mean(axis=(1, 2)) / source.mean()
+    np.testing.assert_allclose(free.gains, expected)
+    np.testing.assert_allclose(free.units, images().mean(axis=(1, 2)))
+    np.testing.assert_allclose(given(source=source, gains=expected).gains, expected)
 
 
 @pytest.mark.parametrize(("second", "single"), [(1.0, True), (0.95, True), (0.8, False)])

@@ -37,10 +37,9 @@ def weak_scene(size: tuple[int, int], smoothness: tuple[float, float]) -> Scene:
 
 def dense_hessian(scene: Scene, unknowns: Unknowns) -> tuple[FloatArray, FloatArray]:
     """Column by column; and which unknowns are free."""
-    counts = scene.ray_counts(unknowns)
+    linear = scene.linear(unknowns, scene.ray_counts(unknowns))
     columns = [
-        scene.hessian_times(unknowns, counts, unknowns.like(unit)).flat()
-        for unit in np.eye(unknowns.flat().size)
+        linear.hessian_times(unknowns.like(unit)).flat() for unit in np.eye(unknowns.flat().size)
     ]
     matrix = np.stack(columns, axis=1)
     return matrix, np.flatnonzero(np.diag(matrix))
@@ -121,7 +120,10 @@ def test_the_log_volume_falls_by_that_of_better_data(
     exact = [half_log_determinant(one) for one in (matrix, dense)]
     found = [
         np.mean(
-            [Posterior(one, unknowns, np.random.default_rng(seed)).log_volume() for seed in (4, 5)]
+            [
+                Posterior(one, unknowns, rng).log_volume([rng])
+                for rng in map(np.random.default_rng, (4, 5))
+            ]
         )
         for one in (scene, better)
     ]

@@ -25,6 +25,7 @@ def prior() -> Prior:
         tie=2.0,
         decay=15.0,
         beam_modes=4,
+        beam_spread=0.3,
         fiducials=Fiducials(
             np.array([[9.3, 11.2], [20.0, 30.5]]),
             np.array([[0.3, -0.2], [1.0, 0.4]]),
@@ -115,7 +116,7 @@ def test_smoothness_holds_the_squared_derivatives_of_a_cosine(which: int, power:
     """½ λ ∫ |k⁴ a cos(kx)|², half of that on average, for λ; k⁶ for κ."""
     smoothness = np.zeros((1, 2))
     smoothness[0, which] = 7.0
-    prior = Prior(RayModel(SIZE, PAD), np.ones(1), smoothness, 0.0, np.inf, 0, None, 1)
+    prior = Prior(RayModel(SIZE, PAD), np.ones(1), smoothness, 0.0, np.inf, 0, 0.3, None, 1)
     rows, columns = prior.rays.shape
     like = nothing(prior)
     wave = np.pi * 5 / (columns * KNOT)
@@ -126,7 +127,7 @@ def test_smoothness_holds_the_squared_derivatives_of_a_cosine(which: int, power:
 
 
 def test_the_strip_ties_the_potential_and_the_image_does_not() -> None:
-    prior = Prior(RayModel(SIZE, PAD), np.ones(1), np.zeros((1, 2)), 2.0, 15.0, 0, None, 1)
+    prior = Prior(RayModel(SIZE, PAD), np.ones(1), np.zeros((1, 2)), 2.0, 15.0, 0, 0.3, None, 1)
     y, x = places(prior)
     inside, outside = nothing(prior), nothing(prior)
     inside.potentials[0] = np.maximum(0, 1 - ((y - 12) ** 2 + (x - 16) ** 2) / 60)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry import triangulation as module
 from napari_shadowinv.geometry._mesh import LIMIT
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
@@ -478,6 +478,32 @@ def test_hilbert_order_is_a_permutation_with_short_steps() -> None:
     steps = np.abs(np.diff(points[order], axis=0)).sum(axis=1)
     assert np.all(steps == 1)
     np.testing.assert_array_equal(hilbert_order(points[order]), np.arange(4096))
+
+
+def test_building_in_parts_gives_the_same_triangles(monkeypatch: pytest.MonkeyPatch) -> None:
+    sites = np.random.default_rng(0).random((1000, 2))
+    weights = np.random.default_rng(1).random(1000) / 500
+    whole = RegularTriangulation(sites, weights)
+    monkeypatch.setattr(module, "_PART", 150)
+    signs: list[int] = []
+    parts = RegularTriangulation(sites, weights, alive=lambda: signs.append(1))
+    assert len(signs) == 7
+    np.testing.assert_array_equal(parts.vertices, whole.vertices)
+    np.testing.assert_array_equal(parts.hidden, whole.hidden)
+
+
+def test_building_ends_when_a_sign_of_life_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_PART", 150)
+    signs: list[int] = []
+
+    def stopped() -> None:
+        signs.append(1)
+        if len(signs) == 2:
+            raise InversionCancelled("stopped")
+
+    with pytest.raises(InversionCancelled):
+        RegularTriangulation(np.random.default_rng(0).random((1000, 2)), alive=stopped)
+    assert len(signs) == 2
 
 
 def test_arrays_cannot_be_written() -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -101,10 +102,35 @@ def test_every_variable_has_units_and_a_name(make_fit: MakeFit) -> None:
     assert "path_integrated_b_E" not in dataset
 
 
-@pytest.mark.parametrize("ending", ["h5", "csv", "tif"])
+@pytest.mark.parametrize("ending", ["csv", "tif"])
 def test_other_formats_are_refused(tmp_path: Path, make_fit: MakeFit, ending: str) -> None:
-    with pytest.raises(FileFormatError, match=rf"ending is '.{ending}', expected one of .shadowi"):
+    with pytest.raises(FileFormatError, match=rf"ending is '.{ending}', expected one of .h5"):
         write(tmp_path / f"fit.{ending}", make_fit())
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_field_of_a_fit_is_written_as_pradformat_with_its_verdict(
+    tmp_path: Path, make_fit: MakeFit
+) -> None:
+    fit = make_fit(setups=(protons(14.7), protons(5.0)), verdict=Verdict.SEVERAL)
+    write(tmp_path / "fit.h5", fit)
+    again = read(tmp_path / "fit.h5")
+    assert isinstance(again, xr.Dataset)
+    setup = setup_from_dataset(again)
+    assert isinstance(setup, ProtonSetup)
+    assert setup.energy == pytest.approx(14.7)
+    assert setup.object_pixel_size == pytest.approx(protons(14.7).object_pixel_size)
+    np.testing.assert_allclose(again["displacement"], fit.fields[0].displacement, rtol=1e-12)
+    np.testing.assert_allclose(again["potential"], fit.fields[0].potential, rtol=1e-12)
+    with h5py.File(tmp_path / "fit.h5") as file:
+        assert file.attrs["description"].endswith(": one of several")
+
+
+def test_what_pradformat_cannot_hold_of_a_fit_is_refused(tmp_path: Path, make_fit: MakeFit) -> None:
+    with pytest.raises(InputError, match=r"holds one field, received B and E: write .shadowinv"):
+        write(tmp_path / "fit.h5", make_fit(names=("B", "E"), setups=(protons(3), protons(5))))
+    with pytest.raises(InputError, match="needs a setup of kind 'proton'"):
+        write(tmp_path / "fit.h5", make_fit())
     assert not list(tmp_path.iterdir())
 
 

@@ -12,11 +12,13 @@ import pytest
 pytest.importorskip("napari")
 
 from napari.components import ViewerModel
+from simulated_pack import Truth, simulate
 
 from napari_shadowinv import InversionOptions, invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
+from napari_shadowinv.pipeline import read_pack, run_film
 
 
 @pytest.fixture
@@ -33,6 +35,18 @@ def solved() -> Inversion:
     """A small inversion that was really solved, of an object without symmetry."""
     image = synthetic_image(ellipse_pair((40, 52)).displacement)
     return invert(image, options=InversionOptions(n_sites=500))
+
+
+@pytest.fixture(scope="session")
+def film_pack(tmp_path_factory: pytest.TempPathFactory) -> Truth:
+    """Scans of three small films, and what describes them."""
+    folder = tmp_path_factory.mktemp("films") / "trio"
+    return simulate(folder, layers=3, shape=(80, 100), strata=4, seed=2)
+
+
+@pytest.fixture(scope="session")
+def pack_dataset(film_pack: Truth) -> Any:
+    return run_film(read_pack(film_pack.pack))
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
-from napari_shadowinv import InputError, ProtonSetup, invert
+from napari_shadowinv import InputError, InversionOptions, ProtonSetup, add_inversion, fit, invert
 from napari_shadowinv._napari import commands
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of
 from napari_shadowinv._napari.shots import shot_layer
@@ -87,6 +87,35 @@ def test_a_wrong_layer_is_one_sentence(viewer: ViewerModel, command: Any) -> Non
         command(viewer.add_points(np.zeros((2, 2))))
     with pytest.raises(InputError, match="'colours' is a colour image: select a grey image"):
         command(viewer.add_image(np.zeros((5, 6, 3)), rgb=True, name="colours"))
+
+
+def test_what_shows_no_inversion_is_not_refined(viewer: ViewerModel, shot: np.ndarray) -> None:
+    with pytest.raises(InputError, match="no layer is selected: select a layer of an inversion"):
+        commands.refine(None)
+    with pytest.raises(InputError, match="'shot' shows no inversion: select a layer of an"):
+        commands.refine(add_shot(viewer, shot))
+
+
+def test_an_inversion_is_refined_from_any_of_its_layers(
+    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup
+) -> None:
+    inversion = invert(shot, options=InversionOptions(n_sites=500))
+    layers = add_inversion(viewer, inversion, proton_setup, name="shot", translate=(30.0, 60.0))
+    arrows = next(layer for layer in layers if role_of(layer) == "arrows")
+    described = {role_of(one): (data, one) for data, one, _ in commands.refine(arrows, viewer)}
+    data, keywords = described["field"]
+    expected = fit(
+        inversion.image,
+        setups=[proton_setup],
+        source=inversion.source,
+        mask=inversion.mask,
+        start=inversion.potential,
+    )
+    field = proton_setup.path_integrated_b(expected.fields[0].displacement)
+    np.testing.assert_allclose(data, 1e6 * np.hypot(*field), rtol=1e-6, atol=1e-6 * data.max())
+    assert keywords["name"].startswith("shot refined ")
+    assert keywords["translate"] == (30.0, 60.0)
+    assert "uncertainty" in described
 
 
 def registered(name: str) -> Any:

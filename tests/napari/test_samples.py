@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from napari.components import ViewerModel
+from qtpy.QtCore import QSettings
 
 from napari_shadowinv import OpticalSetup, ProtonSetup
 from napari_shadowinv._napari import samples
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, source_of
+from napari_shadowinv._napari.widgets.fit_images import FitImages
+from napari_shadowinv.fitting import FitOptions, Verdict
 from napari_shadowinv.physics.forward import synthetic_image
 
 SHOTS = ("toroid", "toroid_with_caustics", "four_toroids", "coaxial_line")
 
 
-@pytest.mark.parametrize("name", [*SHOTS, "wakefield_run"])
+@pytest.mark.parametrize("name", [*SHOTS, "two_energies", "wakefield_run"])
 def test_each_opens_within_two_seconds(viewer: ViewerModel, name: str) -> None:
     synthetic_image(np.zeros((2, 8, 8)))  # compiles its kernels
     start = time.thread_time()
@@ -48,8 +54,46 @@ def test_caustics_are_where_the_name_promises_them() -> None:
     assert below.max() < 8 * below.mean()
 
 
+def test_two_energies_are_one_object_in_one_beam_that_is_not_told(viewer: ViewerModel) -> None:
+    films = viewer.open_sample("napari-shadowinv", "two_energies")
+    setups: Any = [setup_of(film) for film in films]
+    assert [setup.energy for setup in setups] == [14.7, 3.0]
+    assert setups[0].object_pixel_size == setups[1].object_pixel_size
+    assert [role_of(film) for film in films] == ["shot", "shot"]
+    assert all(source_of(film) is None for film in films)
+    # Corners show the beam: uneven by tens of per cent, and alike in both films but for a factor.
+    ends = slice(None, 12), slice(-12, None)
+    corners = [[film.data[row, column].mean() for row in ends for column in ends] for film in films]
+    shares = np.array(corners) / np.mean(corners, axis=1, keepdims=True)
+    assert np.ptp(shares[0]) > 0.2
+    np.testing.assert_allclose(shares[0], shares[1], atol=0.05)
+
+
+def test_two_energies_are_fitted_as_they_open(
+    make_napari_viewer: Callable[[], Any], tmp_path: Path
+) -> None:
+    QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(tmp_path))
+    viewer = make_napari_viewer()
+    viewer.open_sample("napari-shadowinv", "two_energies")
+    tool = FitImages(viewer)
+    tool.source.picker.set_kind("unknown")
+    tool.noise.setCurrentIndex(tool.noise.findData("poisson"))
+    job = tool.request()
+    assert job.names == ("14.7 MeV", "3 MeV")
+    setups: Any = [shot.setup for shot in job.shots]
+    assert [setup.energy for setup in setups] == [14.7, 3.0]
+    choices = job.choices.model_copy(update={"options": FitOptions(samples=0)})
+    found = replace(job, recipe=job.recipe.model_copy(update={"fit": choices})).fitted()
+    assert found.verdict is Verdict.DETERMINED
+    (field,) = found.fields
+    strength = np.hypot(*setups[0].path_integrated_b(field.displacement, "MG um"))
+    assert strength.max() == pytest.approx(30.3, rel=0.02)
+    unevenness = found.source[0].std() / found.source[0].mean()
+    assert unevenness == pytest.approx(0.103, rel=0.05)
+
+
 def test_the_same_sample_is_the_same_every_time() -> None:
-    for make in (samples.four_toroids, samples.coaxial_line):
+    for make in (samples.four_toroids, samples.coaxial_line, samples.two_energies):
         np.testing.assert_array_equal(make()[-1][0], make()[-1][0])
 
 

@@ -18,10 +18,10 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
+from command_line import flat, shadowinv
 from napari_shadowinv import InversionOptions, invert, read
-from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.preprocessing import Provenance
 
@@ -40,14 +40,6 @@ source_object_distance = 0.01
 object_image_distance = 0.3
 pixel_size = 1e-5
 """
-
-
-def shadowinv(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def flat(text: str) -> str:
-    return " ".join(text.split())
 
 
 @pytest.fixture

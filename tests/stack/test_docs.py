@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from napari_shadowinv import invert
 from napari_shadowinv.cli import app
+from napari_shadowinv.pipeline.shot_table import ShotRow
 
 PAGE = (Path(__file__).parents[2] / "docs" / "batch.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^    (shadowinv [^#\n]*)", PAGE, re.MULTILINE)
@@ -36,6 +37,14 @@ def test_the_python_blocks_make_what_they_promise(folder, night):
     alone = invert(tifffile.imread("shots/shot_3.tif"), source=tifffile.imread("reference.tif"))
     assert float(names["one"].max()) == pytest.approx(alone.potential.max())  # type: ignore[attr-defined]
     assert list(names["later"].status) == [1] * 6  # type: ignore[attr-defined]
+
+
+def test_the_columns_of_a_table_are_those_of_its_model():
+    (section,) = re.findall(r"^## Each shot with .*?(?=^## )", PAGE, re.DOTALL | re.MULTILINE)
+    listed = re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
+    only_fits = {"strength", "psf", "noise", "shot"}
+    assert {*listed} == ShotRow.model_fields.keys() - only_fits
+    assert all(f"`{name}`" in section for name in only_fits)
 
 
 def test_the_commands_work_as_shown(folder, night):

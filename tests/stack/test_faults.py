@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import distributed
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
@@ -268,6 +269,21 @@ def test_workers_that_die_of_what_all_shots_share_end_the_run_and_blame_no_shot(
             engine.result(Future("beam-of-all"))
         with pytest.raises(_engines.WorkerDied):
             engine.result(Future("a-shot"))
+
+
+def test_a_result_lost_with_its_worker_is_waited_for(night, out, expected, cluster, monkeypatch):
+    result, slow = distributed.Future.result, Counter()
+
+    def made_again(future, timeout=None):
+        slow[future.key] += 1
+        if slow[future.key] == 1:
+            raise TimeoutError
+        return result(future, timeout)
+
+    monkeypatch.setattr(distributed.Future, "result", made_again)
+    night.run(out, scheduler=cluster.scheduler_address)
+    assert set(slow.values()) == {2}
+    assert content(out) == expected
 
 
 class Dask:

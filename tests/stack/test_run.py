@@ -22,7 +22,9 @@ from napari_shadowinv import (
     run_stack,
 )
 from napari_shadowinv.inversion import compilation
+from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
+from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import read_shot
 from napari_shadowinv.stack._references import described_reader
 
@@ -331,3 +333,13 @@ def test_a_reader_is_known_by_where_it_comes_from_and_its_choices():
     chosen = partial(read_shot, factor=2, channel="red")
     assert described_reader(chosen) == "napari_shadowinv.read_shot(channel='red', factor=2)"
     assert described_reader(np.load) == "numpy.load"
+
+
+def test_fields_of_binned_shots_have_the_units_of_binned_pixels(night, out, optical_setup):
+    arguments = {"source": night.source, "options": OPTIONS, "setup": optical_setup}
+    arguments["filters"] = (Bin(factor=2),)
+    written = run_stack(night.images[:1], out, dtype="float64", **arguments)
+    lazy = invert_stack(night.images[:1], **arguments)
+    angle = lazy["deflection_angle"].values
+    np.testing.assert_allclose(written["deflection_angle"], angle, rtol=1e-12)
+    assert setup_from_dataset(written).object_pixel_size == 2 * optical_setup.object_pixel_size

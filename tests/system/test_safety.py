@@ -18,9 +18,9 @@ from scipy.io import savemat
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import LIMIT_VARIABLE, refusing_damage, size_limit
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
+from napari_shadowinv.film import Calibration
 from napari_shadowinv.io import read, read_toml
 from napari_shadowinv.io.reading import read_radiograph
-from napari_shadowinv.preprocessing.film import Calibration
 
 IMAGE = np.random.default_rng(0).poisson(300, (40, 50)).astype(np.uint16)
 

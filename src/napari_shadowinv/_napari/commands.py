@@ -51,6 +51,24 @@ def invert_uniform(
 
 
 @notifications.notify_errors(otherwise=list)
+def refine(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> list[napari.types.LayerDataTuple]:
+    """Fit the forward model to the image of the selected inversion; in a window by Invert shot."""
+    if layer is None:
+        raise InputError("no layer is selected: select a layer of an inversion's result")
+    from napari_shadowinv._napari.fit_jobs import name_of_result, refinement
+
+    name = name_of_result([layer] if viewer is None else viewer.layers, layer)
+    job = refinement(layer, layer, name, psf=0.0)
+    if viewer is None or not notifications.in_event_loop():
+        return list(job.run(lambda _: None, lambda: False).described)
+    _, tool = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert shot")
+    tool.refine_layer(layer)
+    return []
+
+
+@notifications.notify_errors(otherwise=list)
 def remove_hot_pixels(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, mark, role_of
+from napari_shadowinv._napari.layer_metadata import KEY, Result, mark, role_of
 from napari_shadowinv._napari.layers import (
+    KINDS,
     FullLayerData,
     dataset_layers,
     intensity_limits,
-    result_layers,
     symmetric_limits,
 )
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import FIELDS
 
 if TYPE_CHECKING:
@@ -27,50 +26,61 @@ if TYPE_CHECKING:
 
 # In another answer only what differs is of interest.
 _COMPARED = ("field", "arrows")
+_KINDS = {kind.role: kind for kind in KINDS if kind.shown_of != "stack"}
+_SAME_BEAM = 1e-6  # of the beam's mean, but for a gain
 
 
 def fit_layers(
-    fit: Fit,
-    frame: Frame,
-    name: str,
-    *,
-    with_source: bool = False,
-    attributes: Mapping[str, str] | None = None,
+    result: Result, frame: Frame, name: str, *, alone: bool = False
 ) -> list[FullLayerData]:
-    """Describe the layers of a fit, the lowest first; of several fields the first is visible."""
-    setup = setup_of_fit(fit)
-    layers = _image_layers(fit, frame, name, with_source)
+    """Describe the layers of a fit, the lowest first; of several fields the first is visible.
+
+    A fit that comes `alone`, as from a file, has layers of its images and of all other answers.
+    """
+    fit = _fit_of(result)
+    facts = _facts(result, fit)
+    layers = _image_layers(fit, frame, name, facts, with_images=alone)
+    if alone:
+        for number in range(len(fit.basins) - 1, 0, -1):
+            for layer in answer_layers(result, number, frame, name):
+                layer[1]["visible"] = False
+                layers.append(layer)
     for number, field in reversed(list(enumerate(fit.fields))):
-        # A layer stands for its field: each can be saved, and projected, alone.
-        one = slice(number, number + 1)
-        basins = (replace(b, displacement=b.displacement[one]) for b in fit.basins)
-        alone = replace(fit, fields=(field,), strengths=fit.strengths[:, one], basins=tuple(basins))
-        content = alone.to_dataset(attributes=attributes)
-        described = result_layers(
-            Result(content, setup, dict(attributes or {})), frame, _titled(name, fit, field)
-        )
-        layers += _parted(described, number, field)
+        variables: dict[str, Any] = {
+            "potential": (("y", "x"), field.potential),
+            "displacement": (("component", "y", "x"), field.displacement),
+        }
+        if field.uncertainty is not None:
+            variables["displacement_uncertainty"] = ("component", "y", "x"), field.uncertainty
+        titled = _titled(f"{name}{doubt_in_words(fit)}", fit, field)
+        described = _field_layers(variables, field, setup_of_fit(fit), frame, titled, facts)
+        if number:
+            _part(described, field.name)
+        for _, keywords, _ in described:
+            keywords["visible"] &= number == 0
+        layers += described
     return layers
 
 
-def answer_layers(fit: Fit, number: int, frame: Frame, name: str) -> list[FullLayerData]:
+def answer_layers(result: Result, number: int, frame: Frame, name: str) -> list[FullLayerData]:
     """Describe the fields of another answer, the one of the fit's basin `number`."""
-    import xarray as xr
-
+    fit = _fit_of(result)
     basin = fit.basins[number]
     layers: list[FullLayerData] = []
     for m, field in reversed(list(enumerate(fit.fields))):
         displacement = _full_size(basin.displacement[m], field.potential.shape)
-        described = dataset_layers(
-            xr.Dataset({"displacement": (("component", "y", "x"), displacement)}),
+        described = _field_layers(
+            {"displacement": (("component", "y", "x"), displacement)},
+            field,
             setup_of_fit(fit),
             frame,
             _titled(f"{name} {start_in_words(basin)}", fit, field),
-            {},
-            deflector=FIELDS[field.name],
+            _facts(result, fit),
         )
         kept = [layer for layer in described if role_of(layer[1]) in _COMPARED]
-        layers += _parted(kept, m, field)
+        for _, keywords, _ in kept:
+            keywords["visible"] &= m == 0
+        layers += _part(kept, f"{field.name} {number}")
     return layers
 
 
@@ -79,61 +89,101 @@ def start_in_words(basin: Basin) -> str:
     return "from the inversion" if basin.start == "given" else basin.start
 
 
+def doubt_in_words(fit: Fit) -> str:
+    """Return what a name has after it unless the fields are determined, the verdict."""
+    from napari_shadowinv.fitting import Verdict
+
+    return "" if fit.verdict is Verdict.DETERMINED else f" ({fit.verdict.value})"
+
+
+def verdict_in_words(fit: Fit) -> str:
+    """Return the verdict and why, in a sentence."""
+    return f"the fit's verdict is '{fit.verdict.value}': {fit.explanation}"
+
+
 def setup_of_fit(fit: Fit) -> Setup | None:
     """Return the experiment that the fields are told in: that of the first image."""
     return fit.setups[0] if fit.setups else None
+
+
+def _fit_of(result: Result) -> Fit:
+    from napari_shadowinv.fitting import Fit
+
+    assert isinstance(result.content, Fit)
+    return result.content
+
+
+def _facts(result: Result, fit: Fit) -> dict[str, Any]:
+    """What all layers of a fit know about it."""
+    return {
+        "result": result,
+        "made_from": dict(result.attributes),
+        "verdict": fit.verdict.value,
+        "explanation": fit.explanation,
+    }
 
 
 def _titled(name: str, fit: Fit, field: FittedField) -> str:
     return name if len(fit.fields) == 1 else f"{name} {field.name}"
 
 
-def _parted(
-    described: Sequence[FullLayerData], number: int, field: FittedField
+def _field_layers(
+    variables: dict[str, Any],
+    field: FittedField,
+    setup: Setup | None,
+    frame: Frame,
+    name: str,
+    facts: dict[str, Any],
 ) -> list[FullLayerData]:
-    """Tell the layers of a further field from those of the first, and hide them."""
-    if number == 0:
-        return list(described)
+    import xarray as xr
+
+    facts = {**facts, "displacement": variables["displacement"][1]}
+    dataset = xr.Dataset(variables)
+    return dataset_layers(dataset, setup, frame, name, facts, deflector=FIELDS[field.name])
+
+
+def _part(described: Sequence[FullLayerData], part: str) -> list[FullLayerData]:
+    """Tell layers from those of the first field."""
     for _, keywords, _ in described:
-        keywords["metadata"][KEY]["part"] = field.name
-        keywords["visible"] = False
+        keywords["metadata"][KEY]["part"] = part
     return list(described)
 
 
-def _image_layers(fit: Fit, frame: Frame, name: str, with_source: bool) -> list[FullLayerData]:
-    """Hidden layers of the beam, if it was fitted, and of how the images are explained."""
+def _image_layers(
+    fit: Fit, frame: Frame, name: str, facts: dict[str, Any], *, with_images: bool
+) -> list[FullLayerData]:
+    """Hidden layers of the beam, if it is uneven, and of how the images are explained."""
     setup = setup_of_fit(fit)
-    limits = intensity_limits(fit.images[0])
+    grey = intensity_limits(fit.images[0])
     means = [image[use].mean() for image, use in zip(fit.images, fit.mask, strict=True)]
     percent = 100 * fit.residual / np.array(means)[:, None, None]
-
-    def described(data: AnyArray, role: str, title: str, unit: str, **look: Any) -> FullLayerData:
+    shown = {"reprojection": (fit.reprojection, grey), "residual": (percent, None)}
+    if np.ptp(fit.source[0]):
+        shown = {"source": (_without_gains(fit.source), grey), **shown}
+    if with_images:
+        shown = {"image": (fit.images, grey), **shown}
+    layers: list[FullLayerData] = []
+    for role, (planes, limits) in shown.items():
+        kind = _KINDS[role]
+        data = planes[0] if len(planes) == 1 else planes
         keywords = {
-            "name": f"{name} {title}",
-            "metadata": mark(role, unit, setup),
+            "name": f"{name} {kind.title}",
+            "metadata": mark(role, kind.unit, setup, **facts),
             "visible": False,
             **frame.keywords(stacked=data.ndim == 3),
-            **look,
+            "colormap": kind.colormap,
+            "contrast_limits": limits or symmetric_limits(planes[0]),
         }
         if data.ndim == 3:
             keywords["axis_labels"] = ("image", "y", "x")
-        return data, keywords, "image"
-
-    grey = {"colormap": "gray", "contrast_limits": limits}
-    red_blue = {"colormap": "RdBu_r", "contrast_limits": symmetric_limits(percent[0])}
-    layers = [
-        described(
-            _unstacked(fit.reprojection), "reprojection", "re-projection", "flux/px²", **grey
-        ),
-        described(_unstacked(percent), "residual", "residual (% of mean)", "%", **red_blue),
-    ]
-    if with_source:
-        layers.insert(0, described(fit.source[0], SOURCE, "fitted source", "flux/px²", **grey))
+        layers.append((data, keywords, "image"))
     return layers
 
 
-def _unstacked(planes: FloatArray) -> FloatArray:
-    return planes[0] if len(planes) == 1 else planes
+def _without_gains(beams: FloatArray) -> FloatArray:
+    """The first beam only, where all are the same but for a factor."""
+    scaled = beams / beams.mean(axis=(1, 2), keepdims=True)
+    return beams[:1] if np.abs(scaled - scaled[0]).max() < _SAME_BEAM else beams
 
 
 def _full_size(displacement: FloatArray, shape: tuple[int, ...]) -> FloatArray:

@@ -76,11 +76,16 @@ def frame_for(
     scale: Sequence[float] | None = None,
     translate: Sequence[float] | None = None,
     units: Sequence[str] | None = None,
+    pixel_size: float | None = None,
 ) -> Frame:
-    """Choose a frame in µm, in mm for more than 1 cm, or in pixels; what is given goes before."""
+    """Choose a frame in µm, in mm for more than 1 cm, or in pixels; what is given goes before.
+
+    Without a setup, `pixel_size` (m) may be known.
+    """
     frame = Frame()
-    if setup is not None:
-        pixel, unit = setup.object_pixel_size * 1e6, "um"
+    side = pixel_size if setup is None else setup.object_pixel_size
+    if side is not None:
+        pixel, unit = side * 1e6, "um"
         if max(shape[-2:]) * pixel > _LONGEST_IN_MICROMETRES:
             pixel, unit = pixel * 1e-3, "mm"
         frame = Frame(scale=(pixel, pixel), units=(unit, unit))

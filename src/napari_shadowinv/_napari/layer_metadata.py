@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     import xarray
 
+    from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
 
@@ -30,7 +31,7 @@ CAME_WITH = "came with"
 class Result:
     """What the layers of one result show, whole: all that is needed to write it."""
 
-    content: Inversion | xarray.Dataset  # a dataset where a file holds no more than a field
+    content: Inversion | Fit | xarray.Dataset  # a dataset where a file holds only a field
     setup: Setup | None = None
     attributes: Mapping[str, str] = field(default_factory=dict)  # words about its origin
 
@@ -51,6 +52,11 @@ def mark_of(layer: Any) -> dict[str, Any]:
 def role_of(layer: Any) -> str | None:
     """Return what a layer shows, such as ``"potential"``; None for a layer of other origin."""
     return mark_of(layer).get("role")
+
+
+def slot_of(layer: Any) -> str:
+    """Return what tells a layer from all others of its result: its role, and its `part`, if any."""
+    return f"{role_of(layer)} {mark_of(layer).get('part', '')}".strip()
 
 
 def unit_of(layer: Any) -> str:
@@ -100,6 +106,22 @@ def result_of(layer: Any) -> Result | None:
     """Return the result that a layer shows a part of, None for any other layer."""
     found = mark_of(layer).get("result")
     return found if isinstance(found, Result) else None
+
+
+def displacement_of(layer: Any) -> FloatArray | None:
+    """Return the displacement in px that a layer of a result stands for, None for any other."""
+    result, own = result_of(layer), mark_of(layer).get("displacement")
+    if own is not None or result is None:
+        return own
+    content: Any = result.content
+    found = getattr(content, "displacement", None)  # a film pack has none
+    return None if found is None else np.asarray(found)
+
+
+def usable_of(layer: Any) -> BoolArray | None:
+    """Return the usable pixels that came with an image, None if all are, or nobody knows."""
+    found = mark_of(layer).get("usable")
+    return None if found is None else np.asarray(found, dtype=np.bool_)
 
 
 def source_of(layer: Any) -> FloatArray | None:

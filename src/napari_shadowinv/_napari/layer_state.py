@@ -9,19 +9,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._napari.frame import frame_for, matrix_of
-from napari_shadowinv._napari.layer_metadata import Result, role_of
+from napari_shadowinv._napari.fit_layers import fit_layers, verdict_in_words
+from napari_shadowinv._napari.frame import Frame, frame_for, matrix_of
+from napari_shadowinv._napari.layer_metadata import Result, role_of, slot_of
 from napari_shadowinv._napari.layers import FullLayerData, result_layers
-from napari_shadowinv.inversion.labels import is_fit, setup_from_dataset
+from napari_shadowinv._napari.packs import pack_frame, pack_layers, pack_result, warnings_of_pack
+from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
 
 if TYPE_CHECKING:
     import xarray
+
+    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.inversion import Inversion
 
 _LOOKS = "napari_layers"
 
 # Attributes that the dataset of a result makes anew.
 _OWN_ATTRIBUTES = {_LOOKS, "format", "options", "report", "image_residual"}
 _OWN_ATTRIBUTES |= {"setup", "provenance", "package_version", "created"}
+_OWN_ATTRIBUTES |= {"verdict", "explanation", "folded", "fields", "setups"}
 
 _PLACE = ("scale", "translate", "units")
 _TURN = ("rotate", "shear", "affine")
@@ -35,51 +41,102 @@ _KEPT: dict[str, tuple[str, ...]] = {
 _KEPT_BY_ALL = ("name", "visible", "opacity", "blending", *_PLACE, *_TURN)
 
 
+def layers_of_result(
+    result: Result, frame: Frame, name: str = "", *, cells: bool = False
+) -> list[FullLayerData]:
+    """Describe the layers of any result, the lowest first."""
+    from napari_shadowinv.fitting import Fit
+
+    if isinstance(result.content, Fit):
+        return fit_layers(result, frame, name, alone=True)
+    if _is_pack(result):
+        return pack_layers(result, frame, name)
+    return result_layers(result, frame, name, cells=cells)
+
+
 def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]:
     """Describe the layers of a result as they were saved; those that were not are hidden."""
-    from napari_shadowinv.inversion import Inversion
-
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
+    if is_pack(dataset.attrs):
+        layers = pack_layers(pack_result(dataset), pack_frame(dataset), name)
+        return _looking(layers, looks)
     setup = setup_from_dataset(dataset)
-    inverted = "report" in dataset.attrs and not is_fit(dataset.attrs)
     result = Result(
-        Inversion.from_dataset(dataset) if inverted else dataset,
+        _content(dataset),
         setup,
         {key: value for key, value in dataset.attrs.items() if key not in _OWN_ATTRIBUTES},
     )
     place = next(iter(looks.values()), {})
-    shape = dataset["displacement"].shape[-2:]
+    shape = dataset.sizes["y"], dataset.sizes["x"]
     frame = frame_for(shape, setup, **{key: place.get(key) for key in _PLACE})
     if all(name in place for name in _TURN):  # not in files of older versions
         frame = replace(
             frame,
-            rotate=matrix_of(place["rotate"]),
+            rotate=matrix_of(np.array(place["rotate"])[-2:, -2:]),
             shear=float(place["shear"][-1]),
-            affine=matrix_of(place["affine"]),
+            affine=matrix_of(np.array(place["affine"])[-3:, -3:]),
         )
-    layers = result_layers(result, frame, name, cells="cells" in looks)
+    return _looking(layers_of_result(result, frame, name, cells="cells" in looks), looks)
+
+
+def _looking(layers: list[FullLayerData], looks: dict[str, dict[str, Any]]) -> list[FullLayerData]:
+    """Layers as they looked; those that were not there are hidden."""
     if not looks:
         return layers
     hidden = {"visible": False}
     return [
-        (data, keywords | looks.get(role_of(keywords) or "", hidden), kind)
+        (data, keywords | looks.get(slot_of(keywords), hidden), kind)
         for data, keywords, kind in layers
     ]
+
+
+def doubts_of(result: Result) -> tuple[str, ...]:
+    """Return why a result may be wrong, in sentences; nothing where there is no reason."""
+    from napari_shadowinv.fitting import Fit, Verdict
+    from napari_shadowinv.inversion import Inversion
+
+    content = result.content
+    if _is_pack(result):
+        return warnings_of_pack(content)  # type: ignore[arg-type]
+    if isinstance(content, Inversion):
+        return content.report.warnings
+    if isinstance(content, Fit) and content.verdict is not Verdict.DETERMINED:
+        return (verdict_in_words(content),)
+    return ()
 
 
 def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray.Dataset:
     """Make the dataset of a result that keeps how its layers look, with caustics as painted."""
     import xarray as xr
 
+    from napari_shadowinv.fitting import Fit
+
     content = result.content
-    looks = {role_of(keywords): _look(keywords, kind) for _, keywords, kind in layers}
+    looks = {slot_of(keywords): _look(keywords, kind) for _, keywords, kind in layers}
     kept = {_LOOKS: json.dumps(looks)}
     if isinstance(content, xr.Dataset):
         return content.assign_attrs(kept)
+    told = {**result.attributes, **kept}
+    if isinstance(content, Fit):
+        return content.to_dataset(attributes=told)
     for data, keywords, _ in layers:
         if role_of(keywords) == "caustic":
             content = replace(content, caustic=np.asarray(data) > 0)
-    return content.to_dataset(result.setup, attributes={**result.attributes, **kept})
+    return content.to_dataset(result.setup, attributes=told)
+
+
+def _is_pack(result: Result) -> bool:
+    return is_pack(getattr(result.content, "attrs", {}))
+
+
+def _content(dataset: xarray.Dataset) -> Inversion | Fit | xarray.Dataset:
+    """The result that a dataset holds; itself where that is only a field."""
+    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.inversion import Inversion
+
+    if is_fit(dataset.attrs):
+        return Fit.from_dataset(dataset)
+    return Inversion.from_dataset(dataset) if "report" in dataset.attrs else dataset
 
 
 def _look(keywords: dict[str, Any], kind: str) -> dict[str, Any]:

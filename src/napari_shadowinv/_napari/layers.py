@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +15,7 @@ from napari_shadowinv._napari.sites import Cells, power_cells, site_features
 from napari_shadowinv._napari.viewer_sync import keep_in_step
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.inversion.labels import VARIABLES
+from napari_shadowinv.io.store import of_each_setup
 from napari_shadowinv.physics.units import ShownField, shown_fields, shown_potential
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ Limits = tuple[float, float]
 _CAUSTIC_COLOUR = "#5dff5d"
 _ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
 
-_OF_A_FIELD = ("displacement", "potential", "displacement_uncertainty")
+_OF_A_FIELD = ("displacement", "potential")
 _ARROWS_ALONG = 28
 _SHORTEST_ARROW = 0.05
 _MOST_SITES_SHOWN = 200_000
@@ -154,8 +154,8 @@ def add_layers(
         place = len(viewer.layers) if below is None else viewer.layers.index(below)
         viewer.layers.insert(place, layer)
     for layer in added:
-        if role_of(layer) == "field":
-            # The status line then tells the field below the mouse.
+        if role_of(layer) in ("field", "fluence"):
+            # The status line then tells the value below the mouse.
             viewer.layers.selection.active = layer
     overlays = getattr(getattr(viewer, "canvas", None), "overlays", viewer)  # napari before 0.9
     overlays.scale_bar.visible = True
@@ -166,29 +166,22 @@ def add_layers(
 def result_layers(
     result: Result, frame: Frame, name: str = "", *, cells: bool = False
 ) -> list[FullLayerData]:
-    """Describe the layers of a result or of a mere field; with `cells`, its power cells, too."""
+    """Describe the layers of an inversion or of a mere field; with `cells`, its power cells."""
     import xarray as xr
+
+    from napari_shadowinv.inversion import Inversion
 
     content = result.content
     facts = {"result": result, "made_from": dict(result.attributes)}
     if isinstance(content, xr.Dataset):
         field = content[[variable for variable in _OF_A_FIELD if variable in content]]
-        return dataset_layers(
-            field, result.setup, frame, name, facts, deflector=deflector_of(content)
-        )
+        return dataset_layers(field, result.setup, frame, name, facts)
+    assert isinstance(content, Inversion)
     dataset = xr.Dataset(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     )
     diagram = power_cells(content) if cells else None
     return dataset_layers(dataset, result.setup, frame, name, facts, cells=diagram)
-
-
-def deflector_of(dataset: xarray.Dataset) -> str | None:
-    """What deflects by the only field of a fit; None for other datasets."""
-    from napari_shadowinv.fitting import FIELDS
-
-    fields = json.loads(dataset.attrs.get("fields", "[]"))
-    return FIELDS.get(fields[0]) if len(fields) == 1 else None
 
 
 def dataset_layers(
@@ -272,13 +265,22 @@ class _Shown:
         if self.shot is None:
             return self.field.vectors
         # All fields are linear in the displacement.
-        matrix = np.eye(2)
-        if self.setup is not None:
-            matrix = self.setup.field_in_si(self.setup.main_field.name, matrix)
+        matrix = np.eye(2) if self.setup is None else _field_per_pixel(self.setup)
         first = np.tensordot(matrix, self.plane("displacement"), axes=1)
         matrix = matrix * _ratio(self.field.vectors, first)
         stack = self.dataset["displacement"].transpose("component", "shot", "y", "x").data
-        return [sum(factor * stack[k] for k, factor in enumerate(row) if factor) for row in matrix]
+        own = self.relative_to_shot(lambda one: float(np.linalg.norm(_field_per_pixel(one))))
+        return [
+            sum((own * factor) * stack[k] for k, factor in enumerate(row) if factor)
+            for row in matrix
+        ]
+
+    def relative_to_shot(self, measure: Callable[[Setup], Any]) -> Any:
+        """What a setup tells of each shot, relative to `shot`; 1 where all share one setup."""
+        of_each = of_each_setup(self.dataset, measure)
+        if of_each is None or self.setup is None:
+            return 1.0
+        return (of_each / measure(self.setup))[:, np.newaxis, np.newaxis]
 
     @cached_property
     def intensity_limits(self) -> Limits:
@@ -287,6 +289,11 @@ class _Shown:
             if self.along_shots(name):
                 return intensity_limits(self.plane(name))
         return 0.0, 1.0
+
+
+def _field_per_pixel(setup: Setup) -> FloatArray:
+    """What a setup's main field (y, x) is of displacements by 1 px along y and along x."""
+    return setup.field_in_si(setup.main_field.name, np.eye(2))
 
 
 Content = tuple[Any, dict[str, str], dict[str, Any]]  # data, words of the title, keywords
@@ -305,7 +312,11 @@ def _image(shown: _Shown, kind: Kind) -> Content:
     elif kind.role == "potential":
         plane = shown.plane("potential")
         values, unit = shown_potential(plane, shown.setup)
-        data = values if shown.shot is None else data * _ratio(values, plane)
+        if shown.shot is None:
+            data = values
+        else:
+            own = shown.relative_to_shot(lambda one: float(one.potential(np.ones(1))[0]))
+            data = data * (own * _ratio(values, plane))
         limits, words = (float(values.min()), float(values.max())), {"unit": unit}
     elif kind.role == "residual":
         if kind.unit == "%":

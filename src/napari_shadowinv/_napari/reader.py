@@ -81,8 +81,12 @@ def _matches(pattern: str) -> list[Path]:
 
 @refusing_damage
 def _read_file(path: Path) -> list[FullLayerData]:
-    from napari_shadowinv._napari.layer_state import layers_of_dataset
+    from napari_shadowinv._napari.layer_metadata import result_of
+    from napari_shadowinv._napari.layer_state import doubts_of, layers_of_dataset
     from napari_shadowinv._napari.shots import radiograph_layers
+    from napari_shadowinv._napari.stores import viewer_in_window
+    from napari_shadowinv._napari.viewer_sync import keep_in_step
+    from napari_shadowinv.inversion.labels import is_pack
     from napari_shadowinv.io import Radiograph, read
 
     content = read(path)
@@ -90,4 +94,11 @@ def _read_file(path: Path) -> list[FullLayerData]:
         for text in content.warnings:
             show_caution(f"{path.name}: {text}")
         return radiograph_layers(content)
-    return layers_of_dataset(content, path.stem)
+    layers = layers_of_dataset(content, path.stem)
+    viewer = viewer_in_window() if is_pack(content.attrs) else None
+    if viewer is not None:
+        keep_in_step(viewer)
+    result = result_of(layers[0][1])
+    for text in () if result is None else doubts_of(result):
+        show_caution(f"{path.name}: {text}")
+    return layers

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from napari_shadowinv._napari.layer_metadata import CAME_WITH
@@ -11,10 +13,13 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.io import Radiograph
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.setup import setup_from_dict
 
 _SHAPE = (200, 200)
 _COUNTS = 400.0  # of a pixel: 5 % of noise
 
+_FILM_SHAPE = (96, 96)
+_FILMS = {14.7: 400.0, 3.0: 300.0}  # protons per pixel at each energy in MeV
 
 _RUN_SHAPE = (120, 320)
 _RUN_LENGTH = 20
@@ -42,6 +47,27 @@ def coaxial_line() -> list[FullLayerData]:
     return _proton_shot("coaxial line", phantom, np.where(obstructed, 0.0, 1.0))
 
 
+def two_energies() -> list[FullLayerData]:
+    """Two opposite toroidal fields at 14.7 and 3 MeV; of the beam, uneven by 10 %, no image."""
+    lengths = {"source_object_distance": 0.01, "object_image_distance": 0.28, "pixel_size": 5e-6}
+    films = [{"kind": "proton", "energy": energy, **lengths} for energy in _FILMS]
+    setups: list[Any] = [setup_from_dict(one, "the sample") for one in films]
+    first = setups[0]
+    truth = (
+        phantoms.toroid(_FILM_SHAPE, first, 30.0, 48e-6, center=(43, 38)).displacement
+        + phantoms.toroid(_FILM_SHAPE, first, -20.0, 34e-6, center=(59, 67)).displacement
+    )
+    y, x = _places(_FILM_SHAPE)
+    beam = np.exp(0.14 * np.sin(1.9 * x + 0.4) * np.cos(1.4 * y - 0.5) + 0.06 * x)
+    layers = []
+    for seed, (setup, level) in enumerate(zip(setups, _FILMS.values(), strict=True)):
+        # Fields displace in inverse proportion to the momentum.
+        moved = truth * first.momentum / setup.momentum
+        image = _counted(moved, level * beam, seed)
+        layers += radiograph_layers(Radiograph(image, setup=setup), f"{setup.energy:g} MeV")
+    return layers
+
+
 def wakefield_run() -> list[FullLayerData]:
     """Twenty optical shots of a plasma wave that moves, grows and fades; made when shown."""
     stack = lazy_stack(_wakefield_shot, range(_RUN_LENGTH), _RUN_SHAPE)
@@ -59,19 +85,20 @@ def _proton_shot(
     name: str, phantom: phantoms.Phantom, beam: FloatArray | None = None
 ) -> list[FullLayerData]:
     source = None if beam is None else _COUNTS * beam
-    image = _counted(phantom, np.full(_SHAPE, _COUNTS) if source is None else source, seed=1)
+    undisturbed = np.full(_SHAPE, _COUNTS) if source is None else source
+    image = _counted(phantom.displacement, undisturbed, seed=1)
     return radiograph_layers(Radiograph(image, setup=phantoms.paper_setup(), source=source), name)
 
 
-def _counted(phantom: phantoms.Phantom, source: FloatArray, seed: int) -> FloatArray:
+def _counted(displacement: FloatArray, source: FloatArray, seed: int) -> FloatArray:
     """Image of a source through an object, with the noise of counting."""
-    expected = synthetic_image(phantom.displacement, source)
+    expected = synthetic_image(displacement, source)
     return np.random.default_rng(seed).poisson(expected).astype(np.float64)
 
 
-def _places() -> tuple[AnyArray, AnyArray]:
+def _places(shape: tuple[int, int] = _SHAPE) -> tuple[AnyArray, AnyArray]:
     """Coordinates from -1 to 1 on both axes."""
-    y, x = (np.linspace(-1, 1, side) for side in _SHAPE)
+    y, x = (np.linspace(-1, 1, side) for side in shape)
     return y[:, None], x[None, :]
 
 
@@ -95,4 +122,4 @@ def _wakefield_shot(shot: int) -> FloatArray:
         0.8 * np.sin(np.pi * (0.15 + 0.75 * phase)) ** 2,
         center=((height - 1) / 2, width * (0.2 + 0.6 * phase)),
     )
-    return _counted(wave, np.full(_RUN_SHAPE, 2500.0), seed=shot)
+    return _counted(wave.displacement, np.full(_RUN_SHAPE, 2500.0), seed=shot)

@@ -14,7 +14,15 @@ import numpy as np
 
 from napari_shadowinv import io
 from napari_shadowinv._napari.frame import Frame, frame_for
-from napari_shadowinv._napari.layer_metadata import CAME_WITH, MASK, SHOT, SOURCE, mark, mark_of
+from napari_shadowinv._napari.layer_metadata import (
+    CAME_WITH,
+    MASK,
+    SHOT,
+    SOURCE,
+    mark,
+    mark_of,
+    role_of,
+)
 from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
 from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv._typing import FloatArray
@@ -93,15 +101,29 @@ def _frame(shot: io.Radiograph) -> Frame:
     return Frame(scale=(side * 1e6, side * 1e6), units=("um", "um"))
 
 
-def radiograph_of(layer: Any, image: Any) -> io.Radiograph:
-    """An image of a layer, which may be lazy still, with what is known of the layer's file."""
+def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> io.Radiograph:
+    """An image of a layer, or a plane of a stack, which may be lazy still, with its file."""
     known = mark_of(layer)
     path = known.get("path") or layer.source.path
     shot = io.Radiograph(image, warnings=tuple(known.get("warnings", ())))
+    paths = known.get("paths", ())
+    if plane is not None and len(paths) == len(layer.data):
+        return replace(shot, path=Path(paths[plane]))
     # What was split off a stack still knows the first of its files.
     if layer.ndim != 2 or len(known.get("paths", ())) > 1 or path is None:
         return shot
     return replace(shot, path=Path(path), metadata=known.get("file") or {})
+
+
+def source_of_shot(
+    layer: Any, image: Any, shot: io.Radiograph, plane: int | None = None
+) -> io.Radiograph:
+    """A layer's image as the source of a shot, with its file unless that is another shot's."""
+    beam = radiograph_of(layer, image, plane)
+    if role_of(layer) != SOURCE or beam.path == shot.path:
+        return beam
+    # It came with the other shot, whose file holds more than the source.
+    return replace(beam, path=None, metadata={})
 
 
 def loaded(shot: io.Radiograph, name: str) -> io.Radiograph:

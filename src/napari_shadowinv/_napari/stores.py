@@ -16,6 +16,7 @@ from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.formats import RESULT
+from napari_shadowinv.io.store import with_own_setups
 
 if TYPE_CHECKING:
     import xarray
@@ -26,10 +27,11 @@ def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot."""
     dataset = _opened(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
-    setup = setup_from_dataset(dataset)
+    first = _first_done(dataset, path)
+    setup = setup_from_dataset(dataset.isel(shot=first))
     frame = frame_for(dataset["displacement"].shape, setup)
     facts = {"store": str(path), "shots": _shot_names(dataset)}
-    return dataset_layers(dataset, setup, frame, name, facts, _first_done(dataset, path))
+    return dataset_layers(dataset, setup, frame, name, facts, first)
 
 
 @refusing_damage
@@ -50,7 +52,7 @@ def _opened(path: Path) -> xarray.Dataset:
             f"{path} is a Zarr folder but not a store of inverted shots (it has no "
             "displacement): open it with napari's own reader"
         )
-    return dataset.transpose("shot", "component", "y", "x", ...)
+    return with_own_setups(dataset).transpose("shot", "component", "y", "x", ...)
 
 
 def _first_done(dataset: xarray.Dataset, path: Path) -> int:
@@ -119,13 +121,18 @@ def _displacement(layer: Any) -> xarray.DataArray:
     return _opened(Path(mark_of(layer)["store"]))["displacement"]
 
 
-def follow_once_added(described: Sequence[FullLayerData]) -> None:
-    """Let arrows follow in the window that asked for them; without one, nobody leafs."""
+def viewer_in_window() -> Any | None:
+    """Return the viewer of the window that asks, None without a window."""
     if "napari._qt" not in sys.modules:
-        return
+        return None
     from napari import current_viewer
 
-    viewer = current_viewer()
+    return current_viewer()
+
+
+def follow_once_added(described: Sequence[FullLayerData]) -> None:
+    """Let arrows follow in the window that asked for them; without one, nobody leafs."""
+    viewer = viewer_in_window()
     stores = {mark_of(one[1]).get("store") for one in described if role_of(one[1]) == "arrows"}
     if viewer is None or not stores:
         return

@@ -1,12 +1,13 @@
-"""What keeps in step with a viewer that shows results: a colour bar, and where images lie."""
+"""What keeps in step with a viewer: a colour bar, where images lie, which film is in view."""
 
 from __future__ import annotations
 
 import weakref
+from dataclasses import dataclass
 from typing import Any
 
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layer_metadata import role_of
+from napari_shadowinv._napari.layer_metadata import mark_of, role_of
 
 _watched: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -19,6 +20,7 @@ def keep_in_step(viewer: Any) -> None:
         _watched.add(events)
         _follow_top_image(viewer, events)
         _place_newcomers(viewer, events)
+        _tell_films(viewer, events)
 
 
 def _follow_top_image(viewer: Any, events: Any) -> None:
@@ -116,3 +118,79 @@ def _size(layer: Any) -> tuple[int, ...]:
     data = layer.data[0] if layer.multiscale else layer.data
     shape = data.shape[:-1] if layer.rgb else data.shape
     return tuple(shape[-2:])
+
+
+@dataclass
+class _InView:
+    """The plane of a stack of films that is seen, and the contrast of each."""
+
+    given: Any
+    limits: list[Any]
+    plane: int
+
+
+def plane_in_view(viewer: Any, layer: Any) -> int:
+    """Return which plane of a stack is shown."""
+    at = round(float(layer.world_to_data(viewer.dims.point[-layer.ndim :])[0]))
+    return min(max(at, 0), len(layer.data) - 1)
+
+
+def _tell_films(viewer: Any, events: Any) -> None:
+    """Write above the canvas which film of a pack is in view; give each its own contrast."""
+    seen: weakref.WeakKeyDictionary[Any, _InView] = weakref.WeakKeyDictionary()
+    written: list[str] = []
+
+    def follow(_: Any = None) -> None:
+        text = ""
+        for layer in viewer.layers:
+            films = mark_of(layer).get("films")
+            if films is None or layer.ndim != 3:
+                continue
+            plane = plane_in_view(viewer, layer)
+            _adjust(seen, layer, plane)
+            if layer.visible:
+                text = films[plane]
+        if text or written:
+            overlay = _text_overlay(viewer)
+            if not text and overlay.text in written:
+                overlay.visible = False
+            elif text:
+                overlay.text, overlay.visible = text, True
+            written[:] = [text]
+
+    def watch(event: Any) -> None:
+        for emitter in (event.value.events.visible, event.value.events.metadata):
+            emitter.connect(follow)
+        follow()
+
+    for layer in viewer.layers:
+        layer.events.visible.connect(follow)
+        layer.events.metadata.connect(follow)
+    events.inserted.connect(watch)
+    events.removed.connect(follow)
+    viewer.dims.events.current_step.connect(follow)
+    follow()
+
+
+def _adjust(seen: weakref.WeakKeyDictionary[Any, _InView], layer: Any, plane: int) -> None:
+    """Let the dose or fluence of a film have the contrast that it had when it was last seen."""
+    given = mark_of(layer).get("limits")
+    if given is None:
+        return
+    before = seen.get(layer)
+    if before is None or before.given is not given:
+        seen[layer] = _InView(given, list(given), plane)
+        return
+    if before.plane == plane:
+        return
+    before.limits[before.plane] = tuple(layer.contrast_limits)
+    before.plane = plane
+    low, high = before.limits[plane]
+    # Fluences of films differ by powers of ten: the slider should span those of one.
+    layer.contrast_limits_range = (min(0.0, low), 2 * high)
+    layer.contrast_limits = (low, high)
+
+
+def _text_overlay(viewer: Any) -> Any:
+    overlays = getattr(getattr(viewer, "canvas", None), "overlays", None)
+    return viewer.text_overlay if overlays is None else overlays.text  # napari before 0.9

@@ -73,19 +73,19 @@ def _one_result(layers: Sequence[FullLayerData]) -> tuple[list[FullLayerData], R
 def _warn_of_changes(layers: Sequence[FullLayerData], result: Result) -> None:
     """Say which layers no longer show what the file will hold."""
     from napari_shadowinv._napari.frame import Frame
-    from napari_shadowinv._napari.layer_metadata import role_of
-    from napari_shadowinv._napari.layers import result_layers
+    from napari_shadowinv._napari.layer_metadata import slot_of
+    from napari_shadowinv._napari.layer_state import layers_of_result
 
     images = [layer for layer in layers if layer[2] == "image"]
-    retrieved = {role_of(layer[1]): layer[0] for layer in result_layers(result, Frame())}
+    retrieved = {slot_of(layer[1]): layer[0] for layer in layers_of_result(result, Frame())}
     changed = [
-        _name(layer) for layer in images if not _same(layer[0], retrieved.get(role_of(layer[1])))
+        _name(layer) for layer in images if not _same(layer[0], retrieved.get(slot_of(layer[1])))
     ]
     if changed:
         from napari.utils.notifications import show_warning
 
         show_warning(
-            f"{_listed(changed)} changed since the inversion: the file contains the original "
+            f"{_listed(changed)} changed since the result was made: the file contains the original "
             "result; save the changed layers separately, as images"
         )
 

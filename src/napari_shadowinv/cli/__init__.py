@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from napari_shadowinv import __version__
-from napari_shadowinv.cli import _fit_command, _shot_commands, _stack_commands
+from napari_shadowinv.cli import _film_command, _fit_command, _shot_commands, _stack_commands
 
 __all__ = ["app"]
 
@@ -52,6 +52,7 @@ def main(
 app.command(epilog=_shot_commands.INVERT_EPILOG)(_shot_commands.invert)
 app.command()(_shot_commands.rerun)
 app.command(epilog=_fit_command.EPILOG)(_fit_command.fit)
+app.command(epilog=_film_command.EPILOG)(_film_command.film)
 app.command(epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
 app.command()(_shot_commands.info)
 app.command()(_shot_commands.demo)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from rich import box, progress
 from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Table
 
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli._tables import Rows, options_text, two_columns
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 EXIT_FAILED_SHOTS = 1
 _NAMED = 10  # failures that a table names
+_DETERMINED = "determined"  # the verdict on a fit that may be believed
 
 
 @dataclass
@@ -82,7 +83,7 @@ def run_batch(
     **choices: Any,
 ) -> None:
     """Invert all shots into a store, with `choices` of `run_stack`, and tell how it went."""
-    from napari_shadowinv.stack import STORED, read_shot, run_stack
+    from napari_shadowinv.stack import read_shot, run_stack
 
     _check(out, resume or choices["redo_failed"], choices["overwrite"])
     ledger = _Ledger()
@@ -94,7 +95,7 @@ def run_batch(
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
-                variables=STORED if variables is None else _names(variables),
+                variables=None if variables is None else _names(variables),
                 reader=functools.partial(read_shot, **part),
                 on_progress=show,
                 should_stop=interrupted,
@@ -109,8 +110,15 @@ def run_batch(
         say(_summary(store, ledger))
     if (store.statuses() != DONE).any():
         raise typer.Exit(EXIT_FAILED_SHOTS)
-    if not all(report.get("converged") for report in store.reports()):
+    if not all(_is_good(report) for report in store.reports()):
         raise typer.Exit(EXIT_NOT_CONVERGED)
+
+
+def _is_good(report: Mapping[str, Any]) -> bool:
+    """Whether a shot that is done may be believed, as far as that is known."""
+    if "verdict" in report:
+        return bool(report["verdict"] == _DETERMINED)
+    return bool(report.get("converged"))
 
 
 def _check(out: Path, resume: bool, overwrite: bool) -> None:
@@ -187,16 +195,31 @@ def _summary(store: StackStore, ledger: _Ledger) -> Table:
     return two_columns("Batch", rows)
 
 
-def _recipe_rows(attributes: Mapping[str, Any]) -> Rows:
+def _recipe_rows(store: StackStore) -> Rows:
     """Where the source came from, and what was done to each shot."""
     from napari_shadowinv.preprocessing import Provenance
 
-    provenance = Provenance.of(attributes)
+    provenance = Provenance.of(store.attributes)
     measured = None if provenance is None else provenance.source
     source = measured.file if measured is not None else ""
-    rows = [("source", source or str(attributes["source_image"]))]
+    # Rows of a table may have their own.
+    made = [report.get("provenance", {}).get("source", {}) for report in store.reports()]
+    own = list(dict.fromkeys(one["file"] for one in made if one.get("file")))
+    rows = [("source", _listed(own) or source or str(store.attributes["source_image"]))]
     steps = () if provenance is None else provenance.recipe.steps
     return rows + [("step", step.described) for step in steps]
+
+
+def _energy_rows(store: StackStore) -> Rows:
+    """Energies of the shots that are done, where they are those of rows of a table."""
+    found = sorted({report["energy"] for report in store.reports() if "energy" in report})
+    return [("energies", f"{', '.join(f'{one:g}' for one in found)} MeV")] if found else []
+
+
+def _fit_rows(attributes: Mapping[str, Any]) -> Rows:
+    """What was fitted to each shot."""
+    choices = {**json.loads(attributes["fit"]), "fields": json.loads(attributes["fields"])}
+    return [("fit", options_text(choices))]
 
 
 def _trouble_rows(store: StackStore) -> Rows:
@@ -217,9 +240,39 @@ def _trouble_rows(store: StackStore) -> Rows:
         if statuses[index] == DONE and not report.get("converged")
     ]
     if rough:
-        named = ", ".join(rough[:_NAMED]) + (", …" if len(rough) > _NAMED else "")
-        rows.append(("warning", f"{len(rough)} shots did not converge: {named}"))
-    return rows
+        rows.append(("warning", f"{len(rough)} shots did not converge: {_listed(rough)}"))
+    return [*rows, *_verdict_rows(store)]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
+
+
+def _verdict_rows(store: StackStore) -> Rows:
+    """Which fits may be believed, and which not."""
+    found: dict[str, list[str]] = {}
+    for name, report in zip(store.names, store.reports(), strict=True):
+        if "verdict" in report:
+            found.setdefault(str(report["verdict"]), []).append(name)
+    good = found.pop(_DETERMINED, [])
+    told = f"{len(good)} {_DETERMINED}"
+    rows = [("verdicts", told)] if good or found else []
+    return rows + [
+        ("warning", f"{len(names)} {verdict}: {_listed(names)}") for verdict, names in found.items()
+    ]
+
+
+_SHOT_COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "iterations": ("iterations", str),
+    "image residual": ("image_residual", "{:.2%}".format),
+}
+_ROW_COLUMNS = {"MeV": ("energy", "{:g}".format), **_SHOT_COLUMNS}
+_FIT_COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "verdict": ("verdict", str),
+    "χ²": ("chi2", "{:.3g}".format),
+    "crossed": ("folded", "{:.1%}".format),
+    "error bars": ("uncertainty", "{:.2%}".format),
+}
 
 
 @refusing_damage
@@ -229,16 +282,21 @@ def status_tables(path: Path, every: bool) -> list[Table]:
     if not every:
         return tables
     store = StackStore(path)
-    headings = "shot", "name", "status", "seconds", "iterations", "image residual", "how it went"
-    shots = Table(*(Column(heading, overflow="fold") for heading in headings), box=box.SIMPLE)
+    own = _ROW_COLUMNS if store.own_setups else _SHOT_COLUMNS
+    columns = own if store.field is None else _FIT_COLUMNS
+    headings = "shot", "name", "status", "seconds", *columns, "how it went"
+    shots = Table(box=box.SIMPLE)
+    for heading in headings:
+        # Wide enough for the words of a verdict.
+        width = len(_DETERMINED) if heading == "verdict" else None
+        shots.add_column(heading, overflow="fold", min_width=width)
     for index, (status, report) in enumerate(zip(store.statuses(), store.reports(), strict=True)):
         shots.add_row(
             str(index),
             plain(store.names[index]),
             STATUS_NAMES[status],
             f"{report['seconds']:.1f}" if "seconds" in report else "",
-            plain(report.get("iterations", "")),
-            f"{report['image_residual']:.2%}" if "image_residual" in report else "",
+            *(show(report[key]) if key in report else "" for key, show in columns.values()),
             plain(report.get("reason") or "; ".join(report.get("warnings", ()))),
             style="red" if STATUS_NAMES[status] == "failed" else "",
         )
@@ -255,8 +313,10 @@ def store_rows(path: Path, *, trouble: bool = True) -> Rows:
         ("created", str(attributes["created"])),
         ("shots", _counts_text(store)),
         ("image", str(attributes["image_size"])),
-        *_recipe_rows(attributes),
+        *_recipe_rows(store),
+        *_energy_rows(store),
         ("stored", str(attributes["stored"])),
+        *([] if store.field is None else _fit_rows(attributes)),
         ("options", options_text(json.loads(attributes["options"]))),
     ]
     if seconds:

@@ -26,8 +26,18 @@ if TYPE_CHECKING:
 
 FORMATS = ("tiff", "pradformat", "csv")
 # Columns of the table: what a shot's report says, and how it says it.
-_REPORTED = ("converged", "flux_residual", "image_residual", "iterations", "reason")
-_KEYS = ("converged", "residual", "image_residual", "iterations", "reason")
+_REPORTED = {
+    "converged": "converged",
+    "flux_residual": "residual",
+    "image_residual": "image_residual",
+    "iterations": "iterations",
+    "reason": "reason",
+}
+_ROW_REPORTED = {"energy (MeV)": "energy", **_REPORTED}
+_FIT_REPORTED = {
+    name: name
+    for name in ("verdict", "chi2", "folded", "uncertainty", "converged", "iterations", "reason")
+}
 
 
 def _opened(path: Path, shots: str | None) -> xarray.Dataset:
@@ -72,13 +82,19 @@ def export_shots(
     protect_store(store, out)
     if form == "csv":
         return [_write_table(store, out, shots, overwrite)]
+    field = StackStore(store).field
+    if form == "pradformat" and field is not None:
+        raise InputError(
+            f"{store} holds fits, expected inversions for pradformat: use --format tiff or csv"
+        )
     dataset = _opened(store, shots)
     jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
-    setup = setup_from_dataset(dataset)  # for the size of a pixel in a TIFF
     make_folder(out)
-    for name, _ in jobs:
+    for name, *_ in jobs:
         check_output(out / name, overwrite)
-    return [write(out / name, load(), setup=setup, overwrite=overwrite) for name, load in jobs]
+    return [
+        write(out / name, load(), setup=setup, overwrite=overwrite) for name, load, setup in jobs
+    ]
 
 
 def _stem(shot: xarray.Dataset) -> str:
@@ -88,7 +104,8 @@ def _stem(shot: xarray.Dataset) -> str:
     return f"{int(shot['index']):04d}_{safe}"
 
 
-_Job = tuple[str, Callable[[], Any]]  # the name of a file, and what reads its content
+# The name of a file, what reads its content, and the setup, which gives the size of a pixel.
+_Job = tuple[str, Callable[[], Any], Any]
 
 
 def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
@@ -102,6 +119,7 @@ def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
             )
     for index in range(dataset.sizes["shot"]):
         shot = dataset.isel(shot=index)
+        setup = setup_from_dataset(shot)
         for variable in variables:
             planes = {variable: shot[variable]}
             if "component" in shot[variable].dims:
@@ -110,22 +128,25 @@ def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
                     for component in ("y", "x")
                 }
             for name, plane in planes.items():
-                yield f"{_stem(shot)}_{name}{TIFF.suffix}", partial(np.asarray, plane, dtype=float)
+                load = partial(np.asarray, plane, dtype=float)
+                yield f"{_stem(shot)}_{name}{TIFF.suffix}", load, setup
 
 
 def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[_Job]:
     check_pradformat_setup(setup_from_dataset(dataset))
     for index in range(dataset.sizes["shot"]):
         shot = _with_origin(dataset.isel(shot=index))
-        yield f"{_stem(shot)}{PRADFORMAT.suffix}", shot.compute
+        yield f"{_stem(shot)}{PRADFORMAT.suffix}", shot.compute, setup_from_dataset(shot)
 
 
 def _with_origin(shot: xarray.Dataset) -> xarray.Dataset:
-    """A shot of a store with the store's provenance, but for its own image."""
+    """A shot of a store with its own provenance, or the store's but for its own image."""
+    report = json.loads(str(shot["report"].values))
+    if "provenance" in report:
+        return shot.assign_attrs(provenance=json.dumps(report["provenance"]))
     provenance = Provenance.of(shot.attrs)
     if provenance is None:
         return shot
-    report = json.loads(str(shot["report"].values))
     origin = {"file": str(shot["name"].values), "sha256": report.get("sha256", "")}
     image = provenance.image.model_copy(update=origin)
     own = provenance.model_copy(update={"image": image})
@@ -149,9 +170,11 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
         temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as f,
     ):
         rows = csv.writer(f)
-        rows.writerow(["shot", "name", "status", *_REPORTED, *headings])
+        own = _ROW_REPORTED if content.own_setups else _REPORTED
+        reported = own if content.field is None else _FIT_REPORTED
+        rows.writerow(["shot", "name", "status", *reported, *headings])
         for index in chosen:
-            report = (reports[index].get(name, "") for name in _KEYS)
+            report = (reports[index].get(name, "") for name in reported.values())
             peak = (f"{columns[name][index]:.9g}" for name in names)
             status = STATUS_NAMES[statuses[index]]
             rows.writerow([index, content.names[index], status, *report, *peak])

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from napari_shadowinv.cli import _flags, _outputs
+from napari_shadowinv.cli import _flags, _inputs, _outputs
 from napari_shadowinv.cli._terminal import notify_errors, say
 from napari_shadowinv.io.formats import IMAGE_TITLES
 
@@ -18,22 +18,20 @@ HELP = {
     "strengths": "Displacement of each image relative to the first, separated by commas, where "
     "there are no setups; for two fields '1 1,0.7 0.5'.",
     "setup": "TOML file with the experimental geometry of all images.",
-    "fields": "What deflects: B, E, plasma or phase; two of them separated by a comma need images "
-    "of two energies. Default: B, and for light phase.",
     "source": "Image of the undisturbed beam, or unknown to fit a smooth one. Default: uniform.",
-    "noise": "poisson if images are counts, or the standard deviation in a pixel, after --bin. "
-    "Default: estimated from the images.",
-    "psf": "Point spread: standard deviation in px, after --bin.",
-    "source_size": "Standard deviation of the beam's source in m (FWHM / 2.355); with "
-    "--resolution, in place of --psf.",
-    "resolution": "Standard deviation of the detector's point spread in m, at the detector.",
+    "compare": "Fit B alone, E alone and both, and tell which explains the images; needs setups. "
+    "Writes the likeliest, or what --fields names.",
+    "leave_one_out": "Also predict each image from a fit of the others, and name those that one "
+    "static field does not explain.",
+    "window": "Also fit so many neighbouring images at a time, in order of energy: a film of the "
+    "field.",
     "gains": "known: images are as bright as the source; free: by unknown factors brighter; or "
     "the factors, separated by commas.",
     "mask": "Image of the same size, 0 at pixels that no image can use.",
     "fiducials": "Table (.csv) of known displacements in the first image: columns y, x, dy, dx "
     "and sigma, in px after --bin.",
-    "out": "Result file: .shadowinv. Default: the first image's name with _fit.shadowinv, in the "
-    "current folder.",
+    "out": "Result file: .shadowinv, or .h5 for one field alone (pradformat). Default: the first "
+    "image's name with _fit.shadowinv, in the current folder.",
 }
 EPILOG = r"""
 [bold]Examples[/bold]
@@ -41,12 +39,16 @@ shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml
 shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml --fields B,E --gains free
 shadowinv fit a.tif b.tif --strengths 1,0.68 --source unknown --noise poisson
 shadowinv fit shots.csv --source-size 10e-6 --resolution 30e-6 --bin 2
+shadowinv fit shots.csv --setup setup.toml --compare
+shadowinv fit shots.csv --setup setup.toml --leave-one-out --window 3
+shadowinv fit next.csv --recipe recipe.toml
 
 [bold]shots.csv[/bold] (files are looked for beside it; flags hold where a cell is empty)
 file, energy, setup, source, gain
 a.tif, 14.7, setup.toml, beam.tif, 1
 b.tif, 30, setup.toml, beam.tif, 1.2
-Columns: file, setup, energy, strength, gain, psf, mask, source, noise.
+Columns: file, setup, energy, strength, gain, psf, mask, source, noise; exclude (yes leaves the
+image out); shot for many shots.
 
 [bold]Verdict[/bold]
 Whether the field may be believed is told with each result: "determined", "one of several",
@@ -54,7 +56,8 @@ Whether the field may be believed is told with each result: "determined", "one o
 
 [bold]Exit codes[/bold]
 0 the field is determined; 2 invalid input, nothing written;
-3 result written, but its verdict is another; 130 cancelled.
+3 result written, but its verdict is another, or images left out are not explained;
+130 cancelled.
 """
 
 
@@ -69,19 +72,21 @@ def fit(
         str | None, typer.Option(metavar="NUMBER,NUMBER,…", help=HELP["strengths"])
     ] = None,
     setup: Annotated[Path | None, typer.Option("--setup", help=HELP["setup"])] = None,
-    fields: Annotated[str | None, typer.Option(metavar="NAMES", help=HELP["fields"])] = None,
     source: Annotated[
         str | None, typer.Option("--source", metavar="PATH|unknown", help=HELP["source"])
     ] = None,
-    noise: Annotated[str | None, typer.Option(metavar="poisson|NUMBER", help=HELP["noise"])] = None,
-    psf: Annotated[float | None, typer.Option(metavar="PX", help=HELP["psf"])] = None,
-    source_size: Annotated[
-        float | None, typer.Option(metavar="M", help=HELP["source_size"])
+    gains: Annotated[
+        str | None, typer.Option(metavar="known|free|NUMBERS", help=HELP["gains"])
     ] = None,
-    resolution: Annotated[float | None, typer.Option(metavar="M", help=HELP["resolution"])] = None,
-    gains: Annotated[str, typer.Option(metavar="known|free|NUMBERS", help=HELP["gains"])] = "known",
     mask: Annotated[Path | None, typer.Option("--mask", help=HELP["mask"])] = None,
     fiducials: Annotated[Path | None, typer.Option(help=HELP["fiducials"])] = None,
+    compare: Annotated[bool, typer.Option("--compare", help=HELP["compare"])] = False,
+    leave_one_out: Annotated[
+        bool, typer.Option("--leave-one-out", help=HELP["leave_one_out"])
+    ] = False,
+    window: Annotated[int | None, typer.Option("--window", help=HELP["window"])] = None,
+    recipe: _flags.RecipeFile = None,
+    save_recipe: _flags.SaveRecipe = None,
     options: Annotated[
         Path | None, typer.Option("--options", help="TOML file with options of the fit.")
     ] = None,
@@ -99,43 +104,46 @@ def fit(
     Rays may cross, images may be blurred, the beam may be unknown. Writes fields with error
     bars, re-projections, residuals and a verdict to one file, and a figure next to it.
     """
-    from napari_shadowinv.cli import _fit_result
-    from napari_shadowinv.cli._fit_rows import fiducials_from, shot_rows
-    from napari_shadowinv.cli._fit_shots import fields_for, fit_shots
-    from napari_shadowinv.io import read_toml
+    from napari_shadowinv.cli import _fit_result, _static_result
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, FIT_WRITERS
+    from napari_shadowinv.pipeline import write_recipe
+    from napari_shadowinv.pipeline._fit_shots import read_rows
+    from napari_shadowinv.pipeline.shot_table import shot_rows
 
     lists = {"energy": energies, "strength": strengths}
-    if gains not in ("known", "free"):
-        lists["gain"] = gains
-    shared = {"setup": setup, "source": source, "noise": noise, "psf": psf, "mask": mask}
-    rows = shot_rows(images, shared, lists)
+    if gains not in (None, "known", "free"):
+        lists["gain"], gains = gains, None
+    rows = shot_rows(images, {"setup": setup}, lists)
     first = rows[0].file
     named = Path(f"{first.stem}_fit{next(iter(FIT_WRITERS))}") if out is None else out
     result, figure = _outputs.result_and_figure(first, named, report)
-    _outputs.check_outputs({result: tuple(FIT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
-    read = [*images, fiducials, options, *(file for row in rows for file in row.files)]
-    _outputs.protect([result, figure], read)
-    content = {} if options is None else read_toml(options)
-    where = "options" if options is None else str(options)
-    steps, chosen = _flags.fit_choices_of(flags, content, where)
-    shots = fit_shots(
-        rows,
-        steps,
-        channel=channel,
-        variable=variable,
-        source_size=source_size,
-        resolution=resolution,
-    )
-    found = _fit_result.fitted(
-        shots,
-        fields=fields_for(fields, shots.setups),
-        gains=gains if "gain" not in lists else "known",
-        fiducials=None if fiducials is None else fiducials_from(fiducials),
-        options=chosen,
-        quiet=quiet,
-    )
-    _fit_result.write_fit(found, shots, result, figure, overwrite, fiducials)
+    asked: dict[str, Any] = {"left_out": leave_one_out, "window": window}
+    _static_result.check_asked(len(rows), **asked, fiducials=fiducials, result=result)
+    figures = [figure, *_static_result.static_figures(figure, **asked)]
+    outputs = {result: tuple(FIT_WRITERS), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
+    if save_recipe is not None:
+        outputs[save_recipe] = (".toml",)
+    _outputs.check_outputs(outputs, overwrite)
+    described = [file for row in rows for file in row.files.values()]
+    _outputs.protect(list(outputs), [*images, fiducials, options, recipe, *described])
+    chosen = _inputs.fit_recipe_from(flags, recipe, options, source=source, gains=gains, mask=mask)
+    _outputs.protect_files_of(chosen, list(outputs))
+    shots = read_rows(rows, chosen, channel=channel, variable=variable)
+    _outputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
+    names = [str(row.file) for row in rows]
+    if compare:
+        found = _fit_result.compared(chosen, shots, fiducials, quiet, written=flags.get("fields"))
+    else:
+        found = _fit_result.fitted(chosen, shots, fiducials, quiet)
+    checked = _static_result.checked(chosen, shots, found, quiet, **asked)
+    _fit_result.write_fit(found, names, result, figure, overwrite, checked)
+    if save_recipe is not None:
+        setups = {shot.setup for shot in shots}
+        (common,) = setups if len(setups) == 1 else (None,)
+        write_recipe(save_recipe, chosen.model_copy(update={"setup": common}), overwrite=overwrite)
     if not quiet:
-        say(_fit_result.fit_table(found, shots, [result, figure]))
+        for table in checked.tables(found, names):
+            say(table)
+        say(_fit_result.fit_table(found, names, list(outputs)))
+    checked.alarm_unless_static(result)
     _fit_result.alarm_unless_determined(found, result)

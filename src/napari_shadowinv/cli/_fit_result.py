@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -17,63 +15,120 @@ from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
     interrupted,
     progress_bars,
+    say,
     say_on_stderr,
 )
+from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
     import xarray
     from rich.table import Table
 
-    from napari_shadowinv.cli._fit_shots import FitShots
-    from napari_shadowinv.fitting import Fit, FitOptions, FittedField
+    from napari_shadowinv._typing import FloatArray
+    from napari_shadowinv.cli._static_result import Checked
+    from napari_shadowinv.fitting import Fit, FittedField
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.pipeline import FitShot
+    from napari_shadowinv.preprocessing import FitProvenance, Recipe
 
 
 def fitted(
-    shots: FitShots,
-    *,
-    fields: Sequence[str],
-    gains: str,
-    fiducials: Any,
-    options: FitOptions,
-    quiet: bool,
+    recipe: Recipe, shots: Sequence[FitShot], fiducials: FloatArray | Path | None, quiet: bool
 ) -> Fit:
     """Fit fields to images, with a bar for each stage."""
-    from napari_shadowinv.fitting import fit
+    from napari_shadowinv.pipeline import run_fit
 
-    given = shots.given(gains)
     with nullcontext() if quiet else progress_bars() as show:
-        found = fit(
-            **given,
-            fields=fields,
-            fiducials=fiducials,
-            options=options,
+        return run_fit(
+            recipe, shots, fiducials=fiducials, on_progress=show, should_stop=interrupted
+        )
+
+
+def refined(inversion: Inversion, made: FitProvenance, quiet: bool) -> Fit:
+    """Refine an inversion as a fit was made from it, with a bar for each stage."""
+    from napari_shadowinv.pipeline import run_refinement
+
+    assert made.recipe.fit is not None
+    with nullcontext() if quiet else progress_bars() as show:
+        return run_refinement(
+            inversion,
+            made.images[0].setup,
+            made.recipe.fit,
             on_progress=show,
             should_stop=interrupted,
         )
-    return replace(found, setups=shots.setups or ())
+
+
+def compared(
+    recipe: Recipe,
+    shots: Sequence[FitShot],
+    fiducials: Path | None,
+    quiet: bool,
+    *,
+    written: str | None,
+) -> Fit:
+    """Fit several choices of fields and tell how likely each is; return the one to be written."""
+    from napari_shadowinv.pipeline import run_comparison
+    from napari_shadowinv.pipeline._fit import COMPARED
+
+    wanted = set(recipe.fit.fields or ()) if recipe.fit else set()
+    if written is not None and wanted not in map(set, COMPARED):
+        choices = "; ".join(",".join(one) for one in COMPARED)
+        raise InputError(
+            f"received --fields {written} and --compare, which compares {choices}: write one of "
+            "these, or leave out --fields to write the likeliest"
+        )
+    with nullcontext() if quiet else progress_bars() as show:
+        fits = run_comparison(
+            recipe, shots, fiducials=fiducials, on_progress=show, should_stop=interrupted
+        )
+    if not quiet:
+        say(comparison_table(fits))
+    if written is None:
+        return fits[0]
+    return next(one for one in fits if {field.name for field in one.fields} == wanted)
+
+
+def comparison_table(fits: Sequence[Fit]) -> Table:
+    """Tell how well each choice of fields explains the images, the likeliest first."""
+    from rich import box
+    from rich.table import Table
+
+    headings = "fields", "χ²", "log evidence", "verdict"
+    table = Table(*headings, title="Comparison", title_justify="left", box=box.SIMPLE)
+    table.caption = "A difference of 10 decides."
+    best = fits[0].report.log_evidence
+    for one in fits:
+        names = ", ".join(field.name for field in one.fields)
+        chi2 = ", ".join(f"{value:.3g}" for value in one.chi2)
+        worse = one.report.log_evidence - best
+        table.add_row(names, chi2, "likeliest" if one is fits[0] else f"{worse:+.1f}", one.verdict)
+    return table
 
 
 def write_fit(
-    fit: Fit, shots: FitShots, out: Path, report: Path, overwrite: bool, fiducials: Path | None
+    fit: Fit,
+    names: Sequence[str],
+    out: Path,
+    report: Path,
+    overwrite: bool,
+    checked: Checked | None = None,
 ) -> None:
-    """Write a fit and its figure, both or none of them; tell which files it was made from."""
-    from napari_shadowinv.cli._outputs import write_both
-    from napari_shadowinv.io.files import sha256, text_of
+    """Write a fit and its figures, all or none of them; `names` are of the images."""
+    from napari_shadowinv.cli._outputs import write_with_figures
+    from napari_shadowinv.io.files import text_of
     from napari_shadowinv.plotting import fit_figure
-    from napari_shadowinv.preprocessing import Origin
 
-    title = ", ".join(text_of(row.file.name) for row in shots.rows)
-    told = {"origins": shots.origins()}
-    if fiducials is not None:
-        table = Origin(file=text_of(fiducials.name), sha256=sha256(fiducials))
-        told["fiducials"] = table.model_dump_json(exclude_none=True)
-    dataset = fit.to_dataset(attributes=told)
-    write_both(dataset, fit_figure(fit, title=title), out, report, overwrite)
+    title = ", ".join(text_of(Path(name).name) for name in names)
+    dataset, figures = fit.to_dataset(), {report: fit_figure(fit, title=title)}
+    if checked is not None:
+        dataset = checked.added_to(dataset)
+        figures |= checked.figures(fit, report, title)
+    write_with_figures(dataset, figures, out, overwrite)
 
 
-def fit_table(fit: Fit, shots: FitShots, written: Sequence[Path]) -> Table:
+def fit_table(fit: Fit, names: Sequence[str], written: Sequence[Path]) -> Table:
     """Tell whether the answer may be believed, what it is, and where."""
-    names = [str(row.file) for row in shots.rows]
     rows = [*fit_rows(fit, names), *[("written", str(path)) for path in written]]
     return two_columns("Fit", rows)
 
@@ -89,29 +144,36 @@ def alarm_unless_determined(fit: Fit, out: Path) -> None:
 
 def fit_file_rows(dataset: xarray.Dataset) -> Rows:
     """Tell what the file of a fit holds."""
+    from napari_shadowinv.cli._static_result import static_file_rows
     from napari_shadowinv.fitting import Fit
 
     fit = Fit.from_dataset(dataset)
-    origins = _origins(dataset.attrs)
-    names = [one["image"].get("file", "") for one in origins]
-    files = [
-        (f"{name} sha256", one[name]["sha256"])
-        for one in origins
-        for name in ("image", "source", "mask")
-        if isinstance(one.get(name), dict) and one[name].get("sha256")
-    ]
+    made = fit.provenance
     return [
         ("kind", f"fit of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
-        *fit_rows(fit, names if len(names) == len(fit.images) else ()),
-        *files,
+        *fit_rows(fit, [] if made is None else [one.image.file for one in made.images]),
+        *static_file_rows(dataset),
+        *([] if made is None else _made_from(made)),
         ("options", options_text(fit.options.model_dump())),
     ]
 
 
-def _origins(attributes: Mapping[str, Any]) -> list[dict[str, Any]]:
-    found = json.loads(attributes.get("origins", "[]"))
-    return [one for one in found if isinstance(one, dict) and isinstance(one.get("image"), dict)]
+def _made_from(made: FitProvenance) -> Rows:
+    """What was done to the images and known about them, and the files."""
+    steps = [("step", step.described) for step in made.recipe.steps]
+    choices = made.recipe.fit
+    known = {} if choices is None else choices.model_dump(exclude_none=True, exclude={"options"})
+    rows = [*steps, ("fit", options_text(known))]
+    for number, one in enumerate(made.images, 1):
+        masks = [made.masks[place] for place in (one.mask, one.source_mask) if place is not None]
+        origins = [("image", one.image), ("source", one.source)]
+        for name, origin in [*origins, *(("mask", mask) for mask in masks)]:
+            if origin is not None and origin.sha256:
+                rows.append((f"{name} {number} sha256", f"{origin.sha256} ({origin.file})"))
+    if made.fiducials is not None and made.fiducials.sha256:
+        rows.append(("fiducials sha256", f"{made.fiducials.sha256} ({made.fiducials.file})"))
+    return rows
 
 
 def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:

@@ -2,7 +2,7 @@
 
 Those of steps, estimates of the source and options are made from the models: `takes_recipe` gives
 them to a command, and `recipe_of` makes a recipe of those that were given. `takes_fit` and
-`fit_choices_of` do the same for a fit.
+`fit_recipe_of` do the same for a fit.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -20,15 +20,15 @@ from typer import Argument, Option
 
 from napari_shadowinv._system.validation import nearest, validated
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import FitOptions
 from napari_shadowinv.io.formats import IMAGE_TITLES
-from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.preprocessing import ESTIMATES, FILTERS, STEPS, HotPixelFilter, Recipe, Step
+from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
+from napari_shadowinv.preprocessing import ESTIMATES, FIT_STEPS, STEPS, Recipe, Step
 
 _STEPS = "Steps before the inversion, in this order"
 _ESTIMATES = "Source estimated from the image (docs/sources.md)"
 _OPTIONS = "Options of the inversion"
 _FIT_STEPS = "Steps before the fit, in this order"
+_FIT_CHOICES = "What the fit finds and what is known"
 _FIT_OPTIONS = "Options of the fit"
 
 ImageFile = Annotated[
@@ -67,7 +67,8 @@ Variable = Annotated[
     Option(
         "--variable",
         metavar="NAME",
-        help="Name of the array in an HDF5 file, or in a MATLAB file with several images.",
+        help="Name of the array in an HDF5 file, or in a MATLAB file with several images; of a "
+        "CR-39 scan the tracks to count, such as 'diameter=4:12 contrast=:40 bin=300'.",
     ),
 ]
 SourceVariable = Annotated[
@@ -126,6 +127,9 @@ def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
 
 def _flag(flag: str, field: FieldInfo, panel: str, told: str) -> tuple[str, inspect.Parameter]:
     kind, metavar = _type_of(field)
+    extra = field.json_schema_extra
+    if isinstance(extra, dict):
+        metavar = str(extra.get("metavar", metavar or "")) or None
     option = Option(f"--{flag}", help=told, metavar=metavar, rich_help_panel=panel)
     name = flag.replace("-", "_")
     annotation = Annotated[kind | None, option]  # type: ignore[valid-type]
@@ -148,10 +152,12 @@ def _step_flags(steps: Iterable[type[Step]], panel: str) -> Flags:
     ]
 
 
-def _option_flags(model: type[BaseModel], usual: str) -> Flags:
+def _option_flags(model: type[BaseModel], usual: str, without: Collection[str] = ()) -> Flags:
     """Flags of a model's fields, in the panel that a field asks for or the usual one."""
     flags = []
     for name, field in model.model_fields.items():
+        if name in without:
+            continue
         extra = field.json_schema_extra
         panel = extra.get("panel", usual) if isinstance(extra, dict) else usual
         flags.append(_flag(name.replace("_", "-"), field, str(panel), _with_default(field)))
@@ -172,9 +178,12 @@ def _recipe_flags() -> Flags:
 
 
 def _fit_flags() -> Flags:
-    # Filters that blur or flatten would change what the forward model is fitted to.
-    kept = [one for name, one in STEPS.items() if name not in FILTERS or one is HotPixelFilter]
-    return _step_flags(kept, _FIT_STEPS) + _option_flags(FitOptions, _FIT_OPTIONS)
+    return [
+        *_step_flags(FIT_STEPS.values(), _FIT_STEPS),
+        # The command's own --source and --gains say more than these.
+        *_option_flags(FitChoices, _FIT_CHOICES, without=("beam", "gains", "options")),
+        *_option_flags(FitOptions, _FIT_OPTIONS),
+    ]
 
 
 def _with_default(field: FieldInfo) -> str:
@@ -245,12 +254,22 @@ def recipe_of(
     return base.model_copy(update={"steps": steps, "source": source, "options": made})
 
 
-def fit_choices_of(
-    flags: Mapping[str, Any], options: Mapping[str, Any], where: str = "options"
-) -> tuple[tuple[Step, ...], FitOptions]:
-    """Steps and options that flags ask for; `options` are those of a file, named `where`."""
-    chosen = {name: flags[name] for name in FitOptions.model_fields if name in flags}
-    return _steps(flags, ()), validated(FitOptions, {**options, **chosen}, where)
+def fit_recipe_of(
+    flags: Mapping[str, Any], base: Recipe, options: Mapping[str, Any], where: str = "options"
+) -> Recipe:
+    """Put flags of a fit on top of a recipe; `options` are those of a file, named `where`."""
+    before = base.fit or FitChoices()
+    chosen = {**before.options.model_dump(exclude_unset=True), **options}
+    chosen |= {name: flags[name] for name in FitOptions.model_fields if name in flags}
+    made = validated(FitOptions, chosen, where)
+    own = {name: flags[name] for name in FitChoices.model_fields if name in flags}
+    kept = before.model_dump(exclude_none=True, exclude={"options"})
+    in_metres = ("source_size", "resolution")
+    # A point spread is given in one way: that of the flags takes the place of the other.
+    replaced = in_metres if "psf" in own else ("psf",) if own.keys() & set(in_metres) else ()
+    kept = {name: value for name, value in kept.items() if name not in replaced}
+    choices = validated(FitChoices, {**kept, **own, "options": made}, "fit")
+    return base.model_copy(update={"steps": _steps(flags, base.steps), "fit": choices})
 
 
 def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...]:

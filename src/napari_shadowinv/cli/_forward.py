@@ -28,7 +28,7 @@ class Field:
 
 def field_from(path: Path, variable: str | None = None) -> Field:
     """Displacement from a result, or from an array of px or px²."""
-    from napari_shadowinv.inversion.labels import is_fit, setup_from_dataset
+    from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
     from napari_shadowinv.io import read_dataset, read_radiograph
     from napari_shadowinv.io.formats import kind_of
     from napari_shadowinv.io.hdf5 import read_hdf5
@@ -43,6 +43,8 @@ def field_from(path: Path, variable: str | None = None) -> Field:
         dataset = read_dataset(path)
         if is_fit(dataset.attrs):
             return _fitted(path, dataset)
+        if is_pack(dataset.attrs):
+            raise _no_field(path, "a film pack")
         source = dataset["source"].values if "source" in dataset else None
         return Field(dataset["displacement"].values, source, setup_from_dataset(dataset))
     if kind == "npy":

@@ -47,6 +47,8 @@ def _rows(path: Path, variable: str | None) -> _tables.Rows:
     found = format_of(path)
     if found.name == "mat":
         return _matlab_rows(path, variable)
+    if found.name == "cpsa":
+        return _radiograph_rows(read(path, variable=variable))
     if variable is not None and found.named_reader:
         array = read_hdf5(path, variable)
         return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
@@ -92,7 +94,11 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _tables.Rows:
     from napari_shadowinv.io import Radiograph
 
     assert isinstance(shot, Radiograph)
-    names = {"text": "numbers as text", "pradformat": "pradformat radiograph"}
+    names = {
+        "text": "numbers as text",
+        "pradformat": "pradformat radiograph",
+        "cpsa": "tracks in CR-39",
+    }
     kind = str(shot.metadata["kind"])
     rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image)]
     if shot.source is not None:
@@ -103,7 +109,9 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _tables.Rows:
         if isinstance(value, int | float):
             unit = "MeV" if name == "energy" else "m"
             rows.append((f"{name.replace('_', ' ')} ({unit})", f"{value:g}"))
-    return [*rows, ("setup", _tables.setup_text(shot.setup, shot))]
+    rows.append(("setup", _tables.setup_text(shot.setup, shot)))
+    rows += [("note", text) for text in shot.notes]
+    return [*rows, *[("warning", text) for text in shot.warnings]]
 
 
 def _array_rows(array: AnyArray) -> _tables.Rows:
@@ -121,12 +129,18 @@ def _array_rows(array: AnyArray) -> _tables.Rows:
 
 
 def _result_rows(dataset: xarray.Dataset) -> _tables.Rows:
+    from napari_shadowinv.cli._film_command import pack_rows
     from napari_shadowinv.cli._fit_result import fit_file_rows
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.labels import is_fit, setup_from_dataset
+    from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
 
     if is_fit(dataset.attrs):
         return fit_file_rows(dataset)
+    if is_pack(dataset.attrs):
+        version = dataset.attrs["package_version"]
+        first, last = dataset["energy"].values[[0, -1]]
+        energies = ("energies", f"{first:.4g} to {last:.4g} MeV")
+        return [("kind", f"film pack of shadowinv {version}"), energies, *pack_rows(dataset)]
     setup = setup_from_dataset(dataset)
     displacement = dataset["displacement"].values
     experiment = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,49 +58,67 @@ def options_from(flags: Mapping[str, Any], clip_negative: bool) -> InversionOpti
     return recipe_from(flags, None, None, clip_negative=clip_negative).options
 
 
-def read_shot(path: Path, channel: str | None, variable: str | None) -> Radiograph:
-    """Read an image, and note which part of its file it is."""
-    from napari_shadowinv.io import read_radiograph
+def fit_recipe_from(
+    flags: Mapping[str, Any],
+    recipe: Path | None,
+    options: Path | None,
+    *,
+    source: str | None,
+    gains: str | None,
+    mask: Path | None,
+) -> Recipe:
+    """Recipe of a fit from a file, with an options file and flags on top."""
+    from napari_shadowinv.cli._flags import fit_recipe_of
+    from napari_shadowinv.io import read_toml
+    from napari_shadowinv.pipeline import read_recipe
+    from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 
-    shot = read_radiograph(path, channel=channel, variable=variable)
-    part = {name: one for name, one in (("channel", channel), ("variable", variable)) if one}
-    return replace(shot, metadata={**shot.metadata, **part})
+    base = Recipe() if recipe is None else read_recipe(recipe)
+    content = {} if options is None else read_toml(options)
+    own = {} if gains is None else {"gains": gains}
+    changes: dict[str, Any] = {} if mask is None else {"mask": mask}
+    if source is not None:
+        unknown = source == "unknown"
+        own["beam"] = "unknown" if unknown else "known"
+        changes["source"] = None if unknown else MeasuredSource(file=Path(source))
+    where = "options" if options is None else str(options)
+    return fit_recipe_of({**flags, **own}, base, content, where).model_copy(update=changes)
+
+
+def fit_recipe(
+    recipe: Recipe, flags: Mapping[str, Any], options: Path | None, *, clip_negative: bool
+) -> Recipe:
+    """Recipe for shots that are fitted; refuse flags of an inversion."""
+    from napari_shadowinv.options import FitChoices, InversionOptions
+
+    given = [
+        f"--{name.replace('_', '-')}" for name in InversionOptions.model_fields if name in flags
+    ]
+    given += ["--options"] if options is not None else []
+    given += ["--clip-negative"] if clip_negative else []
+    if given:
+        raise InputError(
+            f"received {given[0]}, which an inversion takes, and shots that are to be fitted: "
+            "write the fit's options into the recipe's section [fit.options]"
+        )
+    return recipe.model_copy(update={"fit": recipe.fit or FitChoices()})
 
 
 def source_from(recipe: Recipe, image: Path, channel: str | None) -> Radiograph | None:
     """Read the measured source that a recipe names; one without a file is in the image's."""
+    from napari_shadowinv.pipeline.files import read_part
     from napari_shadowinv.preprocessing import MeasuredSource
 
     measured = recipe.source
     if not isinstance(measured, MeasuredSource) or measured == MeasuredSource():
         return None
-    return read_shot(measured.file or image, channel, measured.variable)
+    return read_part(measured.file or image, channel, measured.variable)
 
 
 def setup_for(path: Path | None, shot: Radiograph, recipe: Recipe) -> Setup | None:
     """Setup from a file, completed by the geometry that the image's file knows."""
+    from napari_shadowinv.pipeline.files import setup_from
+
     if path is None:
         return recipe.setup or shot.setup
     return setup_from(path, shot.metadata.get("geometry"))
-
-
-def setup_from(
-    path: Path, known: Mapping[str, Any] | None = None, changes: Mapping[str, Any] | None = None
-) -> Setup:
-    """Setup from a file, with changes; what it leaves out is taken from what is `known`."""
-    from napari_shadowinv.io import read_toml
-    from napari_shadowinv.physics.setup import SETUPS, setup_from_dict
-
-    entries, known = {**read_toml(path), **(changes or {})}, known or {}
-    if "kind" in known and entries.get("kind", known["kind"]) != known["kind"]:
-        known = {}
-    elif known and "kind" not in known:
-        # A text image tells distances, and of particles the energy, but not what flew.
-        meant = [kind for kind, model in SETUPS.items() if entries.keys() & model.own_fields()]
-        kind = entries.get("kind", meant[-1] if meant else "proton")
-        strange = () if kind == "proton" else SETUPS["proton"].own_fields()
-        known = {name: known[name] for name in known if name not in strange} | {"kind": kind}
-    pixel_sizes = {"pixel_size", "detector_pixel_size"}
-    if pixel_sizes & entries.keys():
-        known = {name: value for name, value in known.items() if name not in pixel_sizes}
-    return setup_from_dict({**known, **entries}, str(path))

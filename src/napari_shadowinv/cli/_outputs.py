@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,12 +64,13 @@ def protect_store(store: Path, output: Path) -> None:
         )
 
 
-def check_setup(result: Path, setup: Setup | None) -> None:
-    """Refuse a setup that the result's format cannot keep."""
-    from napari_shadowinv.io.pradformat import check_pradformat_setup
+def check_setup(result: Path, setup: Setup | None, fields: Sequence[str] | None = None) -> None:
+    """Refuse a setup, or fields, that the result's format cannot keep."""
+    from napari_shadowinv.io.pradformat import check_pradformat_fields, check_pradformat_setup
 
     if result.suffix.lower() in PRADFORMAT.suffixes:
         check_pradformat_setup(setup)
+        check_pradformat_fields(fields or ())
 
 
 def make_folder(path: Path) -> None:
@@ -90,16 +92,18 @@ def write_all(
 
     title = "" if shot.path is None else text_of(shot.path.name)
     figure = report_figure(inversion, inversion.setup, title=title)
-    write_both(inversion, figure, out, report, overwrite)
+    write_with_figures(inversion, {report: figure}, out, overwrite)
 
 
-def write_both(
-    result: Inversion | xarray.Dataset, figure: Figure, out: Path, report: Path, overwrite: bool
+def write_with_figures(
+    result: Inversion | xarray.Dataset, figures: Mapping[Path, Figure], out: Path, overwrite: bool
 ) -> None:
-    """Write result and figure, both or none of them."""
+    """Write a result and its figures, all or none of them."""
     from napari_shadowinv.io import replacing, write
     from napari_shadowinv.plotting._figures import DOTS_PER_INCH
 
-    with replacing(report, overwrite) as drawn:
-        figure.savefig(drawn, dpi=DOTS_PER_INCH)
+    with ExitStack() as drawn:
+        for path, figure in figures.items():
+            temporary = drawn.enter_context(replacing(path, overwrite))
+            figure.savefig(temporary, dpi=DOTS_PER_INCH)
         write(out, result, overwrite=overwrite)

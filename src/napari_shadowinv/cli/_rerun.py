@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from napari_shadowinv import __version__
-from napari_shadowinv.cli._inputs import read_shot
 from napari_shadowinv.cli._outputs import protect
 from napari_shadowinv.cli._terminal import inverted
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.labels import is_fit
-from napari_shadowinv.io import read_dataset
+from napari_shadowinv.pipeline.files import read_part
 
 if TYPE_CHECKING:
+    import xarray
+
     from napari_shadowinv._typing import BoolArray
     from napari_shadowinv.preprocessing import Origin, Provenance, Radiograph
+
+SAME = "none: the same result, bit for bit"
 
 
 @dataclass(frozen=True)
@@ -33,51 +35,69 @@ class Again:
     difference: str
 
 
-def made_again(
-    result: Path,
-    image: Path | None,
-    source: Path | None,
-    outputs: list[Path],
-    *,
-    quiet: bool = False,
-) -> Again:
-    """Make a result again; files are looked for beside it and in the current folder.
+@dataclass(frozen=True)
+class Places:
+    """Where the files of a result are looked for: as named now, beside it, and here."""
 
-    Nothing that is read may be among `outputs`.
-    """
-    dataset = read_dataset(result)
-    if is_fit(dataset.attrs):
+    result: Path
+    images: Sequence[Path] = ()
+    source: Path | None = None
+
+    def find(self, origin: Origin, name: str, given: Path | None = None) -> Path:
+        """Return the file of an image, source, mask or table."""
+        folders = (self.result.parent, Path())
+        places = [folder / origin.file for folder in folders if origin.file]
+        path = given or next((place for place in places if place.is_file()), None)
+        if path is None:
+            found = f"{origin.file} is not there" if origin.file else "was not made from a file"
+            raise FileFormatError(f"{name} {found}: name the file to use")
+        return path
+
+    def read(self, origin: Origin, name: str, given: Path | None = None) -> Radiograph:
+        """Return the part of a file that an image or source was."""
+        channel = None if origin.channel is None else str(origin.channel)
+        return read_part(self.find(origin, name, given), channel, origin.variable)
+
+
+def made_again(
+    dataset: xarray.Dataset, places: Places, outputs: list[Path], *, quiet: bool = False
+) -> Again:
+    """Make an inversion again. Nothing that is read may be among `outputs`."""
+    if len(places.images) > 1:
         raise InputError(
-            f"{result} is a fit, expected the result of an inversion: repeat the command "
-            "shadowinv fit to make it again"
+            f"received {len(places.images)} images, and {places.result} was made from one: name "
+            "one, or none if it is beside the result"
         )
     before = Inversion.from_dataset(dataset)
     made = before.provenance
     if made is None:
         raise InputError(
-            f"{result} does not say how it was made, as results of scripts that call invert() do "
-            "not: make it again with a recipe (docs/recipes.md)"
+            f"{places.result} does not say how it was made, as results of scripts that call "
+            "invert() do not: make it again with a recipe (docs/recipes.md)"
         )
-    folders = [result.parent, Path()]
-    shot = _read(made.image, image, folders, "the image")
+    inversion, shot, changes = inversion_again(made, places, outputs, quiet=quiet)
+    return Again(inversion, shot, tuple(changes), _difference(before, inversion))
+
+
+def inversion_again(
+    made: Provenance, places: Places, outputs: list[Path], *, quiet: bool = False
+) -> tuple[Inversion, Radiograph, list[str]]:
+    """Return the inversion that a provenance describes, its shot, and what has changed."""
+    shot = places.read(made.image, "the image", next(iter(places.images), None))
     beam, own = None, (made.image.file, made.image.variable)
     if made.source is not None and (made.source.file, made.source.variable) != own:
-        beam = _read(made.source, source, folders, "the source")
-    protect(outputs, [result, shot.path, None if beam is None else beam.path])
+        beam = places.read(made.source, "the source", places.source)
+    protect(outputs, [places.result, shot.path, None if beam is None else beam.path])
     masks = {"mask": made.mask, "source_mask": made.source_mask}
     drawn = {name: _mask(origin, name.replace("_", " ")) for name, origin in masks.items()}
-    inversion = inverted(made.recipe, shot, beam, quiet, **drawn)
-    return Again(inversion, shot, tuple(_changes(made, inversion)), _difference(before, inversion))
-
-
-def _read(origin: Origin, given: Path | None, folders: Sequence[Path], name: str) -> Radiograph:
-    places = [folder / origin.file for folder in folders if origin.file]
-    path = given or next((place for place in places if place.is_file()), None)
-    if path is None:
-        found = f"{origin.file} is not there" if origin.file else "was not made from a file"
-        raise FileFormatError(f"{name} {found}: name the file to use")
-    channel = None if origin.channel is None else str(origin.channel)
-    return read_shot(path, channel, origin.variable)
+    # What else its file holds was not used, unless the provenance says so.
+    image = shot.image if made.gain is None else shot.image / made.gain
+    alone = replace(shot, image=image, setup=None, mask=None, source_mask=None)
+    inversion = inverted(made.recipe, alone, beam, quiet, **drawn)
+    if inversion.provenance is not None:
+        told = inversion.provenance.model_copy(update={"gain": made.gain})
+        inversion = replace(inversion, provenance=told)
+    return inversion, shot, _changes(made, inversion)
 
 
 def _mask(origin: Origin | None, name: str) -> BoolArray | None:
@@ -95,18 +115,27 @@ def _mask(origin: Origin | None, name: str) -> BoolArray | None:
 def _changes(before: Provenance, again: Inversion) -> list[str]:
     now = again.provenance
     assert now is not None
-    changes = []
-    if before.version != __version__:
-        changes.append(f"made by version {before.version}, now {__version__}")
-    for name in ("image", "source"):
-        old, new = getattr(before, name), getattr(now, name)
-        if old is None or new is None:
-            continue
-        if not old.sha256:
-            changes.append(f"the {name} was no file before: {new.file} may differ from it")
-        elif old.sha256 != new.sha256:
-            changes.append(f"the {name} {new.file} differs from the {old.file} used before")
-    return changes
+    return [
+        *changed_version(before.version),
+        *changed_file("image", before.image, now.image),
+        *changed_file("source", before.source, now.source),
+    ]
+
+
+def changed_version(before: str) -> list[str]:
+    """Tell that another version is at work now, if it is."""
+    return [] if before == __version__ else [f"made by version {before}, now {__version__}"]
+
+
+def changed_file(name: str, before: Origin | None, now: Origin | None) -> list[str]:
+    """Tell that a file is not what it was, if so."""
+    if before is None or now is None:
+        return []
+    if not before.sha256:
+        return [f"the {name} was no file before: {now.file} may differ from it"]
+    if before.sha256 != now.sha256:
+        return [f"the {name} {now.file} differs from the {before.file} used before"]
+    return []
 
 
 def _difference(before: Inversion, again: Inversion) -> str:
@@ -114,6 +143,6 @@ def _difference(before: Inversion, again: Inversion) -> str:
         return f"another size: {again.image.shape}, before {before.image.shape}"
     names = ("displacement", "potential", "weights", "source", "image", "reprojection")
     if all(np.array_equal(getattr(before, one), getattr(again, one)) for one in names):
-        return "none: the same result, bit for bit"
+        return SAME
     largest = np.abs(before.displacement - again.displacement).max()
     return f"displacement differs by up to {largest:.2g} px"

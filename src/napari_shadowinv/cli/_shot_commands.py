@@ -14,8 +14,8 @@ from napari_shadowinv.errors import InputError
 
 # Of arguments whose help is longer than a line.
 HELP = {
-    "image": "Its image, or another one. Default: the file of that name beside the result or in "
-    "the current folder.",
+    "image": "Its image, or another one; all images of a fit, in their order. Default: the files "
+    "of that name beside the result or in the current folder.",
     "field": ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) "
     "containing a displacement (2, H, W) in px or a potential (H, W) in px².",
     "setup": "TOML file with the setup to predict the image for, for example another energy. "
@@ -97,6 +97,7 @@ def invert(
     from napari_shadowinv.cli._tables import summary
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
     from napari_shadowinv.pipeline import write_recipe
+    from napari_shadowinv.pipeline.files import read_part
 
     result, figure = _outputs.result_and_figure(image, out, report)
     outputs = {result: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}
@@ -115,7 +116,7 @@ def invert(
         source_mask=source_mask,
     )
     _outputs.protect_files_of(chosen, list(outputs))
-    shot = _inputs.read_shot(image, channel, variable)
+    shot = read_part(image, channel, variable)
     chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
     _outputs.check_setup(result, chosen.setup)
     inversion = inverted(chosen, shot, _inputs.source_from(chosen, image, channel), quiet)
@@ -132,7 +133,9 @@ def rerun(
     result: Annotated[
         Path, typer.Argument(help="A .shadowinv result of this program.", show_default=False)
     ],
-    image: Annotated[Path | None, typer.Argument(help=HELP["image"], show_default=False)] = None,
+    image: Annotated[
+        list[Path] | None, typer.Argument(help=HELP["image"], show_default=False)
+    ] = None,
     source: Annotated[
         Path | None, typer.Option("--source", help="Its measured source, if it has moved.")
     ] = None,
@@ -147,17 +150,39 @@ def rerun(
 
     With the same files and version the result is the same, bit for bit.
     """
-    from napari_shadowinv.cli._rerun import made_again
-    from napari_shadowinv.cli._tables import rerun_table
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
+    from napari_shadowinv.cli import _fit_result
+    from napari_shadowinv.cli._film_command import pack_made_again, write_pack
+    from napari_shadowinv.cli._rerun import Places, made_again
+    from napari_shadowinv.cli._rerun_fit import fit_made_again, refit_table
+    from napari_shadowinv.cli._tables import rerun_table, two_columns
+    from napari_shadowinv.inversion.labels import is_fit, is_pack
+    from napari_shadowinv.io import read_dataset
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, FIT_WRITERS, RESULT_WRITERS
 
     target = out or Path(f"{result.stem}_again{result.suffix}")
     again_out, figure = _outputs.result_and_figure(result, target, report)
+    written = [again_out, figure]
     _outputs.check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
-    again = made_again(result, image, source, [again_out, figure], quiet=quiet)
+    dataset = read_dataset(result)
+    places = Places(result, image or (), source)
+    if is_pack(dataset.attrs):
+        remade, changes = pack_made_again(dataset, result, written, quiet)
+        write_pack(remade, result.name, again_out, figure, overwrite)
+        if not quiet:
+            say(two_columns("Film pack, made again", changes))
+        return
+    if is_fit(dataset.attrs):
+        _outputs.check_outputs({again_out: tuple(FIT_WRITERS)}, overwrite)
+        refit = fit_made_again(dataset, places, written, quiet=quiet)
+        _fit_result.write_fit(refit.fit, refit.names, again_out, figure, overwrite)
+        if not quiet:
+            say(refit_table(refit, written))
+        _fit_result.alarm_unless_determined(refit.fit, again_out)
+        return
+    again = made_again(dataset, places, written, quiet=quiet)
     _outputs.write_all(again.inversion, again.shot, again_out, figure, overwrite)
     if not quiet:
-        say(rerun_table(again, [again_out, figure]))
+        say(rerun_table(again, written))
     alarm_unless_converged(again.inversion.report, again_out)
 
 
@@ -204,14 +229,15 @@ def forward(
     from napari_shadowinv.cli._tables import size_text
     from napari_shadowinv.io import read_radiograph, write
     from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
+    from napari_shadowinv.pipeline.files import setup_from
 
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
     _outputs.check_outputs({path: tuple(IMAGE_WRITERS)}, overwrite)
     _outputs.protect([path], [field, source, setup, made_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")
-    seen = None if setup is None else _inputs.setup_from(setup)
-    told = None if made_with is None else _inputs.setup_from(made_with)
+    seen = None if setup is None else setup_from(setup)
+    told = None if made_with is None else setup_from(made_with)
     known = field_from(field, variable)
     first, second = experiments(known, seen, told, deflector, dispersion)
     # In another experiment the beam is another one, too.

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from napari_shadowinv.cli import _flags, _outputs
-from napari_shadowinv.cli._inputs import recipe_from, setup_from
+from napari_shadowinv.cli._inputs import fit_recipe, recipe_from
 from napari_shadowinv.cli._terminal import notify_errors, say
 
 # Of options whose help is longer than a line.
@@ -21,6 +21,10 @@ HELP = {
     "workers": "Number of shots processed at once on this machine. Default: one per core.",
     "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
     "csv (a table with one row per shot).",
+    "shots": "A quoted glob, a list of files, one multi-page TIFF with one shot per page, or one "
+    "table (.csv) with a row for each shot.",
+    "fit": "Fit the forward model to each shot in place of inverting it, as the recipe's section "
+    "fit says; rows of a table with the same shot are images of one object.",
     "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
 }
 BATCH_EPILOG = """
@@ -29,10 +33,24 @@ shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr
 shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr --resume
 shadowinv batch 'shots/*.tif' --source-from polynomial --low-pass 1 --out night.shadowinv.zarr
 shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
+shadowinv batch pack.csv --setup setup.toml --out pack.shadowinv.zarr
+shadowinv batch shots.csv --fit --recipe recipe.toml --out fits.shadowinv.zarr
+
+[bold]pack.csv[/bold] (one inversion for each row; flags hold where a cell is empty)
+file, energy, gain, mask, exclude
+film1.tif, 4.3, 1, mask1.png,
+film2.tif, 6.1, 1.2, mask2.png,
+film3.tif, 7.6, 0.8, , yes
+Columns: file, setup, energy, gain, mask, source, exclude.
+
+[bold]shots.csv[/bold] (one fit for each shot; other columns as for shadowinv fit)
+shot, file, energy, setup
+7, shot7_low.tif, 14.7, setup.toml
+7, shot7_high.tif, 30, setup.toml
 
 [bold]Exit codes[/bold]
 0 all done; 1 some shots failed, the others are written; 2 invalid input;
-3 all done, but some did not converge; 130 cancelled, continue with --resume.
+3 all done, but some did not converge or are not determined; 130 cancelled, continue with --resume.
 """
 
 
@@ -41,10 +59,7 @@ shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
 def batch(
     shots: Annotated[
         list[str],
-        typer.Argument(
-            help="A quoted glob, a list of files, or one multi-page TIFF with one shot per page.",
-            show_default=False,
-        ),
+        typer.Argument(help=HELP["shots"], show_default=False),
     ],
     out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
     source: Annotated[str | None, typer.Option("--source", help=HELP["source"])] = None,
@@ -54,6 +69,7 @@ def batch(
     save_recipe: _flags.SaveRecipe = None,
     setup: _flags.SetupFile = None,
     options: _flags.OptionsFile = None,
+    fit: Annotated[bool, typer.Option("--fit", help=HELP["fit"])] = False,
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
     clip_negative: _flags.ClipNegative = False,
@@ -74,9 +90,10 @@ def batch(
     *,
     flags: dict[str, Any],
 ) -> None:
-    """Invert many shots into one store, which can be resumed after a crash."""
+    """Invert, or fit, many shots into one store, which can be resumed after a crash."""
     from napari_shadowinv.cli._batch import run_batch
     from napari_shadowinv.pipeline import write_recipe
+    from napari_shadowinv.pipeline.files import setup_from
 
     chosen = recipe_from(
         flags,
@@ -87,6 +104,8 @@ def batch(
         mask=mask,
         source_mask=source_mask,
     )
+    if fit or chosen.fit is not None:
+        chosen = fit_recipe(chosen, flags, options, clip_negative=clip_negative)
     if setup is not None:
         chosen = chosen.model_copy(update={"setup": setup_from(setup)})
     if save_recipe is not None:

@@ -69,6 +69,8 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
     for name, mask in (("mask", provenance.mask), ("source mask", provenance.source_mask)):
         if mask is not None:
             rows.append((name, mask.file or "drawn"))
+    if provenance.gain is not None:
+        rows.append(("gain", f"{provenance.gain:g}, by which the image was divided"))
     return rows
 
 

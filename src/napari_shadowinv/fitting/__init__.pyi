@@ -1,8 +1,10 @@
 from ._fit import compare, fit
-from .measurements import FIELDS, point_spread
-from .options import FitOptions
+from ._leave_one_out import leave_one_out
+from .agreement import LeaveOneOut
+from .measurements import FIELDS, FitOptions, point_spread
 from .result import Basin, Fit, FitReport, FittedField
 from .verdict import Verdict
+from .windows import FitWindows
 
 __all__ = [
     "FIELDS",
@@ -10,9 +12,12 @@ __all__ = [
     "Fit",
     "FitOptions",
     "FitReport",
+    "FitWindows",
     "FittedField",
+    "LeaveOneOut",
     "Verdict",
     "compare",
     "fit",
+    "leave_one_out",
     "point_spread",
 ]

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Literal
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,29 +16,32 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting.descent import coarser, descend, finer
+from napari_shadowinv.fitting.compilation import ensure_compiled
+from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import Measured, measured
-from napari_shadowinv.fitting.options import FitOptions
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
+    HELD,
     MIDDLE,
     MIDDLE_SPACING,
     Found,
     Start,
     refined,
     search,
+    settled,
     with_likely_smoothness,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import judged
 from napari_shadowinv.inversion import invert
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import FitOptions, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant
+from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["compare", "fit"]
+__all__ = ["compare", "fit", "reweighted", "starts"]
 
 _FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
 _FROM_NEAR = ((2, 4.0), (2, 2.0), (2, 1.0))
@@ -45,6 +49,8 @@ _FROM_FIELD = ((4, 1.0), (2, 1.0))
 _SHARES_OF_TRANSPORT = (1.0, 1.4, 1.9, 2.4)  # past caustics, transport is too weak
 _ROUNDED = 8.0  # px
 _TRANSPORT_SITES = 10_000
+_DECIDES = 10.0  # in log evidence
+_WIDER = 1.5  # px; images that are blurred by 1 px or more are then explained better
 _SMOOTHED_ERRORS, _SPACING_OF_SAMPLES = 4.0, 1 / 3  # px
 
 
@@ -62,6 +68,7 @@ def fit(
     fiducials: ArrayLike | None = None,
     options: FitOptions | None = None,
     start: ArrayLike | None = None,
+    names: Sequence[str] | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Fit:
@@ -101,6 +108,8 @@ def fit(
         Everything else.
     start : array_like, shape (H, W), optional
         A potential in px² to start from, too, of the first field in the first image.
+    names : sequence of str, optional
+        What messages call the images. Default: their numbers.
     on_progress, should_stop : callable, optional
         Receives a `Progress` after each step, with the objective in its message; ends the work
         when it returns true.
@@ -143,9 +152,10 @@ def fit(
         gains=gains,
         fiducials=fiducials,
         options=options,
+        names=names,
     )
-    known = (options.smoothness or 0.0, 0.0)
-    scene = replace(given.scene, smoothness=np.tile(known, (len(fields), 1)))
+    ensure_compiled(on_progress, should_stop)
+    scene = given.held(options.smoothness)
     steps = 0
 
     def tell(stage: str, objective: float) -> None:
@@ -154,22 +164,27 @@ def fit(
         report("fit", steps, None, f"{stage}, objective {objective:.6g}")
 
     with _timed("starts", seconds):
-        starts = _starts(given, start, tell, should_stop)
-        found = search(scene, starts, tell)
+        found = search(scene, starts(given, start, tell, should_stop), tell)
     with _timed("smoothness", seconds):
         scene, best = with_likely_smoothness(scene, found[0], rng, tell)
         if given.counted:
-            scene = _reweighted(given, scene, best)
+            scene = reweighted(given, scene, best)
+            best = settled(scene, best, tell)
         basins = _basins(scene, best, found[1:], tell)
+        # In several images it shows in χ².
+        wider = _with_wider_spread(scene, best, tell) if given.single else best
     with _timed("full size", seconds):
         fine, unknowns, value, taken, ended = refined(scene, best, options, tell)
     with _timed("samples", seconds):
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", value))
         errors = _errors(scene, posterior, given.size, options.samples)
-        evidence = posterior.log_evidence() if options.evidence else float("nan")
+        evidence = float("nan")
+        if options.evidence:
+            evidence = _log_evidence(scene, best, fields, options, tell)
     found_by = FitReport(value, taken, ended, seconds, float("nan"), evidence)
-    return _result(given, fine, unknowns, fields, setups, options, basins, errors, found_by)
+    gain = best.value - wider.value
+    return _result(given, fine, unknowns, fields, setups, options, basins, errors, found_by, gain)
 
 
 def compare(
@@ -191,8 +206,8 @@ def compare(
     Returns
     -------
     tuple of Fit
-        One for each choice, the likeliest first: by ``report.log_evidence``, in which more
-        fields have to be worth it. A difference of 10 decides.
+        One for each choice, the likeliest first, by ``report.log_evidence``. A difference of 10
+        decides: of those nearer to the likeliest, that with the fewest fields comes first.
 
     Raises
     ------
@@ -206,7 +221,13 @@ def compare(
         )
     asked = (options or FitOptions()).model_copy(update={"evidence": True})
     fits = [fit(images, fields=choice, options=asked, **keywords) for choice in choices]
-    return tuple(sorted(fits, key=lambda each: -each.report.log_evidence))
+    least = max(each.report.log_evidence for each in fits) - _DECIDES
+
+    def rank(one: Fit) -> tuple[float, float]:
+        evidence = one.report.log_evidence
+        return (len(one.fields) if evidence > least else np.inf), -evidence
+
+    return tuple(sorted(fits, key=rank))
 
 
 @contextmanager
@@ -216,12 +237,12 @@ def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
     seconds[stage] = time.perf_counter() - begun
 
 
-def _starts(
+def starts(
     given: Measured, start: ArrayLike | None, tell: Any, should_stop: ShouldStop | None
 ) -> list[Start]:
     """What to start from: nothing, a field that was given, what transport makes of an image."""
     scene = given.scene
-    starts = []
+    found = []
     if start is not None:
         potential = np.array(start, dtype=np.float64)
         if potential.shape != given.size or not np.isfinite(potential).all():
@@ -229,22 +250,24 @@ def _starts(
                 f"start has shape {potential.shape}: expected a finite potential in px² of the "
                 f"images' shape {given.size}"
             )
-        starts.append(Start("given", ((2, 1.0),), potential))
+        found.append(Start("given", ((2, 1.0),), potential))
     if not given.single:
-        starts.append(Start("from far", _FROM_FAR))
-    starts.append(Start("from near", _FROM_NEAR))
+        found.append(Start("from far", _FROM_FAR))
+    found.append(Start("from near", _FROM_NEAR))
+    if scene.beam_modes and not given.single:
+        found.append(Start("from far, beam held", _FROM_FAR, beam_held=True))
     if scene.strengths.shape[1] > 1 or scene.beam_modes:
-        return starts
+        return found
     sizes = np.abs(scene.strengths[:, 0])  # zero where the object does not deflect: a blank shot
     weakest = int(np.argmin(np.where(sizes > 0, sizes, np.inf)))
     tell("transport", float("nan"))
     transported = _transported(given, weakest, should_stop)
     if transported is None:
-        return starts
+        return found
     potential = gaussian_filter(transported, _ROUNDED) / scene.strengths[weakest, 0]
     if not given.single:
-        return [*starts, Start("transport", ((2, 2.0), (2, 1.0)), potential)]
-    return starts + [
+        return [*found, Start("transport", ((2, 2.0), (2, 1.0)), potential)]
+    return found + [
         Start(f"{share:g} × transport", _FROM_FIELD, share * potential)
         for share in _SHARES_OF_TRANSPORT
     ]
@@ -272,7 +295,7 @@ def _transported(given: Measured, number: int, should_stop: ShouldStop | None) -
         return None
 
 
-def _reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
+def reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
     """Weights of counts, by what is expected instead of what was counted."""
     unknowns = finer(found.unknowns)
     expected = scene.model(unknowns, scene.ray_counts(unknowns))
@@ -282,28 +305,37 @@ def _reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
 
 
 def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tuple[Basin, ...]:
-    """The best answer and others, with the same λ and without blur."""
+    """The best answer and others, with the same λ and without blur.
+
+    Which is best has been told by smoother fields: the λ that is held now favours what follows the
+    noise.
+    """
     middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
-    found = []
-    for one in (best, *others[:2]):
-        unknowns, value = one.unknowns, one.value
-        if one is not best:
-            unknowns, value, _ = descend(
-                middle,
-                unknowns,
-                iterations=60,
-                least_gain=3.0,
-                after_step=lambda now: tell("other starts", now),
-            )
-        chi2 = middle.chi2(unknowns, middle.ray_counts(unknowns)).mean()
-        displacement = 2 * np.stack([middle.rays.displacement(p) for p in unknowns.potentials])
-        end = replace(one, unknowns=unknowns, value=value, displacement=displacement)
-        found.append((end, float(chi2)))
-    first = found[0][0]
+    ends = [best, *(settled(scene, one, tell, "other starts") for one in others[:2])]
+    chi2 = [middle.chi2(one.unknowns, middle.ray_counts(one.unknowns)).mean() for one in ends]
     return tuple(
-        Basin(end.start, end.value, chi2, first.distance(end), end.displacement)
-        for end, chi2 in found
+        Basin(end.start, end.value, float(each), best.distance(end), end.displacement)
+        for end, each in zip(ends, chi2, strict=True)
     )
+
+
+def _with_wider_spread(scene: Scene, best: Found, tell: Any) -> Found:
+    """What explains the images if they are blurred more than was said; kernels stay."""
+    wider = [float(np.hypot(one, _WIDER)) if isinstance(one, float) else one for one in scene.psf]
+    return settled(replace(scene, psf=wider), best, tell, "point spread")
+
+
+def _log_evidence(
+    scene: Scene, best: Found, names: Sequence[str], options: FitOptions, tell: Any
+) -> float:
+    """That of the likeliest λ and κ, where it does not depend on how closely they were found."""
+    if options.smoothness is None:
+        scene = replace(scene, smoothness=scene.smoothness / HELD)
+    ended = settled(scene, best, tell, "evidence", least_gain=0.1)
+    middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+    chances = [np.random.default_rng([options.seed, crc32(name.encode())]) for name in names]
+    posterior = Posterior(middle, ended.unknowns, chances[0], lambda: tell("evidence", ended.value))
+    return posterior.log_evidence(chances)
 
 
 def _errors(
@@ -331,6 +363,7 @@ def _result(
     basins: tuple[Basin, ...],
     errors: FloatArray | None,
     report: FitReport,
+    gain_by_blur: float,
 ) -> Fit:
     height, width = given.size
     counts = scene.ray_counts(unknowns)
@@ -343,11 +376,12 @@ def _result(
     fields = []
     for m, name in enumerate(names):
         potential = scene.rays.values(unknowns.potentials[m])[:height, :width]
-        edge = np.concatenate([potential[0], potential[-1], potential[:, 0], potential[:, -1]])
         displacement = scene.rays.displacement(unknowns.potentials[m])[:, :height, :width]
         error = None if errors is None else errors[m]
         smooth = (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1]))
-        fields.append(FittedField(name, potential - edge.mean(), displacement, error, smooth))
+        fields.append(
+            FittedField(name, potential - border_mean(potential), displacement, error, smooth)
+        )
     found = np.stack([field.displacement for field in fields])
     uncertainty = float("nan")
     if errors is not None:
@@ -368,9 +402,10 @@ def _result(
         single=given.single,
         beam_unknown=scene.beam_modes > 0,
         jacobian=jacobian,
-        folded=folded,
         uncertainty=uncertainty,
-        at_edge=_share_at_edge(np.hypot(*found.sum(axis=0))),
+        ended=report.converged,
+        gain_by_blur=gain_by_blur,
+        displacement=found.sum(axis=0),
         edge_is_free=options.edge == "free",
     )
     return Fit(
@@ -379,7 +414,7 @@ def _result(
         strengths=scene.strengths,
         fields=tuple(fields),
         source=scene.beam(unknowns)[:, :height, :width] * units * gains[:, None, None],
-        gains=gains,
+        gains=gains * given.gains,
         frames=unknowns.frames,
         reprojection=made,
         residual=np.where(used, data - made, 0.0),
@@ -392,12 +427,6 @@ def _result(
         options=options,
         setups=tuple(setups or ()),
     )
-
-
-def _share_at_edge(length: FloatArray) -> float:
-    """Largest value at an image's edge as a share of the largest anywhere."""
-    edge = max(side.max() for side in (length[0], length[-1], length[:, 0], length[:, -1]))
-    return float(edge / max(length.max(), 1e-12))
 
 
 def _names(setups: Sequence[Setup] | None, count: int) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.geometry._kernel import njit
 
-__all__ = ["KNOT", "MOST_RAYS", "deposit", "gather", "push", "spline_tables"]
+__all__ = ["KNOT", "MOST_RAYS", "boxes", "collect", "deposit", "gather", "spline_tables"]
 
 KNOT = 2  # px between knots
 MOST_RAYS = 64  # along a cell's side
@@ -79,7 +79,6 @@ def _land(
     m: int,
     y: float,
     x: float,
-    step: float,
     frame: FloatArray,
     steepness: float,
     size: tuple[int, int],
@@ -90,7 +89,7 @@ def _land(
     last_row, last_column = size[0] - 2.0, size[1] - 2.0
     for b in range(m):
         down = y - slopes[0, b]
-        right = x + (b + 0.5) * step - slopes[1, b]
+        right = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
         v = frame[0] + frame[1] * down + frame[2] * right
         u = frame[3] + frame[4] * down + frame[5] * right
         # Rays that miss land in the outermost pixels, which nobody looks at.
@@ -137,7 +136,7 @@ def deposit(
 ) -> None:
     """Share the rays of bands of cells among the pixels of each band's image."""
     rows, columns = counts.shape[1:]
-    bands, height, width = images.shape
+    bands, size = images.shape[0], (images.shape[1], images.shape[2])
     slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
     pixels, flux = np.empty((2, MOST_RAYS), np.uint32), np.empty(MOST_RAYS)
     for band in range(start, stop):
@@ -146,20 +145,9 @@ def deposit(
             for column in range(columns):
                 n, m = counts[0, row, column], counts[1, row, column]
                 for a in range(n):
-                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                    _land(
-                        slopes,
-                        m,
-                        y,
-                        x,
-                        KNOT / m,
-                        frame,
-                        steepness,
-                        (height, width),
-                        pixels,
-                        shares,
-                    )
+                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
+                    _land(slopes, m, y, x, frame, steepness, size, pixels, shares)
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     for b in range(m):
                         i, j = pixels[0, b], pixels[1, b]
@@ -247,20 +235,9 @@ def gather(
             for column in range(columns):
                 n, m = counts[0, row, column], counts[1, row, column]
                 for a in range(n):
-                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                    _land(
-                        slopes,
-                        m,
-                        y,
-                        x,
-                        KNOT / m,
-                        frame,
-                        steepness,
-                        size,
-                        pixels,
-                        shares,
-                    )
+                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
+                    _land(slopes, m, y, x, frame, steepness, size, pixels, shares)
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     for b in range(m):
                         i, j = pixels[0, b], pixels[1, b]
@@ -294,7 +271,7 @@ def gather(
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
-def push(
+def boxes(
     start: int,
     stop: int,
     potential: FloatArray,
@@ -304,73 +281,121 @@ def push(
     frame: FloatArray,
     pad: int,
     steepness: float,
-    change: FloatArray,
-    beam_change: FloatArray,
-    frame_change: FloatArray,
-    images: FloatArray,
+    size: tuple[int, int],
+    found: IntArray,
 ) -> None:
-    """Change of each band's image with that of coefficients, beam and frame: `gather` turned."""
-    rows, columns = counts.shape[1:]
-    bands, height, width = images.shape
+    """First row and column of the pixels that each cell reaches, and those after the last."""
+    columns = counts.shape[2]
     slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
-    moves = np.empty((2, MOST_RAYS))
-    pixels, flux = np.empty((2, MOST_RAYS), np.uint32), np.empty(MOST_RAYS)
-    more = np.empty(MOST_RAYS)
-    for band in range(start, stop):
-        image = images[band]
-        for row in range(rows * band // bands, rows * (band + 1) // bands):
-            for column in range(columns):
-                n, m = counts[0, row, column], counts[1, row, column]
-                for a in range(n):
-                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
-                    _slopes_of_row(change, row, column, tables, a, n, m, moves)
-                    y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                    _land(
-                        slopes,
-                        m,
-                        y,
-                        x,
-                        KNOT / m,
-                        frame,
-                        steepness,
-                        (height, width),
-                        pixels,
-                        shares,
-                    )
-                    _flux_of_row(beam, row, column, a, n, m, flux)
-                    _flux_of_row(beam_change, row, column, a, n, m, more)
-                    for b in range(m):
-                        i, j = pixels[0, b], pixels[1, b]
-                        i1, j1 = i + _ONE, j + _ONE
-                        down, right = shares[0, b], shares[1, b]
-                        landed_y = y - slopes[0, b]
-                        landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
-                        in_v = (
-                            frame_change[0]
-                            + frame_change[1] * landed_y
-                            + frame_change[2] * landed_x
-                            - frame[1] * moves[0, b]
-                            - frame[2] * moves[1, b]
-                        )
-                        in_u = (
-                            frame_change[3]
-                            + frame_change[4] * landed_y
-                            + frame_change[5] * landed_x
-                            - frame[4] * moves[0, b]
-                            - frame[5] * moves[1, b]
-                        )
-                        in_v *= flux[b] * shares[2, b]
-                        in_u *= flux[b] * shares[3, b]
-                        grown = more[b]
-                        image[i, j] += (
-                            grown * (1 - down) * (1 - right)
-                            - in_v * (1 - right)
-                            - in_u * (1 - down)
-                        )
-                        image[i, j1] += (
-                            grown * (1 - down) * right - in_v * right + in_u * (1 - down)
-                        )
-                        image[i1, j] += (
-                            grown * down * (1 - right) + in_v * (1 - right) - in_u * down
-                        )
-                        image[i1, j1] += grown * down * right + in_v * right + in_u * down
+    pixels = np.empty((2, MOST_RAYS), np.uint32)
+    for row in range(start, stop):
+        for column in range(columns):
+            n, m = counts[0, row, column], counts[1, row, column]
+            top, left, bottom, right = size[0], size[1], 0, 0
+            for a in range(n):
+                y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
+                _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
+                _land(slopes, m, y, x, frame, steepness, size, pixels, shares)
+                for b in range(m):
+                    i, j = int(pixels[0, b]), int(pixels[1, b])
+                    top, bottom = min(top, i), max(bottom, i + 2)
+                    left, right = min(left, j), max(right, j + 2)
+            found[row, column] = top, left, bottom, right
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def collect(
+    start: int,
+    stop: int,
+    potential: FloatArray,
+    counts: IntArray,
+    beam: FloatArray,
+    tables: FloatArray,
+    frame: FloatArray,
+    pad: int,
+    steepness: float,
+    size: tuple[int, int],
+    boxes: IntArray,
+    begins: IntArray,
+    width: int,
+    middle: tuple[float, float],
+    free: tuple[bool, bool],
+    places: IntArray,
+    values: FloatArray,
+) -> None:
+    """Derivatives of the pixels in each cell's box by its coefficients, its beam and the frame.
+
+    `places` are numbers of pixels in lines of `width`, and of coefficients, beam and frame.
+    """
+    columns = counts.shape[2]
+    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
+    pixels = np.empty((2, MOST_RAYS), np.uint32)
+    flux, first = np.empty(MOST_RAYS), np.empty(4)
+    beam_is_free, frame_is_free = free
+    last = potential.size + beam.size
+    for row in range(start, stop):
+        for column in range(columns):
+            n, m = counts[0, row, column], counts[1, row, column]
+            top, left, bottom, right = boxes[row, column]
+            wide = right - left
+            block = np.zeros((max(bottom - top, 0) * max(wide, 0), 26))
+            if not block.size:
+                continue
+            for a in range(n):
+                y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
+                _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
+                _land(slopes, m, y, x, frame, steepness, size, pixels, shares)
+                _flux_of_row(beam, row, column, a, n, m, flux)
+                upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
+                lower = KNOT**2 / (n * m) - upper
+                for b in range(m):
+                    landed_y = y - slopes[0, b] - middle[0]
+                    landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b] - middle[1]
+                    part = _first_pixels_share(b, m)
+                    first[:] = upper * part, upper * (1 - part), lower * part, lower * (1 - part)
+                    for q in range(4):
+                        i, j = int(pixels[0, b]) + q // 2, int(pixels[1, b]) + q % 2
+                        if not (top <= i < bottom and left <= j < right):
+                            continue
+                        line = block[(i - top) * wide + j - left]
+                        in_v = shares[0, b] if q // 2 else 1 - shares[0, b]
+                        in_u = shares[1, b] if q % 2 else 1 - shares[1, b]
+                        to_v = flux[b] * in_u * (shares[2, b] if q // 2 else -shares[2, b])
+                        to_u = flux[b] * in_v * (shares[3, b] if q % 2 else -shares[3, b])
+                        along = frame[1] * to_v + frame[4] * to_u
+                        across = frame[2] * to_v + frame[5] * to_u
+                        for r in range(4):
+                            steep = tables[n, 1, r, a] * along
+                            plain = tables[n, 0, r, a] * across
+                            for s in range(4):
+                                line[4 * r + s] -= (
+                                    steep * tables[m, 0, s, b] + plain * tables[m, 1, s, b]
+                                )
+                        if beam_is_free:
+                            for s in range(4):
+                                line[16 + s] += in_v * in_u * first[s]
+                        if frame_is_free:
+                            line[20] += to_v
+                            line[21] += to_v * landed_y
+                            line[22] += to_v * landed_x
+                            line[23] += to_u
+                            line[24] += to_u * landed_y
+                            line[25] += to_u * landed_x
+            entry = begins[row, column]
+            for p in range(len(block)):
+                pixel = (top + p // wide) * width + left + p % wide
+                for s in range(26):
+                    if s < 16:
+                        unknown = (row + s // 4) * potential.shape[1] + column + s % 4
+                    elif s < 20:
+                        if not beam_is_free:
+                            continue
+                        i, j = KNOT * row + (s - 16) // 2, KNOT * column + (s - 16) % 2
+                        unknown = potential.size + i * beam.shape[1] + j
+                    else:
+                        if not frame_is_free:
+                            continue
+                        unknown = last + s - 20
+                    places[0, entry], places[1, entry] = pixel, unknown
+                    values[entry] = block[p, s]
+                    entry += 1

@@ -1,4 +1,4 @@
-"""Steps towards the best unknowns: `Preconditioner`, `descend`; pixels: `coarser`, `finer`."""
+"""Steps towards the best unknowns: `descend`, `settle`; pixels: `coarser`, `finer`."""
 
 from __future__ import annotations
 
@@ -10,15 +10,26 @@ from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.minimise import minimise
+from napari_shadowinv.fitting.minimise import minimise, solve
 from napari_shadowinv.fitting.priors import POWERS
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 
-__all__ = ["Preconditioner", "binned", "coarser", "descend", "finer", "smoothness_in_pixels"]
+__all__ = [
+    "Preconditioner",
+    "binned",
+    "coarser",
+    "descend",
+    "finer",
+    "settle",
+    "smoothness_in_pixels",
+]
 
 _DESCENTS = 3  # with fixed numbers of rays each
 _FEW = 10  # steps, after which the numbers of rays still fit
+_MOST_NEWTON, _MOST_SHORTENED, _SHARES_OF_STEP = 8, 2, (1.0, 0.5, 0.25)  # of Gauss and Newton
+_NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many steps
+_MOST_PIXELS = 2_000_000  # of all images
 
 
 class Preconditioner:
@@ -135,6 +146,79 @@ def descend(
         if steps >= iterations or taken < _FEW:
             break
     return unknowns, value, steps
+
+
+def settle(
+    scene: Scene,
+    start: Unknowns,
+    *,
+    steps: int,
+    least_gain: float,
+    after_step: Callable[[float], None] | None = None,
+) -> tuple[Unknowns, float, int, bool]:
+    """Minimise a scene's objective from nearby: Gauss-Newton steps, and a descent if they fail.
+
+    They find what is only just determined, too, where a descent would end early.
+
+    Parameters
+    ----------
+    scene, start
+        What to explain, and from where.
+    steps : int
+        Most steps.
+    least_gain : float
+        Ends where one step, or five of a descent, lower the objective by less.
+    after_step : callable, optional
+        Receives the objective often.
+
+    Returns
+    -------
+    unknowns : Unknowns
+    value : float
+        The objective.
+    steps : int
+    ended : bool
+        Whether steps were left.
+    """
+    scales = Preconditioner(scene)
+    now = scales.damped(start)
+    counts = scene.ray_counts(now)
+    value, slope = scene.value_and_gradient(now, counts)
+    # Jacobians of many pixels would fill the memory.
+    newton = min(_MOST_NEWTON, steps) if scene.images.size <= _MOST_PIXELS else 0
+    taken = shortened = 0
+    while taken < newton and shortened < _MOST_SHORTENED:
+        linear = scene.linear(now, counts)
+
+        def times(flat: FloatArray) -> FloatArray:
+            if after_step is not None:
+                after_step(value)  # noqa: B023
+            change = scales.times(now.like(flat))  # noqa: B023
+            return scales.turned(linear.hessian_times(change)).flat()  # noqa: B023
+
+        down = -scales.turned(slope).flat()
+        step = solve(times, down, tolerance=_NEWTON, iterations=_MOST_SOLVING)
+        change = scales.times(now.like(step))
+        for share in _SHARES_OF_STEP:
+            there = now.plus(now.like(share * change.flat()))
+            counts_there = scene.ray_counts(there)
+            value_there, slope_there = scene.value_and_gradient(there, counts_there)
+            if value_there < value:
+                break
+        else:
+            break
+        taken, shortened = taken + 1, shortened + (share < 1)
+        gain = value - value_there
+        now, counts, value, slope = there, counts_there, value_there, slope_there
+        if gain < least_gain:
+            return now, value, taken, True
+    left = steps - taken
+    if left > 0:
+        now, value, more = descend(
+            scene, now, iterations=left, least_gain=least_gain, after_step=after_step
+        )
+        taken += more
+    return now, value, taken, taken < steps
 
 
 def binned(planes: FloatArray, factor: int) -> FloatArray:

@@ -7,20 +7,22 @@ by the instrument and multiplied by a gain.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.signal import oaconvolve
+from scipy.sparse import csr_array
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting.priors import Prior
-from napari_shadowinv.fitting.rays import Pulls, RayModel, at_rest
+from napari_shadowinv.fitting.rays import RayModel, at_rest
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 
-__all__ = ["Scene", "blurred"]
+__all__ = ["Linear", "Scene", "blurred"]
 
 _SIGMAS = 4.0  # how far Gaussians reach
 
@@ -39,7 +41,7 @@ class Scene:
         Known flux of the beams, as `RayModel.around` returns it.
     psf : sequence of float or ndarray
         Standard deviation in px of each image's point spread, or its kernel.
-    smoothness, tie, decay, beam_modes, fiducials
+    smoothness, tie, decay, beam_modes, beam_spread, fiducials
         See `Prior`; smoothness has the shape (M, 2).
     pad : int
         Width in px of the strip around the image from which rays may enter.
@@ -67,6 +69,7 @@ class Scene:
     decay: float = np.inf
     pad: int = 16
     beam_modes: int = 0
+    beam_spread: float = 0.3
     free_gains: bool = False
     free_frames: BoolArray = field(default_factory=lambda: np.zeros(6, bool))
     fiducials: Fiducials | None = None
@@ -74,6 +77,18 @@ class Scene:
     spacing: float = 0.25
     bin: int = 1
     threads: int | None = None
+
+    def only(self, numbers: Sequence[int]) -> Scene:
+        """Return some of the images, in this order; fields stay in the same unit."""
+        chosen = list(numbers)
+        return replace(
+            self,
+            images=self.images[chosen],
+            weights=self.weights[chosen],
+            strengths=self.strengths[chosen],
+            beams=self.beams[chosen],
+            psf=[self.psf[k] for k in chosen],
+        )
 
     @cached_property
     def rays(self) -> RayModel:
@@ -92,6 +107,7 @@ class Scene:
             tie=self.tie,
             decay=self.decay,
             beam_modes=self.beam_modes,
+            beam_spread=self.beam_spread,
             fiducials=self.fiducials,
             bin=self.bin,
         )
@@ -147,41 +163,18 @@ class Scene:
         slope.beam[:] += self._of_modes(of_shape * self._beam_shape(unknowns))
         return value, self._only_free(slope)
 
-    def hessian_times(
-        self, unknowns: Unknowns, counts: list[IntArray], change: Unknowns
-    ) -> Unknowns:
-        """Return the Gauss-Newton Hessian times a change of the unknowns."""
-        free = self._only_free(change)
-        pulled = self.pulled(unknowns, counts, self.pushed(unknowns, counts, free))
-        return self._only_free(self.prior.times(free)).plus(pulled)
-
-    def pushed(self, unknowns: Unknowns, counts: list[IntArray], change: Unknowns) -> FloatArray:
-        """Return the change of all residuals (f - I) / σ, to first order, shape (L, H, W)."""
-        of_beam = self._beam_shape(unknowns) * self._modes(change.beam)
-        changes = np.empty_like(self.images)
-        for k, psi, counted, beam, frame in self._shots(unknowns, counts):
-            turned = np.einsum("m,myx->yx", self.strengths[k], change.potentials)
-            by = Pulls(turned, self.beams[k] * of_beam, change.frames[k])
-            bare = self.rays.change(psi, counted, beam, by, frame)
-            if change.gains[k]:
-                bare += change.gains[k] * self.rays.image(psi, counted, beam, frame)
-            seen = np.exp(unknowns.gains[k]) * self._spread(k, bare)
-            changes[k] = np.sqrt(self.weights[k]) * seen
-        return changes
-
-    def pulled(self, unknowns: Unknowns, counts: list[IntArray], residuals: FloatArray) -> Unknowns:
-        """Return the transpose of `pushed` times residuals."""
-        slope = unknowns.zeros()
-        of_shape = np.zeros(self.beams.shape[1:])
-        for shot in self._shots(unknowns, counts):
-            k = shot[0]
-            pull = np.sqrt(self.weights[k]) * residuals[k]
-            if self.free_gains:
-                made = np.exp(unknowns.gains[k]) * self._bare(*shot)
-                slope.gains[k] = np.einsum("yx,yx", pull, made)
-            self._add_pulls(slope, of_shape, unknowns, shot, pull)
-        slope.beam[:] = self._of_modes(of_shape * self._beam_shape(unknowns))
-        return self._only_free(slope)
+    def linear(self, unknowns: Unknowns, counts: list[IntArray]) -> Linear:
+        """Return the scene to first order around unknowns."""
+        shots = list(self._shots(unknowns, counts))
+        jacobians = [
+            self.rays.jacobian(
+                *shot[1:],
+                of_beam=bool(self.beam_modes),
+                of_frame=shot[0] > 0 and bool(self.free_frames.any()),
+            )
+            for shot in shots
+        ]
+        return Linear(self, unknowns, jacobians, [self._bare(*shot) for shot in shots])
 
     def _shots(self, unknowns: Unknowns, counts: list[IntArray]) -> Iterator[_Shot]:
         shape = self._beam_shape(unknowns)
@@ -254,6 +247,65 @@ class Scene:
         width = self.psf[k]
         turned = width if isinstance(width, float) else width[::-1, ::-1]
         return _spread(np.pad(pull, self.rays.beyond), turned)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A scene to first order in changes of unknowns.
+
+    Attributes
+    ----------
+    scene, unknowns
+        What it is of, and around what.
+    jacobians : list of csr_array
+        As `RayModel.jacobian` returns them, for each image.
+    bare : list of ndarray
+        The images without their gains.
+    """
+
+    scene: Scene
+    unknowns: Unknowns
+    jacobians: list[csr_array]
+    bare: list[FloatArray]
+
+    def hessian_times(self, change: Unknowns) -> Unknowns:
+        """Return the Gauss-Newton Hessian times a change of the unknowns."""
+        free = self.scene._only_free(change)
+        pulled = self.pulled(self.pushed(free))
+        return self.scene._only_free(self.scene.prior.times(free)).plus(pulled)
+
+    def pushed(self, change: Unknowns) -> FloatArray:
+        """Return the change of all residuals (f - I) / σ, to first order, shape (L, H, W)."""
+        scene = self.scene
+        of_shape = scene._beam_shape(self.unknowns) * scene._modes(change.beam)
+        potentials = scene.potentials(change)
+        gains = np.exp(self.unknowns.gains)
+        changes = np.empty_like(scene.images)
+        for k, jacobian in enumerate(self.jacobians):
+            of_beam = scene.beams[k] * of_shape
+            columns = [potentials[k].ravel(), of_beam.ravel(), change.frames[k]]
+            landed = (jacobian @ np.concatenate(columns)).reshape(scene.rays.seen)
+            bare = scene._spread(k, landed) + change.gains[k] * self.bare[k]
+            changes[k] = np.sqrt(scene.weights[k]) * gains[k] * bare
+        return changes
+
+    def pulled(self, residuals: FloatArray) -> Unknowns:
+        """Return the transpose of `pushed` times residuals."""
+        scene = self.scene
+        slope = self.unknowns.zeros()
+        of_shape = np.zeros(scene.beams.shape[1:])
+        gains = np.exp(self.unknowns.gains)
+        for k, jacobian in enumerate(self.jacobians):
+            pull = gains[k] * np.sqrt(scene.weights[k]) * residuals[k]
+            slope.gains[k] = np.einsum("yx,yx", pull, self.bare[k])
+            columns = jacobian.T @ scene._spread_back(k, pull).ravel()
+            of_potential, of_beam, of_frame = np.split(columns, [math.prod(scene.rays.shape), -6])
+            psi = of_potential.reshape(scene.rays.shape)
+            slope.potentials[:] += scene.strengths[k][:, None, None] * psi
+            of_shape += of_beam.reshape(of_shape.shape) * scene.beams[k]
+            slope.frames[k] = of_frame
+        slope.beam[:] = scene._of_modes(of_shape * scene._beam_shape(self.unknowns))
+        return scene._only_free(slope)
 
 
 _Shot = tuple[int, FloatArray, IntArray, FloatArray, FloatArray]  # number, ψ, rays, beam, frame

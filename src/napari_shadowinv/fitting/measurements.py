@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -18,20 +18,20 @@ from scipy.ndimage import uniform_filter
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.options import FitOptions
 from napari_shadowinv.fitting.unknowns import Fiducials
+from napari_shadowinv.options import FIELDS, FitOptions
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["FIELDS", "Measured", "estimated_noise", "measured", "point_spread", "strengths_of"]
-
-FIELDS = {
-    "B": "magnetic field",
-    "E": "electric field",
-    "plasma": "plasma",
-    "phase": "refractive index",
-}
-"""What can deflect a beam, by the names that a fit takes."""
+__all__ = [
+    "FIELDS",
+    "FitOptions",
+    "Measured",
+    "estimated_noise",
+    "measured",
+    "point_spread",
+    "strengths_of",
+]
 
 _BLOCK = 8  # px; sides are filled up to a multiple of it, for pixels four times as wide
 _SMALLEST_SIDE = 32
@@ -40,6 +40,7 @@ _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
 _LEAST_COUNTS = 1.0
 _SMOOTHED = 5  # px, over which counts are averaged for their first standard deviation
 _SAME = _ALIKE = 1e-6
+_OTHER_UNITS = 3.0  # an image's mean brightness over its source's
 _FREE_SHARE = 0.1  # of the shorter side
 _FREE_TIE = 0.3
 
@@ -55,14 +56,21 @@ class Measured:
     """Images in units of their beams, and what is known about them.
 
     `scene` has the sides of blocks; the images are its first `size` pixels. `units` (L,) is what
-    one unit is in each recorded image; `counted` whether the noise is that of counts.
+    one unit is in each recorded image, `gains` (L,) how much brighter it is than its source, or
+    about where that is unknown; `counted` tells whether the noise is that of counts.
     """
 
     scene: Scene
     size: tuple[int, int]
     units: FloatArray
+    gains: FloatArray
     counted: bool
     single: bool  # one image, or several with the same information
+
+    def held(self, smoothness: float | None) -> Scene:
+        """Return the scene with λ as it was given, or none yet, for each field."""
+        fields = self.scene.strengths.shape[1]
+        return replace(self.scene, smoothness=np.tile((smoothness or 0.0, 0.0), (fields, 1)))
 
 
 def measured(
@@ -78,19 +86,27 @@ def measured(
     gains: ArrayLike | Literal["known", "free"],
     fiducials: ArrayLike | None,
     options: FitOptions,
+    names: Sequence[str] | None = None,
 ) -> Measured:
     """Check what is given to a fit; see `fit` for what it may be."""
     data = _checked_images(images)
     count, height, width = data.shape
-    used = _checked_mask(mask, data)
-    matrix = strengths_of(setups, fields, count) if strengths is None else strengths
+    names = names or [f"image {k + 1}" for k in range(count)]
+    if len(names) != count:
+        raise InputError(f"received {count} images and {len(names)} names: expected one each")
+    used = _checked_mask(mask, data, names)
+    matrix = strengths_of(setups, fields, count, names) if strengths is None else strengths
     matrix = _checked_strengths(matrix, count)
     if strengths is not None and setups is not None:
         raise InputError("received both strengths and setups, expected one of them")
     _refuse_what_one_image_cannot_tell(matrix, source, options)
     free_gains, factors = _checked_gains(gains, count)
-    beams = factors[:, None, None] * _checked_source(source, data, used)
-    _refuse_what_is_given_twice(data, beams, used, matrix)
+    beams = _checked_source(source, data, used)
+    if free_gains:
+        factors = _brightness(data, beams, used)
+    beams = factors[:, None, None] * beams
+    _refuse_other_units(_brightness(data, beams, used), names)
+    _refuse_what_is_given_twice(data, beams, used, matrix, names)
     unknown = isinstance(source, str)
     units = np.array([beam[use].mean() for beam, use in zip(beams, used, strict=True)])
     scaled = np.where(used, data / units[:, None, None], 0.0)
@@ -121,13 +137,18 @@ def measured(
     )
     spread = np.linalg.norm(matrix, axis=1)
     single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
-    return Measured(scene, (height, width), units, isinstance(noise, str), single)
+    return Measured(scene, (height, width), units, factors, isinstance(noise, str), single)
 
 
 _SAME_STRENGTH = 1.08  # images that differ by less tell no more than one
 
 
-def strengths_of(setups: Sequence[Setup] | None, fields: Sequence[str], count: int) -> FloatArray:
+def strengths_of(
+    setups: Sequence[Setup] | None,
+    fields: Sequence[str],
+    count: int,
+    names: Sequence[str] | None = None,
+) -> FloatArray:
     """Return the displacement by each field in each image relative to the first, shape (L, M).
 
     Parameters
@@ -138,6 +159,8 @@ def strengths_of(setups: Sequence[Setup] | None, fields: Sequence[str], count: i
         Of `FIELDS`.
     count : int
         Number of images.
+    names : sequence of str, optional
+        What messages call them. Default: their numbers.
 
     Raises
     ------
@@ -160,8 +183,9 @@ def strengths_of(setups: Sequence[Setup] | None, fields: Sequence[str], count: i
     for k, setup in enumerate(setups):
         ratio = setup.object_pixel_size / first.object_pixel_size
         if abs(ratio - 1) > _SAME:
+            name = names[k] if names else f"image {k + 1}"
             raise InputError(
-                f"image {k + 1} has pixels of {setup.object_pixel_size * 1e6:.6g} µm at the "
+                f"{name} has pixels of {setup.object_pixel_size * 1e6:.6g} µm at the "
                 f"object, the first of {first.object_pixel_size * 1e6:.6g} µm: bring all images "
                 "to the same pixels first"
             )
@@ -244,7 +268,7 @@ def _numbers(name: str, values: ArrayLike) -> FloatArray:
         raise InputError(f"{name} is {text:.60}: expected numbers, as many in each row") from error
 
 
-def _checked_mask(mask: ArrayLike | None, data: FloatArray) -> BoolArray:
+def _checked_mask(mask: ArrayLike | None, data: FloatArray, names: Sequence[str]) -> BoolArray:
     if mask is None:
         used = np.ones(data.shape, bool)
     else:
@@ -255,18 +279,17 @@ def _checked_mask(mask: ArrayLike | None, data: FloatArray) -> BoolArray:
                 "images"
             )
         used = np.broadcast_to(used, data.shape)
-    bad = int((~np.isfinite(data) & used).sum())
-    if bad:
-        raise InputError(
-            f"images have {bad} pixels that are NaN or infinite, expected finite numbers: mask them"
-        )
-    for k, plane in enumerate(used):
-        if plane.mean() < 0.05:
+    for name, image, plane in zip(names, data, used, strict=True):
+        bad = int((~np.isfinite(image) & plane).sum())
+        if bad:
             raise InputError(
-                f"image {k + 1} has {plane.mean():.1%} of its pixels in use: unmask some"
+                f"{name} has {bad} pixels that are NaN or infinite, expected finite numbers: mask "
+                "them"
             )
-        if not data[k][plane].mean() > 0:
-            raise InputError(f"image {k + 1} has no flux: expected a beam; check its background")
+        if plane.mean() < 0.05:
+            raise InputError(f"{name} has {plane.mean():.1%} of its pixels in use: unmask some")
+        if not image[plane].mean() > 0:
+            raise InputError(f"{name} has no flux: expected a beam; check its background")
     return used
 
 
@@ -303,19 +326,23 @@ def _refuse_what_one_image_cannot_tell(
 
 
 def _refuse_what_is_given_twice(
-    data: FloatArray, beams: FloatArray, used: BoolArray, strengths: FloatArray
+    data: FloatArray,
+    beams: FloatArray,
+    used: BoolArray,
+    strengths: FloatArray,
+    names: Sequence[str],
 ) -> None:
     for k, (image, beam, use) in enumerate(zip(data, beams, used, strict=True)):
         if strengths[k].any() and _are_alike(image[use], beam[use]):
             raise InputError(
-                f"the source is image {k + 1} itself, so that nothing would have deflected: give "
+                f"the source is {names[k]} itself, so that nothing would have deflected: give "
                 "an image of the beam without the object"
             )
         for other in range(k):
             both = use & used[other]
             if _are_alike(image[both], data[other][both]):
                 raise InputError(
-                    f"images {other + 1} and {k + 1} are the same: give each image once"
+                    f"{names[other]} and {names[k]} are the same: give each image once"
                 )
 
 
@@ -338,6 +365,24 @@ def _checked_gains(gains: ArrayLike | str, count: int) -> tuple[bool, FloatArray
             f"gains are {gains}: expected a positive number for each of {count} images"
         )
     return False, factors
+
+
+def _brightness(data: FloatArray, beams: FloatArray, used: BoolArray) -> FloatArray:
+    """How much brighter each image is than its beam, on average."""
+    ratios = [
+        image[use].mean() / beam[use].mean()
+        for image, beam, use in zip(data, beams, used, strict=True)
+    ]
+    return np.array(ratios)
+
+
+def _refuse_other_units(brightness: FloatArray, names: Sequence[str]) -> None:
+    for name, ratio in zip(names, brightness, strict=True):
+        if not 1 / _OTHER_UNITS < ratio < _OTHER_UNITS:
+            raise InputError(
+                f"{name} is {ratio:.3g} times as bright as its source: expected the same units; "
+                "give gains, or let them be free"
+            )
 
 
 def _checked_source(source: Any, data: FloatArray, used: BoolArray) -> FloatArray:

@@ -8,13 +8,13 @@ Appl. 38, 1075 (2017).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.fft import dctn
+from scipy.fft import dctn, idctn
 from scipy.linalg import eigh_tridiagonal
 
-from napari_shadowinv._typing import FloatArray, IntArray
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.descent import Preconditioner
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.minimise import product, solve
@@ -22,9 +22,9 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 
 __all__ = ["Posterior"]
 
-_ROUGHLY, _CLOSELY, _MOST_STEPS = 0.05, 0.02, 150
-_BESIDE_BEAM, _MOST_BESIDE_BEAM = 0.002, 600  # what beam and field can trade is found last
-_PROBES, _LANCZOS = 4, 25
+_ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
+_MOST_STEPS = 600
+_PROBES, _LANCZOS = 8, 25
 _LEAST_DETERMINED = 1e-3  # coefficients
 _OVERSHOOT, _MOST_CHANGE = 1.7, 15.0  # of λ in a step; it would approach its end too slowly
 
@@ -50,7 +50,8 @@ class Posterior:
         after_step: Callable[[], None] | None = None,
     ) -> None:
         self._scene, self._unknowns, self._rng = scene, unknowns, rng
-        self._counts: list[IntArray] = scene.ray_counts(unknowns)
+        self._counts = scene.ray_counts(unknowns)
+        self._linear = scene.linear(unknowns, self._counts)
         self._scales = Preconditioner(scene)
         self._after_step = after_step or (lambda: None)
 
@@ -81,16 +82,15 @@ class Posterior:
     def drawn(self) -> Unknowns:
         """Return a random change of the unknowns, as large as the data leave possible."""
         noise = self._rng.normal(size=self._scene.images.shape)
-        slope = self._scene.pulled(self._unknowns, self._counts, noise)
+        slope = self._linear.pulled(noise)
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
-        # The longest waves, which the noise moves most, are the last to be found.
-        tolerance = _BESIDE_BEAM if self._scene.beam_modes else _CLOSELY
-        return self._scales.times(self._unknowns.like(self._solved(slope, tolerance)))
+        return self._scales.times(self._unknowns.like(self._solved(slope, _CLOSELY)))
 
-    def log_volume(self) -> float:
-        """Return half the logarithm of the Hessian's determinant in the cosines' scales.
+    def log_volume(self, chances: Sequence[np.random.Generator]) -> float:
+        """Return half the log of the Hessian's determinant over that of the prior of potentials.
 
-        By stochastic Lanczos quadrature.
+        By stochastic Lanczos quadrature, with the same probes for both, and for each field those
+        of its own generator: a field that the data do not show adds nothing to others.
         """
         # What is fixed has no scale, and no part in the volume; nor what nothing holds.
         ones = self._unknowns.like(np.ones(self._unknowns.flat().size))
@@ -98,37 +98,66 @@ class Posterior:
         if np.isinf(self._scene.decay):
             moved.potentials[:, 0, 0] = 0
         free = moved.flat() != 0
-        size = int(free.sum())
+        held = np.arange(free.size) < ones.potentials.size
         total = 0.0
         for _ in range(_PROBES):
-            signs = free * self._rng.choice([-1.0, 1.0], free.size)
-            diagonal, beside = self._lanczos(signs / np.sqrt(size))
-            values, vectors = eigh_tridiagonal(diagonal, beside)
-            total += size * float((vectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
+            of_fields = [chance.choice([-1.0, 1.0], free.size) for chance in chances]
+            signs = free * self._signs(of_fields)
+            total += self._log_determinant(self._times, signs)
+            total -= self._log_determinant(self._prior_times, held * signs)
         return total / _PROBES / 2 - self._scales.log_size()
 
-    def log_evidence(self) -> float:
-        """Return the logarithm of how likely the model makes the data, but for a constant."""
+    def _signs(self, of_fields: Sequence[FloatArray]) -> FloatArray:
+        """A probe: each field's from its own, the rest from the first."""
+        probe = self._unknowns.like(of_fields[0])
+        for m, signs in enumerate(of_fields):
+            probe.potentials[m] = self._unknowns.like(signs).potentials[0]
+        return probe.flat()
+
+    def log_evidence(self, chances: Sequence[np.random.Generator]) -> float:
+        """Return the logarithm of how likely the model makes the data, but for a constant.
+
+        `chances` are the sources of what is random about each field.
+        """
         value, _ = self._scene.value_and_gradient(self._unknowns, self._counts)
-        return -value - self.log_volume()
+        return -value - self.log_volume(chances)
 
     def _times(self, flat: FloatArray) -> FloatArray:
         self._after_step()
         change = self._scales.times(self._unknowns.like(flat))
-        turned = self._scene.hessian_times(self._unknowns, self._counts, change)
+        turned = self._linear.hessian_times(change)
         return self._scales.turned(turned).flat()
 
     def _solved(self, slope: Unknowns, tolerance: float) -> FloatArray:
         """The scaled change of the unknowns that undoes a slope."""
         right = self._scales.turned(slope).flat()
-        most = _MOST_BESIDE_BEAM if tolerance == _BESIDE_BEAM else _MOST_STEPS
-        return solve(self._times, right, tolerance=tolerance, iterations=most)
+        return solve(self._times, right, tolerance=tolerance, iterations=_MOST_STEPS)
 
-    def _lanczos(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Diagonal and off-diagonal of the Hessian in the space of its first powers."""
+    def _prior_times(self, flat: FloatArray) -> FloatArray:
+        """The potentials' prior in scales in which it is about the identity."""
+        like, prior = self._unknowns, self._scene.prior
+        scale = 1 / np.sqrt(prior.of_potentials())
+        waves = scale * like.like(flat).potentials
+        change = like.zeros()._replace(potentials=idctn(waves, axes=(1, 2), norm="ortho"))
+        turned = scale * dctn(prior.times(change).potentials, axes=(1, 2), norm="ortho")
+        return like.zeros()._replace(potentials=turned).flat()
+
+    def _log_determinant(
+        self, times: Callable[[FloatArray], FloatArray], signs: FloatArray
+    ) -> float:
+        """What a probe tells of the trace of a matrix's logarithm."""
+        size = float(np.abs(signs).sum())
+        diagonal, beside = self._lanczos(times, signs / np.sqrt(size))
+        values, vectors = eigh_tridiagonal(diagonal, beside)
+        return size * float((vectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
+
+    def _lanczos(
+        self, times: Callable[[FloatArray], FloatArray], start: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Diagonal and off-diagonal of a matrix in the space of its first powers."""
         vectors, diagonal, beside = [start], [], []
         for k in range(_LANCZOS):
-            image = self._times(vectors[-1])
+            image = times(vectors[-1])
             diagonal.append(product(image, vectors[-1]))
             for vector in vectors:
                 image -= product(image, vector) * vector

@@ -25,7 +25,6 @@ __all__ = ["POWERS", "Prior"]
 POWERS = (4, 6)  # of the wave number squared: |∇⁴φ|² and |∇⁶φ|²
 
 _GAIN_WEIGHT = 1.0  # 1 / s² of their logarithm
-_BEAM_SPREAD = 0.3  # of the first cosines of its logarithm
 _SHIFT_SPREAD, _STRETCH_SPREAD = 5.0, 0.05  # px of the recorded image, and shares
 
 
@@ -45,6 +44,8 @@ class Prior:
         µ, and the length ℓ in px over which potentials fade in the pad.
     beam_modes : int
         Cosines of the beam's logarithm along each axis.
+    beam_spread : float
+        Standard deviation of the first of them.
     fiducials : Fiducials or None
         Displacements known at points.
     bin : int
@@ -57,6 +58,7 @@ class Prior:
     tie: float
     decay: float
     beam_modes: int
+    beam_spread: float
     fiducials: Fiducials | None
     bin: int
 
@@ -95,8 +97,9 @@ class Prior:
 
     def drawn(self, like: Unknowns, rng: np.random.Generator) -> Unknowns:
         """Return a random slope whose covariance is the terms' Hessian."""
-        potentials = np.stack([self.root_of_smoothness(m, rng.normal(size=self.rays.shape))
-                               for m in range(len(self.smoothness))])  # fmt: skip
+        shape, fields = self.rays.shape, range(len(self.smoothness))
+        rough = [self.root_of_smoothness(m, rng.normal(size=shape)) for m in fields]
+        potentials = np.stack(rough)
         steps_y, steps_x = self._steps(potentials)
         in_y, in_x = (rng.normal(size=steps.shape) for steps in (steps_y, steps_x))
         along_y, along_x = self._in_pad
@@ -145,7 +148,7 @@ class Prior:
         order = np.arange(self.beam_modes)
         square = order[:, None] ** 2 + order**2
         used = (square > 0) & (square < self.beam_modes**2)
-        return np.where(used, square / _BEAM_SPREAD**2, 0.0)
+        return np.where(used, square / self.beam_spread**2, 0.0)
 
     @cached_property
     def frame_weights(self) -> FloatArray:

@@ -15,6 +15,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray, IntArray
@@ -23,7 +24,7 @@ from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
 
 __all__ = ["KNOT", "Pulls", "RayModel", "at_rest"]
 
-_SHARED = 1.8  # of the spacing: width around an edge between pixels where a ray counts in both
+_SHARED = 2.0  # spacings at rest: width of an edge where rays count in both pixels, evenly then
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
 _GUARD = 2  # px around the detector, for rays that miss it
 _WORTH_A_THREAD = 20_000  # rays
@@ -65,6 +66,13 @@ class RayModel:
     beyond: int = 0
     spacing: float = 0.25
     threads: int | None = None
+
+    @property
+    def _at_rest(self) -> int:
+        """Rays along a cell's side where nothing stretches it."""
+        count = math.ceil(KNOT / self.spacing - 1e-9)
+        # They shall not land on the kinks of their shares.
+        return count + (count % 4 == 2)
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -109,9 +117,8 @@ class RayModel:
         # The curvature within a cell is a mean of that at its four corners.
         most = np.maximum(stretch[:, 1:], stretch[:, :-1])
         most = np.maximum(most[:, :, 1:], most[:, :, :-1])
-        wanted = np.ceil(KNOT * np.maximum(most, 0.5) / self.spacing).astype(np.int64)
-        # Rays at rest shall not land on the kinks of their shares.
-        return np.asarray(np.minimum(wanted + (wanted % 4 == 2), MOST_RAYS))
+        wanted = np.rint(np.maximum(most, 0.5) * self._at_rest).astype(np.int64)
+        return np.asarray(np.minimum(wanted, MOST_RAYS))
 
     def image(
         self,
@@ -169,29 +176,46 @@ class RayModel:
         about_middle = self._about_middle(found.frame.sum(axis=0))
         return Pulls(found.potential.sum(axis=0), found.beam, about_middle)
 
-    def change(
+    def jacobian(
         self,
         potential: FloatArray,
         counts: IntArray,
         beam: FloatArray,
-        by: Pulls,
         frame: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return how the image changes, to first order, with potential, beam and frame.
+        *,
+        of_beam: bool = True,
+        of_frame: bool = True,
+    ) -> csr_array:
+        """Return the derivatives of each pixel of the image at fixed `counts`.
 
         Parameters
         ----------
-        potential, counts, beam, frame
-            As for `image`.
-        by : Pulls
-            Their changes.
+        potential, counts, beam, frame, of_beam, of_frame
+            As for `gradient`.
+
+        Returns
+        -------
+        csr_array
+            A row for each pixel; columns for the coefficients, the beam's pixels and the frame.
         """
-        images = self._blank()
-        turned = self._from_corner(by.frame)
-        self._in_bands(
-            kernels.push, potential, counts, beam, frame, by.potential, by.beam, turned, images
-        )
-        return self._of_detector(images)
+        size = self.seen[0] + 2 * _GUARD, self.seen[1] + 2 * _GUARD
+        given = potential, counts, beam, frame
+        reached = np.empty((*self.cells, 4), np.int64)
+        self._in_ranges(kernels.boxes, len(reached), *given, size, reached)
+        # The guard belongs to no pixel.
+        first = np.maximum(reached[..., :2], _GUARD)
+        behind = np.minimum(reached[..., 2:], np.array(self.seen) + _GUARD)
+        reached = np.concatenate([first, behind], axis=2)
+        columns = 16 + 4 * of_beam + 6 * of_frame
+        entries = columns * np.maximum(behind - first, 0).prod(axis=2)
+        ends = np.cumsum(entries).reshape(entries.shape)
+        places = np.empty((2, ends[-1, -1]), np.int32)
+        values = np.empty(ends[-1, -1])
+        rest = reached, ends - entries, size[1], self._middle, (of_beam, of_frame), places, values
+        self._in_ranges(kernels.collect, len(reached), *given, size, *rest)
+        shape = (size[0] * size[1], potential.size + beam.size + 6)
+        inner = np.arange(shape[0]).reshape(size)[_GUARD:-_GUARD, _GUARD:-_GUARD].ravel()
+        return csr_array(coo_array((values, tuple(places)), shape=shape))[inner]
 
     def displacement(self, potential: FloatArray) -> FloatArray:
         """Return -∇ψ in px at the pixels' centres, shape (2, H, W), in axis order (y, x)."""
@@ -225,12 +249,25 @@ class RayModel:
         frame: FloatArray | None,
         *rest: FloatArray | bool,
     ) -> None:
+        self._in_ranges(kernel, _BANDS, potential, counts, beam, frame, *rest)
+
+    def _in_ranges(
+        self,
+        kernel: Callable[..., Any],
+        ranges: int,
+        potential: FloatArray,
+        counts: IntArray,
+        beam: FloatArray,
+        frame: FloatArray | None,
+        *rest: Any,
+    ) -> None:
         seen = self._to_pixels(at_rest() if frame is None else frame)
         threads = available_threads(self.threads)
         if (counts[0] * counts[1]).sum() < _WORTH_A_THREAD:
             threads = 1
-        fixed = (potential, counts, beam, _tables(), seen, self.pad, 1 / (_SHARED * self.spacing))
-        in_ranges(kernel, _BANDS, threads, *fixed, *rest, smallest=1)
+        steepness = self._at_rest / KNOT / _SHARED
+        fixed = (potential, counts, beam, _tables(), seen, self.pad, steepness)
+        in_ranges(kernel, ranges, threads, *fixed, *rest, smallest=1)
 
     @property
     def _middle(self) -> tuple[float, float]:

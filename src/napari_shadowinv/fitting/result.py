@@ -12,10 +12,17 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting.options import FitOptions
 from napari_shadowinv.fitting.verdict import Verdict
-from napari_shadowinv.inversion.labels import FIT_FORMAT, dataset_from_field, label
+from napari_shadowinv.inversion.labels import (
+    FIT_FORMAT,
+    UNCERTAINTY,
+    belongs,
+    dataset_from_field,
+    label,
+)
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
+from napari_shadowinv.preprocessing import FitProvenance
 
 if TYPE_CHECKING:
     import xarray
@@ -147,7 +154,7 @@ class Fit:
     source : ndarray, shape (L, H, W)
         The undisturbed beam of each image, its gain included.
     gains : ndarray, shape (L,)
-        Factors that the images were found to be brighter by than given.
+        How much brighter each image is than the source that was given.
     frames : ndarray, shape (L, 6)
         Where each detector sees what lands at (y, x), px from the image's middle: at
         (f0 + f1 y + f2 x, f3 + f4 y + f5 x).
@@ -169,6 +176,8 @@ class Fit:
         The options used.
     setups : tuple of Setup
         The experiment of each image, if they are known.
+    provenance : FitProvenance or None
+        How it was made, if that is known: from which files, and by which recipe.
     """
 
     images: FloatArray
@@ -188,6 +197,7 @@ class Fit:
     report: FitReport
     options: FitOptions
     setups: tuple[Setup, ...] = ()
+    provenance: FitProvenance | None = None
 
     def to_dataset(
         self,
@@ -225,17 +235,15 @@ class Fit:
             "fields": json.dumps([field.name for field in self.fields]),
             "setups": json.dumps([one.model_dump(mode="json") for one in known]),
         }
+        if self.provenance is not None:
+            history["provenance"] = self.provenance.model_dump_json(exclude_none=True)
         merged = xr.Dataset()
         for field in self.fields:
             one = dataset_from_field(field.displacement, field.potential, setup)
-            one = one.drop_vars([name for name in one.data_vars if not _belongs(name, field.name)])
+            one = one.drop_vars([name for name in one.data_vars if not belongs(name, field.name)])
             if field.uncertainty is not None:
-                told = label("px", "Standard deviation of the displacement")
-                one["displacement_uncertainty"] = (
-                    one["displacement"].dims,
-                    field.uncertainty,
-                    told,
-                )
+                vectors, *words = UNCERTAINTY
+                one["displacement_uncertainty"] = vectors, field.uncertainty, label(*words)
             attrs = one.attrs
             if len(self.fields) > 1:
                 one = one.rename({name: f"{name}_{field.name}" for name in one.data_vars})
@@ -302,6 +310,7 @@ class Fit:
                 setup_from_dict(one, "the dataset's setups")
                 for one in json.loads(attributes["setups"])
             ),
+            provenance=FitProvenance.of(attributes),
         )
 
     def _arrays(self) -> dict[str, AnyArray]:
@@ -338,11 +347,3 @@ def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArr
         )
     weights = float(smoothness[0]), float(smoothness[1])
     return FittedField(name, potential, displacement, uncertainty, weights)
-
-
-_ASSUMES = {"path_integrated_b": "B", "path_integrated_e": "E"}
-
-
-def _belongs(variable: object, field: str) -> bool:
-    """Whether a variable makes sense for a field: ∫E dz of a magnetic one does not."""
-    return _ASSUMES.get(str(variable), field) == field

@@ -9,36 +9,42 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import coarser, descend, finer, smoothness_in_pixels
+from napari_shadowinv.fitting.descent import coarser, descend, finer, settle, smoothness_in_pixels
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.options import FitOptions
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.options import FitOptions
+from napari_shadowinv.physics.poisson import border_mean
 
 __all__ = [
+    "FIRST_SMOOTHNESS",
+    "HELD",
     "MIDDLE",
     "MIDDLE_SPACING",
     "Found",
     "Start",
     "refined",
     "search",
+    "settled",
     "with_likely_smoothness",
 ]
 
 Tell = Callable[[str, float], None]
 
 MIDDLE = 2  # pixels in which starts are compared and λ is found
-_FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
+FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
 _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
 _COARSE_STEPS, _COARSE_GAIN, _FINE_GAIN = 60, 3.0, 2.0
+_LAST_GAIN = 0.5  # in pixels of two, where it costs little
+_HELD_BEAM = 0.01  # spread of an unknown beam's cosines before the field has been found
 _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
 _COARSE_SPACING, MIDDLE_SPACING = 1 / 3, 0.25
 _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
 _ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share they may still change
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
-_HELD = 0.1  # of them
+HELD = 0.1  # of them
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
 
@@ -46,12 +52,14 @@ _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 class Start:
     """Where a descent begins: a potential in px² at the pixels, or none; pixels and blurs of it.
 
-    `stages` are (side of a pixel, blur in such pixels).
+    `stages` are (side of a pixel, blur in such pixels). In all but the last an unknown beam may be
+    held.
     """
 
     name: str
     stages: tuple[tuple[int, float], ...]
     potential: FloatArray | None = None
+    beam_held: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,8 +84,8 @@ def _splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
     rays = scene.rays
     lines = ((KNOT * (np.arange(n) - 1.0) - rays.pad) * scene.bin - 0.5 for n in rays.shape)
     places = np.meshgrid(*lines, indexing="ij")
-    edge = np.concatenate([potential[0], potential[-1], potential[:, 0], potential[:, -1]]).mean()
-    values = map_coordinates(potential - edge, places, order=1, mode="nearest")
+    inner = potential - border_mean(potential)
+    values = map_coordinates(inner, places, order=1, mode="nearest")
     return np.asarray(values) / scene.bin**2
 
 
@@ -88,7 +96,7 @@ def search(scene: Scene, starts: Sequence[Start], tell: Tell) -> list[Found]:
     """
     rough = replace(
         scene,
-        smoothness=_COARSE_SMOOTHNESS * np.tile(_FIRST_SMOOTHNESS, (len(scene.smoothness), 1)),
+        smoothness=_COARSE_SMOOTHNESS * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)),
         spacing=_COARSE_SPACING,
     )
     halfway: dict[tuple[int, float], list[Found]] = {}
@@ -96,8 +104,9 @@ def search(scene: Scene, starts: Sequence[Start], tell: Tell) -> list[Found]:
     for start in starts:
         *before, last = start.stages
         found = _begun(coarser(rough, start.stages[0][0]), start)
+        first = replace(rough, beam_spread=_HELD_BEAM) if start.beam_held else rough
         for stage in before:
-            found = _descended(rough, found, stage, tell)
+            found = _descended(first, found, stage, tell)
         if before:
             halfway.setdefault(before[-1], []).append(found)
         else:
@@ -151,8 +160,8 @@ def with_likely_smoothness(
     """Find λ and κ, unless they are given, and the unknowns that belong to them."""
     given = bool(scene.smoothness.any())
     if not given:
-        scene = replace(scene, smoothness=np.tile(_FIRST_SMOOTHNESS, (len(scene.smoothness), 1)))
-    found = _settled(scene, found, tell)
+        scene = replace(scene, smoothness=np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)))
+    found = settled(scene, found, tell)
     if given:
         return scene, found
     for _ in range(_ROUNDS):
@@ -163,20 +172,26 @@ def with_likely_smoothness(
         if change < _SETTLED:
             break
         scene = replace(scene, smoothness=likely / smoothness_in_pixels(MIDDLE))
-        found = _settled(scene, found, tell)
-    scene = replace(scene, smoothness=_HELD * likely / smoothness_in_pixels(MIDDLE))
-    return scene, _settled(scene, found, tell)
+        found = settled(scene, found, tell)
+    scene = replace(scene, smoothness=HELD * likely / smoothness_in_pixels(MIDDLE))
+    return scene, settled(scene, found, tell, least_gain=_LAST_GAIN)
 
 
-def _settled(scene: Scene, found: Found, tell: Tell) -> Found:
-    """Where the descent ends with other λ and κ, in pixels of two and without blur."""
+def settled(
+    scene: Scene,
+    found: Found,
+    tell: Tell,
+    name: str = "smoothness",
+    least_gain: float = _COARSE_GAIN,
+) -> Found:
+    """Return where a descent ends with other λ and κ, in pixels of two and without blur."""
     middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
-    unknowns, value, _ = descend(
+    unknowns, value, _, _ = settle(
         middle,
         found.unknowns,
-        iterations=_ROUND_STEPS,
-        least_gain=_COARSE_GAIN,
-        after_step=lambda now: tell("smoothness", now),
+        steps=_ROUND_STEPS,
+        least_gain=least_gain,
+        after_step=lambda now: tell(name, now),
     )
     return Found(found.start, unknowns, value, _displacement(middle, unknowns))
 
@@ -188,20 +203,22 @@ def refined(
 
     Tells the number of steps, and whether they ended before the most that were allowed.
     """
-    unknowns, value, steps, ended = finer(found.unknowns), np.inf, 0, False
-    spacings = _SPACINGS if options.spacing is None else (options.spacing,)
-    most = -(-options.steps // len(spacings))
-    for spacing in spacings:
-        scene, allowed = replace(scene, spacing=spacing), min(most, options.steps - steps)
-        unknowns, value, taken = descend(
+    unknowns, steps = finer(found.unknowns), 0
+    denser = list(_SPACINGS) if options.spacing is None else [options.spacing]
+    most = -(-options.steps // len(denser))
+    scene = replace(scene, spacing=denser.pop(0))
+    while True:
+        unknowns, value, taken, ended = settle(
             scene,
             unknowns,
-            iterations=allowed,
+            steps=min(most, options.steps - steps),
             least_gain=_FINE_GAIN,
             after_step=lambda now: tell("full size", now),
         )
-        steps, ended = steps + taken, taken < allowed
+        steps += taken
         chi2 = scene.chi2(unknowns, scene.ray_counts(unknowns))
-        if chi2.max() < _EXPLAINED or steps == options.steps:
-            break
-    return scene, unknowns, value, steps, ended
+        explained = not denser or bool(chi2.max() < _EXPLAINED)
+        if steps >= options.steps or (ended and explained):
+            return scene, unknowns, value, steps, ended
+        if not explained:
+            scene = replace(scene, spacing=denser.pop(0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,17 @@ class Unknowns(NamedTuple):
         ends = np.cumsum([part.size for part in self])[:-1]
         parts = np.split(flat, ends)
         return Unknowns(*(new.reshape(old.shape) for new, old in zip(parts, self, strict=True)))
+
+    def only(self, numbers: Sequence[int]) -> Unknowns:
+        """Return the unknowns of some of the images."""
+        chosen = list(numbers)
+        return self._replace(gains=self.gains[chosen], frames=self.frames[chosen])
+
+    def with_those(self, numbers: Sequence[int], found: Unknowns) -> Unknowns:
+        """Return what was found in some of the images, and of the others what is known here."""
+        gains, frames = self.gains.copy(), self.frames.copy()
+        gains[list(numbers)], frames[list(numbers)] = found.gains, found.frames
+        return found._replace(gains=gains, frames=frames)
 
     def plus(self, other: Unknowns) -> Unknowns:
         """Return the sum of both."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry import _mesh
 from napari_shadowinv.geometry._hilbert import insertion_order
 from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
@@ -393,14 +393,17 @@ def _sort_triangles(mesh: Mesh) -> None:
 
 
 @kernel_that_allocates
-def build(mesh: Mesh) -> int:
-    """Build the regular triangulation of the points, which are sorted along a curve."""
-    _start(mesh)
+def build(mesh: Mesh, order: IntArray, first: int, last: int) -> int:
+    """Put the sites `order[first:last]` in: the first part begins anew, the last one finishes."""
+    if first == 0:
+        _start(mesh)
     status = DONE
-    for v in insertion_order(mesh.hidden.size):
+    for v in order[first:last]:
         status = insert(mesh, v, 1.0)
         if status != DONE:
             break
+    if status == DONE and last < order.size:
+        return DONE
     if status == DONE and mesh.counters[_mesh.OVERFLOW] == 1:
         status = _sweep(mesh, np.empty(0, np.bool_))
     _mesh.compact(mesh)

@@ -20,6 +20,7 @@ triangulations", Algorithmica 15, 223 (1996).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import TypeVar
 
@@ -30,7 +31,7 @@ from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import _flips
-from napari_shadowinv.geometry._hilbert import hilbert_permutation
+from napari_shadowinv.geometry._hilbert import hilbert_permutation, insertion_order
 from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Indices, Mesh
 
 __all__ = ["RegularTriangulation", "hilbert_order"]
@@ -44,6 +45,8 @@ GHOST_DISTANCE = 10.0
 GHOST_STEP = 1024.0
 
 STACK_SIZE = 1 << 14
+
+_PART = 1 << 17  # sites between two signs of life
 
 T = TypeVar("T", bound=np.generic)
 
@@ -98,9 +101,10 @@ class RegularTriangulation:
 
     Sites, shape (n, 2), are (y, x) in any unit, fastest in `hilbert_order`; weights, shape (n,),
     are in its square. The region, two opposite corners of a box that matters such as an image, is
-    only needed where it reaches much further than the sites. Four ghost sites, the corners of a
-    square far outside, close the plane: their cells stay outside three times the bounding box of
-    sites and region. Cells of sites may end at them out there.
+    only needed where it reaches much further than the sites. `alive` is called now and then while
+    many sites are put in, and may raise to end that. Four ghost sites, the corners of a square far
+    outside, close the plane: their cells stay outside three times the bounding box of sites and
+    region. Cells of sites may end at them out there.
 
     Shapes that do not match and values that are not finite raise an `InputError`, here and in the
     methods; reaching the limit of flips raises a RuntimeError.
@@ -120,7 +124,12 @@ class RegularTriangulation:
     """
 
     def __init__(
-        self, sites: ArrayLike, weights: ArrayLike | None = None, *, region: ArrayLike | None = None
+        self,
+        sites: ArrayLike,
+        weights: ArrayLike | None = None,
+        *,
+        region: ArrayLike | None = None,
+        alive: Callable[[], None] | None = None,
     ) -> None:
         given = _checked_points(sites)
         n = given.shape[0]
@@ -141,7 +150,7 @@ class RegularTriangulation:
             scratch=np.empty(16),
         )
         self._set_weights(np.zeros(n) if weights is None else _checked_weights(weights, n))
-        self._build()
+        self._build(alive)
 
     @cached_property
     def points(self) -> FloatArray:
@@ -260,9 +269,14 @@ class RegularTriangulation:
         twin._mesh = Mesh._make([self._mesh.points, *(array.copy() for array in self._mesh[1:])])
         return twin
 
-    def _build(self) -> None:
-        if _flips.build(self._mesh) == _flips.EXHAUSTED:
-            raise RuntimeError(self._exhausted())
+    def _build(self, alive: Callable[[], None] | None = None) -> None:
+        order = insertion_order(self._mesh.hidden.size)
+        for first in range(0, order.size, _PART):
+            if alive is not None:
+                alive()
+            last = min(first + _PART, order.size)
+            if _flips.build(self._mesh, order, first, last) == _flips.EXHAUSTED:
+                raise RuntimeError(self._exhausted())
 
     def _exhausted(self) -> str:
         return (

@@ -1,6 +1,7 @@
 """The compiler's work, done once after an installation.
 
 - do it before an inversion that somebody waits for: `ensure_compiled`
+- how often it is waited for: `how_often`
 - whether it was done: `is_compiled`; where its result is kept: `code_folder`
 """
 
@@ -19,18 +20,21 @@ def ensure_compiled(
     """Compile all kernels, as else the first inversion would, unless an earlier run has."""
     if is_compiled():
         return
-    from napari_shadowinv.geometry._kernel import is_kept
     from napari_shadowinv.inversion import invert
 
-    how_often = (
-        "once, for a minute or so"
-        if is_kept()
-        else "every time: set NUMBA_CACHE_DIR to a writable folder"
-    )
-    Reporter(on_progress, should_stop)("compile", 0, None, how_often)
+    Reporter(on_progress, should_stop)("compile", 0, None, how_often())
     y, x = np.indices((64, 64)) / 64  # enough sites for every kernel to be used
     uneven = np.exp(-4 * (y + x))
     invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)
+
+
+def how_often() -> str:
+    """Return how often the compiler is waited for, in words."""
+    from napari_shadowinv.geometry._kernel import is_kept
+
+    if is_kept():
+        return "once, for a minute or so"
+    return "every time: set NUMBA_CACHE_DIR to a writable folder"
 
 
 def is_compiled() -> bool:

@@ -3,7 +3,8 @@
 - label a field, with units: `dataset_from_field`
 - the names, dimensions and units alone: `variable_labels`
 - the setup that a dataset was made with: `setup_from_dataset`
-- whether it is an inversion's or a fit's: `is_fit`
+- whether it is a fit's or a film pack's: `is_fit`, `is_pack`; what a fit of one field has:
+  `fit_labels`
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 FORMAT = "shadowinv result"
 FIT_FORMAT = "shadowinv fit"
+PACK_FORMAT = "shadowinv film pack"
 
 _PLANE = ("y", "x")
 _VECTORS = ("component", "y", "x")
@@ -46,6 +48,11 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "caustic": (_PLANE, "1", "The map folds or its Jacobian is below the threshold"),
     "mask": (_PLANE, "1", "Pixels that were used"),
 }
+
+UNCERTAINTY = (_VECTORS, "px", "Standard deviation of the displacement")
+"""What a fit has beside potential and displacement."""
+
+_ASSUMES = {"path_integrated_b": "B", "path_integrated_e": "E"}
 
 
 def dataset_from_field(
@@ -90,13 +97,37 @@ def variable_labels(
     return labels
 
 
+def fit_labels(
+    field: str, setup: Setup | None = None
+) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+    """Dimensions, ``units`` and ``long_name`` of every variable of a fitted field by its name."""
+    known = variable_labels(setup)
+    dims, *told = UNCERTAINTY
+    found = {name: known[name] for name in ("potential", "displacement")}
+    found["displacement_uncertainty"] = dims, label(*told)
+    in_si = {name: one for name, one in known.items() if name not in VARIABLES}
+    return found | {name: one for name, one in in_si.items() if belongs(name, field)}
+
+
+def belongs(variable: object, field: str) -> bool:
+    """Tell whether a variable makes sense for a field: ∫E dz of a magnetic one does not."""
+    return _ASSUMES.get(str(variable), field) == field
+
+
 def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:
-    """Return the setup that a dataset of `Inversion.to_dataset` was made with, if there was one."""
+    """Return the setup that a dataset of `Inversion.to_dataset` was made with, if there was one.
+
+    Of a stack whose shots have their own setups, that of the first; of one of its shots, its own.
+    """
     from napari_shadowinv.physics.setup import setup_from_dict
 
-    if "setup" not in dataset.attrs:
-        return None
-    return setup_from_dict(json.loads(dataset.attrs["setup"]), "the dataset's setup")
+    own = dataset.get("setup")  # of each shot, in a stack of which one is chosen
+    text = dataset.attrs.get("setup", "") if own is None or own.ndim else str(own.values)
+    return setup_from_dict(json.loads(text), "the dataset's setup") if text else None
+
+
+SETUPS_LABEL = {"units": "1", "long_name": "Setup of the shot (JSON)"}
+"""Attributes of the variable ``setup`` of a stack whose shots have setups of their own."""
 
 
 def is_fit(attributes: Mapping[Any, Any]) -> bool:
@@ -104,9 +135,19 @@ def is_fit(attributes: Mapping[Any, Any]) -> bool:
     return bool(attributes.get("format") == FIT_FORMAT)
 
 
+def is_pack(attributes: Mapping[Any, Any]) -> bool:
+    """Tell whether the attributes of a dataset are those of a film pack."""
+    return bool(attributes.get("format") == PACK_FORMAT)
+
+
 def label(units: str, long_name: str) -> dict[str, str]:
     """Return the attributes of a variable."""
     return {"units": units, "long_name": long_name}
+
+
+def place_label(name: str) -> dict[str, str]:
+    """Return the attributes of pixels' places along y or x in metres."""
+    return label("m", f"{name} in the object plane")
 
 
 def _vectors_first(setup: Setup) -> list[SIField]:
@@ -123,5 +164,5 @@ def _coordinates(height: int, width: int, setup: Setup | None) -> dict[str, Any]
         coords[name] = (name, index, label("px", f"{name} in the object plane"))
         if setup is not None:
             metres = index * setup.object_pixel_size
-            coords[f"{name}_si"] = (name, metres, label("m", f"{name} in the object plane"))
+            coords[f"{name}_si"] = (name, metres, place_label(name))
     return coords

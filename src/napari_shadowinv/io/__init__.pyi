@@ -1,5 +1,6 @@
+from .cpsa import read_tracks
 from .files import check_output, replacing
-from .reading import Radiograph, read, read_dataset, read_radiograph, read_toml
+from .reading import Radiograph, read, read_cpsa, read_dataset, read_radiograph, read_toml
 from .store import is_stack, read_stack
 from .writing import write
 
@@ -8,10 +9,12 @@ __all__ = [
     "check_output",
     "is_stack",
     "read",
+    "read_cpsa",
     "read_dataset",
     "read_radiograph",
     "read_stack",
     "read_toml",
+    "read_tracks",
     "replacing",
     "write",
 ]

@@ -27,7 +27,7 @@ def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> Fl
         raise InputError(
             f"{where} is a colour image with {colours.shape[-1]} channels: if it is a scan of "
             "film, which darkens with dose, convert it to dose first "
-            "(napari_shadowinv.preprocessing.film); "
+            "(napari_shadowinv.film); "
             'otherwise choose a channel that is linear in fluence, "red", "green", "blue" or '
             '"mean", or its number'
         )
@@ -58,7 +58,7 @@ def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[str, ...]
         return ()
     return (
         f"{sign}: film darkens with dose, so a scan gives a field of the wrong sign unless it is "
-        "converted to dose first (napari_shadowinv.preprocessing.film)",
+        "converted to dose first (napari_shadowinv.film)",
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import FORMAT, is_fit
+from napari_shadowinv.inversion.labels import FORMAT, is_fit, is_pack
 from napari_shadowinv.io.hdf5 import check_arrays, hdf5_in_memory
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ def write_result(path: Path, dataset: xarray.Dataset) -> None:
         if variable.dtype.kind in "fiub":
             encoding[str(name)] = {**packed, "_FillValue": None}
     # A field that was read from a file of another format still says so.
-    marked = dataset if is_fit(dataset.attrs) else dataset.assign_attrs(format=FORMAT)
+    says_so = is_fit(dataset.attrs) or is_pack(dataset.attrs)
+    marked = dataset if says_so else dataset.assign_attrs(format=FORMAT)
     with hdf5_in_memory(path) as content, h5netcdf.File(content, "w") as file:
         marked.dump_to_store(H5NetCDFStore(file), encoding=encoding)
 

@@ -36,10 +36,11 @@ class Format:
     unmarked: Literal["text", "binary", ""] = ""  # what it looks like without a mark
     holds: tuple[Literal["image", "result"], ...] = ("image",)
     reader: str = ""  # of a path: image and metadata, which replace what `read` says, or a dataset
-    named_reader: str = ""  # the same, of a path and the name of an array
+    named_reader: str = ""  # the same, of a path and the name of an array, or what to count
     image_writer: str = ""  # of a path, an image and its pixel size (m) or None
     result_writer: str = ""  # of a path and a dataset
     fit_writer: str = ""  # of a path and a fit's dataset
+    pack_writer: str = ""  # of a path and a film pack's dataset
     is_scan: bool = False  # may it be a scan of film, whose grey levels fall with dose
 
     @property
@@ -97,12 +98,18 @@ RESULT = Format(
     "shadowinv", (".shadowinv",), ".shadowinv", _HDF5, test="pradformat:is_result",
     holds=("result",), reader="dataset:read_result", named_reader="hdf5:read_plane",
     result_writer="dataset:write_result", fit_writer="dataset:write_result",
+    pack_writer="dataset:write_result",
 )
 # The reader of all other HDF5 files: it says which array can be named.
 PRADFORMAT = Format(
     "hdf5", (".h5", ".hdf5"), "pradformat HDF5", _HDF5,
     holds=("image", "result"), reader="pradformat:read_pradformat",
     named_reader="hdf5:read_plane", result_writer="pradformat:write_pradformat",
+    fit_writer="pradformat:write_pradformat",
+)
+CPSA = Format(
+    "cpsa", (".cpsa",), "CR-39 .cpsa", unmarked="binary",
+    reader="cpsa:read_image", named_reader="cpsa:read_image",
 )
 # The oldest programs left the marks out.
 SPE = Format(
@@ -117,7 +124,22 @@ TEXT = Format(
 STORE = Format("store", (".shadowinv.zarr",), holds=("result",))
 # fmt: on
 
-FORMATS = (TIFF, PNG, BMP, JPEG, NPY, PCO, MATLAB, RESULT, PRADFORMAT, SPE, TEXT, SITES, STORE)
+FORMATS = (
+    TIFF,
+    PNG,
+    BMP,
+    JPEG,
+    NPY,
+    PCO,
+    MATLAB,
+    RESULT,
+    PRADFORMAT,
+    CPSA,
+    SPE,
+    TEXT,
+    SITES,
+    STORE,
+)
 
 
 def _listed(titles: Iterable[str]) -> str:
@@ -129,7 +151,9 @@ def _suffixes(formats: Iterable[Format]) -> frozenset[str]:
     return frozenset(suffix for each in formats for suffix in each.suffixes)
 
 
-def _writers(kind: Literal["image_writer", "result_writer", "fit_writer"]) -> dict[str, str]:
+def _writers(
+    kind: Literal["image_writer", "result_writer", "fit_writer", "pack_writer"],
+) -> dict[str, str]:
     found = {suffix: getattr(each, kind) for each in FORMATS for suffix in each.suffixes}
     return {suffix: writer for suffix, writer in found.items() if writer}
 
@@ -143,6 +167,7 @@ OPENED_BY_NAPARI = SCAN_SUFFIXES | {".npy", SITES.suffix}
 IMAGE_WRITERS = _writers("image_writer")  # by the ending
 RESULT_WRITERS = _writers("result_writer")
 FIT_WRITERS = _writers("fit_writer")
+PACK_WRITERS = _writers("pack_writer")
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
 
 _OTHERS = {

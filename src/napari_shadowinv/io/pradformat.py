@@ -11,6 +11,8 @@ Feister, S. pradformat, https://github.com/sfeister/pradformat
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +22,13 @@ import numpy as np
 from napari_shadowinv._system.safety import check_regular, refusing_damage
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import FORMAT, dataset_from_field, is_fit, setup_from_dataset
+from napari_shadowinv.inversion.labels import (
+    FORMAT,
+    dataset_from_field,
+    is_fit,
+    is_pack,
+    setup_from_dataset,
+)
 from napari_shadowinv.io.dataset import require
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
 from napari_shadowinv.preprocessing import Provenance
@@ -49,7 +57,8 @@ def is_result(path: Path) -> bool:
     if not h5py.is_hdf5(path):
         return False
     attributes = _root_attributes(path)
-    return is_fit(attributes) or str(attributes.get("format", "")).startswith(FORMAT)
+    known = is_fit(attributes) or is_pack(attributes)
+    return known or str(attributes.get("format", "")).startswith(FORMAT)
 
 
 @refusing_damage
@@ -181,9 +190,12 @@ def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
 
 
 def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
-    """Write a result's potential and deflection angles as a pradformat "simple inversion"."""
-    import h5py
+    """Write a result's potential and deflection angles as a pradformat "simple inversion".
 
+    Of a fit's other parts, only the verdict is kept, in the description.
+    """
+    fields = json.loads(dataset.attrs["fields"]) if is_fit(dataset.attrs) else ()
+    check_pradformat_fields(fields)
     require(dataset, ("displacement", "potential"))
     setup = check_pradformat_setup(setup_from_dataset(dataset))
     angle = setup.deflection_angle(dataset["displacement"].values)
@@ -192,8 +204,37 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
     attributes: dict[str, Any] = {
         "object_type": "inversion",
         "inversion_type": "simple",
-        "pradformat_version": _VERSION,
         "dr": setup.object_pixel_size,
+        **_described(setup),
+        "description": "Power-diagram inversion by napari-shadowinv",
+    }
+    if fields:
+        verdict = dataset.attrs["verdict"]
+        attributes["description"] = f"Fit of the forward model by napari-shadowinv: {verdict}"
+    provenance = Provenance.of(dataset.attrs)
+    if provenance is not None:
+        attributes["provenance"] = provenance.model_dump_json(exclude_none=True)
+        if provenance.image.file:
+            attributes["radiograph_filename"] = provenance.image.file
+    _write(path, datasets, attributes)
+
+
+def write_radiograph(path: Path, image: AnyArray, setup: Setup, description: str) -> None:
+    """Write an image, proportional to the fluence, as a pradformat radiograph."""
+    known = check_pradformat_setup(setup)
+    attributes = {
+        "object_type": "radiograph",
+        "pixel_width": known.object_pixel_size * known.magnification,
+        **_described(known),
+        "description": description,
+    }
+    _write(path, {"image": image}, attributes)
+
+
+def _described(setup: Any) -> dict[str, Any]:
+    """What every object of the format tells of the beam and the distances."""
+    return {
+        "pradformat_version": _VERSION,
         "source_object_dist": setup.source_object_distance,
         "object_image_dist": setup.object_image_distance,
         "spec_name": _SYMBOLS[setup.species],
@@ -201,17 +242,25 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         "spec_charge": setup.particle.charge,
         "spec_energy": setup.energy * _EV_PER_MEV,
         "file_date": datetime.now(UTC).date().isoformat(),
-        "description": "Power-diagram inversion by napari-shadowinv",
     }
-    provenance = Provenance.of(dataset.attrs)
-    if provenance is not None:
-        attributes["provenance"] = provenance.model_dump_json(exclude_none=True)
-        if provenance.image.file:
-            attributes["radiograph_filename"] = provenance.image.file
+
+
+def _write(path: Path, datasets: dict[str, AnyArray], attributes: dict[str, Any]) -> None:
+    import h5py
+
     with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
         for name, values in datasets.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
         file.attrs.update(attributes)
+
+
+def check_pradformat_fields(names: Sequence[str]) -> None:
+    """Refuse several fields, of which a pradformat inversion holds one."""
+    if len(names) > 1:
+        raise InputError(
+            f"a pradformat inversion holds one field, received {' and '.join(names)}: write "
+            ".shadowinv"
+        )
 
 
 def check_pradformat_setup(setup: Setup | None) -> Any:

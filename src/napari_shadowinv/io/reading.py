@@ -1,6 +1,7 @@
 """Read whatever a user points at; the content decides what it is, not the name.
 
 - any file: `read`; where only one makes sense: `read_radiograph`, `read_dataset`
+- a scan of CR-39, of whose tracks some count: `read_cpsa`
 - a file with options or a setup: `read_toml`
 """
 
@@ -15,9 +16,10 @@ import numpy as np
 from napari_shadowinv._system.safety import refusing_damage, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.inversion.labels import is_pack
 from napari_shadowinv.io.colours import film_warnings, to_grey
 from napari_shadowinv.io.files import sha256
-from napari_shadowinv.io.formats import Format, format_of
+from napari_shadowinv.io.formats import CPSA, Format, format_of
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.preprocessing import Radiograph
 
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Radiograph", "read", "read_dataset", "read_radiograph", "read_toml"]
+__all__ = ["Radiograph", "read", "read_cpsa", "read_dataset", "read_radiograph", "read_toml"]
 
 _COMPLETE = {"energy", "source_object_distance", "object_image_distance"}
 
@@ -41,13 +43,15 @@ def read(
     ----------
     path : str or Path
         TIFF (8, 16 or 32 bits, one page) and other pictures, NPY, MATLAB (version 5 to 7.3), frames
-        of cameras (one each), numbers as text, a pradformat radiograph or inversion, a
-        ``.shadowinv`` result, or a ``.shadowinv.zarr`` store of many shots (read lazily).
+        of cameras (one each), numbers as text, tracks in CR-39, a pradformat radiograph or
+        inversion, a ``.shadowinv`` result, or a ``.shadowinv.zarr`` store of many shots (read
+        lazily).
     channel : {"red", "green", "blue", "mean"} or int, optional
         What to take of a colour image whose channels differ.
     variable : str, optional
         Name of the array to take from a MATLAB file that holds several, or from any HDF5 file,
-        with its groups: ``"shots/3/image"``.
+        with its groups: ``"shots/3/image"``. For CR-39 the tracks to count:
+        ``"diameter=4:12 contrast=:40 eccentricity=:15 bin=300"``; see `read_cpsa`.
 
     Returns
     -------
@@ -66,8 +70,8 @@ def read(
     found = format_of(path)
     if variable is not None and not found.named_reader:
         raise InputError(
-            f"{path} is neither a MATLAB nor an HDF5 file (its kind is {found.name!r}): variable "
-            f"{variable!r} does not apply; leave it out"
+            f"{path} is neither a MATLAB nor an HDF5 file nor a CR-39 scan (its kind is "
+            f"{found.name!r}): variable {variable!r} does not apply; leave it out"
         )
     content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = found.read(path, variable)
     if not isinstance(content, tuple):
@@ -94,6 +98,7 @@ def _radiograph(
     if array.ndim == 3 and channel is not None:
         described["channel"] = channel
     source, mask = described.pop("source", None), described.pop("mask", None)
+    warnings = tuple(described.pop("warnings", ()))
     return Radiograph(
         image=image,
         setup=_complete_setup(path, metadata.get("geometry", {})),
@@ -101,7 +106,7 @@ def _radiograph(
         metadata=described,
         source=None if source is None else np.ascontiguousarray(source, dtype=np.float64),
         mask=mask,
-        warnings=film_warnings(array, channel) if found.is_scan else (),
+        warnings=(*warnings, *(film_warnings(array, channel) if found.is_scan else ())),
     )
 
 
@@ -120,10 +125,56 @@ def read_radiograph(
     """Read an image, as by `read`; a result raises a `FileFormatError`, too."""
     content = read(path, channel=channel, variable=variable)
     if not isinstance(content, Radiograph):
+        if is_pack(content.attrs):
+            raise FileFormatError(
+                f"{path} is a film pack: expected one image; write its layers with shadowinv film "
+                "--layers"
+            )
         raise FileFormatError(
             f"{path} is the result of an inversion: expected an image; give the original image"
         )
     return content
+
+
+def read_cpsa(
+    path: str | Path,
+    *,
+    diameter: tuple[float | None, float | None] | None = None,
+    contrast: tuple[float | None, float | None] | None = None,
+    eccentricity: tuple[float | None, float | None] | None = None,
+    bin: float | None = None,
+) -> Radiograph:
+    """Read a scan of etched CR-39 and count its tracks in bins.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.cpsa`` file.
+    diameter, contrast, eccentricity : tuple of float or None, optional
+        Smallest and largest value of the tracks that count, the diameter in µm; None for no
+        limit.
+    bin : float, optional
+        Side of a bin in µm of the detector. Default: about 50 tracks in each on average, but at
+        most 300 along the longer side.
+
+    Returns
+    -------
+    Radiograph
+        Counts, whose standard deviation is their root, with the bin as the detector's pixel in
+        ``metadata["geometry"]``, and the ranges as ``metadata["variable"]``.
+
+    Raises
+    ------
+    FileFormatError
+        As `read`, and if the file is no such scan.
+    InputError
+        If a range or the bin is impossible, or no track is within the ranges.
+    """
+    from napari_shadowinv.io.cpsa import as_text  # what reads tracks needs more of the package
+
+    if format_of(path) is not CPSA:
+        raise FileFormatError(f"{path} is no CR-39 scan: expected {CPSA.title}; read it with read")
+    return read_radiograph(path, variable=as_text(diameter, contrast, eccentricity, bin))
 
 
 def read_dataset(path: str | Path) -> xarray.Dataset:

@@ -11,7 +11,7 @@ written again. So workers can write side by side, and any of them may die.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +22,13 @@ import numpy as np
 from napari_shadowinv._system.safety import refusing_damage, small_text
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.inversion.labels import setup_from_dataset, variable_labels
+from napari_shadowinv.inversion.labels import (
+    SETUPS_LABEL,
+    fit_labels,
+    place_label,
+    setup_from_dataset,
+    variable_labels,
+)
 from napari_shadowinv.io.files import check_folder_of
 from napari_shadowinv.io.formats import STORE
 
@@ -42,9 +48,28 @@ SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
     "iterations": (int, {"units": "1", "long_name": "Solver iterations, summed over all levels"}),
     "seconds": (float, {"units": "s", "long_name": "Time its worker spent on the shot"}),
 }
+FIT_SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
+    "verdict": (str, {"units": "1", "long_name": "Whether the field may be believed"}),
+    "chi2": (float, {"units": "1", "long_name": "Largest χ² of the shot's images"}),
+    "folded": (float, {"units": "1", "long_name": "Share of the pixels whose rays have crossed"}),
+    "uncertainty": (
+        float,
+        {"units": "1", "long_name": "Displacement's error bar, r.m.s., as a share of it"},
+    ),
+    "converged": (bool, {"units": "1", "long_name": "Ended before the most steps allowed"}),
+    "iterations": (int, {"units": "1", "long_name": "Steps at full size"}),
+    "seconds": SUMMARY["seconds"],
+}
+TABLE_SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
+    **SUMMARY,
+    "energy": (float, {"units": "MeV", "long_name": "Energy of the particles"}),
+}
+# Attribute of a store whose shots are rows of a table, each with its own setup in its report.
+OWN_SETUPS = "table_of_shots"
 PENDING, DONE, FAILED = 0, 1, 2
 STATUS_NAMES = ("pending", "done", "failed")
-_OWN_ORDER = ("status", *SUMMARY, "report")
+_NO_TEXT = np.array([], object)
+_OWN_ORDER = ("status", *dict.fromkeys((*FIT_SUMMARY, *TABLE_SUMMARY)), "setup", "report")
 
 
 class StoreError(OSError):
@@ -69,6 +94,24 @@ def check_store_path(path: str | Path) -> Path:
 def is_stack(path: str | Path) -> bool:
     """Tell whether a folder is a store of many shots."""
     return _attributes(Path(path)).get("format") == FORMAT
+
+
+def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
+    """Return the field that was fitted to each shot of a store; None if shots were inverted."""
+    names = json.loads(attributes.get("fields", "[]"))
+    return str(names[0]) if names else None
+
+
+def summary_of(attributes: Mapping[Any, Any]) -> dict[str, tuple[type, dict[str, str]]]:
+    """Return the numbers that are gathered of each shot of a store: their types and labels."""
+    if fitted_field(attributes) is not None:
+        return FIT_SUMMARY
+    return TABLE_SUMMARY if OWN_SETUPS in attributes else SUMMARY
+
+
+def nothing_yet(kind: type) -> Any:
+    """Return what stands for a number of a shot that is not known."""
+    return "" if kind is str else np.nan if kind is float else 0
 
 
 def _attributes(path: Path) -> dict[str, Any]:
@@ -140,7 +183,10 @@ def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
 
 
 class StackStore:
-    """A store as a run sees it: what is done, failed, pending."""
+    """A store as a run sees it: what is done, failed, pending.
+
+    The `field`, if it was fitted; `own_setups` tells whether its shots are rows of a table.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -152,6 +198,8 @@ class StackStore:
         self.attributes = _attributes(path)
         if self.attributes.get("format") != FORMAT:
             raise FileFormatError(f"{path} is not a stack of shots: expected name{STORE_SUFFIX}")
+        self.field = fitted_field(self.attributes)
+        self.own_setups = OWN_SETUPS in self.attributes
         self._arrays = _readable(path)
         self.names = tuple(map(str, self._values("name").tolist()))
         self.statuses()
@@ -179,13 +227,12 @@ class StackStore:
         reports = self.reports()
         group = self.writer.arrays()
         try:
-            for name, (kind, _) in SUMMARY.items():
+            for name, (kind, _) in summary_of(self.attributes).items():
                 if name not in group:  # a store of an older version
                     continue
-                missing = np.nan if kind is float else 0
                 key = "residual" if name == "flux_residual" else name
-                values = [report.get(key, missing) for report in reports]
-                group[name][...] = np.array(values, dtype=kind)
+                values = [report.get(key, nothing_yet(kind)) for report in reports]
+                group[name][...] = np.array(values, dtype=object if kind is str else kind)
         except OSError as error:
             raise store_error(self.path, error) from error
 
@@ -237,7 +284,8 @@ def read_stack(path: Path) -> xarray.Dataset:
     -------
     xarray.Dataset
         Dimensions shot, y, x and component. ``status`` is 0 where a shot is pending, 1 done,
-        2 failed; the values of shots that are not done are NaN.
+        2 failed; the values of shots that are not done are NaN. Where shots have setups of their
+        own, ``setup`` has that of each, empty until it is done.
 
     Raises
     ------
@@ -253,11 +301,44 @@ def read_stack(path: Path) -> xarray.Dataset:
         CheckedStore(path), decode_times=False, mask_and_scale=False, chunks={}
     )
     setup = setup_from_dataset(dataset)
-    complete = _with_fields(dataset, setup)
+    complete = _with_fields(with_own_setups(dataset), setup)
     # The folder's own order is arbitrary.
-    order = [*variable_labels(setup), *_OWN_ORDER]
+    order = [*_labels(dataset, setup), *_OWN_ORDER]
     shown = complete[[name for name in order if name in complete]]
     return shown.assign(status=shown["status"].copy(data=store.statuses()))
+
+
+def _labels(dataset: xarray.Dataset, setup: Any) -> dict[str, Any]:
+    """What a store's dataset may hold, by name, and how it is labelled."""
+    field = fitted_field(dataset.attrs)
+    return variable_labels(setup) if field is None else fit_labels(field, setup)
+
+
+def with_own_setups(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Add the setup of each shot, read when it is asked for, if shots have their own."""
+    if OWN_SETUPS not in dataset.attrs or "setup" not in dataset.attrs:
+        return dataset
+    texts = dataset["report"].data.map_blocks(_setups_of_block, dtype=object, meta=_NO_TEXT)
+    return with_places(dataset.assign(setup=(("shot",), texts, SETUPS_LABEL)))
+
+
+def with_places(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Add where the pixels of each shot are in metres, by the shot's own setup."""
+    sizes = of_each_setup(dataset, _pixel_size)[:, np.newaxis]
+    places = {
+        f"{name}_si": (("shot", name), sizes * dataset[name].values, place_label(name))
+        for name in ("y", "x")
+    }
+    return dataset.assign_coords(places)
+
+
+def _pixel_size(setup: Any) -> float:
+    return float(setup.object_pixel_size)
+
+
+def _setups_of_block(reports: AnyArray) -> AnyArray:
+    made = (json.loads(str(text) or "{}").get("provenance", {}) for text in reports)
+    return np.array([json.dumps(one["setup"]) if "setup" in one else "" for one in made], object)
 
 
 def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
@@ -265,14 +346,46 @@ def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
     if setup is None:
         return dataset
     found = {}
-    for name, (dims, labels) in variable_labels(setup).items():
+    in_si = {field.name for field in setup.si_fields}
+    for name, (dims, labels) in _labels(dataset, setup).items():
         origin = "displacement" if "component" in dims else "potential"
-        if name in dataset or name in variable_labels() or origin not in dataset:
+        if name in dataset or name not in in_si or origin not in dataset:
             continue
-        blocks = dataset[origin].data.map_blocks(_field_of_block, name, setup, dtype=np.float64)
-        found[name] = (("shot", *dims), blocks, labels)
+        found[name] = (("shot", *dims), field_in_si(dataset, origin, name, setup), labels)
     return dataset.assign(found)
 
 
-def _field_of_block(block: AnyArray, name: str, setup: Any) -> FloatArray:
-    return np.stack([setup.field_in_si(name, values) for values in block])
+def of_each_setup(dataset: xarray.Dataset, measure: Callable[[Any], float]) -> Any:
+    """A number of the setup of each shot, NaN until it is done; None if all share one setup."""
+    if "setup" not in dataset:
+        return None
+    return dataset["setup"].data.map_blocks(_measured, measure, dtype=np.float64)
+
+
+def _measured(texts: AnyArray, measure: Callable[[Any], float]) -> FloatArray:
+    from napari_shadowinv.physics.setup import setup_from_dict
+
+    found = (measure(setup_from_dict(json.loads(text))) if text else np.nan for text in texts)
+    return np.array(list(found))
+
+
+def field_in_si(dataset: xarray.Dataset, origin: str, name: str, setup: Any) -> Any:
+    """A field of all shots in SI units, by the setup of each or by one for all; not read yet."""
+    data = dataset[origin].data
+    if "setup" not in dataset:
+        return data.map_blocks(_field_of_block, None, name, setup, dtype=np.float64)
+    texts = dataset["setup"].data[(..., *[np.newaxis] * (data.ndim - 1))]
+    return data.map_blocks(
+        _field_of_block, texts, name, setup, dtype=np.float64, chunks=data.chunks
+    )
+
+
+def _field_of_block(block: AnyArray, texts: AnyArray | None, name: str, setup: Any) -> FloatArray:
+    from napari_shadowinv.physics.setup import setup_from_dict
+
+    own = [setup] * len(block)
+    if texts is not None:
+        # What is not done yet is NaN with any setup.
+        own = [setup_from_dict(json.loads(text)) if text else setup for text in texts.flat]
+    pairs = zip(own, block, strict=True)
+    return np.stack([one.field_in_si(name, values) for one, values in pairs])

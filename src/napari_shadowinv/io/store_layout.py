@@ -28,10 +28,11 @@ from napari_shadowinv.io.store import (
     FORMAT,
     PENDING,
     STATUS_NAMES,
-    SUMMARY,
     StackStore,
     is_along_shots,
+    nothing_yet,
     store_error,
+    summary_of,
 )
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
@@ -131,7 +132,7 @@ def _write_template(path: Path, contents: Contents) -> None:
             "coordinates": " ".join(extra),
         },
     )
-    own = _own_variables(contents.sizes["shot"])
+    own = _own_variables(contents.sizes["shot"], contents.attributes)
     arrays = {**contents.coordinates, **contents.variables, **own}
     for name, variable in arrays.items():
         _create_array(group, name, variable, contents.sizes)
@@ -141,7 +142,7 @@ def _write_template(path: Path, contents: Contents) -> None:
         zarr.consolidate_metadata(path)
 
 
-def _own_variables(shots: int) -> dict[str, Variable]:
+def _own_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Variable]:
     """What every store says about its shots."""
     status = {
         "units": "1",
@@ -154,9 +155,11 @@ def _own_variables(shots: int) -> dict[str, Variable]:
         "status": Variable(("shot",), np.dtype("int8"), status),
         "report": Variable(("shot",), str, report),
     }
-    for name, (kind, labels) in SUMMARY.items():
-        nothing: AnyArray = np.full(shots, np.nan if kind is float else 0, dtype=kind)
-        own[name] = Variable(("shot",), np.dtype(kind), labels, nothing)
+    for name, (kind, labels) in summary_of(attributes).items():
+        dtype = str if kind is str else np.dtype(kind)
+        kept = object if kind is str else kind
+        nothing: AnyArray = np.full(shots, nothing_yet(kind), dtype=kept)
+        own[name] = Variable(("shot",), dtype, labels, nothing)
     return own
 
 

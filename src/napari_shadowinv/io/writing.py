@@ -9,9 +9,15 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import is_fit
+from napari_shadowinv.inversion.labels import is_fit, is_pack
 from napari_shadowinv.io.files import check_output, replacing
-from napari_shadowinv.io.formats import FIT_WRITERS, IMAGE_WRITERS, RESULT_WRITERS, function
+from napari_shadowinv.io.formats import (
+    FIT_WRITERS,
+    IMAGE_WRITERS,
+    PACK_WRITERS,
+    RESULT_WRITERS,
+    function,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -37,8 +43,8 @@ def write(
     ----------
     path : str or Path
         For a result: ``.shadowinv`` for all of it, ``.h5`` for pradformat, ``.csv`` for the
-        sites; for a fit ``.shadowinv``. For an image: ``.tif`` (float32), ``.npy``, ``.png``
-        (16 bits, its largest value white).
+        sites; for a fit ``.shadowinv``, or ``.h5`` for its field alone. For an image: ``.tif``
+        (float32), ``.npy``, ``.png`` (16 bits, its largest value white).
     result : Inversion, Uncertainty, Fit, xarray.Dataset, or ndarray of shape (H, W)
         What to write.
     setup : Setup, optional
@@ -72,11 +78,17 @@ def write(
             _write_image(temporary, result, setup)
         return Path(path)
     dataset = _dataset(result, setup)
-    writers = FIT_WRITERS if is_fit(dataset.attrs) else RESULT_WRITERS
+    writers = _writers_of(dataset)
     check_output(path, overwrite, suffixes=writers)
     with replacing(path, overwrite) as temporary:
         function(writers[temporary.suffix.lower()])(temporary, dataset)
     return Path(path)
+
+
+def _writers_of(dataset: xarray.Dataset) -> dict[str, str]:
+    if is_pack(dataset.attrs):
+        return PACK_WRITERS
+    return FIT_WRITERS if is_fit(dataset.attrs) else RESULT_WRITERS
 
 
 def _dataset(

@@ -2,6 +2,10 @@
 
 - apply a recipe to a shot: `run`; what a window keeps between runs: `Cache`
 - the same in two parts, for stacks: `gathered`, `run_prepared`
+- fit several images of one object by a recipe: `run_fit`, of `FitShot`; which fields explain
+  them: `run_comparison`
+- whether one static field explains them: `run_leave_one_out`; a film of fields: `run_windows`
+- refine an inversion by a fit that starts from it: `run_refinement`
 - recipes as files: `read_recipe`, `write_recipe`
 """
 

@@ -23,7 +23,7 @@ from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.inversion.normalise import checked_source, prepare
 from napari_shadowinv.io import read_radiograph
-from napari_shadowinv.io.files import text_of
+from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.pipeline.cache import Cache
 from napari_shadowinv.preprocessing import (
     MeasuredSource,
@@ -246,10 +246,10 @@ def gathered(
     source_mask: ArrayLike | None = None,
 ) -> Inputs:
     """Bring together what a recipe is applied to: read files, fill in defaults of the shot."""
-    whole = _radiograph(shot, "the image")
+    whole = radiograph_of(shot, "the image")
     beam, wanted = None, recipe.source
     if source is not None:
-        beam = _radiograph(source, "the source")
+        beam = radiograph_of(source, "the source")
     elif isinstance(wanted, MeasuredSource) and (file := _source_file(wanted, whole)) is not None:
         beam = read_radiograph(file, variable=wanted.variable)
     elif whole.source is not None and recipe.estimate is None:
@@ -310,7 +310,8 @@ class _Mask:
         packed = Origin.of_mask(self.pixels)
         if self.file is None:
             return packed
-        return packed.model_copy(update={"file": text_of(self.file.name)})
+        told = {"file": text_of(self.file.name), "sha256": sha256(self.file)}
+        return packed.model_copy(update=told)
 
 
 def _mask(given: ArrayLike | None, file: Path | None, name: str, shot: Radiograph) -> _Mask | None:
@@ -338,7 +339,8 @@ def picture_mask(path: Path) -> BoolArray:
     return mask
 
 
-def _radiograph(given: Shot, name: str) -> Radiograph:
+def radiograph_of(given: Shot, name: str) -> Radiograph:
+    """Return one image with what is known about it, read from its file if it is a path."""
     if isinstance(given, Radiograph):
         return given
     if isinstance(given, (str, Path)):

@@ -21,10 +21,14 @@ _LARGEST_INTENSITY = 3.5
 
 
 def draw_intensity(
-    panel: Panel, plane: FloatArray, title: str, limits: tuple[float, float]
+    panel: Panel,
+    plane: FloatArray,
+    title: str,
+    limits: tuple[float, float],
+    label: str = "Intensity / mean source",
 ) -> None:
     """Show an image, or what an answer predicts of it, in units of the mean source."""
-    panel.show(plane, title, "Intensity / mean source", "gray", limits)
+    panel.show(plane, title, label, "gray", limits)
 
 
 def intensity_limits(image: FloatArray) -> tuple[float, float]:
@@ -151,11 +155,16 @@ def _finish_cuts(panel: Panel, field: ShownField, title: str) -> None:
     panel.few_ticks()
 
 
-def draw_side_by_side(panels: list[Panel], fields: Mapping[str, ShownField]) -> None:
-    """Show fields on the first one's scale, and in the last panel a cut through its peak."""
+def draw_side_by_side(
+    panels: list[Panel], fields: Mapping[str, ShownField], *, common: bool = False
+) -> None:
+    """Show fields on the first one's scale, and in the last panel a cut through its peak.
+
+    A `common` scale is that of the strongest.
+    """
     *pictures, cuts = panels
     reference = next(iter(fields.values()))
-    largest = _strongest(reference)
+    largest = max(map(_strongest, fields.values() if common else [reference]))
     row, _ = reference.peak
     for panel, (name, field) in zip(pictures, fields.items(), strict=True):
         _draw_vectors(panel, field, name, largest)

@@ -22,12 +22,11 @@ from napari_shadowinv.plotting._drawing import (
     intensity_limits,
     outline_caustics,
 )
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Grid, Panel
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Grid, Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_GOOD_COLOUR = "#1b6e3c"
 _MOST_ROWS = 3  # images that have a row each; more have a column each
 _UNIFORM = 1e-6
 _LARGEST_RESIDUAL = 20.0  # σ
@@ -113,7 +112,8 @@ def _draw_image(panel: Panel, fit: Fit, k: int, kind: str) -> None:
     plane = {"Beam": fit.source, "Image": fit.images, "Re-projection": fit.reprojection}[kind][k]
     probe = f": {fit.setups[k].probe}" if fit.setups else ""
     title = f"Image {k + 1}{probe}" if kind == "Image" else kind
-    draw_intensity(panel, plane / mean, title, intensity_limits(fit.images[k] / mean))
+    scale = fit.source if kind == "Beam" else fit.images
+    draw_intensity(panel, plane / mean, title, intensity_limits(scale[k] / mean))
 
 
 def _draw_fitted(
@@ -167,7 +167,7 @@ def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
 
 def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
     """The verdict and why, each line with its colour."""
-    colour = _GOOD_COLOUR if fit.verdict is Verdict.DETERMINED else ALARM_COLOUR
+    colour = GOOD_COLOUR if fit.verdict is Verdict.DETERMINED else ALARM_COLOUR
     told = f"{fit.verdict.upper()}: {fit.explanation}"
     lines = [(line, colour) for line in textwrap.wrap(told, letters)]
     if not fit.report.converged:

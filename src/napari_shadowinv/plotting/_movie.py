@@ -78,11 +78,22 @@ def stack_frames(
     if unit in PREFIXED_UNITS:
         factor, prefix = prefix_for(max(abs(low), abs(high)))
     label = f"{field.attrs.get('long_name', variable)} ({prefix}{unit})"
-    draw = _Frame((field.sizes["y"], field.sizes["x"]), setup, label, (factor * low, factor * high))
+    shape = field.sizes["y"], field.sizes["x"]
+    draw = _Frame(shape, _scale_of_all(stack), label, (factor * low, factor * high))
     return (
         draw(factor * _plane(field, index), str(stack["name"].values[index]))
         for index in range(field.sizes["shot"])
     )
+
+
+def _scale_of_all(stack: xarray.Dataset) -> Any:
+    """A setup with the size of all shots' pixels; None if they differ, or there is none."""
+    shots = (
+        [stack] if "setup" not in stack else [stack.isel(shot=k) for k in range(stack.shot.size)]
+    )
+    setups = [setup_from_dataset(shot) for shot in shots]
+    sizes = {None if one is None else one.object_pixel_size for one in setups}
+    return setups[0] if len(sizes) == 1 else None
 
 
 def _plane(field: xarray.DataArray, index: int) -> FloatArray:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-ALARM_COLOUR, QUIET_COLOUR = "#b00020", "0.3"
+ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR = "#b00020", "#1b6e3c", "0.3"
 STYLE: Any = {
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,

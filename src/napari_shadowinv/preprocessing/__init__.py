@@ -6,7 +6,6 @@
 - estimates of the source by name in `ESTIMATES`; as functions `uniform_source`,
   `isotropic_source`, `gaussian_source`, `polynomial_source`, `low_pass_source`,
   `total_variation_source`, `interpolated_source`
-- film: `napari_shadowinv.preprocessing.film`
 """
 
 import lazy_loader

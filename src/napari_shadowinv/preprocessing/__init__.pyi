@@ -22,6 +22,7 @@ from .filters import (
     low_pass,
     remove_background,
 )
+from .fit_provenance import FitOrigin, FitProvenance
 from .gaussian import GaussianEstimate, gaussian_source
 from .hot_pixels import HotPixelFilter, remove_hot_pixels
 from .isotropic import IsotropicEstimate, isotropic_source, uniform_warnings
@@ -30,6 +31,7 @@ from .radiograph import Radiograph
 from .recipe import (
     ESTIMATES,
     FILTERS,
+    FIT_STEPS,
     STEPS,
     MeasuredSource,
     Origin,
@@ -43,6 +45,7 @@ from .steps import Bin, Choice, Crop, Rotate, Step
 __all__ = [
     "ESTIMATES",
     "FILTERS",
+    "FIT_STEPS",
     "STEPS",
     "BackgroundFilter",
     "Bin",
@@ -51,6 +54,8 @@ __all__ = [
     "Crop",
     "Estimate",
     "Filter",
+    "FitOrigin",
+    "FitProvenance",
     "GaussianEstimate",
     "HighPassFilter",
     "HotPixelFilter",

@@ -1,7 +1,7 @@
 """Everything that is done to a shot, as one model: `Recipe`.
 
-- the steps there are, by name: `STEPS`; those that filter: `FILTERS`; estimates of the source:
-  `ESTIMATES`
+- the steps there are, by name: `STEPS`; those that filter: `FILTERS`; those before a fit:
+  `FIT_STEPS`; estimates of the source: `ESTIMATES`
 - a recipe with what it was applied to, kept with a result: `Provenance`, `Origin`
 """
 
@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing import gaussian, hot_pixels, isotropic  # noqa: F401
 from napari_shadowinv.preprocessing.estimates import Estimate
@@ -57,6 +57,12 @@ class MeasuredSource(Choice):
 # Whatever is defined in the modules imported here is a step, or a source, of a recipe.
 STEPS = choices_of(Step)
 FILTERS = {name: step for name, step in STEPS.items() if issubclass(step, Filter)}
+# Filters that blur or flatten would change what the forward model is fitted to.
+FIT_STEPS = {
+    name: step
+    for name, step in STEPS.items()
+    if name not in FILTERS or issubclass(step, hot_pixels.HotPixelFilter)
+}
 ESTIMATES = choices_of(Estimate)
 
 if TYPE_CHECKING:
@@ -109,6 +115,11 @@ class Recipe(BaseModel):
     )
     options: InversionOptions = Field(
         default=InversionOptions(), title="Options", description="Options of the inversion."
+    )
+    fit: FitChoices | None = Field(
+        default=None,
+        title="Fit",
+        description="Choices of a fit of the forward model, for those that fit and do not invert.",
     )
 
     @property
@@ -301,7 +312,8 @@ class Provenance(BaseModel):
     """How a result was made, so that it can be made again.
 
     The `recipe` has the setup and the kind of source that came with the image's file, too; `setup`
-    is that of the result's pixels; `notes` tell people what the steps found and did.
+    is that of the result's pixels; the image was divided by its `gain`, if it has one; `notes` tell
+    people what the steps found and did.
     """
 
     model_config = _CONFIG
@@ -312,6 +324,7 @@ class Provenance(BaseModel):
     mask: Origin | None = None
     source_mask: Origin | None = None
     setup: Setup | None = None
+    gain: float | None = None
     notes: tuple[str, ...] = ()
 
     @classmethod

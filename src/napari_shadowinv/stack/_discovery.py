@@ -104,7 +104,7 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
         return _from_files([path], reader, shape)
     items = [_references.PageShot(path.absolute(), page, reader) for page in range(pages)]
     names = tuple(f"{text_of(path.name)}[{page}]" for page in range(pages))
-    return Shots(items, names, shape or _usual_shape(items))
+    return Shots(items, names, shape or usual_shape(items))
 
 
 def _page_count(path: Path, reader: Reader) -> int:
@@ -116,23 +116,28 @@ def _page_count(path: Path, reader: Reader) -> int:
 def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | None) -> Shots:
     if not paths:
         raise InputError("shots are an empty list: expected at least one path")
+    items = [_references.FileShot(path.absolute(), reader) for path in paths]
+    return Shots(items, names_of(paths), shape or usual_shape(items))
+
+
+def names_of(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Names of files, with their folders if they differ only there."""
     names = tuple(text_of(path.name) for path in paths)
     if len(set(names)) < len(names):
         names = tuple(text_of(path) for path in paths)
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise InputError(f"shots contain {twice} twice: expected each file once")
-    items = [_references.FileShot(path.absolute(), reader) for path in paths]
-    return Shots(items, names, shape or _usual_shape(items))
+    return names
 
 
-def _usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
+def usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
     """Shape of most of the first few shots that can be read; bad ones fail later, by name."""
     shapes: Counter[tuple[int, ...]] = Counter()
     first_error: Exception | None = None
     for shot in items:
         try:
-            shapes[np.shape(shot.load()[0])] += 1
+            shapes[shot.shape()] += 1
         except (OSError, ValueError) as error:
             first_error = first_error or error
         if shapes.total() == _LOOKED_AT:

@@ -57,7 +57,10 @@ class _Threads:
         return self._pool.submit(task, shots, *args)
 
     def result(self, future: Any) -> Any:
-        """Return what a task returned; raise `WorkerDied`, or `EngineError` if all is lost."""
+        """Return what a task returned, or None if its worker died since and it is done again.
+
+        Raises `WorkerDied`, or `EngineError` if all is lost.
+        """
         return future.result()
 
     def check(self) -> None:
@@ -121,8 +124,9 @@ class _Cluster:
         from distributed.scheduler import KilledWorker
 
         try:
-            with self._connected_or_lost():
+            with self._connected_or_lost(), suppress(TimeoutError):
                 return future.result(timeout=_CONNECT_SECONDS)
+            self.check()
         except KilledWorker as error:
             if str(error.task) in {shared.key for shared in self._shared}:
                 raise EngineError(
@@ -133,6 +137,7 @@ class _Cluster:
                 "the worker crashed on every attempt: it may have too little memory for this "
                 "shot, or its machine may have gone down"
             ) from error
+        return None
 
     def check(self) -> None:
         if self._client.status != "running":

@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import variable_labels
-from napari_shadowinv.io.store import SUMMARY
+from napari_shadowinv.inversion.labels import SETUPS_LABEL, variable_labels
+from napari_shadowinv.io.store import SUMMARY, with_places
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack import _spec
 from napari_shadowinv.stack._references import Reader, Shot, read_shot
+from napari_shadowinv.stack._stacks import Stack
 from napari_shadowinv.stack._worker import Beam, Work
 
 if TYPE_CHECKING:
@@ -50,8 +51,9 @@ def invert_stack(
     ----------
     shots : array (shot, y, x), xarray.DataArray or Dataset, str, Path or sequence of paths
         A dask or numpy array; an xarray object with one such variable; paths of one image each;
-        a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; or a TIFF with a
-        page for each shot. Files are read by the tasks that invert them.
+        a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; a TIFF with a page for
+        each shot; or a table (CSV) with a row for each shot, which may have its own energy, setup,
+        gain, mask and source. Files are read by the tasks that invert them.
     source : array (y, x), path, Estimate, or as `shots`, optional
         The undisturbed beam, one for all shots or one for each, or an estimate of
         `napari_shadowinv.preprocessing` by which it is estimated from each shot. Default: uniform,
@@ -83,7 +85,8 @@ def invert_stack(
         The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
         chunk, and ``converged``, ``flux_residual``, ``image_residual`` and ``iterations``; nothing
         is computed yet. Sites have no dimension ``shot`` where all shots share a source, and are
-        left out with a free boundary and a source for each shot, as their number then differs.
+        left out with a free boundary and a source for each shot, or with masks of their own, as
+        their number then differs. Of a table, ``setup`` has that of each shot as JSON.
 
     Raises
     ------
@@ -104,6 +107,11 @@ def invert_stack(
     >>> float(abs(stack.displacement.isel(shot=1)).max())
     0.0
     """
+    if recipe is not None and recipe.fit is not None:
+        raise InputError(
+            "the recipe has a section fit, and invert_stack inverts: use run_stack to fit, or "
+            "leave the section out"
+        )
     stack = _spec.describe_stack(
         shots,
         variables=variables,
@@ -157,7 +165,7 @@ def _pick(record: dict[str, Any], name: str, with_shot: bool) -> AnyArray:
 class _Graph:
     """The tasks of a stack: one for each shot, one that takes each variable out of it."""
 
-    def __init__(self, stack: _spec.Stack) -> None:
+    def __init__(self, stack: Stack) -> None:
         from dask.base import tokenize
         from dask.delayed import delayed
         from dask.highlevelgraph import HighLevelGraph
@@ -167,6 +175,7 @@ class _Graph:
             stack.shots.items if stack.shots.array is None else stack.shots.array.name,
             None if stack.sources is None else stack.sources.items,
             None if stack.beam is None else stack.beam.key,
+            stack.source_text(None),
             stack.inputs.shot.mask,
             stack.inputs.shot.source_mask,
             stack.recipe.model_dump_json(),
@@ -211,12 +220,17 @@ class _Graph:
                 variables[name] = (dims, self._shared(name, dims), labels)
             else:
                 variables[name] = (("shot", *dims), self._of_each(name, dims), labels)
+        setups = stack.setups
+        if setups is not None:
+            da: Any = import_module("dask.array")
+            variables["setup"] = (("shot",), da.from_array(np.array(setups, "O"), 1), SETUPS_LABEL)
         for name in _NUMBERS:
             dtype, labels = SUMMARY[name]
             variables[name] = (("shot",), self._of_each(name, (), dtype), labels)
-        return xr.Dataset(
+        dataset = xr.Dataset(
             variables, coords=_spec.coordinates_of(stack), attrs=_spec.attributes_of(stack)
         )
+        return dataset if setups is None else with_places(dataset)
 
     def _of_each(self, name: str, dims: tuple[str, ...], dtype: Any = None) -> Any:
         from dask.highlevelgraph import HighLevelGraph

@@ -29,6 +29,10 @@ class Shot:
         """Return the image and its ``sha256``, with ``warnings`` for the shot's report if any."""
         raise NotImplementedError
 
+    def shape(self) -> tuple[int, ...]:
+        """Return the shape of the image, which is read for it."""
+        return np.shape(self.load()[0])
+
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Whether it is still the image of which `load` said this."""
         return bool(self.load()[1]["sha256"] == origin.get("sha256"))
@@ -63,14 +67,15 @@ def read_shot(
         image, told = read_tiff_page(path, page, channel=channel)
         shot = Radiograph(image, warnings=told)
     if warnings is not None:
-        warnings.extend(shot.warnings)
-        ignored = [name for name in ("source", "mask") if getattr(shot, name) is not None]
-        if ignored:
-            warnings.append(
-                f"the file contains its own {' and '.join(ignored)}, which a stack ignores: pass "
-                "one for the whole stack"
-            )
+        warnings.extend(doubts_of_file(shot))
     return shot.image
+
+
+def doubts_of_file(shot: Radiograph) -> list[str]:
+    """What the user should know before trusting the image of a file in a stack."""
+    ignored = [name for name in ("source", "mask") if getattr(shot, name) is not None]
+    told = f"the file contains its own {' and '.join(ignored)}, which a stack ignores: pass one"
+    return [*shot.warnings, *([f"{told} for the whole stack"] if ignored else [])]
 
 
 def _read(reader: Reader, path: Path, **chosen: int) -> tuple[AnyArray, dict[str, Any]]:
@@ -93,23 +98,24 @@ class FileShot(Shot):
         # A file that changed is another input, and what dask has of it another result.
         from dask.base import normalize_token
 
-        stamp = _stamp(self.path) if self.path.exists() else {}
-        return (str(self.path), normalize_token(self.reader), *stamp.values())
+        known = stamp(self.path) if self.path.exists() else {}
+        return (str(self.path), normalize_token(self.reader), *known.values())
 
     def load(self) -> tuple[AnyArray, dict[str, Any]]:
         image, told = _read(self.reader, self.path)
-        return image, {**_stamp(self.path), "sha256": sha256(self.path), **told}
+        return image, {**stamp(self.path), "sha256": sha256(self.path), **told}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare size and time, and only where these differ the checksum."""
         if not self.path.exists():
             return True  # put away after it was inverted
-        if _stamp(self.path).items() <= origin.items():
+        if stamp(self.path).items() <= origin.items():
             return True
         return bool(sha256(self.path) == origin.get("sha256"))
 
 
-def _stamp(path: Path) -> dict[str, int]:
+def stamp(path: Path) -> dict[str, int]:
+    """Return size and time of a file, by which it is taken for the same."""
     status = path.stat()
     return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
 

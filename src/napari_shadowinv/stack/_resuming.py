@@ -12,12 +12,12 @@ import numpy as np
 from napari_shadowinv import __version__
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import variable_labels
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.io.store_layout import Contents, Variable, grow_store
 from napari_shadowinv.stack import _spec
 from napari_shadowinv.stack._references import checksum
-from napari_shadowinv.stack._spec import Stack, dtype_of
+from napari_shadowinv.stack._spec import dtype_of
+from napari_shadowinv.stack._stacks import Stack
 
 _APPENDED = "appended_at"  # attribute: where later runs began to append shots
 _INSTEAD = "use the same, overwrite the store, or choose another name"
@@ -54,7 +54,7 @@ def _stored_coordinate(coordinate: Any) -> Variable:
 
 def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
     found: dict[str, Variable] = {}
-    for name, (dims, labels) in variable_labels(stack.setup).items():
+    for name, (dims, labels) in stack.labels.items():
         if name not in stack.variables:
             continue
         exact = dtype_of(name).kind != "f" or "site" in dims
@@ -71,17 +71,11 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
     """What must be the same for a store to be continued; of so many of its shots."""
     height, width = stack.shape
     recipe, shot = stack.recipe, stack.inputs.shot
-    source = "uniform"
-    if stack.sources is not None:
-        source = f"one for each shot: {', '.join(stack.sources.names[:shots])}"
-    elif stack.beam is not None and stack.beam.source is not None:
-        source = f"sha256 {checksum(stack.beam.source)}"
-    elif stack.beam is None and recipe.estimate is not None:
-        source = f"estimated from each shot: {recipe.estimate.model_dump_json()}"
     return {
-        "options": recipe.options.model_dump_json(exclude={"threads"}),
-        "setup": "" if recipe.setup is None else recipe.setup.model_dump_json(),
-        "source_image": source,
+        "fit": stack.fit_text,
+        "options": stack.options_text,
+        **stack.setup_texts,
+        "source_image": stack.source_text(shots),
         "mask_image": _sum_of(shot.mask) or "none",
         "steps": json.dumps([step.model_dump() for step in recipe.steps]) if recipe.steps else "",
         "source_mask_image": _sum_of(shot.source_mask),

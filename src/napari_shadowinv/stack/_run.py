@@ -24,7 +24,8 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
 from napari_shadowinv.stack._references import Reader, read_shot
 from napari_shadowinv.stack._resuming import append_shots, contents_of, resume
-from napari_shadowinv.stack._spec import Stack, describe_stack
+from napari_shadowinv.stack._spec import STORED, describe_stack
+from napari_shadowinv.stack._stacks import Stack
 from napari_shadowinv.stack._worker import Settings, ShotOutcome, run_shots
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Recipe, Step
 
-STORED = ("potential", "displacement", "caustic")
 _POLL = 0.25  # seconds between two looks at the engine and at `should_stop`
 
 
@@ -78,7 +78,7 @@ def run_stack(
     source_mask: ArrayLike | None = None,
     reader: Reader = read_shot,
     warm_start: int = 1,
-    variables: Collection[str] = STORED,
+    variables: Collection[str] | None = None,
     dtype: str = "float32",
     scheduler: Any = None,
     workers: int | None = None,
@@ -87,21 +87,24 @@ def run_stack(
     on_progress: OnRunProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> xarray.Dataset:
-    """Invert every shot into one store; run again, it goes on where it stopped.
+    """Invert, or fit, every shot into one store; run again, it goes on where it stopped.
 
-    A shot that cannot be inverted fails alone, with its reason. What is written of a shot counts
-    once it is complete, so a run may be interrupted or killed at any time. Shots that have
-    arrived since the store was begun are appended, whatever their names: a shot keeps its number.
+    With a recipe that has a section `fit`, the forward model is fitted to each shot. A shot that
+    cannot be inverted fails alone, with its reason. What is written of a shot counts once it is
+    complete, so a run may be interrupted or killed at any time. Shots that have arrived since the
+    store was begun are appended, whatever their names: a shot keeps its number.
 
     Parameters
     ----------
     shots, source, mask, recipe, options, setup, filters, source_mask, reader, warm_start
-        As for `invert_stack`. They and earlier shots must be those of a store that is resumed.
+        As for `invert_stack`. They and earlier shots must be those of a store that is resumed. In
+        a table of shots to fit, rows with the same ``shot`` are images of one object.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
     variables : collection of str, optional
         What to store. Default: potential, displacement and caustic, at a million pixels 13 MB a
-        shot before compression; the rest can be computed from them and the image.
+        shot before compression; the rest can be computed from them and the image. Of a fit
+        potential, displacement and its error bars.
     dtype : {"float32", "float64"}, optional
         Type of stored images; sites, weights and numbers of a shot keep 64 bits.
     scheduler : str, distributed.Client, cluster or None, optional
@@ -136,6 +139,8 @@ def run_stack(
     if dtype not in ("float32", "float64"):
         raise InputError(f"dtype is {dtype!r}: expected 'float32' or 'float64'")
     kept = np.dtype(dtype)
+    if variables is None and (recipe is None or recipe.fit is None):
+        variables = STORED
     stack = describe_stack(
         shots,
         variables=variables,
@@ -236,8 +241,12 @@ class _Run:
                     return
                 future = self._wait(engine, ended)
                 window = engine.window(files=is_file) if engine.workers is None else window
-                if future is not None:
-                    self._end(engine, future, running.pop(future))
+                if future is None:
+                    continue
+                if self._end(engine, future, running[future]):
+                    del running[future]
+                else:
+                    future.add_done_callback(ended.put)
         except BaseException:
             for future in running:
                 future.cancel()
@@ -278,7 +287,8 @@ class _Run:
             engine.check()
             return None
 
-    def _end(self, engine: Engine, future: Any, batch: list[int]) -> None:
+    def _end(self, engine: Engine, future: Any, batch: list[int]) -> bool:
+        """Count the shots of a task, or return False if it is being done again."""
         try:
             outcomes = engine.result(future)
         except WorkerDied as error:
@@ -286,6 +296,9 @@ class _Run:
             outcomes = [ShotOutcome(index, FAILED, 0.0, str(error)) for index in lost]
             for index in lost:
                 self._store.writer.fail(index, {"reason": str(error)})
+        if outcomes is None:
+            return False
         for outcome in outcomes:
             self._todo.discard(outcome.index)
             self.tell(engine.name, outcome)
+        return True

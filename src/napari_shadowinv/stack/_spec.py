@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,13 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
 from napari_shadowinv.inversion.normalise import checked_mask, checked_source
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.pipeline import Inputs, gathered
+from napari_shadowinv.pipeline._fit import check_fit
+from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
 from napari_shadowinv.preprocessing import (
     Estimate,
     MeasuredSource,
@@ -28,79 +30,27 @@ from napari_shadowinv.preprocessing import (
     Step,
     UniformEstimate,
 )
-from napari_shadowinv.stack._discovery import Shots, find_shots, find_source
-from napari_shadowinv.stack._references import Reader, Shot, described_reader
-from napari_shadowinv.stack._worker import Beam, Work, shared_plan, threads_here
+from napari_shadowinv.stack._discovery import Shots, find_shots, find_source, usual_shape
+from napari_shadowinv.stack._references import (
+    Reader,
+    described_reader,
+    read_shot,
+)
+from napari_shadowinv.stack._stacks import FitStack, Stack, TableStack
+from napari_shadowinv.stack._tables import (
+    RowShot,
+    first_image,
+    row_shots,
+    shots_of_table,
+)
+from napari_shadowinv.stack._worker import Beam, shared_plan, threads_here
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
-
-@dataclass(frozen=True, eq=False)
-class Stack:
-    """Everything about a stack that is known before any shot is inverted."""
-
-    shots: Shots
-    inputs: Inputs  # recipe, masks, and where they came from
-    beam: Beam | None  # source, after all steps, and mask of all shots; None if each has its own
-    sources: Shots | None  # one for each shot, if these were measured
-    variables: tuple[str, ...]
-    warm_start: int = 1  # shots in a group, each initialised from the one before
-    reader: str = ""  # name of what reads the files
-
-    @property
-    def recipe(self) -> Recipe:
-        return self.inputs.recipe
-
-    @cached_property
-    def moved(self) -> Radiograph:
-        """Masks and setup after the steps that move pixels; its image means nothing."""
-        return self.recipe.moved(self.inputs.shot)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.moved.shape
-
-    @property
-    def setup(self) -> Setup | None:
-        return self.moved.setup
-
-    @cached_property
-    def sizes(self) -> dict[str, int]:
-        height, width = self.shape
-        # Where each shot has its own, there are sites only if they do not depend on it.
-        beam = self.beam or Beam.of(self.shape, None, self.moved.mask)
-        sites = count_sites(beam.image, self.recipe.options, mask=beam.mask)
-        return {"shot": len(self.shots), "y": height, "x": width, "component": 2, "site": sites}
-
-    def is_shared(self, name: str) -> bool:
-        """Whether all shots have one such variable together."""
-        return (
-            self.beam is not None
-            and name in ("sites", "site_mass", "source", "mask")
-            and not (name == "source" and self.beam.source is None)
-        )
-
-    def source_of(self, index: int) -> Shot | None:
-        """Reference to the measured source of one shot; None if it is shared, or estimated."""
-        return None if self.sources is None else self.sources.items[index]
-
-    def chosen(self, order: Sequence[int]) -> Stack:
-        """Return the stack with its shots, and their sources, in another order."""
-        sources = None if self.sources is None else self.sources.chosen(order)
-        return replace(self, shots=self.shots.chosen(order), sources=sources)
-
-    def work(self, variables: tuple[str, ...]) -> Work:
-        """Return what the task of each shot needs to know to make some variables."""
-        return Work(self.shots.shape, self.inputs, variables)
-
-    def changed(self, index: int, origin: dict[str, Any]) -> str:
-        """Name what of a shot is not what its report says; empty if nothing."""
-        if not self.shots.items[index].unchanged(origin):
-            return self.shots.label(index)
-        if self.sources is not None and not self.sources.items[index].unchanged(origin["source"]):
-            return f"the source of {self.shots.label(index)}"
-        return ""
+# What is stored of an inversion, and of a fit, unless it is said.
+STORED = ("potential", "displacement", "caustic")
+FITTED = ("potential", "displacement", "displacement_uncertainty")
 
 
 def describe_stack(
@@ -126,6 +76,43 @@ def describe_stack(
     if isinstance(source, Estimate):
         wanted = wanted.model_copy(update={"source": source})
         source = None
+    found, inputs, sources = _described(shots, wanted, source, mask, source_mask, reader)
+    own = sources if isinstance(sources, Shots) else None
+    if own is not None and len(own) != len(found):
+        raise InputError(
+            f"got {len(own)} sources for {len(found)} shots: expected one, or one for each shot"
+        )
+    named = described_reader(reader)
+    if wanted.fit is not None:
+        return _fit_stack(found, inputs, sources, wanted, variables, warm_start, named)
+    rows = [shot.row for shot in found.items if isinstance(shot, RowShot)]
+    own_masks = any(row.mask is not None for row in rows)
+    alone = own_masks or any(row.source is not None for row in rows)
+    beam = None if alone else _shared_beam(inputs, sources)
+    if beam is None and warm_start > 1:
+        raise InputError(
+            f"warm_start is {warm_start} and each shot has its own source or mask: the previous "
+            "solution belongs to different sites; leave warm_start out, or give one source and "
+            "mask for all shots"
+        )
+    ragged = own_masks or (beam is None and inputs.recipe.options.boundary == "free")
+    chosen = _checked_variables(variables, inputs.recipe, ragged=ragged)
+    if not rows:
+        return Stack(found, inputs, beam, own, chosen, warm_start, named)
+    common = None if sources is None or own is not None else np.asarray(sources, np.float64)
+    guess = wanted.estimate
+    return TableStack(found, inputs, beam, own, chosen, warm_start, named, common, guess)
+
+
+def _described(
+    shots: Any,
+    wanted: Recipe,
+    source: Any,
+    mask: ArrayLike | None,
+    source_mask: ArrayLike | None,
+    reader: Reader,
+) -> tuple[Shots, Inputs, Any]:
+    """Return the shots, the recipe with its masks, and the source of all or that of each."""
     measured = wanted.source if isinstance(wanted.source, MeasuredSource) else MeasuredSource()
     source = measured.file if source is None else source
     source_reader = reader
@@ -139,7 +126,12 @@ def describe_stack(
     # Where the source tells it, no shot needs to be read for its shape.
     shape = (() if mask is None else np.shape(mask)) if sources is None else sources.shape
     known = (shape[0], shape[1]) if len(shape) == 2 else None
-    found = find_shots(shots, reader=reader, shape=known)
+    table = _table_of(shots)
+    if table is not None:
+        found, first = _shots_of(table, wanted, reader, known)
+        wanted = wanted.model_copy(update={"setup": first})
+    else:
+        found = find_shots(shots, reader=reader, shape=known)
     if sources is not None and sources.shape != found.shape:
         raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
     usable = None if mask is None else checked_mask(mask, found.shape)
@@ -159,20 +151,79 @@ def describe_stack(
         origin = Origin(file=text_of(Path(source).name))
         provenance = inputs.provenance.model_copy(update={"source": origin})
         inputs = replace(inputs, provenance=provenance)
-    inputs = replace(inputs, shot=replace(inputs.shot, source=None))
-    beam = _shared_beam(inputs, sources)
+    return found, replace(inputs, shot=replace(inputs.shot, source=None)), sources
+
+
+def _table_of(shots: Any) -> Path | Sequence[ShotRow] | None:
+    """The table that describes the shots, or its rows, if it is one."""
+    if isinstance(shots, Sequence) and shots and all(isinstance(one, ShotRow) for one in shots):
+        return shots
+    alone = shots[0] if isinstance(shots, (list, tuple)) and len(shots) == 1 else shots
+    if not isinstance(alone, (str, Path)) or not Path(alone).is_file():
+        return None
+    return Path(alone) if is_table(Path(alone)) else None
+
+
+def _shots_of(
+    table: Path | Sequence[ShotRow],
+    recipe: Recipe,
+    reader: Reader,
+    shape: tuple[int, int] | None,
+) -> tuple[Shots, Setup | None]:
+    """The shots of a table, and the setup of the first image."""
+    part = getattr(reader, "keywords", {})
+    if getattr(reader, "func", reader) is not read_shot:
+        raise InputError(
+            f"received a reader for the table {table}, which names files: leave the reader out"
+        )
+    chosen = part.get("channel"), part.get("variable")
+    if recipe.fit is None:
+        rows = row_shots(table, recipe, *chosen)
+        items = list(rows.values())
+        return Shots(items, tuple(rows), shape or usual_shape(items)), items[0].setup
+    if not isinstance(table, Path):
+        raise InputError("received rows of a table to fit, expected its file: write it first")
+    named = shots_of_table(table, recipe, *chosen)
+    first = first_image(list(named.values()))
+    assert isinstance(first.image, Radiograph)
+    return Shots(list(named.values()), tuple(named), first.image.shape), first.setup
+
+
+def _fit_stack(
+    found: Shots,
+    inputs: Inputs,
+    sources: Any,
+    wanted: Recipe,
+    variables: Collection[str] | None,
+    warm_start: int,
+    reader: str,
+) -> FitStack:
+    check_fit(wanted)
+    choices = wanted.fit or FitChoices()
+    if warm_start > 1:
+        raise InputError(f"warm_start is {warm_start}: fits start on their own; leave it out")
+    if choices.fields is not None and len(choices.fields) > 1:
+        raise InputError(
+            f"the recipe fits the fields {', '.join(choices.fields)}, and a store holds one: fit "
+            "one field, or each shot alone with shadowinv fit"
+        )
     own = sources if isinstance(sources, Shots) else None
-    if own is not None and len(own) != len(found):
-        raise InputError(
-            f"got {len(own)} sources for {len(found)} shots: expected one, or one for each shot"
-        )
-    if beam is None and warm_start > 1:
-        raise InputError(
-            f"warm_start is {warm_start} and each shot has its own source: the previous solution "
-            "belongs to different sites; leave warm_start out, or give one source for all shots"
-        )
-    chosen = _checked_variables(variables, inputs.recipe, own_sources=beam is None)
-    return Stack(found, inputs, beam, own, chosen, warm_start, described_reader(reader))
+    image = None if sources is None or own is not None else np.asarray(sources, np.float64)
+    # Estimates, and beams of their own, are those of each shot.
+    alone = own is not None or inputs.recipe.estimate not in (None, UniformEstimate())
+    beam = None if alone else Beam.of(found.shape, image, None)
+    stack = FitStack(found, inputs, beam, own, (), 1, reader, wanted)
+    known = stack.labels
+    if choices.options.samples < 2:
+        known.pop("displacement_uncertainty")
+    for name in variables or ():
+        if name not in known:
+            raise InputError(
+                f"there is no variable {name!r} of a fit: expected one or more of "
+                f"{', '.join(known)}"
+            )
+    usual = tuple(name for name in FITTED if name in known)
+    return replace(stack, variables=tuple(variables or usual))
 
 
 def _recipe(
@@ -204,19 +255,21 @@ def _shared_beam(inputs: Inputs, sources: Any) -> Beam | None:
 
 
 def _checked_variables(
-    wanted: Collection[str] | None, recipe: Recipe, *, own_sources: bool
+    wanted: Collection[str] | None, recipe: Recipe, *, ragged: bool
 ) -> tuple[str, ...]:
-    """Names of the variables that a stack shall have."""
+    """Names of the variables that a stack shall have; shots may differ in the number of sites."""
     labels = variable_labels(recipe.setup)
-    # As many sites then as the source shines into the margin: shots would differ.
-    ragged = own_sources and recipe.options.boundary == "free"
+    # By as many as the masks hide, or as the source shines into the margin.
     known = tuple(name for name, (dims, _) in labels.items() if not (ragged and "site" in dims))
     for name in wanted or ():
         if name in known:
             continue
         hint = " (it needs a setup)" if recipe.setup is None else ""
         if name in labels:
-            hint = " (sites differ between shots with a free boundary and one source per shot)"
+            hint = (
+                " (sites differ between shots with a free boundary and one source per shot, or "
+                "with masks of their own)"
+            )
         raise InputError(
             f"there is no variable {name!r}{hint}: expected one or more of {', '.join(known)}"
         )
@@ -224,7 +277,9 @@ def _checked_variables(
 
 
 def coordinates_of(stack: Stack) -> dict[str, Any]:
-    plane = dataset_from_field(np.zeros((2, *stack.shape)), None, stack.setup)
+    own = isinstance(stack, TableStack)
+    # Where setups differ, so may the pixels' size.
+    plane = dataset_from_field(np.zeros((2, *stack.shape)), None, None if own else stack.setup)
     shots = stack.shots
     numbers = np.arange(len(shots)) if shots.coordinate is None else shots.coordinate
     coords: dict[str, Any] = {str(name): value for name, value in plane.coords.items()}
@@ -241,6 +296,7 @@ def attributes_of(stack: Stack) -> dict[str, str]:
         **attributes,
         "options": stack.recipe.options.model_dump_json(),
         "provenance": provenance.model_dump_json(exclude_none=True),
+        **({"fields": json.dumps([stack.bends])} if isinstance(stack, FitStack) else {}),
     }
 
 

@@ -1,4 +1,7 @@
-"""What a worker does: `Work` inverts one shot, `run_shots` some and writes each."""
+"""What a worker does: `Work` inverts one shot, `run_shots` some and writes each.
+
+`FitWork` takes the place of `Work` in a stack that is fitted, and has the same methods.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +22,14 @@ from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
 from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.pipeline import Cache, Inputs, run_prepared
+from napari_shadowinv.preprocessing import UniformEstimate
+from napari_shadowinv.stack._fit_work import FitWork
 from napari_shadowinv.stack._references import Shot, checksum
 from napari_shadowinv.transport.sites import SitePlan
 
@@ -111,7 +117,7 @@ class Work:
 
     def invert(
         self,
-        image: AnyArray,
+        content: Any,
         beam: Beam | None,
         source: AnyArray | None = None,
         *,
@@ -120,17 +126,18 @@ class Work:
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
         """Apply the recipe to a shot as recorded, and to its source if it has its own."""
-        if np.shape(image) != self.shape:
+        image = getattr(content, "image", content)
+        found = getattr(image, "shape", None) or np.shape(image)
+        if found != self.shape:
             others = "the others" if beam is None or beam.source is None else "the source"
-            raise InputError(
-                f"image has shape {np.shape(image)}, expected {self.shape} as {others}"
-            )
+            raise InputError(f"image has shape {found}, expected {self.shape} as {others}")
         if source is not None and np.shape(source) != self.shape:
             raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
-        recipe = self.inputs.recipe
-        values = np.asarray(image, dtype=np.float64)
-        shot = replace(self.inputs.shot, image=values, source=source)
-        ready = recipe.prepared(shot, should_stop)
+        inputs = self.gathered(content, beam, source)
+        recipe = inputs.recipe
+        ready = recipe.prepared(inputs.shot, should_stop)
+        if beam is None and isinstance(recipe.source, UniformEstimate):
+            beam = Beam.of(ready.shape, None, ready.mask)
         if beam is not None:
             ready = replace(ready, source=beam.image)
             if beam.source is None:
@@ -138,10 +145,14 @@ class Work:
         options = recipe.options
         if options.threads is None:
             options = options.model_copy(update={"threads": threads_here(workers)})
-        recipe = recipe.model_copy(update={"options": options})
-        inputs = replace(self.inputs, recipe=recipe, shot=shot)
+        inputs = replace(inputs, recipe=recipe.model_copy(update={"options": options}))
         sites = _SharedSites(beam=beam)
         return run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
+
+    def gathered(self, content: Any, beam: Beam | None, source: AnyArray | None) -> Inputs:
+        """Return what the recipe is applied to."""
+        values = np.asarray(content, dtype=np.float64)
+        return replace(self.inputs, shot=replace(self.inputs.shot, image=values, source=source))
 
     def arrays(self, inversion: Inversion) -> dict[str, AnyArray]:
         """Return the variables by name, fields in SI units among them."""
@@ -153,6 +164,10 @@ class Work:
             )
             arrays |= {name: fields[name].values for name in self.variables if name not in own}
         return arrays
+
+    def report(self, inversion: Inversion) -> dict[str, Any]:
+        """Return what is told of a shot."""
+        return {**dataclasses.asdict(inversion.report), "stages": inversion.report.seconds}
 
 
 def _relative(image: AnyArray, mask: BoolArray | None) -> AnyArray:
@@ -220,7 +235,7 @@ class ShotOutcome:
     seconds : float
         Time that its worker spent on it, reading and writing included.
     reason, converged : str and bool
-        Why it failed, and whether the solver reached its tolerance.
+        Why it failed, and whether the solver reached its tolerance, or the fit its end.
     """
 
     index: int
@@ -235,7 +250,7 @@ class Settings:
     """What the task of every shot needs to know."""
 
     writer: ShotWriter
-    work: Work
+    work: Work | FitWork
     workers: int | None
 
 
@@ -246,9 +261,10 @@ def run_shots(
     settings: Settings,
     stop: Any = None,
 ) -> list[ShotOutcome]:
-    """Task: invert some shots one after the other and write each."""
+    """Task: invert, or fit, some shots one after the other and write each."""
     should_stop = None if stop is None else stop.is_set
-    previous: Inversion | None = None
+    work: Any = settings.work
+    previous: Inversion | Fit | None = None
     outcomes = []
     for shot, (index, wanted, source) in zip(shots, labels, strict=True):
         start = time.perf_counter()
@@ -258,7 +274,7 @@ def run_shots(
             own = None
             if source is not None:
                 own, origin["source"] = source.load()
-            previous = settings.work.invert(
+            previous = work.invert(
                 image, beam, own, start=previous, workers=settings.workers, should_stop=should_stop
             )
         except InversionCancelled:
@@ -273,14 +289,10 @@ def run_shots(
             settings.writer.fail(index, {"reason": failure, "seconds": seconds})
             outcomes.append(ShotOutcome(index, FAILED, seconds, failure))
         else:
-            report = {
-                **dataclasses.asdict(previous.report),
-                "stages": previous.report.seconds,
-                "seconds": seconds,
-                **origin,
-                "warnings": [*previous.report.warnings, *origin.get("warnings", ())],
-            }
-            settings.writer.write(index, settings.work.arrays(previous), report)
+            told = work.report(previous)
+            warnings = [*told["warnings"], *origin.get("warnings", ())]
+            report = {**told, "seconds": seconds, **origin, "warnings": warnings}
+            settings.writer.write(index, work.arrays(previous), report)
             spent = time.perf_counter() - start
             outcomes.append(ShotOutcome(index, DONE, spent, converged=previous.report.converged))
     return outcomes

@@ -203,7 +203,9 @@ def plan_levels(
 
     def level(count: int, tell: Callable[[int, int], None]) -> Level:
         sites = sample_sites(source, count, seed)
-        triangulation = RegularTriangulation(sites, region=density.region)
+        triangulation = RegularTriangulation(
+            sites, region=density.region, alive=lambda: tell(0, count)
+        )
         diagram, steps = lloyd(
             triangulation,
             density,

@@ -13,8 +13,9 @@ from napari_shadowinv import InputError, InversionOptions, OpticalSetup, ProtonS
 from napari_shadowinv._napari.widgets._forms import ModelForm, ModelPicker, dump_toml, kinds_of
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._qt import StateKeeper
-from napari_shadowinv.cli._inputs import recipe_from, setup_from
+from napari_shadowinv.cli._inputs import recipe_from
 from napari_shadowinv.io import read_toml
+from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.preprocessing import ESTIMATES
 
 CHANGED = {

@@ -34,6 +34,7 @@ NAMES = (
     "Invert shot",
     "Invert stack",
     "Fit several images",
+    "Film pack",
     "Estimate source",
     "Forward model",
     "Line profile",

@@ -1,21 +1,23 @@
-"""Fits beside a window: `FitJob`, and `FitView`, which shows its progress and its verdict."""
+"""Fits beside a window: `Refining` begins one, `FitView` shows its progress and its verdict."""
 
 from __future__ import annotations
 
 import html
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from napari.utils.notifications import show_warning
 from qtpy.QtCore import QSignalBlocker, Qt
 from qtpy.QtWidgets import QDoubleSpinBox, QPushButton, QWidget
 
-from napari_shadowinv._napari.fit_layers import answer_layers, fit_layers, start_in_words
-from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layer_metadata import result_of, role_of
+from napari_shadowinv._napari.fit_jobs import FitAnswer, FitJob
+from napari_shadowinv._napari.fit_layers import (
+    answer_layers,
+    start_in_words,
+    verdict_in_words,
+)
+from napari_shadowinv._napari.layer_metadata import Result, result_of
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
@@ -27,143 +29,10 @@ from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel
 from napari_shadowinv._napari.widgets._plots import ObjectiveCurve
 from napari_shadowinv._napari.widgets._qt import column, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_together
-from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
-from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import FIELDS, FitOptions, Verdict, fit
-from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.preprocessing import Radiograph, Recipe
-
-if TYPE_CHECKING:
-    from napari_shadowinv._napari.layers import FullLayerData
-    from napari_shadowinv.fitting import Fit
+from napari_shadowinv.fitting import Fit, Verdict
 
 _DRAW_EVERY = 500  # ms
 _WIDEST_BLUR = 100.0  # px
-_STEP = re.compile(r"^(?P<stage>.*), objective (?P<value>\S+)$")
-
-
-@dataclass(frozen=True, eq=False)
-class FitAnswer:
-    fit: Fit
-    described: list[FullLayerData]
-
-
-@dataclass(frozen=True, eq=False)
-class FitJob:
-    """A fit to be made, and the place of its layers; images and source may be lazy."""
-
-    images: tuple[Any, ...]
-    names: tuple[str, ...]
-    keywords: Mapping[str, Any]  # of `fit`
-    name: str
-    frame: Frame
-    given: Sequence[tuple[str, str]]  # what it was given, in words
-    attributes: Mapping[str, str]
-    layer: Any = None  # of the first image
-    companions: tuple[Any, ...] = ()
-    recipe: Recipe = field(default_factory=Recipe)  # steps and setup, of the first image
-    history: list[tuple[str, float]] = field(default_factory=list)  # stage and objective so far
-
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FitAnswer:
-        """Fit and describe the layers, all of it beside the window."""
-
-        def heard(news: Progress) -> None:
-            step = _STEP.match(news.message)
-            if step:
-                self.history.append((step["stage"], float(step["value"])))
-            on_progress(news)
-
-        images, keywords = self._prepared(should_stop)
-        found = fit(images, **keywords, on_progress=heard, should_stop=should_stop)
-        described = fit_layers(
-            found,
-            self.frame,
-            self.name,
-            with_source=isinstance(keywords["source"], str),
-            attributes=self.attributes,
-        )
-        return FitAnswer(found, described)
-
-    def _prepared(self, should_stop: ShouldStop) -> tuple[FloatArray, dict[str, Any]]:
-        """Read the images and do the recipe's steps to them, and to what lies on them."""
-        from napari_shadowinv.pipeline._run import plane_of
-
-        keywords = dict(self.keywords)
-        planes = np.stack(
-            [
-                plane_of(image, f"'{name}'")
-                for image, name in zip(self.images, self.names, strict=True)
-            ]
-        )
-        source, mask, setups = (keywords[name] for name in ("source", "mask", "setups"))
-        measured = source is not None and not isinstance(source, str)
-        if measured:
-            keywords["source"] = source = np.asarray(source)
-        if not self.recipe.steps:
-            return planes, keywords
-        beams: Any = [None] * len(planes)
-        if measured:
-            _check_size("source", source, planes)
-            beams = np.broadcast_to(source, planes.shape)
-        shots = [
-            self.recipe.prepared(
-                Radiograph(image, source=beam, mask=mask, setup=setup), should_stop
-            )
-            for image, beam, setup in zip(
-                planes, beams, setups or [None] * len(planes), strict=True
-            )
-        ]
-        if measured:
-            keywords["source"] = np.stack([shot.source for shot in shots])  # type: ignore[misc]
-        if shots[0].mask is not None:
-            keywords["mask"] = np.stack([shot.mask for shot in shots])  # type: ignore[misc]
-        if setups is not None:
-            keywords["setups"] = [shot.setup for shot in shots]
-        return np.stack([shot.image for shot in shots]), keywords
-
-
-def _check_size(what: str, values: FloatArray, images: FloatArray) -> None:
-    if values.shape not in (images.shape, images.shape[1:]):
-        raise InputError(
-            f"the {what} has shape {values.shape}: expected {images.shape[1:]} or {images.shape}, "
-            "like the images"
-        )
-
-
-def refinement(layers: Sequence[Any], image: Any, psf: float) -> FitJob:
-    """The fit to an inversion's image, with its source, mask and setup, that starts from it.
-
-    Of the `layers` that show the inversion, the field tells where the image lies.
-    """
-    shown = next((layer for layer in layers if role_of(layer) == "field"), None)
-    result = None if shown is None else result_of(shown)
-    if result is None or not isinstance(result.content, Inversion):
-        raise InputError(
-            "there is no inversion of this image to refine: press Run first, then Refine"
-        )
-    inversion, setup, name = result.content, result.setup, str(image.name)
-    bends = ("magnetic field",) if setup is None else setup.deflectors
-    (fields, *_) = (name for name, deflector in FIELDS.items() if deflector in bends)
-    edge = "free" if inversion.options.boundary == "free" else "fading"
-    keywords = {
-        "setups": None if setup is None else [setup],
-        "fields": (fields,),
-        "source": inversion.source,
-        "mask": inversion.mask,
-        "psf": psf,
-        "start": inversion.potential,
-        "options": FitOptions(edge=edge, seed=inversion.options.seed),
-    }
-    given = [
-        ("Start", f"the inversion of '{name}'"),
-        ("Point spread", f"σ {psf:g} px" if psf else "none"),
-    ]
-    attributes = {"start_origin": f"the inversion of '{name}'"}
-    frame = frame_of(shown)
-    return FitJob(
-        (inversion.image,), (name,), keywords, f"{name} refined", frame, given, attributes, image
-    )
 
 
 class Refining(QWidget):
@@ -198,7 +67,7 @@ class FitView(QWidget):
         super().__init__()
         self._viewer, self._panel = viewer, panel
         self._job: FitJob | None = None
-        self._fit: Fit | None = None
+        self._result: Result | None = None
         self._others = ResultLayers(viewer, self)
         self.curve = ObjectiveCurve()
         self.verdict = wrapping_label()
@@ -218,7 +87,7 @@ class FitView(QWidget):
 
     def empty(self) -> None:
         """Take away what was said of the last fit; its layers stay."""
-        self._fit = None
+        self._result = None
         self.curve.empty()
         self.verdict.setVisible(False)
         self._answers_row.setVisible(False)
@@ -229,16 +98,32 @@ class FitView(QWidget):
         found = answer.fit
         if job.layer not in self._viewer.layers:
             show_warning(f"'{job.names[0]}' was deleted during its fit; the result is shown anyway")
-        elif job.recipe.setup is not None:
-            place_together(self._viewer, job.layer, job.recipe.setup, job.companions)
+        here = [one for one in (job.layer, *job.companions) if one in self._viewer.layers]
+        if here and job.recipe.setup is not None:
+            place_together(self._viewer, here[0], job.recipe.setup, here[1:])
         self._tell(found)
+        if found.verdict is not Verdict.DETERMINED:
+            text = verdict_in_words(found)
+            show_warning(text[:1].upper() + text[1:])
         self.report.show_rows([*job.given, *fit_rows(found, job.names)])
         self._others.show([])
-        self._job, self._fit = job, found
+        self._job, self._result = job, answer.result
         self._fill_answers(found)
         results = last.next_of((job.layer, job.name))
         results.show(answer.described)
         return results
+
+    def follow(self) -> None:
+        """Tell the verdict on the fit whose layer is selected, such as one of a file."""
+        layer = self._viewer.layers.selection.active
+        result = None if layer is None else result_of(layer)
+        if result is None or result is self._result or self._panel.runner.running:
+            return
+        if isinstance(result.content, Fit):
+            self.empty()
+            self._result = result
+            self._tell(result.content)
+            self.report.show_rows(fit_rows(result.content))
 
     def _tell(self, found: Fit) -> None:
         good = found.verdict is Verdict.DETERMINED
@@ -248,8 +133,6 @@ class FitView(QWidget):
         )
         self.verdict.setStyleSheet("" if good else PROBLEM_STYLE)
         self.verdict.setVisible(True)
-        if not good:
-            show_warning(f"The fit's verdict is '{found.verdict.value}': {found.explanation}")
 
     def _fill_answers(self, found: Fit) -> None:
         with QSignalBlocker(self.answers):
@@ -266,11 +149,11 @@ class FitView(QWidget):
 
     def _show_answer(self) -> None:
         number = self.answers.currentData()
-        if self._fit is None or self._job is None or number is None:
+        if self._result is None or self._job is None or number is None:
             return
         described = []
         if number:
-            described = answer_layers(self._fit, number, self._job.frame, self._job.name)
+            described = answer_layers(self._result, number, self._job.frame, self._job.name)
         self._others.show(described, select=False)
 
     def _on_start(self) -> None:
@@ -281,19 +164,20 @@ class FitView(QWidget):
     def _draw(self) -> None:
         job = self._panel.runner.tag
         if isinstance(job, FitJob):
-            self.curve.show_steps(list(job.history))
+            self.curve.show_steps(list(job.course.history))
 
     def _on_end(self, outcome: Any) -> None:
         self._drawing.stop()
         if isinstance(outcome.tag, FitJob):
-            self.curve.show_steps(list(outcome.tag.history))
+            self.curve.show_steps(list(outcome.tag.course.history))
 
 
-def fit_rows(found: Fit, names: Sequence[str]) -> list[tuple[str, str]]:
+def fit_rows(found: Fit, names: Sequence[str] = ()) -> list[tuple[str, str]]:
     """How a fit went, in two columns of text."""
     rows = []
-    for k, name in enumerate(names):
-        told = [name, *([found.setups[k].probe] if found.setups else []), f"χ² {found.chi2[k]:.3g}"]
+    for k, chi2 in enumerate(found.chi2):
+        told = [*names[k : k + 1], *([found.setups[k].probe] if found.setups else [])]
+        told.append(f"χ² {chi2:.3g}")
         if abs(found.gains[k] - 1) > 1e-6:
             told.append(f"gain {found.gains[k]:.3f}")
         shift = found.frames[k][[0, 3]]

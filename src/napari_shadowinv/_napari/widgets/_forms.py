@@ -66,6 +66,14 @@ def section(title: str, *widgets: QtWidgets.QWidget) -> QCollapsible:
     return folded
 
 
+def titled_section(*widgets: QtWidgets.QWidget) -> QCollapsible:
+    """A section whose title tells what is in it; a long one does not widen the window."""
+    folded = section("", *widgets)
+    policy = QtWidgets.QSizePolicy.Policy
+    folded.toggleButton().setSizePolicy(policy.Ignored, policy.Fixed)
+    return folded
+
+
 def wrapping_label(text: str = "", style: str = "") -> QtWidgets.QLabel:
     """Text that wraps at the width there is, instead of asking for more."""
     label = QtWidgets.QLabel(text)

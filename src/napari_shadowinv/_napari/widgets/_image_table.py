@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
-from qtpy.QtGui import QColor
-from qtpy.QtWidgets import QHeaderView, QSizePolicy, QTableWidget, QTableWidgetItem, QWidget
+from qtpy.QtWidgets import QSizePolicy, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.widgets._fields import parsed, shown, unit_of_title
-from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled
+from napari_shadowinv._napari.widgets._fields import parsed, unit_of_title
+from napari_shadowinv._napari.widgets._forms import labelled
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
+from napari_shadowinv._napari.widgets._number_table import NumberTable
 from napari_shadowinv._napari.widgets._qt import column, while_alive
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import SETUPS, Setup
@@ -23,8 +23,6 @@ _KEPT = "fit"  # what a layer's metadata keep of its rows
 _NAME, _BEAM, _GAIN, _PSF = range(4)
 _COLUMNS = {_GAIN: ("gain", "Gain", 1.0), _PSF: ("psf", "PSF σ (px)", 0.0)}
 _WIDTHS = {_BEAM: 90, _GAIN: 44, _PSF: 72}
-_TALLEST = 8  # rows
-_PROBLEM = QColor(PROBLEM_STYLE.removeprefix("color: ").removesuffix(";"))
 _BEAM_FIELDS = {"proton": "energy", "optical": "wavelength"}
 
 
@@ -104,17 +102,8 @@ class ImageTable(QWidget):
             "2-D image layers",
             lambda layer: layer.ndim == 3 and suits(layer),
         )
-        self.table = QTableWidget(0, 4)
-        self.table.verticalHeader().setVisible(False)
+        self.table = NumberTable(4, _WIDTHS)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
-        self.table.setSelectionMode(QTableWidget.SelectionMode.NoSelection)
-        self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)
-        self.table.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        header = self.table.horizontalHeader()
-        header.setSectionResizeMode(_NAME, QHeaderView.ResizeMode.Stretch)
-        for at, width in _WIDTHS.items():
-            header.setSectionResizeMode(at, QHeaderView.ResizeMode.Fixed)
-            header.resizeSection(at, width)
         column(self, labelled("Images", self.stacks), self.table)
         self.stacks.picked.connect(self.fill)
         self.table.itemChanged.connect(self._on_edit)
@@ -128,12 +117,7 @@ class ImageTable(QWidget):
     @property
     def used(self) -> list[ImageRow]:
         """The rows that are checked, the reference first."""
-        checked = Qt.CheckState.Checked
-        return [
-            row
-            for number, row in enumerate(self.rows)
-            if self.table.item(number, _NAME).checkState() == checked
-        ]
+        return [row for number, row in enumerate(self.rows) if self.table.is_checked(number)]
 
     @property
     def reference(self) -> ImageRow | None:
@@ -153,21 +137,10 @@ class ImageTable(QWidget):
             self.table.setRowCount(len(self.rows))
             for number, row in enumerate(self.rows):
                 use = row.kept().get("use", row.layer.data.shape == usual)
-                item = QTableWidgetItem(row.name)
-                item.setFlags(Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsUserCheckable)
-                item.setCheckState(Qt.CheckState.Checked if use else Qt.CheckState.Unchecked)
-                item.setToolTip(f"<qt>{row.name}: {_setup_in_words(row)}.</qt>")
-                self.table.setItem(number, _NAME, item)
-                for at in (_BEAM, _GAIN, _PSF):
-                    self.table.setItem(number, at, QTableWidgetItem())
-        self._fit_height()
+                tip = f"{row.name}: {_setup_in_words(row)}."
+                self.table.fill_row(number, row.name, tip, checked=use)
+        self.table.fit_height()
         self._on_use()
-
-    def _fit_height(self) -> None:
-        rows = sum(self.table.rowHeight(row) for row in range(min(len(self.rows), _TALLEST)))
-        header = self.table.horizontalHeader()
-        header.setFixedHeight(header.sizeHint().height())
-        self.table.setFixedHeight(header.height() + rows + 2 * self.table.frameWidth())
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
@@ -191,9 +164,9 @@ class ImageTable(QWidget):
                 beam = value if at_first and kind in _BEAM_FIELDS else self._beam_of(row)
                 if at_first and kind not in _BEAM_FIELDS:
                     beam = 1.0
-                self._write(number, _BEAM, beam, self.beam.unit, self.beam.tip)
+                self.table.write(number, _BEAM, beam, self.beam.unit, self.beam.tip)
                 for at, (name, _, usual) in _COLUMNS.items():
-                    self._write(number, at, row.kept().get(name, usual), "", _TIPS[name])
+                    self.table.write(number, at, row.kept().get(name, usual), "", _TIPS[name])
                 gain = self.table.item(number, _GAIN)
                 editable = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsEditable
                 gain.setFlags(editable if gains_known else Qt.ItemFlag.NoItemFlags)
@@ -216,9 +189,8 @@ class ImageTable(QWidget):
         return self._value(row, _PSF, "px") or 0.0
 
     def _value(self, row: ImageRow, at: int, unit: str) -> float | None:
-        text = self.table.item(self.rows.index(row), at).text().strip()
         try:
-            return parsed(text, unit) if text else None
+            return self.table.number(self.rows.index(row), at, unit)
         except InputError as error:
             raise InputError(f"'{row.name}': {error}") from error
 
@@ -227,31 +199,15 @@ class ImageTable(QWidget):
         given = row.kept().get(self.beam.name)
         if given is not None or row.plane is not None:
             return given
+        if self.beam.name == "strength" and self._first is not None:
+            own, first = (about.mark_of(one.layer).get("strength") for one in (row, self._first))
+            return own / first if own and first else None
         return getattr(row.setup, self.beam.name, None)
 
-    def _write(self, number: int, at: int, value: Any, unit: str, tip: str) -> None:
-        item = self.table.item(number, at)
-        if isinstance(value, str) or value is None:
-            item.setText(value or "")
-        else:
-            item.setText(shown(value, unit) if unit not in ("", "MeV") else f"{value:.6g}")
-        self._judge(item, unit, tip)
-
-    def _judge(self, item: QTableWidgetItem, unit: str, tip: str) -> None:
-        """Colour what is no number, and say so in its tool tip."""
-        try:
-            parsed(item.text() or "0", unit)
-        except InputError as error:
-            item.setForeground(_PROBLEM)
-            item.setToolTip(f"<qt>{error}</qt>")
-        else:
-            item.setData(Qt.ItemDataRole.ForegroundRole, None)
-            item.setToolTip(f"<qt>{tip}</qt>")
-
-    def _on_edit(self, item: QTableWidgetItem) -> None:
+    def _on_edit(self, item: Any) -> None:
         row, at = self.rows[item.row()], item.column()
         if at == _NAME:
-            row.keep(use=item.checkState() == Qt.CheckState.Checked)
+            row.keep(use=self.table.is_checked(item.row()))
             self._on_use()
             return
         name = self.beam.name if at == _BEAM else _COLUMNS[at][0]
@@ -266,7 +222,8 @@ class ImageTable(QWidget):
         else:
             row.keep(**{name: value})
         with QSignalBlocker(self.table):
-            self._write(item.row(), at, value, unit, self.beam.tip if at == _BEAM else _TIPS[name])
+            tip = self.beam.tip if at == _BEAM else _TIPS[name]
+            self.table.write(item.row(), at, value, unit, tip)
         self.changed.emit()
 
     def _on_use(self) -> None:

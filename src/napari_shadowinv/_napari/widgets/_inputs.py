@@ -14,7 +14,7 @@ from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.shots import radiograph_of
+from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._qt import column
@@ -276,10 +276,13 @@ class SourcePicker(forms.RowPicker):
                     "no source layer is selected: choose one below 'a layer', or choose another "
                     "source"
                 )
-            beam = radiograph_of(
-                self.layers.layer, layers.image_of(self.layers.layer, "source image")
-            )
-            return replace(beam, warnings=layers.warnings_of(self.layers.layer))
+            chosen = self.layers.layer
+            data = layers.image_of(chosen, "source image")
+            shot = preprocessing.Radiograph(data)
+            if image_layer is not None:
+                shot = radiograph_of(image_layer, image_layer.data)
+            beam = source_of_shot(chosen, data, shot)
+            return replace(beam, warnings=layers.warnings_of(chosen))
         if kind == _OWN:
             own = about.source_of(image_layer)
             if own is None:

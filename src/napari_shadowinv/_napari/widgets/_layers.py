@@ -80,7 +80,7 @@ def _grey(layer: Any | None, role: str) -> Any:
         raise InputError(
             f"'{layer.name}' is a colour image, expected a greyscale one: if it is a scan of "
             "film, which darkens with dose, convert it to dose first "
-            "(napari_shadowinv.preprocessing.film); if it is linear in fluence, "
+            "(napari_shadowinv.film); if it is linear in fluence, "
             "split it (right click on the layer → Split RGB) and choose one channel"
         )
     return _data_of(layer)
@@ -321,14 +321,21 @@ class MaskPicker(QWidget):
 
     def usable(self, image: Any) -> BoolArray | None:
         """Usable pixels of an image layer, or of each image of a stack or of files (None)."""
-        return mask_of(self.layer, image, self.painted_is_unusable.isChecked())
+        painted = mask_of(self.layer, image, self.painted_is_unusable.isChecked())
+        own = None if image is None else about.usable_of(image)
+        if painted is None or own is None:
+            return own if painted is None else painted
+        return painted & own
 
     def described(self, image: Any) -> str:
         """Which layer it is, and how much it leaves out; empty for none, or nothing painted."""
         usable = self.usable(image)
-        if usable is None or self.layer is None:
+        if usable is None:
             return ""
-        return f"layer '{self.layer.name}', excludes {1 - usable.mean():.1%} of the pixels"
+        own = image is not None and about.usable_of(image) is not None
+        names = [] if self.layer is None else [f"layer '{self.layer.name}'"]
+        names += ["the film's own"] if own else []
+        return f"{' and '.join(names)}, excludes {1 - usable.mean():.1%} of the pixels"
 
     def follow(self, image: Any) -> None:
         """Choose the mask that came with an image's file, if one did."""

@@ -34,6 +34,10 @@ _STAGES = {
     "image": "Tracing the rays",
     "shots": "Inverting",
     "fit": "Fitting",
+    "read": "Reading the scans",
+    "dose": "Computing the doses",
+    "register": "Aligning the films",
+    "unfold": "Unfolding the spectra",
 }
 _LOOK_EVERY = 500  # ms
 _SHOW_SECONDS_FROM = 2.0
@@ -254,8 +258,19 @@ class ToolPanel(qt.Docked):
             QtWidgets.QSizePolicy.Policy.Preferred, QtWidgets.QSizePolicy.Policy.Expanding
         )
         self._keeper = qt.StateKeeper(self, name, self.state)
+        self._revealed: QtWidgets.QWidget | None = None
+        self._revealing = qt.timer(self, _SETTLE, self._reveal, once=True)
         panel.button.clicked.connect(lambda: self._run_or_cancel())
         panel.runner.ended.connect(self._on_end)
+
+    def reveal(self, widget: QtWidgets.QWidget) -> None:
+        """Scroll to a widget once the column has its new heights."""
+        self._revealed = widget
+        self._revealing.start()
+
+    def _reveal(self) -> None:
+        if self._revealed is not None:
+            self.area.ensureWidgetVisible(self._revealed)
 
     def sizeHint(self) -> QSize:
         return QSize(WIDTH + 30, 600)

@@ -1,4 +1,7 @@
-"""What the controls ask for as a file, the same as the command's: `RecipeButton`."""
+"""What the controls ask for as a file, the same as the command's.
+
+- of tools that invert: `RecipeButton`; of the one that fits: `FitRecipeButton`
+"""
 
 from __future__ import annotations
 
@@ -8,27 +11,40 @@ from typing import Any
 from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
 from napari_shadowinv._napari.layer_metadata import mark_of, source_of
+from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv._napari.shots import radiograph_layers
 from napari_shadowinv._napari.widgets._forms import TOML
 from napari_shadowinv._napari.widgets._layers import new_crop, new_mask
 from napari_shadowinv._napari.widgets._qt import notify_errors
-from napari_shadowinv._typing import AnyArray, BoolArray
+from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import check_output, write
 from napari_shadowinv.io.formats import NPY, PNG
+from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline import read_recipe, write_recipe
+from napari_shadowinv.pipeline._fit import check_fit
 from napari_shadowinv.pipeline._run import picture_mask, plane_of
-from napari_shadowinv.preprocessing import Crop, MeasuredSource, Recipe
+from napari_shadowinv.pipeline.files import read_part
+from napari_shadowinv.preprocessing import (
+    Crop,
+    MeasuredSource,
+    Radiograph,
+    Recipe,
+    UniformEstimate,
+)
 
 
 class RecipeButton(QPushButton):
     """A menu to load what a tool with `InversionInputs` is to do, or to save it, as TOML."""
+
+    command = "invert"
 
     def __init__(self, tool: Any) -> None:
         super().__init__("Recipe")
         self._tool = tool
         self.setToolTip(
             "<qt>Steps, source, masks, setup and options as one TOML file, for here or "
-            "<code>shadowinv invert --recipe</code>.</qt>"
+            f"<code>shadowinv {self.command} --recipe</code>.</qt>"
         )
         self.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Fixed)
         menu = QMenu(self)
@@ -66,31 +82,24 @@ class RecipeButton(QPushButton):
         if recipe.setup is not None:
             tool.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
         for picker, usable in masks.items():
-            picker.layer = None
-            if usable is not None:
-                picker.layer = new_mask(tool.viewer, image, picker.title.lower(), ~usable)
-                picker.painted_is_unusable.setChecked(True)
+            _show_mask(picker, usable, tool.viewer, image)
         if tool.crop is not None:
             tool.crop.layer = None if crop is None else new_crop(tool.viewer, image, crop)
 
     @notify_errors
     def save(self, path: Path) -> None:
         """Write a recipe, with masks and a source that are no files beside it."""
-        tool, image = self._tool, self._tool.chosen_image()
+        image = self._tool.chosen_image()
         # The dialog has asked about the name that was given, and about no other.
         overwrite = bool(path.suffix) and path.exists()
         path = path if path.suffix else path.with_suffix(".toml")
-        recipe = tool.recipe()
-        drawn: dict[str, AnyArray | None] = {
-            "mask": tool.masks.usable(image),
-            "source_mask": tool.hidden_from_source(image),
-        }
+        recipe = self._recipe()
+        drawn, beam = self._drawn(image), self._beam(recipe, image)
         pictures = {
             path.with_name(f"{path.stem}_{name}{PNG.suffix}"): (name, pixels)
             for name, pixels in drawn.items()
             if pixels is not None
         }
-        beam = None if _is_in_file(recipe, image, tool.source) else tool.source.measured(image)
         beside = path.with_name(f"{path.stem}_source{NPY.suffix}")
         for file in (path, *pictures, *(() if beam is None else (beside,))):
             check_output(file, overwrite)
@@ -101,6 +110,86 @@ class RecipeButton(QPushButton):
             write(beside, plane_of(beam.image, "the source"), overwrite=overwrite)
             changes["source"] = MeasuredSource(file=beside)
         write_recipe(path, recipe.model_copy(update=changes), overwrite=overwrite)
+
+    def _recipe(self) -> Recipe:
+        recipe: Recipe = self._tool.recipe()
+        return recipe
+
+    def _drawn(self, image: Any) -> dict[str, BoolArray | None]:
+        """Masks that are no files, by what a recipe calls them."""
+        tool = self._tool
+        return {"mask": tool.masks.usable(image), "source_mask": tool.hidden_from_source(image)}
+
+    def _beam(self, recipe: Recipe, image: Any) -> Radiograph | None:
+        """A measured source that a command would not find."""
+        if _is_in_file(recipe, image, self._tool.source):
+            return None
+        beam: Radiograph | None = self._tool.source.measured(image)
+        return beam
+
+
+class FitRecipeButton(RecipeButton):
+    """A menu to load what `FitImages` is to do, or to save it, but for what its table says."""
+
+    command = "fit"
+
+    @notify_errors
+    def load(self, path: Path) -> None:
+        """Show a recipe; nothing changes unless all of it can be used."""
+        tool, image = self._tool, self._tool.chosen_image()
+        recipe = read_recipe(path)
+        check_fit(recipe)
+        choices = recipe.fit or FitChoices()
+        _refuse_estimates(recipe, path)
+        tool.check_choices(choices, recipe.setup, path)
+        usable = _read_mask(recipe.mask, None if image is None else tuple(image.data.shape[-2:]))
+        beam = None
+        if isinstance(recipe.source, MeasuredSource) and recipe.source.file is not None:
+            beam = read_part(recipe.source.file, variable=recipe.source.variable)
+        tool.steps.show_steps(recipe.steps)
+        if recipe.setup is not None:
+            tool.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
+        tool.show_choices(choices)
+        if beam is not None:
+            (tool.source.layers.layer,) = add_layers(tool.viewer, radiograph_layers(beam)[-1:])
+        tool.source.show(recipe.source, choices.beam)
+        _show_mask(tool.masks, usable, tool.viewer, image)
+
+    def _recipe(self) -> Recipe:
+        recipe = super()._recipe()
+        assert recipe.fit is not None
+        choices = recipe.fit.model_copy(update={"psf": self._tool.common_psf()})
+        return recipe.model_copy(update={"fit": choices})
+
+    def _drawn(self, image: Any) -> dict[str, BoolArray | None]:
+        return {"mask": self._tool.masks.usable(image)}
+
+    def _beam(self, recipe: Recipe, image: Any) -> Radiograph | None:
+        source = self._tool.source
+        if source.layer is not None and source.layer.ndim == 3:
+            raise InputError(
+                f"'{source.layer.name}' has a source for each image, and a recipe has one for all: "
+                "choose one plane (right click on the layer → Split Stack)"
+            )
+        (beam,) = source.measured([Radiograph(image.data)])
+        found: Radiograph | None = beam
+        return found
+
+
+def _refuse_estimates(recipe: Recipe, path: Path) -> None:
+    if recipe.estimate is not None and not isinstance(recipe.estimate, UniformEstimate):
+        raise InputError(
+            f"{path} estimates the source ({recipe.estimate.described}), which is done here by the "
+            "widget 'Estimate source': make a layer by it and choose that, and leave the estimate "
+            "out of the recipe"
+        )
+
+
+def _show_mask(picker: Any, usable: BoolArray | None, viewer: Any, image: Any) -> None:
+    picker.layer = None
+    if usable is not None:
+        picker.layer = new_mask(viewer, image, picker.title.lower(), ~usable)
+        picker.painted_is_unusable.setChecked(True)
 
 
 def _read_mask(file: Path | None, shape: tuple[int, ...] | None) -> BoolArray | None:

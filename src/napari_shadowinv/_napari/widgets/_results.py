@@ -11,7 +11,7 @@ from qtpy.QtCore import QObject, Signal
 from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, place
-from napari_shadowinv._napari.layer_metadata import mark_of, role_of
+from napari_shadowinv._napari.layer_metadata import slot_of
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
 
@@ -82,11 +82,11 @@ class ResultLayers(QObject):
         self._select = select
         self._before = self._viewer.layers.selection.active
         here = self.layers
-        self._order = [_role(keywords) for _, keywords, _ in described]
+        self._order = [slot_of(keywords) for _, keywords, _ in described]
         self._remove_all_but(set(self._order))
         waiting = []
         for data, keywords, kind in described:
-            layer = self._layers.get(_role(keywords))
+            layer = self._layers.get(slot_of(keywords))
             if layer is None or layer not in here:
                 waiting.append((data, keywords, kind))
             elif kind_of(layer) == kind and _can_be_updated(layer, keywords):
@@ -106,10 +106,10 @@ class ResultLayers(QObject):
         earlier._timer.stop()
         self._layers, earlier._layers = earlier._layers, {}
 
-    def _remove_all_but(self, roles: set[str]) -> None:
-        for role, layer in list(self._layers.items()):
-            if role not in roles:
-                del self._layers[role]
+    def _remove_all_but(self, slots: set[str]) -> None:
+        for slot, layer in list(self._layers.items()):
+            if slot not in slots:
+                del self._layers[slot]
                 if layer in self._viewer.layers:
                     self._viewer.layers.remove(layer)
 
@@ -122,21 +122,22 @@ class ResultLayers(QObject):
 
         if self._waiting:
             described = self._waiting.pop(0)
-            role = _role(described[1])
-            (self._layers[role],) = add_layers(
-                self._viewer, [described], below=self._next_above(role)
+            slot = slot_of(described[1])
+            (self._layers[slot],) = add_layers(
+                self._viewer, [described], below=self._next_above(slot)
             )
             # Layers that nobody sees yet must not take the selection.
-            active = self._layers.get("field") if self._select else self._before
+            main = self._layers.get("field") or self._layers.get("fluence")
+            active = main if self._select else self._before
             if active is not None and active in self._viewer.layers:
                 self._viewer.layers.selection.active = active
         if not self._waiting:
             self._timer.stop()
             self.complete.emit()
 
-    def _next_above(self, role: str) -> Any | None:
+    def _next_above(self, slot: str) -> Any | None:
         """The lowest layer of the result that lies above this one and is there already."""
-        higher = self._order[self._order.index(role) + 1 :]
+        higher = self._order[self._order.index(slot) + 1 :]
         layers = (self._layers.get(one) for one in higher)
         return next((layer for layer in layers if layer in self._viewer.layers), None)
 
@@ -156,6 +157,13 @@ class LastResults:
     def of(self, shot: Any) -> list[Any]:
         """The layers of the last result of a shot that are still in the viewer."""
         return [layer for known, last in self._last if known == shot for layer in last.layers]
+
+    def shot_of(self, layer: Any) -> Any | None:
+        """The image of whose last result a layer is a part; None if it is not one of them."""
+        for shot, last in self._last:
+            if layer in last.layers and shot in self._viewer.layers:
+                return shot
+        return None
 
     def next_of(self, shot: Any) -> ResultLayers:
         """Return what shows the next result of a shot: an image layer, or a name."""
@@ -199,11 +207,6 @@ class Origins:
             ("Setup", self.setup),
         ]
         return [(name, text) for name, text in told if text]
-
-
-def _role(keywords: dict[str, Any]) -> str:
-    """Its role; of a further field of the same result, with the name of that field."""
-    return f"{role_of(keywords)} {mark_of(keywords).get('part', '')}".strip()
 
 
 def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:

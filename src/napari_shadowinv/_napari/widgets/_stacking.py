@@ -51,7 +51,7 @@ class RunBooks:
 class StackJob:
     """Many shots to invert into a store: the arguments of `stack.run_stack`, and its books."""
 
-    shots: Any  # an array (shot, y, x), also a lazy one, or files
+    shots: Any  # an array (shot, y, x), also a lazy one, files, or rows of a table
     out: Path
     recipe: Recipe = field(default_factory=Recipe)
     source: ArrayLike | None = None  # measured; also one for each shot

@@ -67,21 +67,19 @@ class StepsSection(QWidget):
 
     changed = Signal()
 
-    def __init__(self) -> None:
+    def __init__(self, kinds: Mapping[str, type[Step]] = STEPS) -> None:
         super().__init__()
+        self._kinds = kinds
         self.forms: list[StepForm] = []
         self.choice = SteadyComboBox()
         self.choice.addItem("add a step…")
-        for name, kind in STEPS.items():
+        for name, kind in kinds.items():
             self.choice.addItem(kind.title, name)
         self.choice.setToolTip("<qt>Done to image, source and masks before all else.</qt>")
         self._list = QWidget()
         column(self._list)
-        self.folded = forms.section("", self._list, forms.labelled("", self.choice))
+        self.folded = forms.titled_section(self._list, forms.labelled("", self.choice))
         column(self, self.folded)
-        # A long list of steps must not widen the window.
-        button = self.folded.toggleButton()
-        button.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
         self.choice.activated.connect(self._on_choice)
         self._on_change()
 
@@ -113,7 +111,7 @@ class StepsSection(QWidget):
             for one in list(self.forms):
                 self._move(one, None)
             for values in state if isinstance(state, list) else ():
-                if isinstance(values, Mapping) and values.get("step") in STEPS:
+                if isinstance(values, Mapping) and values.get("step") in self._kinds:
                     self.add(str(values["step"]), values).fold()
         self._on_change()
 

@@ -2,121 +2,51 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qtpy.QtCore import QSignalBlocker
+import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.fit_course import PACE, forecast_of
+from napari_shadowinv._napari.fit_jobs import FitAnswer, FitJob
+from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._fields import SteadyComboBox
-from napari_shadowinv._napari.widgets._fitting import FitAnswer, FitJob, FitView
+from napari_shadowinv._napari.widgets._fit_inputs import (
+    BOTH,
+    NOISES,
+    UNKNOWN,
+    BeamPicker,
+    ChoiceBox,
+    field_key,
+    fields_of,
+)
+from napari_shadowinv._napari.widgets._fitting import FitView
 from napari_shadowinv._napari.widgets._image_table import ImageRow, ImageTable, beam_column
 from napari_shadowinv._napari.widgets._inputs import OptionsForm, SetupPicker
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._qt import beside, while_alive
+from napari_shadowinv._napari.widgets._recipes import FitRecipeButton
 from napari_shadowinv._napari.widgets._results import LastResults, result_frame
 from napari_shadowinv._napari.widgets._steps import StepsSection
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import FIELDS, FitOptions
+from napari_shadowinv.fitting import point_spread
+from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
-from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.pipeline import FitShot
+from napari_shadowinv.preprocessing import FIT_STEPS, Radiograph, Recipe
 
 if TYPE_CHECKING:
     import napari
 
-_UNIFORM, _LAYER, _UNKNOWN = "uniform", "layer", "unknown"
-_TITLES = {
-    "B": "magnetic field (B)",
-    "E": "electric field (E)",
-    "plasma": "plasma (phase ∝ λ²)",
-    "phase": "refractive index (phase)",
-}
-_BOTH = " and "
 
-
-class BeamPicker(forms.RowPicker):
-    """The undisturbed beam: uniform, a layer, or to be fitted, too."""
-
-    def __init__(self, viewer: Any) -> None:
-        tip = "Image layer of the undisturbed beam, or a stack with one for each image."
-        self.layers = layers.LayerPicker(
-            viewer, ("image",), tip, "choose a layer", about.may_be_source
-        )
-        super().__init__(
-            "Source",
-            {
-                _UNIFORM: ("uniform", None),
-                _LAYER: ("a layer", None),
-                _UNKNOWN: ("unknown: fit it, too", None),
-            },
-            "The beam without the object. An unknown one is fitted as a smooth beam that is the "
-            "same in all images but for gains.",
-            {_LAYER: forms.labelled("", self.layers)},
-        )
-        self.layers.picked.connect(self.changed)
-
-    @property
-    def layer(self) -> Any | None:
-        """The chosen layer; None where another kind of source is chosen."""
-        return self.layers.layer if self.picker.kind == _LAYER else None
-
-    @property
-    def described(self) -> str:
-        if self.layer is not None:
-            return f"layer '{self.layer.name}'"
-        return "fitted" if self.picker.kind == _UNKNOWN else "uniform"
-
-    def chosen(self) -> Any:
-        """The source as `fit` takes it, or an `InputError`."""
-        if self.picker.kind != _LAYER:
-            return _UNKNOWN if self.picker.kind == _UNKNOWN else None
-        if self.layer is None:
-            raise InputError(
-                "no source layer is selected: choose one below 'a layer', or choose another source"
-            )
-        stacked = self.layer.ndim == 3
-        return layers.stack_of(self.layer) if stacked else layers.image_of(self.layer, "source")
-
-    def state(self) -> str:
-        """What is kept: layers belong to a session."""
-        kind = self.picker.kind
-        return _UNIFORM if kind == _LAYER else kind
-
-    def restore(self, state: Any) -> None:
-        self.picker.set_kind(str(state))
-
-
-class ChoiceBox(SteadyComboBox):
-    """A choice that is kept between sessions."""
-
-    def __init__(self, choices: dict[str, str], tip: str) -> None:
-        super().__init__()
-        self._wanted: Any = None
-        self.setToolTip(f"<qt>{tip}</qt>")
-        self.offer(choices)
-        self.activated.connect(self._on_choice)
-
-    def offer(self, choices: dict[str, str]) -> None:
-        """Replace the choices, titles by key; what was chosen stays if it is among them."""
-        with QSignalBlocker(self):
-            self.clear()
-            for key, title in choices.items():
-                self.addItem(title, key)
-            self.setCurrentIndex(max(self.findData(self._wanted), 0))
-
-    def state(self) -> str:
-        return str(self.currentData())
-
-    def restore(self, state: Any) -> None:
-        """Choose a key, at once or as soon as it is offered."""
-        self._wanted = state
-        index = self.findData(state)
-        if index >= 0:
-            self.setCurrentIndex(index)
-
-    def _on_choice(self) -> None:
-        self._wanted = self.currentData()
+def _beam_in_words(shot: FitShot) -> str:
+    if shot.setup is not None:
+        return shot.setup.probe
+    (strength,) = shot.strength or (1.0,)
+    return f"displaced by {strength:g}"
 
 
 def _warnings_of(rows: list[ImageRow]) -> list[tuple[str, str]]:
@@ -134,12 +64,15 @@ class FitImages(ToolPanel):
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         tip = "Fit the fields, and the beam if it is unknown, to all images together."
-        super().__init__(viewer, "fit-images", RunPanel("Fit several images", "Run", tip))
+        super().__init__(
+            viewer, "fit-images", RunPanel("Fit several images", "Run", tip, patience=0.4)
+        )
         self._last = LastResults(viewer, self)
         self._build()
         self._connect()
         self.restore_last()
         self._on_reference()
+        self.view.follow()
         self._ready = True
 
     def _build(self) -> None:
@@ -159,13 +92,16 @@ class FitImages(ToolPanel):
             "unknown source are always fitted.",
         )
         self.noise = ChoiceBox(
-            {"": "estimated from each image", "poisson": "of counts (Poisson)"},
+            NOISES,
             "What χ² and error bars are measured by. 'Of counts': the images are numbers of "
             "particles or photons.",
         )
         self.setup = SetupPicker()
-        self.steps = StepsSection()
+        self.setup_section = forms.titled_section(self.setup)
+        self.steps = StepsSection(FIT_STEPS)
         self.options = OptionsForm(FitOptions, {"smoothness": 1.0, "strip": 16, "threads": 1})
+        self.recipes = FitRecipeButton(self)
+        self.cost = forms.wrapping_label()
         self.view = FitView(self.viewer, self.panel)
         self.add(
             self.images,
@@ -174,15 +110,17 @@ class FitImages(ToolPanel):
             self.masks,
             forms.labelled("Gains", self.gains),
             forms.labelled("Noise", self.noise),
-            self.setup,
+            self.setup_section,
             self.steps,
             forms.section("Options", self.options),
-            self._last.keep_earlier,
+            beside((self._last.keep_earlier, 1), (self.recipes, 0)),
+            self.cost,
             self.panel,
             self.view,
         )
 
     def _connect(self) -> None:
+        while_alive(self, self.viewer.layers.selection.events.active, self._on_active)
         self.images.first_changed.connect(self._on_reference)
         self.images.first_beam.connect(self._take_beam)
         self.images.changed.connect(self._show_beams)
@@ -200,6 +138,9 @@ class FitImages(ToolPanel):
             self.noise.currentIndexChanged,
         ):
             signal.connect(lambda *_: self.keep())
+            signal.connect(lambda *_: self._tell_cost())
+        for signal in (self.images.changed, self.images.first_changed):
+            signal.connect(self._tell_cost)
 
     def parts(self) -> dict[str, Any]:
         return {
@@ -215,31 +156,82 @@ class FitImages(ToolPanel):
 
     # A run
 
+    def recipe(self) -> Recipe:
+        """What the controls ask for, but for what the table says and layers; or an `InputError`."""
+        fields = tuple(self.fields.state().split(BOTH))
+        beam = "unknown" if self.source.picker.kind == UNKNOWN else "known"
+        choices = FitChoices(
+            fields=fields,
+            beam=beam,
+            gains=self.gains.state(),
+            noise=self.noise.state() or None,
+            options=self.options.model(),
+        )
+        return Recipe(
+            steps=self.steps.steps(),
+            source=self.source.chosen(),
+            setup=self.setup.setup(),
+            fit=choices,
+        )
+
+    # What a recipe says
+
+    def chosen_image(self) -> Any | None:
+        """The layer that masks and source of a recipe belong to."""
+        return self._reference_layer()
+
+    def common_psf(self) -> float | None:
+        """The point spread of all images; None if they differ, which no recipe tells."""
+        widths = {self.images.psf(row) for row in self.images.used}
+        return widths.pop() if len(widths) == 1 else None
+
+    def check_choices(self, choices: FitChoices, setup: Setup | None, path: Path) -> None:
+        """Refuse what does not fit to a setup, or else to the one that is shown."""
+        fields = choices.fields
+        offered = fields_of(self.setup.picker.kind if setup is None else setup.kind)
+        in_metres = choices.source_size is not None or choices.resolution is not None
+        if in_metres and setup is None and self._shown_setup() is None:
+            raise InputError(
+                f"{path} gives source size or resolution in m, which need a setup: choose the "
+                "setup first, or give the point spread in px (psf)"
+            )
+        if fields is not None and field_key(fields) not in offered:
+            raise InputError(
+                f"{path} asks for the fields {', '.join(fields)}: with this setup expected one of "
+                f"{', '.join(offered)}; choose another kind of setup first"
+            )
+
+    def show_choices(self, choices: FitChoices) -> None:
+        """Show what a recipe says of the fit."""
+        if choices.fields is not None:
+            self.fields.restore(field_key(choices.fields))
+        self.gains.restore(choices.gains)
+        noise = "" if choices.noise is None else str(choices.noise)
+        self.noise.offer(NOISES | {noise: NOISES.get(noise, f"σ = {noise} in each pixel")})
+        self.noise.restore(noise)
+        self.options.set_values(choices.options.model_dump())
+        for row in self.images.used:
+            width = self._spread(choices, row)
+            if width is not None:
+                row.keep(psf=width)
+        self._show_beams()
+
+    def _spread(self, choices: FitChoices, row: ImageRow) -> float | None:
+        """The point spread of an image in px after the steps, as a recipe tells it."""
+        setup = self._shown_setup()
+        if setup is None or (choices.source_size is None and choices.resolution is None):
+            return choices.psf
+        shot = Radiograph(np.zeros(row.data.shape), setup=self._base_setup(row, setup))
+        after = Recipe(steps=self.steps.steps()).moved(shot).setup
+        assert after is not None
+        return point_spread(after, choices.source_size or 0.0, choices.resolution or 0.0)
+
     def request(self) -> FitJob:
         rows = self._rows()
         first = rows[0]
-        setup = self.setup.setup()
-        recipe = Recipe(steps=self.steps.steps(), setup=setup)
-        known: dict[str, Any]
-        if setup is None:
-            known = {
-                "strengths": [self.images.beam_value(row) for row in rows],
-                "setups": None,
-            }
-            told = [f"displaced by {strength:g}" for strength in known["strengths"]]
-        else:
-            known = {"setups": [self._setup_of(row, setup) for row in rows]}
-            told = [one.probe for one in known["setups"]]
-        keywords = {
-            **known,
-            "fields": tuple(self.fields.state().split(_BOTH)),
-            "source": self.source.chosen(),
-            "noise": self.noise.state() or None,
-            "psf": [self.images.psf(row) for row in rows],
-            "mask": self.masks.usable(first.layer),
-            "gains": self._chosen_gains(rows),
-            "options": self.options.model(),
-        }
+        recipe = self.recipe()
+        shots = self._shots(rows, recipe.setup)
+        told = [_beam_in_words(shot) for shot in shots]
         words = {
             "images": "; ".join(f"{row.name}: {one}" for row, one in zip(rows, told, strict=True)),
             "source_origin": self.source.described,
@@ -255,20 +247,54 @@ class FitImages(ToolPanel):
         ]
         chosen = (*(row.layer for row in rows), self.masks.layer, self.source.layer)
         return FitJob(
-            tuple(row.data for row in rows),
-            tuple(row.name for row in rows),
-            keywords,
-            f"{first.layer.name} fit",
-            result_frame(first.layer, recipe),
-            [(name, text) for name, text in (*given, *_warnings_of(rows)) if text],
-            {name: text for name, text in words.items() if text},
-            first.layer,
-            tuple(one for one in chosen if one is not None and one is not first.layer),
-            recipe,
+            recipe=recipe,
+            shots=shots,
+            names=tuple(row.name for row in rows),
+            name=f"{first.layer.name} fit",
+            frame=result_frame(first.layer, recipe),
+            given=[(name, text) for name, text in (*given, *_warnings_of(rows)) if text],
+            attributes={name: text for name, text in words.items() if text},
+            layer=first.layer,
+            companions=tuple(one for one in chosen if one is not None and one is not first.layer),
+        )
+
+    def _shots(self, rows: list[ImageRow], setup: Setup | None) -> tuple[FitShot, ...]:
+        """The images with all that the controls say of each, not read yet if they are lazy."""
+        images = [radiograph_of(row.layer, row.data, row.plane) for row in rows]
+        sources = self.source.measured(images)
+        gains = self._chosen_gains(rows)
+        return tuple(
+            FitShot(
+                image,
+                setup=None if setup is None else self._setup_of(row, setup),
+                source=source,
+                mask=self.masks.usable(row.layer),
+                strength=(self.images.beam_value(row),) if setup is None else None,
+                gain=gain,
+                psf=self.images.psf(row),
+            )
+            for row, image, source, gain in zip(rows, images, sources, gains, strict=True)
         )
 
     def show_result(self, value: FitAnswer, request: FitJob) -> None:
         self.results = self.view.show_result(request, value, self._last)
+        self.reveal(self.view.verdict)
+        self._tell_cost()
+
+    def _tell_cost(self) -> None:
+        """Say how long it will take."""
+        try:
+            rows = self._rows()
+            shape = Recipe(steps=self.steps.steps()).shape_after(rows[0].data.shape)
+            options = self.options.model()
+        except InputError:
+            self.cost.setVisible(False)  # Run tells what is wrong
+            return
+        source = UNKNOWN if self.source.picker.kind == UNKNOWN else None
+        fields = len(self.fields.state().split(BOTH))
+        forecast = forecast_of(shape, len(rows), fields, source, options)  # type: ignore[arg-type]
+        self.cost.setText(forecast.text(PACE))
+        self.cost.setVisible(True)
 
     def _rows(self) -> list[ImageRow]:
         rows = self.images.used
@@ -286,19 +312,22 @@ class FitImages(ToolPanel):
                 )
         return rows
 
-    def _chosen_gains(self, rows: list[ImageRow]) -> Any:
-        chosen = self.gains.state()
-        if chosen == "free":
-            return chosen
+    def _chosen_gains(self, rows: list[ImageRow]) -> list[float] | list[None]:
+        """The factors in the table, unless all are 1 or they are fitted."""
+        if self.gains.state() == "free":
+            return [None] * len(rows)
         gains = [self.images.gain(row) for row in rows]
-        return chosen if gains == [1.0] * len(rows) else gains
+        return [None] * len(rows) if gains == [1.0] * len(rows) else gains
 
     def _setup_of(self, row: ImageRow, setup: Setup) -> Setup:
         """The setup of an image: its own, or else that of the first, with the beam in its row."""
-        own = row.setup if row.plane is None and row != self.images.reference else None
-        base = own if own is not None and own.kind == setup.kind else setup
+        base = self._base_setup(row, setup)
         values = {**base.model_dump(), self.images.beam.name: self.images.beam_value(row)}
         return validated(SETUPS[setup.kind], values, f"the setup of '{row.name}'")
+
+    def _base_setup(self, row: ImageRow, setup: Setup) -> Setup:
+        own = row.setup if row.plane is None and row != self.images.reference else None
+        return own if own is not None and own.kind == setup.kind else setup
 
     # Controls that follow each other
 
@@ -309,6 +338,9 @@ class FitImages(ToolPanel):
         shown = self._shown_setup()
         if self._ready and row is not None and row.setup not in (None, shown):
             self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
+
+    def _on_active(self, event: Any = None) -> None:
+        self.view.follow()
 
     def _reference_layer(self) -> Any | None:
         row = self.images.reference
@@ -329,6 +361,11 @@ class FitImages(ToolPanel):
                 self._take_over(row, base)
         self.view.empty()
         self._on_setup()
+        # It is known, and what is below it should be seen.
+        if self._shown_setup() is None:
+            self.setup_section.expand(animate=False)
+        else:
+            self.setup_section.collapse(animate=False)
 
     def _take_over(self, row: ImageRow, base: Setup) -> None:
         values, beam = base.model_dump(), beam_column(base.kind).name
@@ -352,15 +389,11 @@ class FitImages(ToolPanel):
             self.setup.show_setup({**form.values(), self.images.beam.name: value})
 
     def _on_setup(self) -> None:
-        kind = self.setup.picker.kind
-        bends = SETUPS[kind].deflectors if kind in SETUPS else (FIELDS["B"],)
-        keys = [key for key, deflector in FIELDS.items() if deflector in bends]
-        choices = {key: _TITLES[key] for key in keys}
-        if kind not in SETUPS:
-            choices = {"B": "one, in pixels"}
-        elif len(keys) > 1:
-            choices[_BOTH.join(keys)] = _BOTH.join(keys)
-        self.fields.offer(choices)
+        self.fields.offer(fields_of(self.setup.picker.kind))
+        shown = self._shown_setup()
+        known = "none" if shown is None else f"{shown.probe}, {self.setup.origin}"
+        self.setup_section.setText(f"Setup: {known}")
+        self.setup_section.setToolTip(f"Setup: {known}")
         self._show_beams()
 
     def _show_beams(self) -> None:

@@ -67,10 +67,7 @@ def known_field(layer: Any | None, point: Any, setup: Any) -> KnownField:
         )
     result = about.result_of(layer)
     if result is not None and about.role_of(layer) in _FIELDS:
-        content: Any = result.content
-        displacement = np.asarray(
-            content["displacement"] if hasattr(content, "data_vars") else content.displacement
-        )
+        displacement = np.asarray(about.displacement_of(layer))
         return KnownField(displacement, 1.0, result.setup, "The displacement of this result.")
     potential = shown_plane(layer, point) if layer.ndim == 3 else image_of(layer, "potential")
     unit, own = about.unit_of(layer), about.setup_of(layer)

@@ -7,18 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from napari.utils.notifications import show_warning
 
+from napari_shadowinv._napari.fit_course import duration_in_words
+from napari_shadowinv._napari.fit_jobs import FitAnswer, FitJob, name_of_result, refinement
 from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, role_of
 from napari_shadowinv._napari.shots import loaded, radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._fitting import (
-    FitAnswer,
-    FitJob,
-    FitView,
-    Refining,
-    refinement,
-)
+from napari_shadowinv._napari.widgets._fitting import FitView, Refining
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._panels import LivePanel, ReportTable, RunPanel, report_rows
 from napari_shadowinv._napari.widgets._qt import notify_errors
@@ -47,7 +43,6 @@ _PREVIEW_ROLES = ("potential", "field", "caustic")
 _SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
 _BYTES, _BYTES_PER_PIXEL, _BYTES_PER_SITE = 200e6, 280.0, 1700.0
 _WORTH_TELLING = 1_000_000  # pixels
-_MINUTE, _HOUR = 60, 3600
 
 
 @dataclass(frozen=True)
@@ -71,7 +66,7 @@ class Cost:
             return ""
         text = (
             f"{self.pixels / 1e6:.3g} Mpx with {self.sites:,} sites: about "
-            f"{_duration(self.seconds)} and up to {self.memory / 1e9:.1f} GB"
+            f"{duration_in_words(self.seconds)} and up to {self.memory / 1e9:.1f} GB"
         )
         if not self.is_too_much:
             return f"{text}."
@@ -91,14 +86,6 @@ def cost_of(shape: tuple[int, ...], options: InversionOptions, pace: float = 1.0
         pace * (_SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites),
         _BYTES + _BYTES_PER_PIXEL * pixels + _BYTES_PER_SITE * sites,
     )
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 2 * _MINUTE:
-        return f"{float(f'{seconds:.1g}'):g} s" if seconds < 10 else f"{round(seconds, -1):g} s"
-    if seconds < 2 * _HOUR:
-        return f"{seconds / _MINUTE:.0f} min"
-    return f"{seconds / _HOUR:.1f} h"
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,8 +218,28 @@ class InvertShot(InversionInputs, LivePanel):
         """Fit the forward model to the last inversion's image, starting from its field."""
         if self.panel.runner.running and not self._running_preview:
             return
-        image = self.image.layer
-        job = refinement(self._last.of(image), image, psf)
+        image: Any = self.image.layer
+        shown = [one for one in self._last.of(image) if role_of(one) == "field"]
+        if not shown:
+            raise InputError(
+                "there is no inversion of this image to refine: press Run first, then Refine"
+            )
+        self._begin(refinement(shown[0], image, str(image.name), psf))
+
+    @notify_errors
+    def refine_layer(self, layer: Any) -> None:
+        """Refine the inversion that a layer shows a part of, such as one of a file."""
+        self.refining.folded.expand()
+        image = self._last.shot_of(layer)
+        name = name_of_result(self.viewer.layers, layer) if image is None else str(image.name)
+        job = refinement(layer, layer if image is None else image, name, self.refining.psf.value())
+        if self.panel.runner.running and not self._running_preview:
+            raise InputError(
+                "Invert shot is at work: wait until it is done, or press Cancel, then refine"
+            )
+        self._begin(job)
+
+    def _begin(self, job: FitJob) -> None:
         self._running_preview = False
         self.panel.run(job.run, job)
 
@@ -241,6 +248,7 @@ class InvertShot(InversionInputs, LivePanel):
             assert isinstance(value, FitAnswer)
             self.previewed.hide()
             self._refined = self.fit_view.show_result(request, value, self._last)
+            self.reveal(self.fit_view.verdict)
         else:
             assert isinstance(value, _Answer)
             self._show_inversion(value, request)

@@ -21,6 +21,7 @@ from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, Tool
 from napari_shadowinv._napari.widgets._qt import notify_errors, timer
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._runner import Outcome
+from napari_shadowinv._napari.widgets._shot_table import ShotTable
 from napari_shadowinv._napari.widgets._stacking import StackJob, StackRequest, place_on
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import InputError
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 _REFRESH_AFTER = 200  # ms; many small shots may end in a second
 _MOST_FAILURES = 100
 _NAME_WIDTH = 110
-_LAYER, _FILES = "layer", "files"
+_LAYER, _FILES, _TABLE = "layer", "files", "table"
 _HERE, _SCHEDULER = "threads", "scheduler"
 _BETWEEN = "; "
 
@@ -88,14 +89,24 @@ class ShotsPicker(RowPicker):
         self.files.edit.setToolTip(
             "<qt>A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF.</qt>"
         )
+        self.table = ShotTable()
         super().__init__(
             "Shots",
-            {_LAYER: ("a stack layer", None), _FILES: ("files", None)},
+            {
+                _LAYER: ("a stack layer", None),
+                _FILES: ("files", None),
+                _TABLE: ("a table (.csv)", None),
+            },
             "Location of the shots.",
-            {_LAYER: labelled("", self.layers), _FILES: labelled("", self.files)},
+            {
+                _LAYER: labelled("", self.layers),
+                _FILES: labelled("", self.files),
+                _TABLE: self.table,
+            },
         )
         self.layers.picked.connect(self.changed)
         self.files.changed.connect(self.changed)
+        self.table.changed.connect(self.changed)
 
     @property
     def layer(self) -> Any | None:
@@ -107,11 +118,15 @@ class ShotsPicker(RowPicker):
         """What to call the shots."""
         if self.picker.kind == _FILES:
             return self.files.path
+        if self.picker.kind == _TABLE:
+            return self.table.file.path
         return "" if self.layer is None else str(self.layer.name)
 
     def shots(self) -> Any:
         if self.picker.kind == _LAYER:
             return stack_of(self.layers.layer)
+        if self.picker.kind == _TABLE:
+            return self.table.shots()
         parts = [part.strip() for part in self.files.path.split(_BETWEEN.strip())]
         paths = [os.path.expanduser(part) for part in parts if part]
         if not paths:

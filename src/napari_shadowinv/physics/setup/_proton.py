@@ -148,6 +148,11 @@ class ProtonSetup(BeamSetup):
         rest_energy = self.particle.mass * _LIGHT_SPEED**2
         return self.momentum * _LIGHT_SPEED**2 / (self.energy * _JOULES_PER_MEV + rest_energy)
 
+    @property
+    def time_of_flight(self) -> float:
+        """Time in s from the source to the object; inf if the beam is collimated."""
+        return self.source_object_distance / self.velocity
+
     def _rigidity(self, unit: FieldUnit) -> float:
         """Magnetic field, integrated along the beam, that deflects by 1 rad: p / q."""
         if unit not in _TESLA_METRES:

@@ -1,8 +1,4 @@
-"""Every choice of an inversion, in one validated model.
-
-The same model is the keyword of `invert`, the CLI's ``--options`` file, the form
-in a window, and is saved with each result: there is no second list of defaults.
-"""
+"""Every choice of an inversion, in one validated model: `InversionOptions`."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ import pytest
 import tifffile
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.preprocessing.film import Calibration, dose, net_optical_density
+from napari_shadowinv.film import Calibration, combined_dose, dose, net_optical_density
 
 HEADER = "Film No's,Actual Dose,Log Dose,Red Ch,std dev,Green Ch,std dev,Blue Ch,std dev\n"
 UNITS = "(C ),(Gy),log10(Gy),pix,,pix,,pix,\n"
@@ -195,3 +195,53 @@ def test_real_tables_rise(shared_data: Path, name: str) -> None:
         assert (np.diff(density) > 0).all()
         assert (np.diff(doses) > 0).all()
         assert len(doses) >= 10
+
+
+def test_all_channels_together_give_back_the_dose(table: Path) -> None:
+    calibration = Calibration.from_csv(table)
+    truth = np.geomspace(2, 900, 60).reshape(6, 10)
+    found = combined_dose(synthetic_film(calibration, truth), calibration)
+    np.testing.assert_allclose(found.dose, truth, rtol=1e-9)
+    assert not found.outside.any()
+
+
+def test_errors_of_noisy_films_are_as_told(table: Path) -> None:
+    """In the spread of the table; of three channels they are smaller than of the best."""
+    np.testing.assert_array_equal(Calibration.from_csv(table).spreads[0], [700, 700, 500])
+    doses = np.geomspace(1, 2000, 25)
+    density = np.log10(1 + doses[:, None] / [15.0, 40.0, 150.0])
+    pixels = 40_000 / 10**density
+    calibration = Calibration(doses, pixels, np.full(3, 40_000.0), 0.01 * pixels)
+    truth = np.repeat([[5.0, 15.0, 40.0, 150.0, 800.0]], 4000, axis=0)
+    film = synthetic_film(calibration, truth)
+    film *= 1 + 0.01 * np.random.default_rng(0).normal(size=film.shape)
+    found = combined_dose(film, calibration)
+    assert not found.outside.any()
+    scatter = np.log(found.dose / truth).std(axis=0)
+    told = np.sqrt((found.error**2).mean(axis=0))
+    # Told by three channels that differ by chance, they are up to a fifth too large.
+    assert ((told / scatter > 0.95) & (told / scatter < 1.3)).all()
+    best = np.min([calibration.log_error(truth[0], channel) for channel in CHANNELS], axis=0)
+    assert (scatter < best).all()
+
+
+def test_a_channel_that_is_black_does_not_count(table: Path) -> None:
+    calibration = Calibration.from_csv(table)
+    film = synthetic_film(calibration, np.full((4, 4), 800.0))
+    film[..., 0] = 10
+    found = combined_dose(film, calibration)
+    np.testing.assert_allclose(found.dose, 800, rtol=1e-9)
+    assert not found.outside.any()
+    assert combined_dose(np.full((2, 2, 3), 5.0), calibration).outside.all()
+    with pytest.raises(InputError, match="in red, green and blue"):
+        combined_dose(film[..., 0], calibration)
+
+
+def test_channels_that_differ_make_the_error(table: Path) -> None:
+    calibration = Calibration.from_csv(table)
+    film = synthetic_film(calibration, np.full((4, 4), 100.0))
+    film[..., 2] = synthetic_film(calibration, np.full((4, 4), 200.0))[..., 2]
+    found = combined_dose(film, calibration)
+    alone = combined_dose(synthetic_film(calibration, np.full((4, 4), 100.0)), calibration)
+    assert (found.error > 1.5 * alone.error).all()
+    assert ((found.dose > 100) & (found.dose < 200)).all()

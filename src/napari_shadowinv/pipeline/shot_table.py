@@ -1,12 +1,15 @@
-"""What a fit is told about each image and each fiducial: rows of a table, or flags.
+"""What is told about each image and each fiducial: rows of a table, or flags.
 
-- one image: `ShotRow`; all of them: `shot_rows`
+- one image: `ShotRow`; those of a fit: `shot_rows`, or `rows_by_shot` for a table of many shots
+- the images of a table that are inverted one by one: `rows_to_invert`
+- whether a file is such a table: `is_table`; all its rows: `table_rows`; write one: `write_table`
 - known displacements: `fiducials_from`
 """
 
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -17,15 +20,23 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from napari_shadowinv._system.safety import small_text
 from napari_shadowinv._system.validation import nearest, validated
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.files import replacing, text_of
 from napari_shadowinv.io.formats import SITES
+from napari_shadowinv.options import Noise
+
+__all__ = [
+    "ShotRow",
+    "fiducials_from",
+    "is_table",
+    "rows_by_shot",
+    "rows_of",
+    "rows_to_invert",
+    "shot_rows",
+    "table_rows",
+    "write_table",
+]
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid")
-
-
-def _noise(value: Any) -> Any:
-    if value != "poisson" and not _is_number(str(value)):
-        raise ValueError("expected 'poisson' or the standard deviation in a pixel")
-    return value if value == "poisson" else float(value)
 
 
 def _strength(value: Any) -> Any:
@@ -44,7 +55,7 @@ def _is_number(text: str) -> bool:
 
 
 class ShotRow(BaseModel):
-    """One image of a fit, and what is known about it."""
+    """One image, and what is known about it."""
 
     model_config = _CONFIG
     file: Path = Field(title="Image", description="Its file.")
@@ -79,10 +90,18 @@ class ShotRow(BaseModel):
         title="Source",
         description="Image of the undisturbed beam, or unknown to fit a smooth one.",
     )
-    noise: Annotated[Literal["poisson"] | float, BeforeValidator(_noise)] | None = Field(
+    noise: Noise | None = Field(
         default=None,
         title="Noise",
         description="poisson for counts, or the standard deviation in a pixel, after --bin.",
+    )
+    shot: str | None = Field(
+        default=None,
+        title="Shot",
+        description="In a table of many shots that are fitted: which of them the image belongs to.",
+    )
+    exclude: bool = Field(
+        default=False, title="Exclude", description="true, yes or 1 to leave the image out."
     )
 
     @property
@@ -91,12 +110,21 @@ class ShotRow(BaseModel):
         return self.source if isinstance(self.source, Path) else None
 
     @property
-    def files(self) -> list[Path | None]:
-        """What is read for it."""
-        return [self.file, self.setup, self.mask, self.source_file]
+    def files(self) -> dict[str, Path]:
+        """What is read for it, by the names of the columns."""
+        known = {"file": self.file, "setup": self.setup, "mask": self.mask}
+        found = {**known, "source": self.source_file}
+        return {name: path for name, path in found.items() if path is not None}
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What it says, without folders, which may be moved."""
+        said = self.model_dump(mode="json", exclude_none=True, exclude={"exclude"})
+        return {**said, **{name: text_of(path.name) for name, path in self.files.items()}}
 
 
 _FILES = ("file", "setup", "mask", "source")
+_FOR_FITS = ("strength", "psf", "noise")
 
 
 class _Fiducial(BaseModel):
@@ -123,13 +151,19 @@ def shot_rows(
         Numbers separated by commas, one for each image, by the names of the columns.
     """
     given = {name: text for name, text in lists.items() if text is not None}
-    if len(images) == 1 and _is_table(images[0]):
+    if len(images) == 1 and is_table(images[0]):
         for name in given:
             raise InputError(
                 f"received a list for each image, {given[name]}, beside the table {images[0]}: "
                 f"write it into its column '{name}'"
             )
-        return _rows_of(images[0], ShotRow, shared)
+        rows = list(_used_rows(images[0], shared).values())
+        if len({row.shot for row in rows}) > 1:
+            raise InputError(
+                f"{images[0]} has the images of several shots, expected one object: fit each with "
+                "shadowinv batch --fit"
+            )
+        return rows
     columns = {name: [part.strip() for part in text.split(",")] for name, text in given.items()}
     for name, parts in columns.items():
         if len(parts) != len(images):
@@ -147,17 +181,86 @@ def shot_rows(
     ]
 
 
+def rows_by_shot(table: Path, shared: Mapping[str, Any]) -> dict[str, tuple[ShotRow, ...]]:
+    """Rows of a table with the images of many shots, by the names of the shots, in their order."""
+    found: dict[str, tuple[ShotRow, ...]] = {}
+    for number, row in _used_rows(table, shared).items():
+        if row.shot is None:
+            raise InputError(
+                f"{table}, row {number} does not say which shot its image belongs to: give the "
+                "column 'shot', the same for all images of one object"
+            )
+        found[row.shot] = (*found.get(row.shot, ()), row)
+    return found
+
+
+def rows_to_invert(table: Path | Sequence[ShotRow]) -> tuple[list[ShotRow], tuple[str, ...]]:
+    """Rows, or those of a table, whose images are inverted one by one; columns only for fits."""
+    rows = _used_rows(table, {})
+    for number, row in rows.items():
+        if row.source == "unknown":
+            raise InputError(
+                f"{_name_of(table)}, row {number} has the source 'unknown', which only a fit can "
+                "find: name an image, or leave the cell empty"
+            )
+    used = list(rows.values())
+    given = (name for name in _FOR_FITS if any(getattr(row, name) is not None for row in used))
+    return used, tuple(given)
+
+
+def table_rows(table: Path) -> list[ShotRow]:
+    """All rows of a table of shots, those that are excluded among them."""
+    return rows_of(table, ShotRow)
+
+
+def write_table(path: Path, rows: Sequence[ShotRow]) -> None:
+    """Write a table of shots, in place of one that is there; files relative to its folder."""
+    folder = path.parent.absolute()
+    told = [row.model_dump(mode="json", exclude_none=True, exclude_defaults=True) for row in rows]
+    for cells, row in zip(told, rows, strict=True):
+        files = row.files.items()
+        cells |= {name: os.path.relpath(file.absolute(), folder) for name, file in files}
+        if row.strength is not None:
+            cells["strength"] = " ".join(f"{one:.17g}" for one in row.strength)
+        if row.exclude:
+            cells["exclude"] = "yes"
+    columns = [name for name in ShotRow.model_fields if any(name in cells for cells in told)]
+    with (
+        replacing(path, overwrite=True) as draft,
+        Path(draft).open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(told)
+
+
+def _used_rows(table: Path | Sequence[ShotRow], shared: Mapping[str, Any]) -> dict[int, ShotRow]:
+    """The rows that are not excluded, by number."""
+    rows = rows_of(table, ShotRow, shared) if isinstance(table, Path) else table
+    used = {number: row for number, row in enumerate(rows, 1) if not row.exclude}
+    if not used:
+        raise InputError(
+            f"{_name_of(table)} excludes all of its {len(rows)} images: empty the column 'exclude' "
+            "in the rows to use"
+        )
+    return used
+
+
+def _name_of(table: Path | Sequence[ShotRow]) -> str:
+    return str(table) if isinstance(table, Path) else "the table"
+
+
 def fiducials_from(path: Path) -> list[tuple[float, ...]]:
     """Known displacements from a table: rows of y, x, dy, dx and their σ, in px."""
-    return [(one.y, one.x, one.dy, one.dx, one.sigma) for one in _rows_of(path, _Fiducial)]
+    return [(one.y, one.x, one.dy, one.dx, one.sigma) for one in rows_of(path, _Fiducial)]
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _is_table(path: Path) -> bool:
-    """Whether a file is a table with names of columns, and no image as numbers."""
+def is_table(path: Path) -> bool:
+    """Tell whether a file is a table with names of columns, and no image as numbers."""
     if path.suffix.lower() not in SITES.suffixes:
         return False
     lines = _lines(path)
@@ -182,10 +285,8 @@ def _delimiter(header: str) -> str:
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def _rows_of(
-    path: Path, model: type[Model], shared: Mapping[str, Any] | None = None
-) -> list[Model]:
-    """Rows of a table as models; files that it names are looked for from its own folder."""
+def rows_of(path: Path, model: type[Model], shared: Mapping[str, Any] | None = None) -> list[Model]:
+    """Return rows of a table as models; files that it names are looked for from its own folder."""
     lines = _lines(path)
     header = _cells(lines[0]) if lines else []
     _check_header(path, header, model)

@@ -2,7 +2,8 @@
 
 - a table of doses and the pixels that they gave: `Calibration`, `Calibration.from_csv`
 - how much darker than unexposed film: `net_optical_density`
-- the dose in every pixel, and where the table does not reach: `dose`
+- the dose in every pixel, and where the table does not reach: by one channel `dose`, by all three
+  with its error `combined_dose`
 
 Film darkens with dose; the net optical density log10(unexposed / exposed) does not depend
 on the scanner's gain, so a table can serve scans of another day if unexposed film was
@@ -31,9 +32,19 @@ from napari_shadowinv._system.safety import refusing_damage, small_text
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 
-__all__ = ["Calibration", "DoseMap", "dose", "net_optical_density"]
+__all__ = [
+    "Calibration",
+    "CombinedDose",
+    "DoseMap",
+    "combined_dose",
+    "dose",
+    "net_optical_density",
+    "unexposed_pixel",
+]
 
 _CHANNELS = ("red", "green", "blue")
+_TYPICAL_SPREAD = 0.02  # of a pixel, where the table does not tell
+_LEAST_SPREAD = 1e-4  # of the optical density
 
 
 class DoseMap(NamedTuple):
@@ -62,6 +73,8 @@ class Calibration:
         Mean red, green and blue pixel of each film.
     background : ndarray, shape (3,)
         Pixel of unexposed film in the same scan; the lightest of `pixels` if it is not given.
+    spreads : ndarray, shape (n, 3)
+        Standard deviation of the pixels of each film; 2 % of them if it is not given.
 
     Raises
     ------
@@ -79,6 +92,7 @@ class Calibration:
     doses: FloatArray
     pixels: FloatArray
     background: FloatArray = field(default_factory=lambda: np.empty(0))
+    spreads: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         doses, pixels = np.asarray(self.doses, float), np.asarray(self.pixels, float)
@@ -95,7 +109,16 @@ class Calibration:
                 f"the calibration's background has shape {background.shape}: expected one pixel "
                 "for red, green and blue"
             )
-        for name, values in (("doses", doses), ("pixels", pixels), ("background", background)):
+        spreads = np.asarray(self.spreads, float)
+        if spreads.size == 0:
+            spreads = _TYPICAL_SPREAD * pixels
+        if spreads.shape != pixels.shape:
+            raise InputError(
+                f"the calibration's spreads have shape {spreads.shape}: expected that of its "
+                f"pixels, {pixels.shape}"
+            )
+        known = {"doses": doses, "pixels": pixels, "background": background, "spreads": spreads}
+        for name, values in known.items():
             if not (np.isfinite(values) & (values > 0)).all():
                 raise InputError(f"a calibration's {name} must be positive numbers; correct them")
             # Frozen, but what was given may have been lists.
@@ -115,8 +138,9 @@ class Calibration:
         ----------
         path : str or Path
             Comma-separated values. The first line names the columns: one holds "dose" but not
-            "log", others begin with "red", "green" and "blue"; the rest is ignored. A second
-            line may tell units.
+            "log", others begin with "red", "green" and "blue"; a column behind one of these whose
+            name begins with "std" holds its spread. The rest is ignored. A second line may tell
+            units.
         background : array_like, shape (3,), optional
             Pixel of unexposed film.
         dose_range : tuple of float
@@ -137,7 +161,8 @@ class Calibration:
                 "Gy: expected at least two; widen dose_range"
             )
         empty = np.empty(0) if background is None else np.asarray(background, float)
-        return cls(used[:, 0], used[:, 1:], empty)
+        spreads = used[:, 4:] if used.shape[1] == 7 else np.empty(0)
+        return cls(used[:, 0], used[:, 1:4], empty, spreads)
 
     def curve(self, channel: str = "red") -> tuple[FloatArray, FloatArray]:
         """Return net optical density and dose of one channel, both strictly increasing, shape (m,).
@@ -165,6 +190,18 @@ class Calibration:
         """Return the smallest and the largest dose that a channel can tell."""
         doses = self.curve(channel)[1]
         return float(doses[0]), float(doses[-1])
+
+    def log_error(self, doses: ArrayLike, channel: str = "red") -> FloatArray:
+        """Return the standard deviation of the logarithm of doses that one pixel tells."""
+        column = _channel(channel)
+        density, known = self.curve(channel)
+        order = np.argsort(self.doses, kind="stable")
+        spread = (self.spreads[order, column] / self.pixels[order, column]) / np.log(10)
+        spread = np.interp(np.log(known), np.log(self.doses[order]), spread)
+        # How fast the dose grows with the density, over two films that are not neighbours.
+        slope = np.gradient(np.log(known), density)
+        error = np.maximum(spread, _LEAST_SPREAD) * slope
+        return np.asarray(np.interp(np.log(np.asarray(doses, float)), np.log(known), error))
 
     def optical_density(self, doses: ArrayLike, channel: str = "red") -> FloatArray:
         """Return the net optical density that doses give, held at the range's ends.
@@ -231,13 +268,24 @@ def _unexposed(background: AnyArray, channel: str) -> float:
     elif background.shape == (3,):
         value = float(background[_channel(channel)])
     else:
-        plane = _plane(background, channel, "background")
-        top, left = (length // 4 for length in plane.shape)
-        middle = plane[top : len(plane) - top, left : plane.shape[1] - left]
-        value = float(np.median(middle))
+        value = _median_of_middle(_plane(background, channel, "background"))
     if not (np.isfinite(value) and value > 0):
         raise InputError(f"the background is {value:g}: expected the pixel of unexposed film, > 0")
     return value
+
+
+def unexposed_pixel(scan: ArrayLike) -> FloatArray:
+    """Return the pixel of unexposed film, shape (3,), from its scan, shape (H, W, 3).
+
+    The median of its middle half in height and width, since its rim shows the scanner's bed.
+    """
+    planes = (_plane(np.asarray(scan), channel, "scan") for channel in _CHANNELS)
+    return np.array([_median_of_middle(plane) for plane in planes])
+
+
+def _median_of_middle(plane: FloatArray) -> float:
+    top, left = (length // 4 for length in plane.shape)
+    return float(np.median(plane[top : len(plane) - top, left : plane.shape[1] - left]))
 
 
 def _channel(channel: str) -> int:
@@ -289,9 +337,78 @@ def dose(
     return DoseMap(10 ** np.interp(density, known, np.log10(doses)), outside)
 
 
+class CombinedDose(NamedTuple):
+    """Dose in every pixel of a film by all three channels.
+
+    Attributes
+    ----------
+    dose : ndarray of float64, shape (H, W)
+        Held at the end of the calibrated range outside of it.
+    error : ndarray of float64, shape (H, W)
+        Its standard deviation in a pixel, as a share of it: by the spread of the calibration's
+        films, or by how far the channels differ if that is more.
+    outside : ndarray of bool, shape (H, W)
+        True where every channel is lighter or darker than any film of the table.
+    """
+
+    dose: FloatArray
+    error: FloatArray
+    outside: BoolArray
+
+
+def combined_dose(
+    scan: ArrayLike,
+    calibration: Calibration,
+    *,
+    background: Sequence[float] | ArrayLike | None = None,
+) -> CombinedDose:
+    """Return the dose in every pixel by the channels that tell it best.
+
+    The logarithms of the doses by the three channels are averaged, each weighted by one over the
+    square of its error: the spread of its pixels over how fast they darken. So red counts most
+    where doses are small, and blue where red is nearly black.
+
+    Parameters
+    ----------
+    scan, calibration, background
+        As for `dose`, with all three channels.
+
+    Raises
+    ------
+    InputError
+        As `dose`, and if the scan has no colours.
+    """
+    values = np.asarray(scan)
+    if values.ndim != 3:
+        raise InputError(
+            f"the scan has shape {values.shape}: expected (height, width, 3), in red, green and "
+            "blue"
+        )
+    shape = values.shape[:2]
+    weights, weighted = np.zeros(shape), np.zeros(shape)
+    squares, counted, outside = np.zeros(shape), np.zeros(shape), np.ones(shape, bool)
+    ends = []
+    for channel in _CHANNELS:
+        one = dose(values, calibration, background=background, channel=channel)
+        logarithm = np.log(one.dose)
+        weight = np.where(one.outside, 0.0, calibration.log_error(one.dose, channel) ** -2)
+        weights += weight
+        weighted += weight * logarithm
+        squares += weight * logarithm**2
+        counted += ~one.outside
+        outside &= one.outside
+        ends.append(logarithm)
+    inside = np.where(outside, 1.0, weights)
+    mean = np.where(outside, np.median(ends, axis=0), weighted / inside)
+    # Of the mean, by how far the channels are from it.
+    scatter = np.sqrt(np.maximum(squares / inside - mean**2, 0.0) / np.maximum(counted - 1, 1))
+    error = np.maximum(1 / np.sqrt(inside), scatter)
+    return CombinedDose(np.exp(mean), np.where(outside, np.inf, error), outside)
+
+
 @refusing_damage
 def _rows(path: Path) -> FloatArray:
-    """Dose and red, green and blue pixel of every film in a table, shape (n, 4)."""
+    """Dose and red, green and blue pixel of every film, then spreads if all are told."""
     text = small_text(path, "a calibration table, comma-separated values", "utf-8-sig")
     lines = list(csv.reader(text.splitlines()))
     columns = _columns(path, [name.strip().lower() for name in lines[0]] if lines else [])
@@ -307,7 +424,7 @@ def _rows(path: Path) -> FloatArray:
                     f"{path}, line {number} has {', '.join(map(repr, picked))[:80]}: expected a "
                     "dose and three pixels as numbers; correct it"
                 ) from None
-    return np.array(rows, dtype=np.float64).reshape(-1, 4)
+    return np.array(rows, dtype=np.float64).reshape(-1, len(columns))
 
 
 def _columns(path: Path, names: list[str]) -> list[int]:
@@ -319,4 +436,7 @@ def _columns(path: Path, names: list[str]) -> list[int]:
             f"{path} has the columns {', '.join(map(repr, names)) or 'none'}: expected one with "
             "'dose', and columns whose names begin with 'red', 'green' and 'blue'"
         )
-    return [candidates[0] for candidates in found]
+    columns = [candidates[0] for candidates in found]
+    beside = [at + 1 for at in columns[1:]]
+    told = all(at < len(names) and names[at].startswith("std") for at in beside)
+    return columns + beside if told else columns

@@ -1,0 +1,180 @@
+"""Fits of layers.
+
+- what is to be fitted: `FitJob`; what has been found, with its layers: `FitAnswer`
+- the job that refines an inversion: `refinement`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import takewhile
+from typing import TYPE_CHECKING, Any
+
+from napari_shadowinv._napari.fit_course import PACE, Course, Forecast, forecast_of
+from napari_shadowinv._napari.fit_layers import fit_layers, setup_of_fit
+from napari_shadowinv._napari.frame import Frame, frame_of
+from napari_shadowinv._napari.layer_metadata import Result, result_of
+from napari_shadowinv._napari.shots import loaded
+from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting import Fit
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.options import FitChoices
+from napari_shadowinv.pipeline import FitShot, run_fit, run_refinement
+from napari_shadowinv.pipeline._refine import refinement_choices
+from napari_shadowinv.preprocessing import Radiograph, Recipe
+
+if TYPE_CHECKING:
+    from napari_shadowinv._napari.layers import FullLayerData
+    from napari_shadowinv.physics.setup import Setup
+
+
+@dataclass(frozen=True, eq=False)
+class FitAnswer:
+    result: Result
+    described: list[FullLayerData]
+
+    @property
+    def fit(self) -> Fit:
+        """What was found."""
+        content = self.result.content
+        assert isinstance(content, Fit)
+        return content
+
+
+@dataclass(frozen=True, eq=False)
+class FitJob:
+    """A fit to be made, and the place of its layers; images and sources may be lazy."""
+
+    recipe: Recipe  # with the fit's choices, and the setup of the first image
+    shots: tuple[FitShot, ...]
+    names: tuple[str, ...]  # of the images
+    name: str
+    frame: Frame
+    given: Sequence[tuple[str, str]]  # what it was given, in words
+    attributes: Mapping[str, str]
+    layer: Any = None  # of the first image
+    companions: tuple[Any, ...] = ()
+
+    @property
+    def choices(self) -> FitChoices:
+        assert self.recipe.fit is not None
+        return self.recipe.fit
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the images after the steps."""
+        image: Any = self.shots[0].image
+        return self.recipe.shape_after(image.image.shape)
+
+    @cached_property
+    def course(self) -> Course:
+        """How far it is, and the objectives so far."""
+        return Course(self.forecast)
+
+    @property
+    def forecast(self) -> Forecast:
+        """What its time depends on."""
+        choices = self.choices
+        source = choices.beam if choices.beam == "unknown" else None
+        fields = len(choices.fields or ("B",))
+        return forecast_of(self.shape, len(self.names), fields, source, choices.options)
+
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FitAnswer:
+        """Fit and describe the layers, all of it beside the window."""
+
+        def heard(news: Progress) -> None:
+            on_progress(self.course.heard(news))
+
+        found = self.fitted(heard, should_stop)
+        PACE.learn(self.forecast, sum(found.report.seconds.values()))
+        result = Result(found, setup_of_fit(found), dict(self.attributes))
+        return FitAnswer(result, fit_layers(result, self.frame, self.name))
+
+    def fitted(
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+    ) -> Fit:
+        """Read the images, do the recipe's steps to them, and fit."""
+        names = [f"'{name}'" for name in self.names]
+        shots = [_loaded(shot, name) for shot, name in zip(self.shots, names, strict=True)]
+        return run_fit(
+            self.recipe, shots, names=names, on_progress=on_progress, should_stop=should_stop
+        )
+
+
+def _loaded(shot: FitShot, name: str) -> FitShot:
+    image, source = shot.image, shot.source
+    if isinstance(image, Radiograph):
+        image = loaded(image, name)
+    if isinstance(source, Radiograph):
+        source = loaded(source, f"the source of {name}")
+    return replace(shot, image=image, source=source)
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement(FitJob):
+    """A fit that starts from an inversion, whose image it explains."""
+
+    inversion: Inversion | None = None
+    setup: Setup | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        assert self.inversion is not None
+        return self.inversion.image.shape
+
+    def fitted(
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+    ) -> Fit:
+        """Fit, starting from the inversion."""
+        assert self.inversion is not None
+        return run_refinement(
+            self.inversion,
+            self.setup,
+            self.choices,
+            on_progress=on_progress,
+            should_stop=should_stop,
+        )
+
+
+def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
+    """The fit to an inversion's image, with its source, mask and setup, that starts from it.
+
+    `layer` shows a part of the inversion, `image` is the layer of its shot, or it again.
+    """
+    result = result_of(layer)
+    if result is None or not isinstance(result.content, Inversion):
+        kind = "a fit" if result is not None and isinstance(result.content, Fit) else "no inversion"
+        raise InputError(
+            f"layer '{layer.name}' shows {kind}: select a layer of an inversion's result, such as "
+            "its field"
+        )
+    inversion, setup = result.content, result.setup
+    choices = refinement_choices(inversion, setup, psf)
+    given = [
+        ("Start", f"the inversion of '{name}'"),
+        ("Point spread", f"σ {psf:g} px" if psf else "none"),
+    ]
+    attributes = {"start_origin": f"the inversion of '{name}'"}
+    return Refinement(
+        recipe=Recipe(fit=choices),
+        shots=(),
+        names=(name,),
+        name=f"{name} refined",
+        frame=frame_of(layer),
+        given=given,
+        attributes=attributes,
+        layer=image,
+        inversion=inversion,
+        setup=setup,
+    )
+
+
+def name_of_result(layers: Iterable[Any], layer: Any) -> str:
+    """Return what the names of all layers of the same result begin with."""
+    result = result_of(layer)
+    names = [str(one.name) for one in layers if result_of(one) is result is not None]
+    alike = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    return "".join(letters[0] for letters in alike).strip(" |∫") or str(layer.name)

@@ -1,0 +1,156 @@
+"""Shots of a table (CSV), a row each with its energy, gain and mask: `ShotTable`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from qtpy.QtCore import QSignalBlocker, Signal
+from qtpy.QtWidgets import QFileDialog, QSizePolicy, QWidget
+
+from napari_shadowinv._napari.widgets._fields import parsed
+from napari_shadowinv._napari.widgets._forms import PathEdit, labelled, small_button
+from napari_shadowinv._napari.widgets._number_table import NumberTable
+from napari_shadowinv._napari.widgets._qt import beside, column, notify_errors
+from napari_shadowinv._system.validation import validated
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.formats import SITES
+from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
+
+_ENERGY, _GAIN, _MASK = 1, 2, 3
+_NUMBERS = {_ENERGY: ("energy", "MeV"), _GAIN: ("gain", "")}
+_WIDTHS = {_ENERGY: 92, _GAIN: 44, _MASK: 90}
+_TITLES = ["Shot", "Energy (MeV)", "Gain", "Mask"]
+_TIPS = {
+    _ENERGY: "Energy of the particles; empty for that of the setup.",
+    _GAIN: "By how much the image is brighter than the source, by which it is divided; empty for "
+    "1.",
+    _MASK: "Image of the same size, 0 at unusable pixels, in the table's folder or with its own; "
+    "empty for the mask of all shots.",
+}
+_SUFFIX = "tables (*.csv)"
+
+
+class _TableEdit(PathEdit):
+    def ask(self) -> str:
+        path, _ = QFileDialog.getOpenFileName(self, self._title, "", _SUFFIX)
+        return str(path)
+
+
+class ShotTable(QWidget):
+    """The rows of a table of shots; what is changed here stays here until it is saved."""
+
+    changed = Signal()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._rows: list[ShotRow] = []
+        self._loaded = ""
+        self.file = _TableEdit("Table of the shots", "shots.csv")
+        self.file.edit.setToolTip(
+            "<qt>A table (.csv) with a row for each shot: file, energy, setup, gain, mask, source, "
+            "exclude.</qt>"
+        )
+        self.save_button = small_button("Save…", "Write the rows to a table (.csv).", self._save)
+        self.table = NumberTable(len(_TITLES), _WIDTHS)
+        self.table.setHorizontalHeaderLabels(_TITLES)
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
+        column(self, labelled("", beside((self.file, 1), (self.save_button, 0))), self.table)
+        self.file.changed.connect(self._load)
+        self.table.itemChanged.connect(self._on_edit)
+        self._fill()
+
+    def shots(self) -> list[ShotRow]:
+        """The rows as they are shown, those that are not checked excluded; or an `InputError`."""
+        if self.file.path != self._loaded:
+            self._read()
+        if not self._rows:
+            raise InputError(
+                "no table is selected: choose a .csv file with a row for each shot, with the "
+                "columns file and energy"
+            )
+        return [self._shown(number) for number in range(len(self._rows))]
+
+    def _shown(self, number: int) -> ShotRow:
+        row = self._rows[number]
+        changes: dict[str, Any] = {"exclude": not self.table.is_checked(number)}
+        try:
+            for at, (name, unit) in _NUMBERS.items():
+                changes[name] = self.table.number(number, at, unit)
+        except InputError as error:
+            raise InputError(f"'{row.file.name}': {error}") from error
+        mask = self.table.item(number, _MASK).text().strip()
+        if not mask or row.mask is None or mask != row.mask.name:
+            changes["mask"] = self._folder / mask if mask else None
+        known = row.model_dump(exclude={"strength"})  # which is written otherwise
+        changed = validated(ShotRow, {**known, **changes}, f"'{row.file.name}'")
+        return changed.model_copy(update={"strength": row.strength})
+
+    @property
+    def _folder(self) -> Path:
+        return Path(self._loaded).expanduser().parent
+
+    @notify_errors
+    def _load(self) -> None:
+        if self.file.path != self._loaded:
+            self._read()
+            self.changed.emit()
+
+    def _read(self) -> None:
+        self._rows, self._loaded = [], self.file.path
+        try:
+            if self._loaded:
+                self._rows = table_rows(Path(self._loaded).expanduser())
+        finally:
+            self._fill()
+
+    def _fill(self) -> None:
+        with QSignalBlocker(self.table):
+            self.table.setRowCount(len(self._rows))
+            for number, row in enumerate(self._rows):
+                self.table.fill_row(number, row.file.name, _more(row), checked=not row.exclude)
+                for at, (name, unit) in _NUMBERS.items():
+                    self.table.write(number, at, getattr(row, name), unit, _TIPS[at])
+                self._show_mask(number, "" if row.mask is None else row.mask.name)
+        self.table.setVisible(bool(self._rows))
+        self.save_button.setEnabled(bool(self._rows))
+        self.table.fit_height()
+
+    def _show_mask(self, number: int, name: str) -> None:
+        item = self.table.item(number, _MASK)
+        item.setText(name)
+        item.setToolTip(f"<qt>{_TIPS[_MASK]}</qt>")
+
+    def showEvent(self, event: Any) -> None:
+        super().showEvent(event)
+        # Only now the rows have the heights of napari's style.
+        self.table.fit_height()
+
+    def _on_edit(self, item: Any) -> None:
+        at = item.column()
+        if at in _NUMBERS:
+            unit, text = _NUMBERS[at][1], item.text().strip()
+            try:
+                value: Any = parsed(text, unit) if text else None
+            except InputError:
+                value = text  # stays to be mended
+            with QSignalBlocker(self.table):
+                self.table.write(item.row(), at, value, unit, _TIPS[at])
+        self.changed.emit()
+
+    @notify_errors
+    def _save(self) -> None:
+        rows = self.shots()
+        path, _ = QFileDialog.getSaveFileName(
+            self, "Save the table", self._loaded or "shots.csv", _SUFFIX
+        )
+        if path:
+            named = Path(path)
+            write_table(named if named.suffix else named.with_suffix(SITES.suffix), rows)
+
+
+def _more(row: ShotRow) -> str:
+    """What a row says that has no cell of its own."""
+    told = {"setup": row.setup, "source": row.source}
+    own = [f"with its own {name} ({one})" for name, one in told.items() if one is not None]
+    return f"{row.file}{', ' if own else ''}{', '.join(own)}. Uncheck it to leave it out."

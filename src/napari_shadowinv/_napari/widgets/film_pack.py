@@ -1,0 +1,379 @@
+"""The widget that turns the scans of a film pack into fluences: `FilmPack`."""
+
+from __future__ import annotations
+
+import tempfile
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from napari.utils.notifications import show_info
+from qtpy import QtWidgets
+from qtpy.QtCore import Qt
+
+from napari_shadowinv._napari import packs
+from napari_shadowinv._napari.frame import frame_of
+from napari_shadowinv._napari.layer_metadata import (
+    Result,
+    mark_of,
+    may_be_mask,
+    result_of,
+    role_of,
+)
+from napari_shadowinv._napari.layer_state import dataset_of_layers
+from napari_shadowinv._napari.viewer_sync import plane_in_view
+from napari_shadowinv._napari.widgets import _qt as qt
+from napari_shadowinv._napari.widgets._corners import CornerEditor
+from napari_shadowinv._napari.widgets._forms import PathEdit, labelled, with_button
+from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
+from napari_shadowinv._napari.widgets._pack_work import PackAnswer, PackJob, edits_beside
+from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._plots import COLOURS, Plot
+from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io import write
+from napari_shadowinv.io.formats import RESULT
+from napari_shadowinv.pipeline import read_pack, write_layers
+
+if TYPE_CHECKING:
+    import xarray
+
+    import napari
+
+_FOLLOW = 60  # ms between two drawings while a region is drawn
+_PLOT_HEIGHT = 260
+_BRUSH = 10  # px
+
+
+class SpectrumPlot(Plot):
+    """Mean fluence against energy."""
+
+    def __init__(self) -> None:
+        super().__init__(_PLOT_HEIGHT)
+        self.setFixedHeight(_PLOT_HEIGHT)
+        policy = QtWidgets.QSizePolicy.Policy
+        self.setSizePolicy(policy.Expanding, policy.Fixed)
+        self.shown: packs.Spectrum | None = None
+
+    def show_spectrum(self, spectrum: packs.Spectrum | None, where: str = "") -> None:
+        """Draw a spectrum; None empties the plot."""
+        self.shown = spectrum
+        self.setVisible(spectrum is not None)
+        if spectrum is None:
+            return
+        (axis,) = self.fresh_axes()
+        axis.errorbar(
+            spectrum.energies,
+            spectrum.fluence,
+            spectrum.error,
+            fmt="o-",
+            color=COLOURS[0],
+            markersize=4,
+            capsize=2,
+        )
+        axis.set_yscale("log", nonpositive="clip")
+        seen = spectrum.fluence[spectrum.fluence > 0]
+        if seen.size:
+            axis.set_ylim(seen.min() / 3, 3 * seen.max())
+        axis.set_xlabel(f"energy (MeV), mean {where}", color=self.ink, fontsize=8)
+        axis.set_ylabel(f"fluence ({packs.PER_AREA})", color=self.ink, fontsize=8)
+        self.draw()
+
+
+class FilmPack(ToolPanel):
+    """Choose what describes a pack, press Run; correct corners and marks and run again."""
+
+    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+        tip = "Compute dose and fluence of each film of the pack."
+        super().__init__(viewer, "film-pack", RunPanel("Film pack", "Run", tip))
+        self._scratch = tempfile.TemporaryDirectory(prefix="film-pack-")
+        qt.when_destroyed(self, self._scratch.cleanup)
+        self._folders = count(1)
+        self._last = LastResults(viewer, self)
+        self.results = ResultLayers(viewer, self)
+        self.fit_images = ResultLayers(viewer, self)
+        self._build()
+        self._connect()
+        self._on_pack()
+        self._ready = True
+
+    def _build(self) -> None:
+        self.path = PathEdit("What describes the pack", "pack.toml")
+        self.path.edit.setToolTip(
+            "<qt>TOML file that tells films, filters, scans and calibrations, the same as for the "
+            "command shadowinv film.</qt>"
+        )
+        self.report = ReportTable()
+        self.packs = LayerPicker(
+            self.viewer,
+            ("image",),
+            "<qt>Fluences of a pack: from a run, or from a .shadowinv file.</qt>",
+            suits=lambda layer: role_of(layer) == packs.FLUENCE,
+        )
+        self.regions = LayerPicker(
+            self.viewer,
+            ("shapes", "labels"),
+            "<qt>Shapes or labels: the spectrum is that of the usable pixels inside.</qt>",
+            "whole film",
+            may_be_mask,
+        )
+        self.plot = SpectrumPlot()
+        self.plot.setToolTip(
+            "<qt>Mean fluence of each film. Bars are the standard deviation of a pixel (median): "
+            "errors of calibration are shared by all pixels and do not average out.</qt>"
+        )
+        self.show_corners = _button(
+            "Show corners", "Show the scan of the film in view, with corners to drag."
+        )
+        self.paint = _button(
+            "Paint marks", "Paint pixels of the film in view that must not be used."
+        )
+        self.run_again = _button(
+            "Run again", "Compute the pack with the corners as dragged and without painted pixels."
+        )
+        self.to_fit = _button(
+            "Layers for a fit",
+            "Add each film as an image with energy, setup and mask, for Invert shot and Fit "
+            "several images.",
+        )
+        self.write = _button("Write layers…", "Write each film as an image, with a table of them.")
+        self.save = _button("Save…", "Save the pack's result as .shadowinv.")
+        self.actions = QtWidgets.QWidget()
+        region = with_button(self.regions, "✎", "Draw a region.", self._draw_region)
+        column = qt.column(
+            self.actions,
+            labelled("Result", self.packs),
+            self.report,
+            labelled("Region", region),
+            self.plot,
+            qt.beside((self.show_corners, 1), (self.paint, 1), (self.run_again, 1)),
+            qt.beside((self.to_fit, 1), (self.write, 1), (self.save, 1)),
+        )
+        column.setAlignment(Qt.AlignmentFlag.AlignTop)
+        self.add(labelled("Pack", self.path), self._last.keep_earlier, self.panel, self.actions)
+        self.corners = CornerEditor(self.viewer, self)
+
+    def _connect(self) -> None:
+        self._timer = qt.timer(self, _FOLLOW, self.update_plot, once=True)
+        edits = LayerWatch(self, (self.regions,))
+        for signal in (self.regions.picked, edits.edited):
+            signal.connect(self._soon)
+        self.packs.picked.connect(self._on_pack)
+        for button, action in (
+            (self.show_corners, self._show_corners),
+            (self.paint, self._paint),
+            (self.run_again, self._run_again),
+            (self.to_fit, self._add_fit_images),
+            (self.write, self._write_layers),
+            (self.save, self._save),
+        ):
+            button.clicked.connect(partial(_call, action))
+
+    # A run
+
+    def request(self) -> PackJob:
+        path = self.path.path
+        if not path:
+            raise InputError(
+                "no pack is selected: choose the TOML file that describes it, such as pack.toml"
+            )
+        file = Path(path).expanduser().absolute()
+        pack = read_pack(file)
+        name = file.stem if file.stem != "pack" else file.parent.name
+        return PackJob(pack, str(file), name, self._new_folder())
+
+    def forget(self) -> None:
+        self.panel.say("")
+
+    def _corrected(self) -> PackJob:
+        """The chosen pack with what was dragged and painted."""
+        layer, dataset = self._chosen()
+        known = mark_of(layer)
+        marks = self._partner(layer, packs.UNUSABLE)
+        by_hand = None if marks is None else packs.painted_by_hand(marks.data, dataset)
+        return PackJob(
+            known.get("pack") or packs.pack_of(dataset),
+            known.get("path", ""),
+            known.get("pack_name") or layer.name.removesuffix(_title(packs.FLUENCE)).strip(),
+            self._new_folder(),
+            self.corners.corners(dataset) or known.get("corners"),
+            by_hand,
+            packs.scales_of(dataset),
+            plane_in_view(self.viewer, layer),
+        )
+
+    @qt.notify_errors
+    def _run_again(self) -> None:
+        if self.panel.runner.running:
+            return
+        request = self._corrected()
+        self.forget()
+        self.panel.run(request.run, request)
+
+    def show_result(self, value: PackAnswer, request: PackJob) -> None:
+        dataset = value.dataset
+        result = packs.pack_result(dataset)
+        described = packs.pack_layers(
+            result,
+            packs.pack_frame(dataset),
+            request.name,
+            by_hand=value.by_hand,
+            plane=request.plane,
+            path=request.path,
+            pack=request.pack,
+            pack_name=request.name,
+            corners=request.corners,
+        )
+        self.corners.close()
+        is_new = not self.viewer.layers
+        self.results = self._last.next_of(request.path or request.name)
+        self.results.complete.connect(partial(self._on_layers, self.results, is_new))
+        self.results.show(described)
+
+    def _on_layers(self, results: ResultLayers, is_new: bool) -> None:
+        for layer in results.layers:
+            if role_of(layer) == packs.FLUENCE:
+                self.packs.layer = layer
+        if is_new:
+            self.viewer.reset_view()
+        self._on_pack()
+
+    # The chosen result
+
+    def _chosen(self) -> tuple[Any, xarray.Dataset]:
+        layer = self.packs.layer
+        result = None if layer is None else result_of(layer)
+        if result is None:
+            raise InputError("there is no result of a film pack: press Run first, or open one")
+        dataset: Any = result.content
+        return layer, dataset
+
+    def _partner(self, layer: Any, role: str) -> Any | None:
+        """Another layer of the same result."""
+        result = result_of(layer)
+        found = (one for one in self.viewer.layers if result_of(one) is result)
+        return next((one for one in found if role_of(one) == role), None)
+
+    def _on_pack(self) -> None:
+        there = self.packs.layer is not None
+        self.actions.setVisible(there)
+        if there:
+            _, dataset = self._chosen()
+            self.report.show_rows(_rows(dataset))
+        self.update_plot()
+
+    def _soon(self) -> None:
+        if not self._timer.isActive():
+            self._timer.start()
+
+    def update_plot(self) -> None:
+        """Draw the spectrum of the region as it is now."""
+        layer = self.packs.layer
+        if layer is None:
+            self.plot.show_spectrum(None)
+            return
+        _, dataset = self._chosen()
+        try:
+            region = mask_of(self.regions.layer, layer, painted_is_unusable=False)
+        except InputError as error:
+            self.show_problem(str(error))
+            return
+        where = "of the whole film" if region is None else "in the region"
+        self.plot.show_spectrum(packs.spectrum_in(dataset, region), where)
+
+    @qt.notify_errors
+    def _draw_region(self) -> None:
+        layer, _ = self._chosen()
+        self.regions.layer = new_shapes(self.viewer, layer, "region", "add_rectangle")
+
+    @qt.notify_errors
+    def _show_corners(self) -> None:
+        layer, dataset = self._chosen()
+        self.corners.show(layer, dataset, packs.pack_of(dataset))
+        self.panel.say("Drag the corners; move the slider for other films; then press Run again.")
+
+    @qt.notify_errors
+    def _paint(self) -> None:
+        layer, _ = self._chosen()
+        marks = self._partner(layer, packs.UNUSABLE)
+        if marks is None:
+            raise InputError(
+                f"the layer '…{_title(packs.UNUSABLE)}' of '{layer.name}' was removed: press Run, "
+                "or open the file again"
+            )
+        marks.visible = True
+        marks.selected_label = packs.BY_HAND
+        marks.brush_size = _BRUSH
+        self.viewer.layers.selection.active = marks
+        marks.mode = "paint"
+        self.panel.say("Paint what must not be used; then press Run again.")
+
+    @qt.notify_errors
+    def _add_fit_images(self) -> None:
+        layer, dataset = self._chosen()
+        for role in (packs.DOSE, packs.FLUENCE, packs.UNUSABLE):
+            shown = self._partner(layer, role)
+            if shown is not None:
+                shown.visible = False
+        described = packs.film_layers(dataset, frame_of(layer), layer.name)
+        self.fit_images = ResultLayers(self.viewer, self)
+        self.fit_images.show(described, select=False)
+
+    @qt.notify_errors
+    def _write_layers(self) -> None:
+        _, dataset = self._chosen()
+        folder = QtWidgets.QFileDialog.getExistingDirectory(self, "Folder for the layers")
+        if folder:
+            show_info(f"Wrote {write_layers(dataset, Path(folder))[-1]}")
+
+    @qt.notify_errors
+    def _save(self) -> None:
+        layer, dataset = self._chosen()
+        name, _ = QtWidgets.QFileDialog.getSaveFileName(
+            self, "Save the result", f"pack{RESULT.suffix}", f"results (*{RESULT.suffix})"
+        )
+        if not name:
+            return
+        is_named = name.lower().endswith(RESULT.suffix)
+        path = Path(name if is_named else name + RESULT.suffix)
+        scratch = Path(self._scratch.name)
+        result = result_of(layer)
+        assert result is not None
+        kept = Result(
+            edits_beside(dataset, packs.pack_of(dataset), scratch, path),
+            result.setup,
+            result.attributes,
+        )
+        own = [one.as_layer_data_tuple() for one in self.viewer.layers if result_of(one) is result]
+        show_info(f"Wrote {write(path, dataset_of_layers(own, kept), overwrite=is_named)}")
+
+    def _new_folder(self) -> Path:
+        return Path(self._scratch.name) / str(next(self._folders))
+
+
+def _rows(dataset: xarray.Dataset) -> list[tuple[str, str]]:
+    """What is known of a pack, in two columns of text; warnings come last."""
+    energies, sizes = dataset["energy"].values, dataset.sizes
+    empty = ~dataset["usable"].values.any(axis=(1, 2))
+    rows = [
+        ("Films", f"{len(energies)}, {energies[0]:.3g} to {energies[-1]:.3g} MeV"),
+        ("Pixels", f"{sizes['y']} × {sizes['x']}, {dataset['usable'].values.mean():.0%} usable"),
+    ]
+    if empty.any():
+        rows.append(("Left out", "film " + ", ".join(map(str, dataset["layer"].values[empty]))))
+    return rows + [("Warning", text) for text in packs.warnings_of_pack(dataset)]
+
+
+def _title(role: str) -> str:
+    return next(kind.title for kind in packs.KINDS if kind.role == role)
+
+
+def _button(text: str, tip: str) -> QtWidgets.QPushButton:
+    button = QtWidgets.QPushButton(text)
+    button.setToolTip(f"<qt>{tip}</qt>")
+    return button
+
+
+def _call(action: Any, _: bool = False) -> None:
+    action()

@@ -1,0 +1,187 @@
+"""`shadowinv film`: doses and fluences from the scans of a film pack."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from napari_shadowinv.cli import _flags, _outputs
+from napari_shadowinv.cli._tables import Rows, two_columns
+from napari_shadowinv.cli._terminal import interrupted, notify_errors, progress_bars, say
+
+if TYPE_CHECKING:
+    import xarray
+    from rich.table import Table
+
+    from napari_shadowinv.film import Pack
+
+LayersFormat = Literal["tiff", "pradformat"]
+# Of options whose help is longer than a line.
+HELP = {
+    "pack": "TOML file: what the pack is made of, which scan shows which film.",
+    "layers": "Folder for the fluence of each layer as an image, with a table of them for fit and "
+    "batch.",
+    "corners": "Table (.csv) for the corners that were found, to correct and give to the pack.",
+    "out": "Result file. Default: the pack's name with .shadowinv, in the current folder.",
+}
+EPILOG = r"""
+[bold]Examples[/bold]
+shadowinv film pack.toml
+shadowinv film pack.toml --layers layers
+shadowinv fit layers/layers.csv --gains free --source unknown
+
+[bold]pack.toml[/bold] (files are looked for beside it)
+scan = "scan.tif"                             # all films on one scan; or a file for each layer
+\[setup]                                       # distances, if they are known
+source_object_distance = 0.01
+object_image_distance = 0.1
+\[films.HDV2]
+calibration = "HDV2.csv"
+unexposed = "unexposed.tif"
+\[\[layers]]
+film = "HDV2"
+filters = \["13 um Al", "25 um Fe"]
+file = "film_01.tif"
+Known films: EBT3, HDV2, MDV3; materials: Al, Au, Cu, Fe, Kapton, Mylar, Ta, Ti and others.
+
+[bold]Exit codes[/bold]
+0 written; 2 invalid input, nothing written; 130 cancelled.
+"""
+
+
+@notify_errors
+def film(
+    pack: Annotated[Path, typer.Argument(help=HELP["pack"], show_default=False)],
+    layers: Annotated[Path | None, typer.Option(help=HELP["layers"])] = None,
+    layers_format: Annotated[
+        LayersFormat, typer.Option(help="Format of the layers' images.")
+    ] = "tiff",
+    corners: Annotated[Path | None, typer.Option("--save-corners", help=HELP["corners"])] = None,
+    out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
+    report: _flags.Figure = None,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.Quiet = False,
+) -> None:
+    """Turn the scans of a film pack into doses and fluences, layer by layer.
+
+    Finds and straightens the films, leaves out writing and damage, lays the layers on each
+    other, and unfolds the spectrum of protons in every pixel.
+    """
+    from napari_shadowinv.film import write_corners
+    from napari_shadowinv.io import replacing
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PACK_WRITERS, SITES
+    from napari_shadowinv.pipeline import read_pack, write_layers
+    from napari_shadowinv.pipeline.film_files import LAYERS_TABLE
+
+    result, figure = _outputs.result_and_figure(pack, out, report)
+    outputs: dict[Path, tuple[str, ...]] = {
+        result: tuple(PACK_WRITERS),
+        figure: FIGURE_SUFFIXES,
+    }
+    if corners is not None:
+        outputs[corners] = SITES.suffixes
+    if layers is not None and (table := layers / LAYERS_TABLE).exists():
+        outputs[table] = SITES.suffixes
+    _outputs.check_outputs(outputs, overwrite)
+    described = read_pack(pack)
+    _outputs.protect(list(outputs), [pack, *described.files])
+    dataset = _made(described, quiet)
+    written = [result, figure]
+    write_pack(dataset, pack.name, result, figure, overwrite)
+    if layers is not None:
+        written.append(write_layers(dataset, layers, form=layers_format, overwrite=overwrite)[-1])
+    if corners is not None:
+        layers_shown = dataset["corners"].dropna("layer")
+        places = {str(int(one["layer"])): one.values for one in layers_shown}
+        with replacing(corners, overwrite) as temporary:
+            write_corners(temporary, places)
+        written.append(corners)
+    if not quiet:
+        say(layer_table(dataset))
+        rows = [*pack_rows(dataset), ("written", ", ".join(map(str, written)))]
+        say(two_columns("Film pack", rows))
+
+
+def _made(pack: Pack, quiet: bool) -> xarray.Dataset:
+    from napari_shadowinv.pipeline import run_film
+
+    with nullcontext() if quiet else progress_bars() as show:
+        return run_film(pack, on_progress=show, should_stop=interrupted)
+
+
+def write_pack(
+    dataset: xarray.Dataset, name: str, result: Path, figure: Path, overwrite: bool
+) -> None:
+    """Write a pack's dataset and its figure, both or none of them."""
+    from napari_shadowinv.plotting import pack_figure
+
+    figures = {figure: pack_figure(dataset, title=name)}
+    _outputs.write_with_figures(dataset, figures, result, overwrite)
+
+
+def pack_made_again(
+    dataset: xarray.Dataset, path: Path, outputs: list[Path], quiet: bool
+) -> tuple[xarray.Dataset, Rows]:
+    """Make a pack's dataset again from the scans that it names, and tell what has changed."""
+    import numpy as np
+
+    from napari_shadowinv.cli._rerun import SAME, changed_version
+    from napari_shadowinv.film import Pack
+
+    pack = Pack.model_validate_json(dataset.attrs["pack"])
+    _outputs.protect(outputs, [path, *pack.files])
+    again = _made(pack, quiet)
+    changes = changed_version(str(dataset.attrs["package_version"]))
+    rows = [("changed", change) for change in changes]
+    for before, now in zip(dataset["sha256"].values, again["sha256"].values, strict=True):
+        if before != now:
+            rows.append(("changed", f"a scan with the checksum {before[:12]}… is now {now[:12]}…"))
+    same = again["fluence"].shape == dataset["fluence"].shape and all(
+        np.array_equal(again[name], dataset[name], equal_nan=True) for name in ("dose", "fluence")
+    )
+    return again, [*rows, ("difference", SAME if same else "doses or fluences differ")]
+
+
+def layer_table(dataset: xarray.Dataset) -> Table:
+    """Tell the energy and the dose of each layer, and how well it lies on the others."""
+    import numpy as np
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE)
+    names = ["layer", "film", "MeV"]
+    if "time_of_flight" in dataset.coords:
+        names.append("flight (ns)")
+    for name in (*names, "median Gy", "usable", "shift y, x (px)", "±"):
+        table.add_column(name, justify="left" if name == "film" else "right")
+    for k in range(dataset.sizes["layer"]):
+        layer = dataset.isel(layer=k)
+        used = layer["usable"].values
+        seen = bool(used.any())
+        dose = f"{np.median(layer['dose'].values[used]):.3g}" if seen else "left out"
+        shift = ", ".join(f"{value:+.1f}" for value in layer["shift"].values)
+        times = [float(layer["time_of_flight"])] if "time_of_flight" in layer.coords else []
+        table.add_row(
+            str(int(layer["layer"])),
+            layer["film"].item(),
+            f"{float(layer['energy']):.4g}",
+            *(f"{1e9 * time:.4g}" for time in times),
+            dose,
+            f"{used.mean():.0%}",
+            shift if seen else "",
+            f"{float(layer['shift_error']):.1f}" if seen else "",
+        )
+    return table
+
+
+def pack_rows(dataset: xarray.Dataset) -> Rows:
+    """What a pack's dataset tells about all layers."""
+    sizes = dataset.sizes
+    rows = [("images", f"{sizes['layer']} of {sizes['y']} × {sizes['x']} px, [y, x]")]
+    if "scan_pixel_size" in dataset.attrs:
+        rows.append(("pixel", f"{1e6 * dataset.attrs['scan_pixel_size']:.4g} µm on the film"))
+    return rows + [("warning", text) for text in json.loads(dataset.attrs["warnings"])]

@@ -1,0 +1,70 @@
+"""Films, CR-39 and image plates: from their scans to doses, counts and luminescence.
+
+- films on a scan: `find_films`, `straightened`, `read_corners`, `write_corners`
+- where a film has no marks: `usable_pixels`
+- doses: `Calibration`, `dose`, `combined_dose`, `net_optical_density`
+- packs, and what each film sees of protons of which energy: `Pack`, `Response`
+- how the films of a pack lie on each other: `register`, `moved_corners`, `check_orientation`
+- fluences at each energy from the doses of all films: `unfold`
+- CR-39: `Tracks`, `TrackImage`
+- image plates: `fuji_luminescence`, `ge_luminescence`, `fading`
+"""
+
+from napari_shadowinv.film.calibration import (
+    Calibration,
+    CombinedDose,
+    DoseMap,
+    combined_dose,
+    dose,
+    net_optical_density,
+    unexposed_pixel,
+)
+from napari_shadowinv.film.image_plates import (
+    Luminescence,
+    fading,
+    fuji_luminescence,
+    ge_luminescence,
+)
+from napari_shadowinv.film.marks import usable_pixels
+from napari_shadowinv.film.pack import FilmType, Material, Pack, PackLayer, Slab
+from napari_shadowinv.film.registration import Poses, check_orientation, moved_corners, register
+from napari_shadowinv.film.response import Band, Response
+from napari_shadowinv.film.scans import find_films, read_corners, straightened, write_corners
+from napari_shadowinv.film.stopping import Stopping
+from napari_shadowinv.film.tracks import TrackImage, Tracks
+from napari_shadowinv.film.unfolding import Spectra, unfold
+
+__all__ = [
+    "Band",
+    "Calibration",
+    "CombinedDose",
+    "DoseMap",
+    "FilmType",
+    "Luminescence",
+    "Material",
+    "Pack",
+    "PackLayer",
+    "Poses",
+    "Response",
+    "Slab",
+    "Spectra",
+    "Stopping",
+    "TrackImage",
+    "Tracks",
+    "check_orientation",
+    "combined_dose",
+    "dose",
+    "fading",
+    "find_films",
+    "fuji_luminescence",
+    "ge_luminescence",
+    "moved_corners",
+    "net_optical_density",
+    "read_corners",
+    "register",
+    "straightened",
+    "unexposed_pixel",
+    "unfold",
+    "usable_pixels",
+    "write_corners",
+]

@@ -1,0 +1,334 @@
+"""A pack of films and filters, the one that is hit first at the top.
+
+What a pack is made of: `Pack`, `PackLayer`, `FilmType`, `Slab`, `Material`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from napari_shadowinv._system.validation import nearest
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.film.stopping import Stopping
+from napari_shadowinv.physics.setup import Setup, setup_from_dict
+
+__all__ = ["FILM_TYPES", "MATERIALS", "FilmType", "Material", "Pack", "PackLayer", "Slab"]
+
+_CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+
+class Material(BaseModel):
+    """What stops protons: by a table of SRIM's, or else by Bethe's formula."""
+
+    model_config = _CONFIG
+    density: float | None = Field(
+        default=None, gt=0, title="Density (kg/m³)", description="Where there is no table."
+    )
+    charge_per_mass: float | None = Field(
+        default=None, gt=0, lt=1.1, title="Z/A", description="Mean, in mol/g; about 0.5."
+    )
+    excitation: float | None = Field(
+        default=None,
+        gt=0,
+        title="Mean excitation energy (eV)",
+        description="About 10 eV times the atomic number.",
+    )
+    table: Path | None = Field(
+        default=None, title="Stopping table", description="File with the stopping by SRIM."
+    )
+
+    @model_validator(mode="after")
+    def _is_known(self) -> Material:
+        formula = (self.density, self.charge_per_mass, self.excitation)
+        if (self.table is None) == all(value is None for value in formula):
+            raise ValueError("expected a table, or density, charge_per_mass and excitation")
+        if self.table is None and None in formula:
+            raise ValueError("expected density, charge_per_mass and excitation, all three")
+        return self
+
+    def stopping(self) -> Stopping:
+        """How protons lose energy in it."""
+        if self.table is not None:
+            return Stopping.from_srim(self.table)
+        assert self.density is not None
+        assert self.charge_per_mass is not None
+        assert self.excitation is not None
+        return Stopping.by_bethe(self.density, self.charge_per_mass, self.excitation)
+
+
+def _matter(density: float, charge_per_mass: float, excitation: float) -> Material:
+    return Material(density=density, charge_per_mass=charge_per_mass, excitation=excitation)
+
+
+# Densities, Z/A and excitation energies of elements and polymers: ICRU Report 49. Of active layers,
+# density and composition are those of their makers, and the excitation follows by Bragg's rule.
+MATERIALS = {
+    "Al": _matter(2699, 0.48181, 166.0),
+    "Fe": _matter(7874, 0.46557, 286.0),
+    "Cu": _matter(8960, 0.45636, 322.0),
+    "Ta": _matter(16654, 0.40343, 718.0),
+    "Ti": _matter(4540, 0.45961, 233.0),
+    "Au": _matter(19320, 0.40108, 790.0),
+    "Mylar": _matter(1400, 0.52037, 78.7),
+    "polyester": _matter(1350, 0.52037, 78.7),
+    "polystyrene": _matter(1060, 0.53768, 68.7),
+    "Kapton": _matter(1420, 0.51264, 79.6),
+    "CR-39": _matter(1310, 0.52697, 73.1),
+    "EBT active": _matter(1200, 0.5450, 69.6),
+    "HD active": _matter(1080, 0.5453, 66.6),
+}
+
+
+class Slab(BaseModel):
+    """One material, so thick; from a text such as ``13 um Al``, too."""
+
+    model_config = _CONFIG
+    material: str
+    thickness: float = Field(gt=0, le=0.1, title="Thickness (m)")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_text(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        parts = _SLAB.match(value.strip())
+        if parts is None:
+            raise ValueError("expected thickness, unit (um or mm) and material, such as 13 um Al")
+        micrometres = float(parts["number"]) * (1000 if parts["unit"] == "mm" else 1)
+        return {"material": parts["material"], "thickness": micrometres * 1e-6}
+
+
+_SLAB = re.compile(r"(?P<number>\d+\.?\d*)\s*(?P<unit>um|µm|μm|mm)\s+(?P<material>\S.*)")
+
+
+def _listed(value: Any) -> Any:
+    """The slabs of a text that separates them by semicolons."""
+    return [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
+
+
+Slabs = Annotated[tuple[Slab, ...], BeforeValidator(_listed)]
+
+
+class FilmType(BaseModel):
+    """A kind of film, in the order in which protons cross it, and how it darkens."""
+
+    model_config = _CONFIG
+    before: Slabs = Field(default=(), title="Before", description="In front of the active layer.")
+    active: Slab = Field(title="Active layer", description="Such as 12 um HD active.")
+    behind: Slabs = Field(default=(), title="Behind", description="Behind the active layer.")
+    calibration: Path | None = Field(
+        default=None, title="Calibration", description="Table (.csv) of doses and pixels."
+    )
+    unexposed: Path | None = Field(
+        default=None, title="Unexposed film", description="Scan of a film that saw nothing."
+    )
+    dose_range: tuple[float, float] = Field(
+        default=(0.0, np.inf),
+        title="Range of doses (Gy)",
+        description="Rows of the calibration to use; tables are often continued by extrapolation.",
+    )
+
+
+def _slab(material: str, micrometres: float) -> Slab:
+    return Slab(material=material, thickness=micrometres * 1e-6)
+
+
+_EBT_BASE = (_slab("polyester", 125),)
+# As Ashland describes them.
+FILM_TYPES = {
+    "HDV2": FilmType(active=_slab("HD active", 12), behind=(_slab("polyester", 97),)),
+    "EBT3": FilmType(before=_EBT_BASE, active=_slab("EBT active", 28), behind=_EBT_BASE),
+    "MDV3": FilmType(before=_EBT_BASE, active=_slab("EBT active", 10), behind=_EBT_BASE),
+}
+
+
+class PackLayer(BaseModel):
+    """A film of the pack, and the filters in front of it."""
+
+    model_config = _CONFIG
+    film: str = Field(title="Film", description="Its type.")
+    filters: Slabs = Field(
+        default=(), title="Filters", description="In front of it, such as 13 um Al; 25 um Fe."
+    )
+    file: Path | None = Field(
+        default=None, title="Scan", description="Its file; otherwise it is one of the pack's scan."
+    )
+    turned: Literal[0, 180] = Field(
+        default=0, title="Turned (°)", description="180 if it was scanned upside down."
+    )
+    mirrored: bool = Field(
+        default=False, title="Mirrored", description="Whether it was scanned with its back down."
+    )
+    mask: Path | None = Field(
+        default=None,
+        title="Mask",
+        description="Image of the upright film's shape, 0 at unusable pixels.",
+    )
+    exclude: bool = Field(
+        default=False, title="Exclude", description="Whether its scan tells nothing."
+    )
+
+
+class Pack(BaseModel):
+    """Films and filters, the first in front; what their types and materials are.
+
+    Types and materials that are given take the place of those known by their names; what a type
+    leaves out is taken from the known one.
+    """
+
+    model_config = _CONFIG
+    layers: tuple[PackLayer, ...] = Field(
+        min_length=1, title="Layers", description="Films and the filters in front of each."
+    )
+    films: Mapping[str, FilmType] = Field(
+        default_factory=dict, title="Films", description="By type: layers, calibration."
+    )
+    materials: Mapping[str, Material] = Field(
+        default_factory=dict, title="Materials", description="How filters and films stop protons."
+    )
+    setup: Mapping[str, Any] | None = Field(
+        default=None,
+        title="Setup",
+        description="Distances, object_image_distance to the first film. The scans tell the size "
+        "of pixels, the pack the energies.",
+    )
+    scan: Path | None = Field(
+        default=None,
+        title="Scan",
+        description="One scan with the films of all layers without a file, row by row.",
+    )
+    corners: Path | None = Field(
+        default=None,
+        title="Corners",
+        description="Table (.csv) of films on their scans, by number: film, y1, x1, … y4, x4.",
+    )
+    pixel_size: float | None = Field(
+        default=None,
+        gt=0,
+        le=0.01,
+        title="Pixel size of the scans (m)",
+        description="Default: as their files say.",
+    )
+    rim: int = Field(
+        default=6,
+        ge=0,
+        title="Rim (px)",
+        description="What does not count along the edges of the films: cut, bent or burnt.",
+    )
+    align: Literal["images", "edges"] = Field(
+        default="images",
+        title="Align",
+        description="By what films show alike, or by their edges alone.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete_types(cls, values: Any) -> Any:
+        films = values.get("films") if isinstance(values, Mapping) else None
+        if not isinstance(films, Mapping):
+            return values
+        whole = {
+            name: {**FILM_TYPES[name].model_dump(), **given}
+            if name in FILM_TYPES and isinstance(given, Mapping)
+            else given
+            for name, given in films.items()
+        }
+        return {**values, "films": whole}
+
+    @model_validator(mode="after")
+    def _has_all_parts(self) -> Pack:
+        for number, layer in enumerate(self.layers, 1):
+            _check_known(layer.film, self.kinds, f"layer {number} is a film of type", "films")
+            for slab in self._slabs(layer):
+                _check_known(slab.material, self._matter, f"layer {number} has", "materials")
+        if self.setup is not None and "energy" in self.setup:
+            raise ValueError("the setup has an energy: leave it out, films see one each")
+        if self.setup is not None:
+            self.setups(np.ones(len(self.layers)), 1e-4)
+        return self
+
+    @property
+    def kinds(self) -> dict[str, FilmType]:
+        """Types of films by name, those known and those given."""
+        return FILM_TYPES | dict(self.films)
+
+    @property
+    def _matter(self) -> dict[str, Material]:
+        return MATERIALS | dict(self.materials)
+
+    def _slabs(self, layer: PackLayer) -> tuple[Slab, ...]:
+        film = self.film(layer)
+        return (*layer.filters, *film.before, film.active, *film.behind)
+
+    @property
+    def files(self) -> list[Path]:
+        """All files that it names."""
+        named = [self.scan, self.corners]
+        named += [file for layer in self.layers for file in (layer.file, layer.mask)]
+        named += [file for one in self.films.values() for file in (one.calibration, one.unexposed)]
+        named += [matter.table for matter in self.materials.values()]
+        return [file for file in named if file is not None]
+
+    def film(self, layer: PackLayer) -> FilmType:
+        """The type of a layer's film."""
+        return self.kinds[layer.film]
+
+    def setups(self, energies: ArrayLike, pixel_size: float | None) -> tuple[Setup, ...]:
+        """Setup of each layer, on common pixels at the object; none if the pack has no setup.
+
+        Parameters
+        ----------
+        energies : array_like, shape (n,)
+            In MeV.
+        pixel_size : float or None
+            Of the scans in m, where the setup does not tell that of the first film.
+        """
+        if self.setup is None:
+            return ()
+        size = {} if pixel_size is None else {"detector_pixel_size": pixel_size}
+        given = {"kind": "proton", **(size if "pixel_size" not in self.setup else {}), **self.setup}
+        known = np.asarray(energies, np.float64)
+        if given["kind"] != "proton" or given.get("species", "proton") != "proton":
+            raise InputError("the pack's setup is not one of protons, whose stopping is known")
+        first = setup_from_dict({**given, "energy": float(known[0])}, "setup")
+        common = {"pixel_size": first.object_pixel_size, "detector_pixel_size": None}
+        return tuple(
+            first.model_copy(
+                update={
+                    **common,
+                    "energy": float(energy),
+                    "object_image_distance": first.object_image_distance + float(depth),
+                }
+            )
+            for energy, depth in zip(known, self.depths(), strict=True)
+        )
+
+    def depths(self) -> FloatArray:
+        """Return how far behind the first film's active layer each film's is, in m."""
+        surface, found = 0.0, []
+        for layer in self.layers:
+            film = self.film(layer)
+            surface += sum(slab.thickness for slab in (*layer.filters, *film.before))
+            found.append(surface + film.active.thickness / 2)
+            surface += sum(slab.thickness for slab in (film.active, *film.behind))
+        return np.array(found) - found[0]
+
+    def stoppings(self) -> dict[str, Stopping]:
+        """How protons lose energy in each material that it has."""
+        names = {slab.material for layer in self.layers for slab in self._slabs(layer)}
+        return {name: self._matter[name].stopping() for name in sorted(names)}
+
+
+def _check_known(name: str, known: Mapping[str, Any], who: str, table: str) -> None:
+    if name not in known:
+        meant = nearest(name, list(known))
+        hint = f"did you mean '{meant}'?" if meant else f"known are {', '.join(known)}"
+        raise ValueError(f"{who} '{name}': {hint} Others are described under [{table}]")

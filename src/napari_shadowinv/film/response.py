@@ -1,0 +1,139 @@
+"""What the films of a pack see of protons of each energy: `Response`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.film.pack import Pack, Slab
+from napari_shadowinv.film.stopping import PROTON_MASS, Stopping
+
+__all__ = ["Band", "Response", "relative_strengths"]
+
+_MEV = 1.602176634e-13  # J
+_FIRST, _LAST, _STEPS = 0.5, 200.0, 6000  # MeV
+_BAND = 0.5  # of the peak
+
+
+@dataclass(frozen=True)
+class Band:
+    """Which protons a film sees best, in MeV.
+
+    Attributes
+    ----------
+    peak : float
+        Those that lose most energy in it: they stop there.
+    low, high : float
+        Around the peak: where they lose half as much.
+    """
+
+    peak: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """The energy that one proton loses in the active layer of each film.
+
+    Attributes
+    ----------
+    energies : ndarray, shape (n,)
+        Of protons in front of the pack, in MeV, increasing.
+    deposits : ndarray, shape (layers, n)
+        What they lose in each active layer, in MeV.
+    doses : ndarray, shape (layers, n)
+        Dose in Gy by one proton per m².
+    """
+
+    energies: FloatArray
+    deposits: FloatArray
+    doses: FloatArray
+
+    @classmethod
+    def of(cls, pack: Pack, energies: ArrayLike | None = None) -> Response:
+        """Work it out for a pack.
+
+        Parameters
+        ----------
+        pack : Pack
+        energies : array_like, shape (n,), optional
+            In MeV. Default: so close together that each film's peak is well resolved.
+
+        Raises
+        ------
+        InputError
+            If an energy is above what a stopping table tells.
+        """
+        stoppings = pack.stoppings()
+        last = min(_LAST, *(one.energies[-1] for one in stoppings.values()))
+        inside = np.geomspace(_FIRST, last, _STEPS) if energies is None else np.asarray(energies)
+        first = np.array(inside, dtype=np.float64)
+        deposits, doses = [], []
+        now = first
+        for layer in pack.layers:
+            film = pack.film(layer)
+            before = _behind(stoppings, (*layer.filters, *film.before), now)
+            after = _behind(stoppings, (film.active,), before)
+            mass = stoppings[film.active.material].density * film.active.thickness  # kg/m²
+            deposits.append(before - after)
+            doses.append((before - after) * _MEV / mass)
+            now = _behind(stoppings, film.behind, after)
+        return cls(first, np.stack(deposits), np.stack(doses))
+
+    @property
+    def bands(self) -> tuple[Band, ...]:
+        """The band of each film.
+
+        Raises
+        ------
+        InputError
+            If no proton of these energies reaches a film.
+        """
+        found = []
+        for number, deposit in enumerate(self.deposits, 1):
+            top = int(np.argmax(deposit))
+            if not deposit[top] > 0:
+                raise InputError(
+                    f"no proton of up to {self.energies[-1]:.4g} MeV reaches film {number}: check "
+                    "the thicknesses of the pack, which are in m"
+                )
+            above = np.flatnonzero(deposit >= _BAND * deposit[top])
+            first = above[0]
+            # The first gap ends it; protons that are much faster cross all films.
+            gaps = np.flatnonzero(np.diff(above[above >= top]) > 1)
+            last = above[above >= top][gaps[0]] if gaps.size else above[-1]
+            low, peak, high = (float(self.energies[k]) for k in (first, top, last))
+            found.append(Band(peak, low, high))
+        return tuple(found)
+
+
+def _behind(
+    stoppings: dict[str, Stopping], slabs: Sequence[Slab], energies: FloatArray
+) -> FloatArray:
+    for slab in slabs:
+        energies = stoppings[slab.material].behind(energies, slab.thickness)
+    return energies
+
+
+def check_increasing(bands: Sequence[Band]) -> None:
+    """Reject a pack whose films do not see faster and faster protons."""
+    for number, (one, other) in enumerate(pairwise(bands), 1):
+        if other.peak <= one.peak:
+            raise InputError(
+                f"film {number + 1} sees {other.peak:.3g} MeV, film {number} {one.peak:.3g} MeV: "
+                "expected films in the order in which protons reach them"
+            )
+
+
+def relative_strengths(energies: ArrayLike) -> FloatArray:
+    """Return how far a magnetic field displaces protons of each energy (MeV), as to the first."""
+    known = np.asarray(energies, np.float64)
+    momenta = np.sqrt(known * (known + 2 * PROTON_MASS))
+    return np.asarray(momenta[0] / momenta)

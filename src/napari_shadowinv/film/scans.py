@@ -1,0 +1,296 @@
+"""Films on the bed of a scanner.
+
+- where they are: `find_films`
+- one of them cut out and turned upright: `straightened`
+- corners from a table and to one: `read_corners`, `write_corners`
+
+Corners are in px of the scan, (y, x), from the film's top left in the direction of reading, shape
+(4, 2); a scan has shape (H, W, 3).
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+
+from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import FileFormatError, InputError
+
+__all__ = ["find_films", "read_corners", "straightened", "write_corners"]
+
+_DARKER = 0.75  # of the bed's brightness, in the film's darkest colour
+_BED = 99.0  # percentile of the brightness
+_SMALLEST = 0.02  # of the scan's area, or `least_side` squared
+_DUST = 2  # px
+_ENDS = 0.08  # of a side, at its ends, do not count for its place: corners are cut and bent
+_NEAR = 0.04  # of the film's size: how far from a side its border may be
+_ROUNDS, _OUTLIERS = 8, 2.5
+_HEADER = ["film", "y1", "x1", "y2", "x2", "y3", "x3", "y4", "x4"]
+
+
+def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[FloatArray]:
+    """Return the corners of the films on a scan, row by row as one reads.
+
+    Parameters
+    ----------
+    scan : array_like, shape (H, W, 3)
+        Films on a bright bed, none of which touches another.
+    least_side : float, optional
+        Smaller side of the smallest film in px. Default: a seventh of the scan's.
+
+    Returns
+    -------
+    list of ndarray, shape (4, 2)
+        Of straight lines along the sides; chips and notches do not count.
+
+    Raises
+    ------
+    InputError
+        If there is no film, or the scan has no colours.
+    """
+    values = checked_scan(scan)
+    inside = _darker_than_bed(values)
+    height, width = inside.shape
+    area = _SMALLEST * height * width if least_side is None else least_side**2
+    labels, count = ndimage.label(inside)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    wanted = [number for number in range(1, count + 1) if sizes[number] >= area]
+    if not wanted:
+        raise InputError(
+            "no film was found on the scan: expected films darker than a bright bed around them; "
+            "give their corners"
+        )
+    slices = ndimage.find_objects(labels)
+    found = []
+    for number in wanted:
+        top, left = (one.start for one in slices[number - 1])
+        film = ndimage.binary_fill_holes(labels[slices[number - 1]] == number)
+        found.append(_rectangle(film) + np.array([top, left]))
+    return _in_reading_order(found)
+
+
+def straightened(
+    scan: ArrayLike,
+    corners: ArrayLike,
+    *,
+    shape: tuple[int, int] | None = None,
+    scale: float = 1.0,
+) -> AnyArray:
+    """Return a film cut out of a scan and turned upright.
+
+    Parameters
+    ----------
+    scan : array_like, shape (H, W) or (H, W, C)
+    corners : array_like, shape (4, 2)
+    shape : tuple of int, optional
+        Of what is returned. Default: that of the film.
+    scale : float, default 1
+        Side of its pixels in those of the scan.
+
+    Returns
+    -------
+    ndarray of float64
+        Cubic between the scan's pixels, within their range; beyond its edge as there.
+    """
+    values = np.asarray(scan)
+    places = checked_corners(corners)
+    (along_y, along_x), middle, size = upright(places)
+    height, width = (round(side / scale) for side in size) if shape is None else shape
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    steps = scale * np.stack([y - (height - 1) / 2, x - (width - 1) / 2])
+    at = middle[:, None, None] + np.einsum("kc,kyx->cyx", np.stack([along_y, along_x]), steps)
+    planes = values[..., None] if values.ndim == 2 else values
+    cut = []
+    for c in range(planes.shape[-1]):
+        plane = planes[..., c].astype(np.float64)
+        # Cubic, because linear interpolation would blur film and noise, here more and there less.
+        smooth = ndimage.map_coordinates(plane, at, order=3, mode="nearest")
+        cut.append(np.clip(smooth, plane.min(), plane.max()))
+    return cut[0] if values.ndim == 2 else np.stack(cut, axis=-1)
+
+
+def common_shape(sizes: ArrayLike) -> tuple[int, int]:
+    """Return the shape that films of sizes (n, 2) are given when they are straightened."""
+    height, width = np.median(np.asarray(sizes, np.float64), axis=0)
+    return round(height), round(width)
+
+
+def checked_scan(scan: ArrayLike) -> AnyArray:
+    """Return a colour scan without its alpha channel, or raise an `InputError`."""
+    values = np.asarray(scan)
+    if values.ndim != 3 or values.shape[-1] not in (3, 4) or not values.size:
+        raise InputError(
+            f"the scan has shape {values.shape}: expected (height, width, 3), in red, green and "
+            "blue"
+        )
+    return values[..., :3]
+
+
+def checked_corners(corners: ArrayLike) -> FloatArray:
+    """Return corners, or raise an `InputError`."""
+    places = np.asarray(corners, dtype=np.float64)
+    if places.shape != (4, 2) or not np.isfinite(places).all():
+        raise InputError(
+            f"corners have shape {places.shape}: expected (y, x) of four, from the top left in "
+            "the direction of reading"
+        )
+    sides = np.roll(places, -1, axis=0) - places
+    turns = sides[:, 0] * np.roll(sides, -1, axis=0)[:, 1]
+    turns -= sides[:, 1] * np.roll(sides, -1, axis=0)[:, 0]
+    if not (turns < 0).all():
+        raise InputError(
+            f"corners {places.round(1).tolist()} do not go around a film in the direction of "
+            "reading: expected top left, top right, bottom right, bottom left, each as (y, x)"
+        )
+    return places
+
+
+def _darker_than_bed(values: AnyArray) -> BoolArray:
+    darkest = values.min(axis=-1)
+    bed = np.percentile(darkest, _BED)
+    dark = darkest < _DARKER * bed
+    return np.asarray(ndimage.binary_opening(dark, np.ones((3, 3)), iterations=_DUST))
+
+
+def _rectangle(film: BoolArray) -> FloatArray:
+    """The corners of lines along the four sides of a region."""
+    from scipy.spatial import ConvexHull
+
+    rim = film & ~ndimage.binary_erosion(film)
+    border = np.argwhere(rim).astype(np.float64)
+    hull = border[ConvexHull(border).vertices]
+    axes = _axes_of_smallest_box(hull)
+    for _ in range(2):  # the second time in the direction of the film, not of its hull
+        turned = border @ axes.T
+        low, high = turned.min(axis=0), turned.max(axis=0)
+        lines = []
+        for axis in (0, 1):
+            for edge in (low[axis], high[axis]):
+                lines.append(_side(turned, axis, edge, low, high))
+        (top, bottom), (left, right) = lines[:2], lines[2:]
+        corners = [
+            _meeting(top, left),
+            _meeting(top, right),
+            _meeting(bottom, right),
+            _meeting(bottom, left),
+        ]
+        # From the middle of the border's pixels to their outer edge.
+        outward = 0.5 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+        places = (np.array(corners) + outward) @ axes
+        (axes, _, _) = upright(places)
+    return places
+
+
+def _axes_of_smallest_box(hull: FloatArray) -> FloatArray:
+    """Unit vectors (down, right) along the sides of the smallest rectangle around some points."""
+    best, found = np.inf, np.eye(2)
+    for step in np.diff(hull, axis=0, append=hull[:1]):
+        along = step / np.hypot(*step)
+        axes = np.stack([along, [-along[1], along[0]]])
+        area = np.ptp(hull @ axes.T, axis=0).prod()
+        if area < best:
+            best, found = area, axes
+    down = found[np.argmax(np.abs(found[:, 0]))]
+    down = down * np.sign(down[0])
+    return np.stack([down, [-down[1], down[0]]])
+
+
+def _side(
+    turned: FloatArray, axis: int, edge: float, low: FloatArray, high: FloatArray
+) -> tuple[float, float]:
+    """Offset and slope of the line along a side, which most of its pixels agree on."""
+    size = (high - low)[1 - axis]
+    along, across = turned[:, 1 - axis], turned[:, axis]
+    inner = np.abs(along - (low + high)[1 - axis] / 2) < (0.5 - _ENDS) * size
+    near = np.abs(across - edge) < _NEAR * max(high - low)
+    along, across = along[inner & near], across[inner & near]
+    used = np.ones(along.size, bool)
+    slope = offset = 0.0
+    for _ in range(_ROUNDS):
+        slope, offset = np.polyfit(along[used], across[used], 1)
+        away = np.abs(across - offset - slope * along)
+        used = away <= max(_OUTLIERS * 1.5 * np.median(away), 0.5)
+    return float(offset), float(slope)
+
+
+def _meeting(row: tuple[float, float], column: tuple[float, float]) -> tuple[float, float]:
+    """Where a line y = a + b x meets a line x = c + d y."""
+    (a, b), (c, d) = row, column
+    y = (a + b * c) / (1 - b * d)
+    return y, c + d * y
+
+
+def upright(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return unit vectors (down, right) of a film, its middle, and its height and width."""
+    top_left, top_right, bottom_right, bottom_left = corners
+    across = (top_right - top_left + bottom_right - bottom_left) / 2
+    down = (bottom_left - top_left + bottom_right - top_right) / 2
+    # One direction of both, as films are cut at right angles.
+    right = across + np.array([-down[1], down[0]])
+    right = right / np.hypot(*right)
+    axes = np.stack([[right[1], -right[0]], right])
+    size = np.array([np.hypot(*down), np.hypot(*across)])
+    return axes, corners.mean(axis=0), size
+
+
+def _in_reading_order(films: Sequence[FloatArray]) -> list[FloatArray]:
+    """Row by row: films whose middles are within half a height of each other make a row."""
+    ordered = sorted(films, key=lambda film: film[:, 0].mean())
+    rows: list[list[FloatArray]] = []
+    for film in ordered:
+        height = np.ptp(film[:, 0])
+        if rows and film[:, 0].mean() - rows[-1][0][:, 0].mean() < height / 2:
+            rows[-1].append(film)
+        else:
+            rows.append([film])
+    return [film for row in rows for film in sorted(row, key=lambda one: one[:, 1].mean())]
+
+
+@refusing_damage
+def _corners_in(path: Path) -> dict[str, FloatArray]:
+    text = small_text(path, "a table of corners, comma-separated values", "utf-8-sig")
+    lines = [line for line in csv.reader(text.splitlines()) if any(map(str.strip, line))]
+    names = [name.strip().lower() for name in lines[0]] if lines else []
+    if names != _HEADER:
+        raise FileFormatError(
+            f"{path} has the columns {', '.join(names) or 'none'}: expected {', '.join(_HEADER)}"
+        )
+    found: dict[str, FloatArray] = {}
+    for number, cells in enumerate(lines[1:], 2):
+        try:
+            values = np.array([float(cell) for cell in cells[1:]]).reshape(4, 2)
+        except ValueError:
+            raise FileFormatError(
+                f"{path}, line {number} has {', '.join(cells)[:80]}: expected a film and eight "
+                "numbers"
+            ) from None
+        found[cells[0].strip()] = checked_corners(values)
+    return found
+
+
+def read_corners(path: str | Path) -> dict[str, FloatArray]:
+    """Read a table of corners: film, y1, x1, … y4, x4.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is no such table.
+    InputError
+        If corners do not go around a film.
+    """
+    return _corners_in(path)
+
+
+def write_corners(path: str | Path, films: dict[str, FloatArray]) -> None:
+    """Write a table that `read_corners` reads."""
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(_HEADER)
+        for name, corners in films.items():
+            rows.writerow([name, *(f"{value:.2f}" for value in np.ravel(corners))])

@@ -1,0 +1,226 @@
+"""From the doses of a pack's films to the fluence of protons at each energy: `unfold`.
+
+Protons that stop in a film have left dose in all films before it. The doses of a pixel in all
+films together tell the spectrum there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import nnls
+
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.film.response import Response, check_increasing
+
+__all__ = ["Spectra", "unfold"]
+
+_PART = 4096  # pixels
+# Of the last energy: in how many MeV the spectrum falls to 1/e beyond it.
+_FIRST_SLOPE, _FASTEST, _SLOWEST = 0.15, 0.02, 2.0
+_ROUNDS = 100
+_DISPLACED = 0.75  # displacement falls with this power of the energy: 0.5 by B, 1 by E
+
+
+class Spectra(NamedTuple):
+    """Fluence per energy in every pixel.
+
+    Attributes
+    ----------
+    energies : ndarray, shape (n,)
+        In MeV, of the protons that a layer's fluence shows: how far fields displace these is the
+        mean over all that contribute.
+    fluence : ndarray of float64, shape (n, H, W)
+        Protons per m² and MeV where those of each film stop.
+    error : ndarray of float64, shape (n, H, W)
+        Its standard deviation.
+    """
+
+    energies: FloatArray
+    fluence: FloatArray
+    error: FloatArray
+
+
+class _Basis(NamedTuple):
+    """Spectra as shares of the usual one at the films' energies, and the doses that they leave.
+
+    Shares are linear in how far fields displace the protons. So the unfolded images are those of
+    one energy each, to the first order of the displacement.
+    """
+
+    peaks: FloatArray  # (n,), MeV
+    usual: FloatArray  # (n,), at the peaks
+    kernel: FloatArray  # (n, m), dose in each film by the usual spectrum in each step of energy
+    energies: FloatArray  # (m,)
+    matrix: FloatArray  # (n, n), dose in film k by share j
+    bends: FloatArray  # (n - 2, n), how much shares are not linear
+
+    @classmethod
+    def of(cls, response: Response, usual: FloatArray, slope: float) -> _Basis:
+        """For a usual spectrum at the films' energies, which falls to 1/e in `slope` MeV beyond."""
+        peaks = np.array([band.peak for band in response.bands])
+        energies = response.energies
+        logarithm = np.interp(energies, peaks, np.log(usual))
+        logarithm -= np.maximum(energies - peaks[-1], 0) / slope
+        steps = np.gradient(energies)
+        steps[[0, -1]] /= 2
+        kernel = response.doses * np.exp(logarithm) * steps
+        places = _displacement(peaks)
+        shares = [
+            np.interp(-_displacement(energies), -places, share) for share in np.eye(len(peaks))
+        ]
+        apart = -np.diff(places)
+        bends = np.diff(np.eye(len(peaks)), 2, axis=0)
+        if len(bends):
+            both = apart[1:] + apart[:-1]
+            rows = np.arange(len(bends))
+            bends[rows, rows] = 2 * apart[1:] / both
+            bends[rows, rows + 2] = 2 * apart[:-1] / both
+        return cls(peaks, usual, kernel, energies, kernel @ np.array(shares).T, bends)
+
+    def seen_energies(self, per_error: FloatArray, curvature: float) -> FloatArray:
+        """Energies whose displacement is the mean over what each unfolded share is made of."""
+        weighed = per_error[:, None] * self.matrix
+        normal = weighed.T @ weighed + self.bends.T @ self.bends / curvature**2
+        unfolded = np.linalg.solve(normal, weighed.T * per_error) @ self.kernel
+        displaced = unfolded @ _displacement(self.energies) / unfolded.sum(axis=1)
+        return np.asarray(displaced ** (-1 / _DISPLACED))
+
+
+def _displacement(energies: FloatArray) -> FloatArray:
+    """How far fields displace protons, up to a factor."""
+    return np.asarray(energies**-_DISPLACED)
+
+
+def unfold(
+    doses: ArrayLike,
+    errors: ArrayLike,
+    response: Response,
+    *,
+    curvature: float = 1.0,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Spectra:
+    """Return the spectrum in every pixel that explains the doses of all films.
+
+    The fluences are the least squares of doses over their errors that are not negative; where they
+    do not tell, the spectrum over that of the mean doses is as straight as its curvature allows.
+    That of the mean doses falls exponentially from film to film, and so beyond the last.
+
+    Parameters
+    ----------
+    doses : array_like, shape (n, H, W)
+        In Gy, the films in the order of the pack, on the same pixels.
+    errors : array_like, shape (n, H, W)
+        Standard deviations as shares of the doses; infinite where a dose is not known. A dose
+        of exactly zero has no error by which it could count, and counts as unknown.
+    response : Response
+        Of the pack.
+    curvature : float, default 1
+        Usual bend of the spectrum from film to film, as a share of the mean spectrum.
+    on_progress, should_stop : callable, optional
+        Receives a `Progress` now and then; ends the work when it returns true.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit, doses are negative, or the films are in another order.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    given, shares = np.asarray(doses, np.float64), np.asarray(errors, np.float64)
+    count = len(response.doses)
+    if given.ndim != 3 or len(given) != count or shares.shape != given.shape:
+        raise InputError(
+            f"doses have shape {given.shape}, errors {shares.shape}: expected both as "
+            f"({count}, height, width), a plane for each film of the pack"
+        )
+    if not curvature > 0:
+        raise InputError(f"curvature is {curvature:g}: expected a number above 0")
+    known = np.isfinite(shares) & np.isfinite(given)
+    if (given[known] < 0).any():
+        raise InputError("doses are negative: expected those of films against unexposed film")
+    report = Reporter(on_progress, should_stop)
+    flat = np.where(known, given, 0.0).reshape(count, -1).T
+    absolute = np.where(known, shares * given, 0.0).reshape(count, -1).T
+    per_error = np.divide(1.0, absolute, out=np.zeros_like(absolute), where=absolute > 0)
+    mean = flat.sum(axis=0) / np.maximum((per_error > 0).sum(axis=0), 1)
+    basis = _usual_basis(mean, response)
+    bends = basis.bends / curvature
+    fluence, variance = np.zeros_like(flat), np.zeros_like(flat)
+    for first in range(0, len(flat), _PART):
+        report("unfold", first, len(flat))
+        part = slice(first, first + _PART)
+        found = _unfolded(flat[part], per_error[part], basis.matrix, bends)
+        fluence[part], variance[part] = found
+    planes = (count, *given.shape[1:])
+    scaled = [(values * basis.usual).T.reshape(planes) for values in (fluence, np.sqrt(variance))]
+    typical = np.sqrt((per_error**2).mean(axis=0))
+    return Spectra(basis.seen_energies(typical, curvature), *scaled)
+
+
+def _usual_basis(mean: FloatArray, response: Response) -> _Basis:
+    """For the spectrum of the mean doses, which goes on as it falls at its end."""
+    check_increasing(response.bands)
+    peaks = np.array([band.peak for band in response.bands])
+    slope = _FIRST_SLOPE * peaks[-1]
+    basis = _Basis.of(response, np.exp(-peaks / slope), slope)
+    for _ in range(_ROUNDS):
+        usual = _one_by_one(mean, basis.matrix / basis.usual)
+        if len(usual) > 1:
+            falls = max(np.log(usual[-2] / usual[-1]), 1e-9)
+            shortest, longest = _FASTEST * peaks[-1], _SLOWEST * peaks[-1]
+            told = np.clip((peaks[-1] - peaks[-2]) / falls, shortest, longest)
+            # Half way, because a slower fall beyond the last film makes the next one faster.
+            slope = float(np.sqrt(slope * told))
+        before, basis = basis.usual, _Basis.of(response, usual, slope)
+        if (np.abs(usual / before - 1) < 1e-4).all():
+            break
+    return basis
+
+
+def _one_by_one(mean: FloatArray, matrix: FloatArray) -> FloatArray:
+    """The spectrum from the last film to the first; positive."""
+    found = np.zeros(len(mean))
+    seen = np.flatnonzero(mean > 0)
+    for k in seen[::-1]:
+        left = mean[k] - matrix[k, k + 1 :] @ found[k + 1 :]
+        # A part of its own, even if the others explain all of it.
+        found[k] = max(left, 0.05 * mean[k]) / matrix[k, k]
+    if not seen.size:
+        return np.ones(len(mean))
+    # A film that tells nothing is as those beside it.
+    return np.exp(np.interp(np.arange(len(mean)), seen, np.log(found[seen])))
+
+
+def _unfolded(
+    doses: FloatArray, per_error: FloatArray, matrix: FloatArray, bends: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Spectra in units of the usual one, and their variances."""
+    weighed = per_error[:, :, None] * matrix
+    sides = per_error * doses
+    # The bends are those of a spectrum as strong as the pixel's own.
+    strength = _strength(doses, per_error > 0, matrix)
+    ties = bends / strength[:, None, None]
+    normal = weighed.transpose(0, 2, 1) @ weighed + ties.transpose(0, 2, 1) @ ties
+    normal += 1e-12 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(matrix.shape[1])
+    inverse = np.linalg.inv(normal)
+    found = (inverse @ (weighed.transpose(0, 2, 1) @ sides[:, :, None]))[:, :, 0]
+    nothing = np.zeros(len(bends))
+    for k in np.flatnonzero((found < 0).any(axis=1)):
+        found[k] = nnls(np.concatenate([weighed[k], ties[k]]), np.append(sides[k], nothing))[0]
+    return found, np.diagonal(inverse, axis1=1, axis2=2)
+
+
+def _strength(doses: FloatArray, known: BoolArray, matrix: FloatArray) -> FloatArray:
+    """How much stronger than the usual spectrum each pixel's is."""
+    expected = matrix.sum(axis=1)
+    ratio = np.where(known, doses / expected, np.nan)
+    strength = np.ones(len(doses))
+    some = known.any(axis=1)
+    strength[some] = np.nanmedian(ratio[some], axis=1)
+    return np.where(np.isfinite(strength) & (strength > 0), strength, 1.0)

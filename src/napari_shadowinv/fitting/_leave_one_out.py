@@ -1,0 +1,376 @@
+"""Each of several images predicted from a fit of the others: `leave_one_out`.
+
+Images that one field does not explain along with the rest spoil every fit that they take part in.
+They are found first, in larger pixels, and take part in no prediction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.fitting._fit import reweighted, starts
+from napari_shadowinv.fitting.agreement import LeaveOneOut, check_count, explanation_of
+from napari_shadowinv.fitting.compilation import ensure_compiled
+from napari_shadowinv.fitting.descent import coarser, finer
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.measurements import Measured, measured
+from napari_shadowinv.fitting.minimise import product
+from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.fitting.rays import at_rest
+from napari_shadowinv.fitting.search import (
+    FIRST_SMOOTHNESS,
+    HELD,
+    MIDDLE,
+    MIDDLE_SPACING,
+    Found,
+    refined,
+    search,
+    settled,
+    with_likely_smoothness,
+)
+from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.options import FitOptions
+from napari_shadowinv.physics.setup import Setup
+
+__all__ = ["leave_one_out"]
+
+_LEAST_AGREEING = 2
+_LAST_GAIN = 0.5
+# A prediction is off by more than the noise: by what the others leave open, which near folds is
+# up to five times what the Gaussian around the best field tells.
+_DRAWN, _OPEN, _SPACING_OF_SAMPLES = 4, 5.0, 1 / 3
+_WORSE = 1.15  # χ² over that of a field of the image's own
+_WORSE_IN_MIDDLE = 1.3  # the same in pixels of two, where a misfit counts four times
+_FRAME_STEPS = 4
+
+
+def leave_one_out(
+    images: ArrayLike,
+    *,
+    fields: Sequence[str] = ("B",),
+    setups: Sequence[Setup] | None = None,
+    options: FitOptions | None = None,
+    names: Sequence[str] | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+    **keywords: Any,
+) -> LeaveOneOut:
+    """Predict each of several images from a fit of the others, to see whether one field fits all.
+
+    Images that one field does not explain along with the rest are found first; they are predicted
+    like the others, and no image is predicted from them. Of the image that is left out only a gain
+    is adjusted, and where it lies if the options let images be aligned.
+
+    Parameters
+    ----------
+    images, fields, setups, options, names, **keywords
+        As for `fit`, with three images or more and without fiducials.
+    on_progress, should_stop : callable, optional
+        As for `fit`.
+
+    Returns
+    -------
+    LeaveOneOut
+
+    Raises
+    ------
+    InputError
+        As `fit`, and if there are fewer than three images.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    options = options or FitOptions()
+    usual: dict[str, Any] = {
+        "strengths": None,
+        "source": None,
+        "noise": None,
+        "psf": 0.0,
+        "mask": None,
+        "gains": "known",
+    }
+    given = measured(
+        images,
+        fields=fields,
+        setups=setups,
+        options=options,
+        names=names,
+        fiducials=None,
+        **{**usual, **keywords},
+    )
+    check_count(len(given.units))
+    ensure_compiled(on_progress, should_stop)
+    report = Reporter(on_progress, should_stop)
+    steps = 0
+
+    def tell(stage: str, objective: float) -> None:
+        nonlocal steps
+        steps += 1
+        report("leave one out", steps, None, f"{stage}, objective {objective:.6g}")
+
+    work = _Work(given, options, tell)
+    begun = work.begun(should_stop)
+    agreeing = work.agreeing(begun)
+    scene, common = work.with_likely_smoothness(agreeing, begun)
+    predictions = work.predictions(agreeing, scene, common)
+    return _result(given, predictions, setups, names)
+
+
+@dataclass(frozen=True)
+class _Prediction:
+    """An image as others predict it, in units of its beam, and what χ² it may have."""
+
+    image: FloatArray
+    gain: float
+    chi2: float
+    alone: float
+    limit: float
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """What a fit at full size tells: unknowns of all images, and what it leaves open."""
+
+    unknowns: Unknowns
+    spacing: float
+    drawn: list[Unknowns]
+
+
+class _Work:
+    """What all steps need: images, options, whom to tell."""
+
+    def __init__(self, given: Measured, options: FitOptions, tell: Any) -> None:
+        self._given, self._options, self._tell = given, options, tell
+        self._count = len(given.units)
+
+    def begun(self, should_stop: ShouldStop | None) -> Found:
+        """Where a search in all images ends, in pixels of two."""
+        scene = self._given.held(self._options.smoothness)
+        begun = starts(self._given, None, self._tell, should_stop)
+        return search(scene, begun, self._tell)[0]
+
+    def agreeing(self, begun: Found) -> list[int]:
+        """The most images that one field explains, found in pixels of two."""
+        scene = self._given.held(self._options.smoothness)
+        if self._options.smoothness is None:
+            usual = HELD * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
+            scene = replace(scene, smoothness=usual)
+        alone = [self._settled(scene, begun, [k], f"image {k + 1} alone") for k in self._all]
+        most: list[int] = []
+        left = self._all
+        while len(left) > len(most):
+            group = self._group(scene, begun, left, alone)
+            most = max(most, group, key=len)
+            left = [k for k in left if k not in group]
+        return most
+
+    def _group(self, scene: Scene, begun: Found, left: list[int], alone: list[Found]) -> list[int]:
+        """Images that one field explains: what is left without those that spoil a fit most."""
+        least = np.array([self._chi2_in_middle(scene, alone[k], [k])[0] for k in self._all])
+        together = self._settled(scene, begun, left, "all images")
+        while len(left) > _LEAST_AGREEING:
+            worse = self._chi2_in_middle(scene, together, left) / least[left]
+            if worse.max() < _WORSE_IN_MIDDLE:
+                break
+            tried = {}
+            for k in left:
+                others = [other for other in left if other != k]
+                # Unknowns of all images are kept, so that each can come back.
+                tried[k] = self._settled(scene, together, others, f"without image {k + 1}")
+            out = min(left, key=lambda k: tried[k].value + alone[k].value)
+            left = [k for k in left if k != out]
+            together = tried[out]
+        return left
+
+    @property
+    def _all(self) -> list[int]:
+        return list(range(self._count))
+
+    def with_likely_smoothness(self, members: list[int], begun: Found) -> tuple[Scene, Found]:
+        """All images with the λ and κ of some, and weights of counts; the field of those."""
+        scene = self._given.held(self._options.smoothness)
+        rng = np.random.default_rng(self._options.seed)
+        first = replace(begun, unknowns=begun.unknowns.only(members))
+        part, best = with_likely_smoothness(scene.only(members), first, rng, self._tell)
+        scene = replace(scene, smoothness=part.smoothness)
+        common = replace(best, unknowns=begun.unknowns.with_those(members, best.unknowns))
+        if self._given.counted:
+            scene = reweighted(self._given, scene, common)
+            common = self._settled(scene, common, members, "all that agree")
+        return scene, common
+
+    def predictions(self, agreeing: list[int], scene: Scene, common: Found) -> list[_Prediction]:
+        """Each image as all others predict it that agree.
+
+        Larger pixels may set aside too many: what the others predict comes back to them.
+        """
+        alone = [self._alone(scene, k, common) for k in self._all]
+        while True:
+            fitted = self._fitted(scene, common, agreeing)
+            outside = [k for k in self._all if k not in agreeing]
+            found = {k: self._predicted(k, agreeing, scene, fitted, alone[k]) for k in outside}
+            back = [k for k, one in found.items() if one.chi2 <= one.limit]
+            if not back:
+                break
+            agreeing = sorted([*agreeing, *back])
+        for k in agreeing:
+            others = [other for other in agreeing if other != k]
+            fitted = self._fitted(scene, common, others)
+            found[k] = self._predicted(k, others, scene, fitted, alone[k])
+        return [found[k] for k in self._all]
+
+    def _fitted(self, scene: Scene, common: Found, members: list[int]) -> _Fitted:
+        name = f"images {', '.join(str(k + 1) for k in members)}"
+        found = self._settled(scene, common, members, name, _LAST_GAIN)
+        part = scene.only(members)
+        first = replace(found, unknowns=found.unknowns.only(members))
+        fine, unknowns, *_ = refined(part, first, self._options, self._tell)
+        whole = finer(found.unknowns).with_those(members, unknowns)
+        posterior = Posterior(
+            replace(coarser(part, MIDDLE), spacing=_SPACING_OF_SAMPLES),
+            first.unknowns,
+            np.random.default_rng(self._options.seed),
+            lambda: self._tell(name, found.value),
+        )
+        drawn = [finer(posterior.drawn()) for _ in range(_DRAWN)]
+        return _Fitted(whole, fine.spacing, drawn)
+
+    def _predicted(
+        self, k: int, others: list[int], scene: Scene, fitted: _Fitted, alone: float
+    ) -> _Prediction:
+        """One image, as others predict it."""
+        scene = replace(scene, spacing=fitted.spacing)
+        whole = fitted.unknowns
+        if scene.free_frames.any():
+            whole = _placed(scene, whole, others[0], k)
+        there = whole.only([k])._replace(gains=np.zeros(1))
+        one = scene.only([k])
+        counts = one.ray_counts(there)
+        (made,) = one.model(there, counts)
+        gain, weights = self._matched(k, made, one)
+        chi2 = _chi2(gain * made, one.images[0], weights)
+        linear, nothing = one.linear(there, counts), there.zeros()
+        changes = [
+            linear.pushed(nothing._replace(potentials=drawn.potentials, beam=drawn.beam))
+            for drawn in fitted.drawn
+        ]
+        left_open = float(np.mean([_chi2(each[0], 0.0, one.weights[0] > 0) for each in changes]))
+        return _Prediction(gain * made, gain, chi2, alone, _WORSE * alone + _OPEN * left_open)
+
+    def _alone(self, scene: Scene, k: int, common: Found) -> float:
+        """χ² of an image with a field of its own."""
+        one, first = scene.only([k]), replace(common, unknowns=common.unknowns.only([k]))
+        found = settled(one, first, self._tell, f"image {k + 1} alone", _LAST_GAIN)
+        fine, unknowns, *_ = refined(one, found, self._options, self._tell)
+        return float(fine.chi2(unknowns, fine.ray_counts(unknowns))[0])
+
+    def _matched(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
+        """The gain with which a prediction is nearest to an image, and the weights of pixels."""
+        (weights,), (data,) = one.weights, one.images
+        gain = _gain(made, data, weights)
+        if self._given.counted:
+            unit = self._given.units[k]
+            expected = np.maximum(gain * made * unit, 1.0)
+            weights = np.where(weights > 0, unit**2 / expected, 0.0)
+            gain = _gain(made, data, weights)
+        return gain, weights
+
+    def _settled(
+        self,
+        scene: Scene,
+        found: Found,
+        members: list[int],
+        name: str,
+        least_gain: float | None = None,
+    ) -> Found:
+        """What some of the images tell; gains and frames of the others stay."""
+        first = replace(found, unknowns=found.unknowns.only(members))
+        known = {} if least_gain is None else {"least_gain": least_gain}
+        end = settled(scene.only(members), first, self._tell, name, **known)
+        return replace(end, unknowns=found.unknowns.with_those(members, end.unknowns))
+
+    @staticmethod
+    def _chi2_in_middle(scene: Scene, found: Found, members: list[int]) -> FloatArray:
+        middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
+        unknowns = found.unknowns.only(members)
+        return middle.chi2(unknowns, middle.ray_counts(unknowns))
+
+
+def _placed(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
+    """Find where an image lies, and its gain, beside one whose place is known."""
+    pair = scene.only([first, k])
+    held = np.append(np.where(scene.free_frames, scene.prior.frame_weights, 0.0), 1.0)
+    now = unknowns.only([first, k])
+    for _ in range(_FRAME_STEPS):
+        counts = pair.ray_counts(now)
+        linear = pair.linear(now, counts)
+        columns = [linear.pushed(change)[1].ravel() for change in _moves(now, scene.free_frames)]
+        misfit = (pair.model(now, counts) - pair.images)[1] * np.sqrt(pair.weights[1])
+        matrix = np.array([[product(a, b) for b in columns] for a in columns])
+        slope = np.array([product(one, misfit.ravel()) for one in columns])
+        about_rest = np.append(now.frames[1] - at_rest(), now.gains[1])
+        free = np.append(scene.free_frames, True)
+        step = np.linalg.solve(matrix + np.diag(held[free]), -slope - held[free] * about_rest[free])
+        for place, change in zip(np.flatnonzero(free), step, strict=True):
+            if place < len(scene.free_frames):
+                now.frames[1, place] += change
+            else:
+                now.gains[1] += change
+    return unknowns.with_those([k], now.only([1]))
+
+
+def _moves(unknowns: Unknowns, free: BoolArray) -> list[Unknowns]:
+    """A unit of each number of the second image's frame that is free, and of its gain."""
+    moves = []
+    for place in np.flatnonzero(free):
+        moves.append(unknowns.zeros())
+        moves[-1].frames[1, place] = 1
+    moves.append(unknowns.zeros())
+    moves[-1].gains[1] = 1
+    return moves
+
+
+def _gain(made: FloatArray, data: FloatArray, weights: FloatArray) -> float:
+    above = np.einsum("yx,yx,yx", weights, made, data)
+    return float(above / max(np.einsum("yx,yx,yx", weights, made, made), 1e-300))
+
+
+def _chi2(made: FloatArray, data: FloatArray | float, weights: AnyArray) -> float:
+    return float(((made - data) ** 2 * weights).sum() / (weights > 0).sum())
+
+
+def _result(
+    given: Measured,
+    predictions: Sequence[_Prediction],
+    setups: Sequence[Setup] | None,
+    names: Sequence[str] | None,
+) -> LeaveOneOut:
+    height, width = given.size
+    units = given.units[:, None, None]
+    used = given.scene.weights[:, :height, :width] > 0
+    data = given.scene.images[:, :height, :width] * units
+    made = np.stack([one.image for one in predictions])[:, :height, :width] * units
+    residual = np.where(used, data - made, 0.0)
+    level = np.where(used, data, 0.0).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
+    squares = (residual**2).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
+    chi2, alone, limit = (
+        np.array([getattr(one, name) for one in predictions]) for name in ("chi2", "alone", "limit")
+    )
+    return LeaveOneOut(
+        images=data,
+        mask=used,
+        predicted=made,
+        residual=residual,
+        gains=np.array([one.gain for one in predictions]) * given.gains,
+        chi2=chi2,
+        alone=alone,
+        limit=limit,
+        rms=np.sqrt(squares) / level,
+        explanation=explanation_of(chi2, limit, setups, names),
+    )

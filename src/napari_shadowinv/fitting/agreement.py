@@ -1,0 +1,177 @@
+"""Whether one static field explains several images: the result `LeaveOneOut`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.labels import label
+from napari_shadowinv.physics.setup import Setup
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["LeaveOneOut", "check_count", "explanation_of"]
+
+_PLANES = ("image", "y", "x")
+# Attribute: variable, dimensions, units, long name.
+_VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
+    "images": ("images", _PLANES, "flux/px²", "Image"),
+    "mask": ("mask", _PLANES, "1", "Pixels that were used"),
+    "predicted": ("left_out_prediction", _PLANES, "flux/px²", "Image as the others predict it"),
+    "residual": ("left_out_residual", _PLANES, "flux/px²", "Image minus prediction"),
+    "gains": ("left_out_gain", ("image",), "1", "Factor that the image is brighter by than given"),
+    "chi2": ("left_out_chi2", ("image",), "1", "Mean squared residual over the noise"),
+    "alone": ("left_out_alone", ("image",), "1", "The same with a field of the image's own"),
+    "limit": ("left_out_limit", ("image",), "1", "Largest χ² that one static field would give"),
+    "rms": ("left_out_rms", ("image",), "1", "R.m.s. residual over the image's mean"),
+}
+_SENTENCE = "left_out"
+_LARGE = 100.0
+_LEAST_IMAGES = 3
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Several images, each predicted from a fit of the others.
+
+    Attributes
+    ----------
+    images : ndarray, shape (L, H, W)
+        The data.
+    mask : ndarray of bool, shape (L, H, W)
+        The pixels that were used.
+    predicted, residual : ndarray, shape (L, H, W)
+        What the others predict, and data minus that; the residual is 0 where masked.
+    gains : ndarray, shape (L,)
+        How much brighter each image is than the source that was given; fitted to the prediction.
+    chi2 : ndarray, shape (L,)
+        Mean of (residual / σ)² over each image.
+    alone : ndarray, shape (L,)
+        The same if the image has a field of its own: what noise, source and point spread leave.
+    limit : ndarray, shape (L,)
+        The largest χ² that one static field would give: 1.15 times that of a field of its own, and
+        what the others leave open.
+    rms : ndarray, shape (L,)
+        R.m.s. residual, relative to the image's mean.
+    explanation : str
+        Which images one static field does not explain, in a sentence.
+    """
+
+    images: FloatArray
+    mask: BoolArray
+    predicted: FloatArray
+    residual: FloatArray
+    gains: FloatArray
+    chi2: FloatArray
+    alone: FloatArray
+    limit: FloatArray
+    rms: FloatArray
+    explanation: str
+
+    @property
+    def explained(self) -> BoolArray:
+        """Whether the field of the others explains each image, shape (L,)."""
+        return np.asarray(self.chi2 <= self.limit)
+
+    def only(self, numbers: Sequence[int]) -> LeaveOneOut:
+        """Return some of the images, in this order."""
+        chosen = list(numbers)
+        arrays = {name: getattr(self, name)[chosen] for name in _VARIABLES}
+        return LeaveOneOut(**arrays, explanation=self.explanation)
+
+    def to_dataset(self) -> xarray.Dataset:
+        """Return everything as one labelled dataset; that of a fit takes its variables, too."""
+        import xarray as xr
+
+        variables: dict[str, Any] = {
+            variable: (dims, getattr(self, name), label(units, text))
+            for name, (variable, dims, units, text) in _VARIABLES.items()
+        }
+        return xr.Dataset(variables, attrs={_SENTENCE: self.explanation})
+
+    @classmethod
+    def from_dataset(cls, dataset: xarray.Dataset) -> LeaveOneOut:
+        """Rebuild it from the dataset that has its variables.
+
+        Raises
+        ------
+        InputError
+            If one of them is missing.
+        """
+        missing = [one for one, *_ in _VARIABLES.values() if one not in dataset]
+        if missing or _SENTENCE not in dataset.attrs:
+            raise InputError(
+                f"dataset has no {', '.join(missing) or _SENTENCE}: expected the result of "
+                "shadowinv fit --leave-one-out"
+            )
+        arrays: dict[str, AnyArray] = {
+            name: np.ascontiguousarray(dataset[variable].values)
+            for name, (variable, *_) in _VARIABLES.items()
+        }
+        return cls(**arrays, explanation=str(dataset.attrs[_SENTENCE]))
+
+
+def check_count(count: int) -> None:
+    """Reject with an `InputError` images that are too few for one of them to be left out."""
+    if count < _LEAST_IMAGES:
+        raise InputError(
+            f"received {count} image{'s' * (count != 1)}: leaving one out needs {_LEAST_IMAGES} or "
+            "more, so that two or more predict it"
+        )
+
+
+def explanation_of(
+    chi2: FloatArray,
+    limit: FloatArray,
+    setups: Sequence[Setup] | None,
+    names: Sequence[str] | None,
+) -> str:
+    """Say which images one static field does not explain, in a sentence.
+
+    Parameters
+    ----------
+    chi2, limit : ndarray, shape (L,)
+        χ² of each image as the others predict it, and what it may be.
+    setups : sequence of Setup or None
+        Their energies name the images.
+    names : sequence of str or None
+        What the images are called otherwise. Default: their numbers.
+    """
+    wrong = np.flatnonzero(chi2 > limit)
+    if not len(wrong):
+        return (
+            f"one static field explains all {len(chi2)} images: each is predicted by the others "
+            f"(χ² {chi2.min():.2f} to {chi2.max():.2f})"
+        )
+    told = ", ".join(f"{value:.1f}" if value < _LARGE else f"{value:.0f}" for value in chi2[wrong])
+    those = f"image{'s' * (len(wrong) > 1)} {_called(wrong, setups, names)}"
+    if len(wrong) < len(chi2) / 2:
+        verb = "are" if len(wrong) > 1 else "is"
+        found = f"the {those} {verb} not explained by one static field with the others (χ² {told})"
+    else:
+        found = (
+            f"no static field explains more than {max(len(chi2) - len(wrong), 1)} of "
+            f"{len(chi2)} images: the {those} differ (χ² {told})"
+        )
+    return (
+        f"{found}: the object may have changed between images, or energy, source or point spread "
+        "is not as given"
+    )
+
+
+def _called(wrong: AnyArray, setups: Sequence[Setup] | None, names: Sequence[str] | None) -> str:
+    energies = [getattr(setup, "energy", None) for setup in setups or ()]
+    if energies and None not in energies:
+        return f"at {_listed([f'{energies[k]:g}' for k in wrong])} MeV"
+    return _listed([names[k] if names else str(k + 1) for k in wrong])
+
+
+def _listed(texts: Sequence[str]) -> str:
+    *most, last = texts
+    return f"{', '.join(most)} and {last}" if most else last

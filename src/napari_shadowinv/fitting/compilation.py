@@ -1,0 +1,70 @@
+"""The compiler's work before a first fit, done once after an installation.
+
+- do it before a fit that somebody waits for: `ensure_compiled`
+- whether it was done: `is_compiled`
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv.fitting import _ray_kernels
+from napari_shadowinv.fitting.rays import RayModel
+from napari_shadowinv.geometry._kernel import is_kept
+from napari_shadowinv.inversion import compilation as of_transport
+
+__all__ = ["ensure_compiled", "is_compiled"]
+
+_KERNELS: tuple[Any, ...] = (
+    _ray_kernels.deposit,
+    _ray_kernels.gather,
+    _ray_kernels.boxes,
+    _ray_kernels.collect,
+)
+_SIZE = (8, 8)
+
+
+def ensure_compiled(
+    on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+) -> None:
+    """Compile what traces rays, and what a start from transport needs, unless it was done."""
+    if not is_compiled():
+        _compile_rays(Reporter(on_progress, should_stop))
+    of_transport.ensure_compiled(on_progress, should_stop)
+
+
+def is_compiled() -> bool:
+    """Return whether this or an earlier run has compiled the kernels that trace rays."""
+    return all(kernel.signatures or _is_kept(kernel) for kernel in _KERNELS)
+
+
+def _is_kept(kernel: Any) -> bool:
+    """Whether there is machine code that was made of the kernel as it is now."""
+    if not is_kept():
+        return False
+    source = Path(kernel.py_func.__code__.co_filename)
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    name = f"{source.stem}.{kernel.py_func.__name__}-*.{version}*.nbi"
+    made = (index.stat().st_mtime for index in Path(kernel.stats.cache_path).glob(name))
+    return max(made, default=0.0) >= source.stat().st_mtime
+
+
+def _compile_rays(report: Reporter) -> None:
+    rays = RayModel(_SIZE, threads=1)
+    potential, beam = np.zeros(rays.shape), rays.around(np.ones(_SIZE))
+    counts = rays.ray_counts(potential)
+    seen = np.ones(rays.seen)
+    works: tuple[Callable[[], object], ...] = (
+        lambda: rays.image(potential, counts, beam),
+        lambda: rays.gradient(potential, counts, beam, seen),
+        lambda: rays.jacobian(potential, counts, beam),
+    )
+    for step, work in enumerate(works):
+        report("compile", step, None, "rays, " + of_transport.how_often())
+        work()

@@ -1,0 +1,149 @@
+"""Fits of neighbouring images one after another, a film of the field: `FitWindows`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.result import Fit
+from napari_shadowinv.inversion.labels import (
+    UNCERTAINTY,
+    belongs,
+    dataset_from_field,
+    label,
+)
+from napari_shadowinv.physics.setup import Setup
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["PREFIX", "FitWindows"]
+
+PREFIX = "window_"
+"""What the variables begin with in the dataset of a fit."""
+
+
+@dataclass(frozen=True)
+class FitWindows:
+    """Groups of neighbouring images, in order of energy, each with the field that explains it.
+
+    Attributes
+    ----------
+    numbers : tuple of tuple of int
+        The images of each group, by their places as given.
+    fits : tuple of Fit
+        What explains each group, in pixels of its own first image.
+    strengths : ndarray, shape (W, M)
+        Displacement of each group's first image by each field, relative to that of the first.
+    """
+
+    numbers: tuple[tuple[int, ...], ...]
+    fits: tuple[Fit, ...]
+    strengths: FloatArray
+
+    @property
+    def setup(self) -> Setup | None:
+        """The experiment of the image to which all displacements belong; None if not known."""
+        first = self.fits[0]
+        return first.setups[0] if first.setups else None
+
+    @property
+    def displacement(self) -> FloatArray:
+        """Displacement in px by each field in the first of all images, shape (W, M, 2, H, W)."""
+        found = [[field.displacement for field in fit.fields] for fit in self.fits]
+        return np.array(found) / self.strengths[:, :, None, None, None]
+
+    @property
+    def energies(self) -> FloatArray | None:
+        """Mean energy of each group in MeV, shape (W,); None if not known."""
+        found = [[getattr(setup, "energy", None) for setup in fit.setups] for fit in self.fits]
+        if any(not one or None in one for one in found):
+            return None
+        return np.array([np.mean(np.array(one, dtype=float)) for one in found])
+
+    @property
+    def times_of_flight(self) -> FloatArray | None:
+        """Time in s from the source to the object at each mean energy; None if not known."""
+        if self.energies is None:
+            return None
+        setups = [
+            fit.setups[0].model_copy(update={"energy": float(energy)})
+            for fit, energy in zip(self.fits, self.energies, strict=True)
+        ]
+        times = np.array([getattr(setup, "time_of_flight", np.inf) for setup in setups])
+        return times if np.isfinite(times).all() else None
+
+    def to_dataset(self) -> xarray.Dataset:
+        """Return fields, χ² and verdicts as one labelled dataset, with units.
+
+        Returns
+        -------
+        xarray.Dataset
+            Dimensions window, component, y and x, and member for the images of a group. Fields are
+            those that displace the first of all images; variables of each end with its name, as in
+            ``displacement_B``, those of the only field do not. Coordinates along the windows are
+            the mean energy and the time of flight, where they are known, and the mean strength.
+        """
+        import xarray as xr
+
+        names = [field.name for field in self.fits[0].fields]
+        merged = xr.Dataset()
+        for m, name in enumerate(names):
+            one = xr.concat([self._of(w, m) for w in range(len(self.fits))], dim="window")
+            if len(names) > 1:
+                one = one.rename({variable: f"{variable}_{name}" for variable in one.data_vars})
+            merged = merged.assign_coords(one.coords).assign(one.data_vars)
+            merged.attrs.update(one.attrs)
+        members = ("window", "member")
+        merged["image_number"] = members, np.array(self.numbers) + 1, label("1", "Image")
+        chi2 = np.array([fit.chi2 for fit in self.fits])
+        merged["chi2"] = members, chi2, label("1", "Mean squared residual over the noise")
+        merged["verdict"] = "window", [str(fit.verdict) for fit in self.fits]
+        merged["explanation"] = "window", [fit.explanation for fit in self.fits]
+        return merged.assign_coords(self._coordinates())
+
+    def added_to(self, dataset: xarray.Dataset) -> xarray.Dataset:
+        """Return the dataset of a fit with these, their names beginning with ``window_``."""
+        own = self.to_dataset()
+        names = {*own.data_vars, "energy", "time_of_flight", "strength"} & {*own.variables}
+        renamed = own.rename({name: f"{PREFIX}{name}" for name in names})
+        return dataset.assign_coords(renamed.coords).assign(renamed.data_vars)
+
+    def _of(self, window: int, field: int) -> xarray.Dataset:
+        """A field of a group."""
+        found, strength = self.fits[window].fields[field], self.strengths[window, field]
+        one = dataset_from_field(
+            found.displacement / strength, found.potential / strength, self.setup
+        )
+        one = one.drop_vars([name for name in one.data_vars if not belongs(name, found.name)])
+        if found.uncertainty is not None:
+            vectors, *words = UNCERTAINTY
+            one["displacement_uncertainty"] = (
+                vectors,
+                found.uncertainty / abs(strength),
+                label(*words),
+            )
+        for variable in one.data_vars.values():
+            if "px" in variable.attrs["units"]:
+                variable.attrs["long_name"] += ", in the image displaced most"
+        return one
+
+    def _coordinates(self) -> Mapping[str, Any]:
+        means = [
+            (fit.strengths[:, 0] * strength).mean()
+            for fit, strength in zip(self.fits, self.strengths[:, 0], strict=True)
+        ]
+        known: dict[str, tuple[Sequence[float] | FloatArray | None, str, str]] = {
+            "strength": (means, "1", "Mean displacement relative to the first image"),
+            "energy": (self.energies, "MeV", "Mean energy"),
+            "time_of_flight": (self.times_of_flight, "s", "Time of flight from source to object"),
+        }
+        return {
+            name: ("window", np.array(values), label(unit, text))
+            for name, (values, unit, text) in known.items()
+            if values is not None
+        }

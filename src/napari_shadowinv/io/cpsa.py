@@ -1,0 +1,237 @@
+"""Scans of etched CR-39, ``.cpsa``: tracks found frame by frame by a microscope.
+
+- all tracks of a scan: `read_tracks`
+- an image of those that are wanted, by ranges that are typed or given: `read_image`, `as_text`
+
+All numbers are little-endian. A header of 48 bytes holds 4 int32, 2 float32, 6 int32: the
+version (negative), the numbers of frames along x and y, a number of bins (unused), the width of
+a pixel in µm, pixels per bin (unused), limits of border, contrast and eccentricity, the number
+of moments, and a frame's width and height in pixels. Each frame, in any order, has 10 int32: its
+number, the stage's x and y at its middle in 0.1 µm, the number n of its tracks, three numbers on
+rejected ones, the focus, and its place along x and y from 0. Then follow, each for all tracks,
+their diameters (int16, 0.01 px), eccentricities, contrasts and mean contrasts (a byte each), and
+pixels x and y (int16), x counted from the frame's right edge and y from its lower one. After the
+last frame stand -1 and a text, which are not read. The readers below agree on this; another of
+the second's author (python-cr39-reader) counts x from the left edge.
+
+The image shows the stage's x to the right and its y upwards, so that the first frame of a scan,
+with places 0 and 0, is at the top left.
+
+References
+----------
+Heuer, P. cr39py, https://github.com/pheuer/cr39py (``scan/cpsa.py``).
+
+Lahmann, B. CR39_Reader, https://github.com/PSFC-HEDP/CR39_Reader (``ScanData.java``).
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from napari_shadowinv._system.safety import check_regular, check_size, refusing_damage
+from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.film.tracks import Tracks
+from napari_shadowinv.io.files import check_promise
+
+__all__ = ["as_text", "read_image", "read_tracks"]
+
+_HEADER, _FRAME, _TRACK = struct.Struct("<4i2f6i"), struct.Struct("<10i"), 9
+_IN_MEMORY = 10  # times the size of a file: its bytes and the arrays of its tracks
+_MOST_FRAMES = 500_000  # scans have some ten thousand
+_STAGE_STEP = 1e-7  # m
+_WIDEST_PIXEL = 100.0  # µm; usual ones have 0.3
+_SAME_PITCH = 0.02  # of the scanned area, by which frames that abut may miss it
+_RANGES = ("diameter", "contrast", "eccentricity")
+_WORD = re.compile(r"(\w+)\s*=\s*([^\s,]+)[\s,]*")
+
+
+@refusing_damage
+def read_tracks(path: Path) -> Tracks:
+    """Read all tracks of a scan.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.cpsa`` file.
+
+    Returns
+    -------
+    Tracks
+        In the order of the file; places from the top left corner of the scanned area.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, truncated, or its numbers cannot be those of a scan.
+    """
+    return _read(path)[0]
+
+
+def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:
+    """Count the tracks of a scan in bins, uint32, shape (H, W), with its ``geometry``.
+
+    `variable` tells ranges and bin as `as_text` writes them: ``"diameter=4:12 bin=300"``.
+    """
+    chosen = {} if variable is None else _chosen(variable)
+    tracks, warnings = _read(path)
+    bin_ = chosen.pop("bin", None)
+    counts, _, bin_ = tracks.selected(**chosen).image(bin_)
+    if not chosen:
+        warnings = (
+            *warnings,
+            f"all {counts.sum()} tracks are counted, whatever their diameter, contrast and "
+            "eccentricity, and not all need be of the beam: choose ranges with variable, such as "
+            "'diameter=4:12 contrast=:40'",
+        )
+    metadata: dict[str, Any] = {
+        "bits": 32,
+        "geometry": {"detector_pixel_size": bin_ * 1e-6},
+        "tracks": int(counts.sum()),
+        "notes": (f"{counts.sum()} of {len(tracks)} tracks counted in bins of {bin_:.5g} µm",),
+        "warnings": warnings,
+    }
+    return counts, metadata if variable is None else {**metadata, "variable": variable}
+
+
+def as_text(
+    diameter: tuple[float | None, float | None] | None = None,
+    contrast: tuple[float | None, float | None] | None = None,
+    eccentricity: tuple[float | None, float | None] | None = None,
+    bin: float | None = None,
+) -> str | None:
+    """Write ranges and the bin as text, or None if there are none.
+
+    Examples
+    --------
+    >>> as_text(diameter=(4, 12), contrast=(None, 40), bin=300)
+    'diameter=4:12 contrast=:40 bin=300'
+    """
+    words = []
+    for name, ends in zip(_RANGES, (diameter, contrast, eccentricity), strict=True):
+        if ends is not None:
+            try:
+                low, high = ("" if end is None else _number(end) for end in ends)
+            except (TypeError, ValueError):
+                raise InputError(
+                    f"{name} is {ends!r}: expected its smallest and its largest value, such as "
+                    "(4, 12), with None for no limit"
+                ) from None
+            words.append(f"{name}={low}:{high}")
+    if bin is not None:
+        words.append(f"bin={_number(bin)}")
+    return " ".join(words) or None
+
+
+def _number(value: float) -> str:
+    return repr(float(value)).removesuffix(".0")
+
+
+def _chosen(text: str) -> dict[str, Any]:
+    """Ranges and bin that a text tells."""
+    chosen: dict[str, Any] = {}
+    try:
+        if not text.strip() or _WORD.sub("", text).strip():
+            raise ValueError
+        for name, value in _WORD.findall(text):
+            if name in chosen or name not in (*_RANGES, "bin"):
+                raise ValueError
+            if name == "bin":
+                chosen[name] = float(value)
+            else:
+                low, high = value.split(":")
+                chosen[name] = tuple(float(end) if end else None for end in (low, high))
+    except ValueError:
+        raise InputError(
+            f"the tracks to count are {text!r}: expected ranges of diameter (µm), contrast (%) and "
+            "eccentricity (%) and a bin (µm), such as 'diameter=4:12 contrast=:40 bin=300'"
+        ) from None
+    return chosen
+
+
+def _read(path: Path) -> tuple[Tracks, tuple[str, ...]]:
+    """Tracks of a scan, and what is odd about it."""
+    check_regular(path, "a CR-39 scan, .cpsa")
+    check_size(path, _IN_MEMORY * path.stat().st_size)
+    data = path.read_bytes()
+    shape, pixel, frame_size = _header(path, data)
+    frames = _frames(path, data, shape)
+    hits = frames[:, 3]
+    ends = np.concatenate([[0], np.cumsum(hits)])
+    columns = {"d": "<i2", "e": "u1", "c": "u1", "mean": "u1", "x": "<i2", "y": "<i2"}
+    found = {name: np.empty(ends[-1], kind) for name, kind in columns.items()}
+    for place, first, last in zip(frames[:, 0], ends[:-1], ends[1:], strict=True):
+        for name, kind in columns.items() if last > first else ():
+            found[name][first:last] = np.frombuffer(data, kind, last - first, place)
+            place += (last - first) * np.dtype(kind).itemsize
+    middles = frames[:, 1:3] * _STAGE_STEP
+    left, bottom = middles.min(axis=0) - frame_size / 2
+    right, top = middles.max(axis=0) + frame_size / 2
+    x = np.repeat(middles[:, 0] + frame_size[0] / 2 - left, hits) - found["x"] * (pixel * 1e-6)
+    y = np.repeat(top - middles[:, 1] + frame_size[1] / 2, hits) - found["y"] * (pixel * 1e-6)
+    diameter = found["d"] * np.float32(0.01 * pixel)
+    tracks = Tracks(y, x, diameter, found["c"], found["e"], (top - bottom, right - left))
+    return tracks, _pitch_warnings(shape, np.array([right - left, top - bottom]), frame_size)
+
+
+def _header(path: Path, data: bytes) -> tuple[tuple[int, int], float, FloatArray]:
+    """Numbers of frames along x and y, width of a pixel (µm), and size of a frame (m) in x, y."""
+    check_promise(path, "CPSA", _HEADER.size, len(data))
+    version, columns, rows, _, pixel, _, _, _, _, _, width, height = _HEADER.unpack_from(data)
+    if version >= 0:
+        raise FileFormatError(
+            f"{path} is no CR-39 scan or damaged: its version is {version}, expected a negative "
+            "number; export the tracks again"
+        )
+    if min(columns, rows, width, height) < 1 or not 0 < pixel <= _WIDEST_PIXEL:
+        raise FileFormatError(
+            f"{path} is damaged: its CPSA header gives {columns} × {rows} frames of "
+            f"{width} × {height} pixels of {pixel:g} µm; copy it again"
+        )
+    if columns * rows > _MOST_FRAMES:
+        raise FileFormatError(
+            f"{path} is damaged: its CPSA header gives {columns} × {rows} frames, expected at most "
+            f"{_MOST_FRAMES}; copy it again"
+        )
+    check_promise(path, "CPSA", _HEADER.size + columns * rows * _FRAME.size, len(data))
+    return (columns, rows), pixel, np.array([width, height]) * (pixel * 1e-6)
+
+
+def _frames(path: Path, data: bytes, shape: tuple[int, int]) -> AnyArray:
+    """Of each frame: where its tracks begin, x and y of its middle, and how many tracks it has."""
+    columns, rows = shape
+    frames = np.empty((columns * rows, 4), np.int64)
+    seen = np.zeros((columns, rows), bool)
+    at = _HEADER.size
+    for number in range(columns * rows):
+        check_promise(path, f"frame {number + 1}", at + _FRAME.size, len(data))
+        _, x, y, hits, _, _, _, _, column, row = _FRAME.unpack_from(data, at)
+        if hits < 0 or not (0 <= column < columns and 0 <= row < rows) or seen[column, row]:
+            raise FileFormatError(
+                f"{path} is damaged: frame {number + 1} is at column {column}, row {row} with "
+                f"{hits} tracks; expected each place of {columns} × {rows} once; copy it again"
+            )
+        seen[column, row] = True
+        at += _FRAME.size
+        frames[number] = at, x, y, hits
+        at += _TRACK * hits
+        check_promise(path, f"frame {number + 1}", at, len(data))
+    return frames
+
+
+def _pitch_warnings(
+    shape: tuple[int, int], extent: FloatArray, frame_size: FloatArray
+) -> tuple[str, ...]:
+    """Warn of frames with gaps between them, or that overlap."""
+    ratios = extent / (np.array(shape) * frame_size)
+    if (np.abs(ratios - 1) <= _SAME_PITCH).all():
+        return ()
+    return (
+        f"the scanned area is {ratios[0]:.3g} times as wide and {ratios[1]:.3g} times as high as "
+        "its frames put side by side: they overlap or leave gaps, which show in the image",
+    )

@@ -1,0 +1,255 @@
+"""Every choice of a fit: `FitOptions`, and `FitChoices` for what it finds and what it knows."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    field_validator,
+    model_validator,
+)
+
+__all__ = ["FIELDS", "FitChoices", "FitOptions", "Noise"]
+
+FIELDS = {
+    "B": "magnetic field",
+    "E": "electric field",
+    "plasma": "plasma",
+    "phase": "refractive index",
+}
+"""What can deflect a beam, by the names that a fit takes."""
+
+
+class FitOptions(BaseModel):
+    """Choices of a fit; all have a default that suits most images.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        (a `ValueError`) if a value is out of range or a name is unknown.
+
+    Examples
+    --------
+    >>> FitOptions(align="shift").edge
+    'fading'
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    smoothness: float | None = Field(
+        default=None,
+        gt=0,
+        title="Smoothness",
+        description=(
+            "Weight of the squared fourth derivatives of each field's potential (px). Default: "
+            "those of fourth and sixth derivatives are found from the data, for each field."
+        ),
+    )
+    edge: Literal["fading", "free"] = Field(
+        default="fading",
+        title="Field at the edge",
+        description=(
+            "'fading': the object lies within the image, its field fades towards the edge. "
+            "'free': it goes on beyond the edge, where its potential decays."
+        ),
+    )
+    strip: int | None = Field(
+        default=None,
+        ge=16,
+        multiple_of=8,
+        title="Strip around the image (px)",
+        description=(
+            "Width of the strip beyond the edge from which rays may enter. Default: 16, or with a "
+            "free edge a tenth of the shorter side."
+        ),
+    )
+    fade_length: float | None = Field(
+        default=None,
+        gt=0,
+        title="Decay length of the field (px)",
+        description=(
+            "Free edge only: length over which the potential decays beyond the edge. Default: "
+            "the width of the strip."
+        ),
+    )
+    align: Literal["none", "shift", "affine"] = Field(
+        default="none",
+        title="Align",
+        description=(
+            "What is not known of how later images lie on the first: 'none', their 'shift', or "
+            "also rotation, magnification and shear ('affine')."
+        ),
+    )
+    beam_modes: int = Field(
+        default=8,
+        ge=2,
+        le=32,
+        title="Cosines of the beam",
+        description="With an unknown source: how many cosines its logarithm has along each axis.",
+    )
+    samples: int = Field(
+        default=6,
+        ge=0,
+        le=1000,
+        title="Samples",
+        description="Random fields from which the error bars are made; 0 for none.",
+    )
+    evidence: bool = Field(
+        default=False,
+        title="Evidence",
+        description=(
+            "Work out how likely the choice of fields makes the data, to compare choices; takes "
+            "as long as some samples."
+        ),
+    )
+    spacing: float | None = Field(
+        default=None,
+        ge=0.05,
+        le=0.5,
+        title="Spacing of rays (px)",
+        description=(
+            "Largest distance between the landing points of neighbouring rays. Default: 0.2, and "
+            "0.14 if bright lines need it."
+        ),
+    )
+    steps: int = Field(
+        default=120,
+        ge=1,
+        title="Steps at full size",
+        description="Maximum number of steps with the pixels as recorded.",
+    )
+    ambiguous: bool = Field(
+        default=False,
+        title="Fit what one image cannot tell",
+        description=(
+            "Fit a single image with an unknown source, too, though many beams and fields explain "
+            "it equally well."
+        ),
+    )
+    seed: int = Field(
+        default=0,
+        ge=0,
+        title="Random seed",
+        description="Seed of all random choices; the same seed gives the same result.",
+    )
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        title="Number of threads",
+        description="Number of threads. Default: all cores. It does not affect the result.",
+    )
+
+
+def _noise(value: Any) -> Any:
+    if value is None or value == "poisson":
+        return value
+    try:
+        deviation = float(value)
+    except (TypeError, ValueError):
+        deviation = 0.0
+    if not 0 < deviation < float("inf"):
+        raise ValueError("expected 'poisson' or the standard deviation in a pixel")
+    return deviation
+
+
+Noise = Annotated[Literal["poisson"] | float, BeforeValidator(_noise)]
+"""The noise of an image: that of counts, or a standard deviation."""
+
+
+class FitChoices(BaseModel):
+    """What a fit is to find, and what is known about the images.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        (a `ValueError`) if a value is out of range, a name is unknown, or the point spread is
+        given both in px and in m.
+
+    Examples
+    --------
+    >>> FitChoices(fields="B, E", options=FitOptions(samples=0)).fields
+    ('B', 'E')
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    fields: tuple[str, ...] | None = Field(
+        default=None,
+        title="Fields",
+        description=(
+            "What deflects: B, E, plasma or phase; two of them separated by a comma need images "
+            "of two energies. Default: B, and for light phase."
+        ),
+        json_schema_extra={"metavar": "NAMES"},
+    )
+    beam: Literal["known", "unknown"] = Field(
+        default="known",
+        title="Beam",
+        description="'unknown': a smooth beam is fitted, the same for all images but for gains.",
+    )
+    gains: Literal["known", "free"] = Field(
+        default="known",
+        title="Gains",
+        description=(
+            "'known': images are as bright as the source; 'free': by unknown factors brighter."
+        ),
+    )
+    noise: Noise | None = Field(
+        default=None,
+        title="Noise",
+        description=(
+            "'poisson' if images are counts, or the standard deviation in a pixel after all "
+            "steps. Default: estimated from the images."
+        ),
+        json_schema_extra={"metavar": "poisson|NUMBER"},
+    )
+    psf: float | None = Field(
+        default=None,
+        ge=0,
+        title="Point spread (px)",
+        description="Point spread: standard deviation in px after all steps. Default: none.",
+    )
+    source_size: float | None = Field(
+        default=None,
+        ge=0,
+        title="Source size (m)",
+        description=(
+            "Standard deviation of the beam's source in m (FWHM / 2.355); with the resolution in "
+            "place of the point spread in px."
+        ),
+    )
+    resolution: float | None = Field(
+        default=None,
+        ge=0,
+        title="Resolution (m)",
+        description="Standard deviation of the detector's point spread in m, at the detector.",
+    )
+    options: FitOptions = Field(
+        default=FitOptions(), title="Options", description="Options of the fit."
+    )
+
+    @field_validator("fields", mode="before")
+    @classmethod
+    def _separated(cls, value: Any) -> Any:
+        return [one.strip() for one in value.split(",")] if isinstance(value, str) else value
+
+    @field_validator("fields")
+    @classmethod
+    def _known(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        chosen = set(names or ())
+        if names is not None and (not chosen or chosen - FIELDS.keys() or len(chosen) < len(names)):
+            raise ValueError(f"expected one or more of {', '.join(FIELDS)}, each once")
+        return names
+
+    @model_validator(mode="after")
+    def _one_point_spread(self) -> Self:
+        if self.psf is not None and (self.source_size, self.resolution) != (None, None):
+            raise ValueError(
+                f"received a point spread of {self.psf:g} px, and a source size or resolution in "
+                "m, which ask for another: expected one of them"
+            )
+        return self

@@ -1,0 +1,69 @@
+"""Images, read as rows of a table or flags describe them: `read_rows`; their setup: `row_setup`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.setup import Setup, setup_from_dict
+from napari_shadowinv.pipeline._fit import FitShot
+from napari_shadowinv.pipeline.files import read_part, setup_from
+from napari_shadowinv.pipeline.shot_table import ShotRow
+from napari_shadowinv.preprocessing import Radiograph, Recipe
+
+__all__ = ["read_rows", "row_setup"]
+
+
+def read_rows(
+    rows: Sequence[ShotRow],
+    recipe: Recipe,
+    *,
+    channel: str | None = None,
+    variable: str | None = None,
+) -> tuple[FitShot, ...]:
+    """Read the images of rows; energies complete the setups of the rows or the recipe.
+
+    Parameters
+    ----------
+    rows : sequence of ShotRow
+        What is known about each image.
+    recipe : Recipe
+        Its setup is that of images without one.
+    channel, variable : str, optional
+        What to take of each file; the channel of sources, too.
+    """
+    return tuple(_read(row, recipe, channel, variable) for row in rows)
+
+
+def _read(row: ShotRow, recipe: Recipe, channel: str | None, variable: str | None) -> FitShot:
+    shot = read_part(row.file, channel, variable)
+    beam = None if row.source_file is None else read_part(row.source_file, channel)
+    return FitShot(
+        image=shot,
+        setup=row_setup(row, shot, recipe),
+        source="unknown" if row.source == "unknown" else beam,
+        mask=row.mask,
+        strength=row.strength,
+        gain=row.gain,
+        psf=row.psf,
+        noise=row.noise,
+    )
+
+
+def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
+    """Return the setup of an image: that of its row, of the recipe, or of its file, in this order.
+
+    An `InputError` if the row gives an energy and none of them the rest.
+    """
+    changes = {} if row.energy is None else {"energy": row.energy}
+    if row.setup is not None:
+        return setup_from(row.setup, shot.metadata.get("geometry"), changes)
+    known = recipe.setup or shot.setup
+    if known is not None:
+        return setup_from_dict({**known.model_dump(), **changes}, str(row.file))
+    if not changes:
+        return None
+    raise InputError(
+        f"{row.file} has an energy of {row.energy:g} MeV and no setup: give the rest of the "
+        "geometry with --setup"
+    )

@@ -1,0 +1,81 @@
+"""An inversion refined by a fit that starts from its field: `run_refinement`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from napari_shadowinv import __version__
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv.fitting import Fit, fit
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.options import FIELDS, FitChoices, FitOptions
+from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.preprocessing import FitOrigin, FitProvenance, Provenance
+
+__all__ = ["refinement_choices", "run_refinement"]
+
+
+def run_refinement(
+    inversion: Inversion,
+    setup: Setup | None,
+    choices: FitChoices,
+    *,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Fit:
+    """Fit the forward model to the image of an inversion, with its source and mask.
+
+    Parameters
+    ----------
+    inversion : Inversion
+        The fit starts from its potential, too.
+    setup : Setup or None
+        The experiment, with the pixels of the inversion.
+    choices : FitChoices
+        Such as `refinement_choices`; the source is known, and so is the gain.
+    on_progress, should_stop : callable, optional
+        As for `napari_shadowinv.fit`.
+
+    Returns
+    -------
+    Fit
+        With its `provenance` if the inversion has one.
+
+    Raises
+    ------
+    InputError
+        If the image cannot be fitted.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    found = fit(
+        inversion.image,
+        setups=None if setup is None else [setup],
+        fields=choices.fields or ("B",),
+        source=inversion.source,
+        noise=choices.noise,
+        psf=choices.psf or 0.0,
+        mask=inversion.mask,
+        start=inversion.potential,
+        options=choices.options,
+        on_progress=on_progress,
+        should_stop=should_stop,
+    )
+    if inversion.provenance is None:
+        return found
+    return replace(found, provenance=_provenance(inversion.provenance, setup, choices))
+
+
+def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0.0) -> FitChoices:
+    """Return what follows from an inversion: the field that bends such beams, edge and seed."""
+    bends = (FIELDS["B"],) if setup is None else setup.deflectors
+    (field, *_) = (key for key, deflector in FIELDS.items() if deflector in bends)
+    edge = "free" if inversion.options.boundary == "free" else "fading"
+    options = FitOptions(edge=edge, seed=inversion.options.seed)
+    return FitChoices(fields=(field,), psf=psf, options=options)
+
+
+def _provenance(start: Provenance, setup: Setup | None, choices: FitChoices) -> FitProvenance:
+    recipe = start.recipe.model_copy(update={"setup": None, "fit": choices})
+    image = FitOrigin(image=start.image, source=start.source, setup=setup, notes=start.notes)
+    return FitProvenance(version=__version__, recipe=recipe, images=(image,), start=start)

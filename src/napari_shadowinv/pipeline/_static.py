@@ -1,0 +1,154 @@
+"""Whether one static field explains several images: `run_leave_one_out`, `run_windows`.
+
+Images are taken in order of energy, whatever order they are given in, so that results do not
+depend on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting import FitWindows, LeaveOneOut, fit, leave_one_out
+from napari_shadowinv.fitting.agreement import check_count
+from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.pipeline._fit import FitInputs, FitShot, gathered_fit
+from napari_shadowinv.pipeline._run import Shot
+from napari_shadowinv.preprocessing import Recipe
+
+__all__ = ["check_count", "check_window", "run_leave_one_out", "run_windows"]
+
+
+def run_leave_one_out(
+    recipe: Recipe,
+    shots: Sequence[FitShot | Shot],
+    *,
+    names: Sequence[str] | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> LeaveOneOut:
+    """Predict each of several images of one object from a fit of the others, as `run_fit`.
+
+    Parameters
+    ----------
+    recipe : Recipe
+        What is to be done; without a section `fit` its defaults count.
+    shots : sequence of FitShot, Radiograph, array_like or path
+        Three images or more, of one size after the steps.
+    names, on_progress, should_stop
+        As for `run_fit`.
+
+    Returns
+    -------
+    LeaveOneOut
+        Its images are in the order in which they were given.
+
+    Raises
+    ------
+    InputError
+        As `run_fit`, and if there are fewer than three images.
+    FileFormatError
+        If a file cannot be read.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    check_count(len(shots))
+    inputs = gathered_fit(recipe, shots, names=names, should_stop=should_stop)
+    order = _by_energy(inputs)
+    found = leave_one_out(
+        **inputs.only(order).keywords,
+        fields=inputs.choices.fields or ("B",),
+        options=inputs.choices.options,
+        on_progress=on_progress,
+        should_stop=should_stop,
+    )
+    return found.only([int(place) for place in np.argsort(order)])
+
+
+def run_windows(
+    recipe: Recipe,
+    shots: Sequence[FitShot | Shot],
+    size: int,
+    *,
+    names: Sequence[str] | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> FitWindows:
+    """Fit groups of neighbouring images, in order of energy, one after another, as `run_fit`.
+
+    Slower particles pass the object later: the fields of all groups are a film of it.
+
+    Parameters
+    ----------
+    recipe, shots, names, on_progress, should_stop
+        As for `run_fit`.
+    size : int
+        Number of images in a group.
+
+    Returns
+    -------
+    FitWindows
+        The first group has the images that are displaced most, those of the lowest energies.
+
+    Raises
+    ------
+    InputError
+        As `run_fit`, and if a group would have no image, or more than there are.
+    FileFormatError
+        If a file cannot be read.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    check_window(size, len(shots))
+    inputs = gathered_fit(recipe, shots, names=names, should_stop=should_stop)
+    order = _by_energy(inputs)
+    strengths = _strengths(inputs.only(order))[: len(order) - size + 1]
+    groups = [order[first : first + size] for first in range(len(strengths))]
+    fits = []
+    for number, group in enumerate(groups, 1):
+
+        def tell(progress: Progress) -> None:
+            if on_progress is not None:
+                stage = f"window {number} of {len(groups)}"  # noqa: B023
+                on_progress(Progress(stage, progress.step, progress.total, progress.message))
+
+        part = inputs.only(group)
+        found = fit(
+            **part.keywords,
+            fields=part.choices.fields or ("B",),
+            options=part.choices.options,
+            on_progress=tell,
+            should_stop=should_stop,
+        )
+        fits.append(part.told(found))
+    return FitWindows(tuple(map(tuple, groups)), tuple(fits), strengths)
+
+
+def check_window(size: int, count: int) -> None:
+    """Reject with an `InputError` groups of no image, or of more than there are."""
+    if not 1 <= size <= count:
+        raise InputError(
+            f"received {count} image{'s' * (count != 1)} and windows of {size}: expected windows "
+            f"of 1 to {count} image{'s' * (count != 1)}"
+        )
+
+
+def _by_energy(inputs: FitInputs) -> list[int]:
+    """The images in order of energy, those displaced most first."""
+    sizes = np.abs(_strengths(inputs)[:, 0])
+    images = [shot.image.tobytes() for shot in inputs.shots]
+    return sorted(range(len(images)), key=lambda k: (-sizes[k], images[k]))
+
+
+def _strengths(inputs: FitInputs) -> FloatArray:
+    """Displacement of each image by each field, relative to the first image."""
+    given = inputs.keywords.get("strengths")
+    if given is None:
+        fields = inputs.choices.fields or ("B",)
+        return strengths_of(inputs.setups, fields, len(inputs.shots), inputs.names)
+    matrix = np.array(given, dtype=np.float64)
+    return np.asarray(matrix / matrix[0])

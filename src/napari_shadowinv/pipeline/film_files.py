@@ -1,0 +1,159 @@
+"""A film pack as a file, and its layers as files for other commands.
+
+- read what describes a pack: `read_pack`
+- write its layers as images with a table of them: `write_layers`
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from napari_shadowinv._system.validation import validated
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.film import Pack, PackLayer
+from napari_shadowinv.inversion.labels import is_pack
+from napari_shadowinv.io import read_toml, replacing, write
+from napari_shadowinv.io.formats import PRADFORMAT, SITES, TIFF
+from napari_shadowinv.io.pradformat import write_radiograph
+from napari_shadowinv.physics.setup import setup_from_dict
+from napari_shadowinv.pipeline.shot_table import rows_of
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["LAYERS_TABLE", "read_pack", "write_layers"]
+
+LAYERS_TABLE = f"layers{SITES.suffix}"
+_COLUMNS = ("file", "mask", "setup", "strength", "exclude")
+
+
+def read_pack(path: Path) -> Pack:
+    """Read a pack; files that it names are looked for from its own folder.
+
+    Parameters
+    ----------
+    path : Path
+        TOML file. Its `layers` are tables, or the name of a table (.csv) with a row for each; its
+        `setup` is a table, or the name of a TOML file.
+
+    Raises
+    ------
+    FileFormatError
+        If a file cannot be read.
+    InputError
+        If an entry is not understood; the message names it.
+    """
+    path = Path(path).absolute()
+    entries = read_toml(path)
+    if isinstance(entries.get("layers"), str):
+        rows = rows_of(path.parent / entries["layers"], PackLayer)
+        entries["layers"] = [row.model_dump() for row in rows]
+    if isinstance(entries.get("setup"), str):
+        entries["setup"] = read_toml(path.parent / entries["setup"])
+    return _with_files(validated(Pack, entries, str(path)), path.parent.joinpath)
+
+
+def write_layers(
+    dataset: xarray.Dataset,
+    folder: Path,
+    *,
+    form: Literal["tiff", "pradformat"] = "tiff",
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write the fluence of each layer as an image, its mask, its setup, and a table of them.
+
+    The table, ``layers.csv``, is one for `shadowinv fit` and `shadowinv batch`. Without a setup it
+    tells how strongly a magnetic field displaces the protons of each layer, relative to the first.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        What `run_film` returns.
+    folder : Path
+        Made if it is not there.
+    form : {"tiff", "pradformat"}
+        Of the images. Those of pradformat hold their setups.
+
+    Returns
+    -------
+    list of Path
+        What was written, the table last.
+
+    Raises
+    ------
+    FileFormatError
+        If a file exists, unless `overwrite`, or cannot be written.
+    InputError
+        If the dataset is not that of a film pack, or has no setup, which pradformat needs.
+    """
+    if not is_pack(dataset.attrs):
+        raise InputError("expected the dataset of a film pack, as shadowinv film writes it")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(
+            f"{folder} cannot be created as a folder ({error.strerror}): choose another name"
+        ) from None
+    setups = [setup_from_dict(one) for one in json.loads(dataset.attrs.get("setups", "[]"))]
+    if form == "pradformat" and not setups:
+        raise InputError("pradformat needs a setup: give the pack's distances, or write TIFF")
+    written, rows = [], []
+    for k, number in enumerate(dataset["layer"].values):
+        name = f"layer_{int(number):02d}"
+        used = dataset["usable"].values[k]
+        row = {"mask": f"{name}_mask{TIFF.suffix}"}
+        fluence = np.where(used, dataset["fluence"].values[k], 0.0)
+        written.append(write(folder / row["mask"], used.astype(np.float32), overwrite=overwrite))
+        if form == "pradformat":
+            row["file"] = f"{name}{PRADFORMAT.suffix}"
+            what = f"Film {int(number)} of a pack, fluence in protons per m² and MeV"
+            with replacing(folder / row["file"], overwrite) as temporary:
+                write_radiograph(temporary, fluence, setups[k], what)
+            written.append(folder / row["file"])
+        else:
+            row["file"] = f"{name}{TIFF.suffix}"
+            written.append(write(folder / row["file"], fluence, overwrite=overwrite))
+        if setups and form == "tiff":
+            row["setup"] = f"{name}.toml"
+            written.append(_write_setup(folder / row["setup"], setups[k].model_dump(), overwrite))
+        elif not setups:
+            row["strength"] = f"{dataset['strength'].values[k]:.6g}"
+        if not used.any():
+            row["exclude"] = "yes"
+        rows.append(row)
+    table = folder / LAYERS_TABLE
+    columns = [name for name in _COLUMNS if any(name in row for row in rows)]
+    with replacing(table, overwrite) as temporary, Path(temporary).open("w", newline="") as text:
+        lines = csv.DictWriter(text, columns, restval="")
+        lines.writeheader()
+        lines.writerows(rows)
+    return [*written, table]
+
+
+def _write_setup(path: Path, content: dict[str, Any], overwrite: bool) -> Path:
+    import tomli_w
+
+    with replacing(path, overwrite) as temporary:
+        Path(temporary).write_text(tomli_w.dumps(content), encoding="utf-8")
+    return path
+
+
+def _with_files(pack: Pack, moved: Callable[[Path], Path]) -> Pack:
+    def of(model: Any, *names: str) -> Any:
+        named = {name: getattr(model, name) for name in names}
+        return model.model_copy(
+            update={name: moved(file) for name, file in named.items() if file is not None}
+        )
+
+    changes = {
+        "films": {name: of(one, "calibration", "unexposed") for name, one in pack.films.items()},
+        "materials": {name: of(one, "table") for name, one in pack.materials.items()},
+        "layers": tuple(of(layer, "file", "mask") for layer in pack.layers),
+    }
+    return Pack.model_validate({**dict(of(pack, "scan", "corners")), **changes})

@@ -1,0 +1,123 @@
+"""The layers of a film pack on a page: `pack_figure`."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.plotting import _panels
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Grid, Panel, Scale
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.figure import Figure
+
+_COLUMNS = 4
+_SMALL = 0.75  # of the usual size of a panel
+_LETTERS = 13  # in an inch of the header
+_FINE, _COARSE = 1.0, 20.0  # px: sizes of the structure in the overlay
+
+
+def pack_figure(dataset: xarray.Dataset, *, title: str | None = None) -> Figure:
+    """Show the dose of each film of a pack, and three neighbouring films in one picture.
+
+    Left-out pixels are light grey. In the last panel three films that lie on each other make
+    grey, and coloured fringes where they do not.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        What `run_film` returns.
+    title : str, optional
+        A heading, such as the pack's name.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
+    """
+    import matplotlib as mpl
+
+    doses, usable = dataset["dose"].values, dataset["usable"].values
+    count, *sides = doses.shape
+    shape = sides[0], sides[1]
+    panels_shown = count + (count >= 3)
+    columns = min(_COLUMNS, panels_shown)
+    width, height = (_SMALL * side for side in _panels.panel_size(shape))
+    grid = Grid(-(-panels_shown // columns), columns, width, height, foot=0.1, head=0.0)
+    header = _header(dataset, int(grid.figure_size[0] * _LETTERS))
+    grid = Grid(grid.rows, columns, width, height, foot=0.1, head=0.52 + 0.18 * len(header))
+    with mpl.rc_context(_panels.STYLE):
+        figure, panels = _panels.new_page(grid, Scale(1.0, "px"), title)
+        for k in range(count):
+            _draw_dose(panels[k], doses[k], usable[k], _layer_title(dataset, k))
+        if count >= 3:
+            _draw_overlay(panels[count], doses, usable)
+        for panel in panels[panels_shown:]:
+            panel.axes.remove()
+        _panels.write_header(figure, header, grid)
+    return figure
+
+
+def _header(dataset: xarray.Dataset, letters: int) -> list[tuple[str, str]]:
+    low, high = dataset["energy"].values[[0, -1]]
+    lines = [(f"{dataset.sizes['layer']} films, {low:.3g} to {high:.3g} MeV", QUIET_COLOUR)]
+    for warning in json.loads(dataset.attrs["warnings"]):
+        lines += [(line, ALARM_COLOUR) for line in textwrap.wrap(warning, letters)]
+    return lines
+
+
+def _layer_title(dataset: xarray.Dataset, k: int) -> str:
+    layer = dataset.isel(layer=k)
+    return f"{int(layer['layer'])}: {float(layer['energy']):.3g} MeV, {layer['film'].item()}"
+
+
+def _draw_dose(panel: Panel, dose: FloatArray, usable: BoolArray, title: str) -> None:
+    if not usable.any():
+        panel.axes.set_title(f"{title}: left out")
+        panel.axes.set_axis_off()
+        return
+    middle = tuple(slice(side // 8, side - side // 8) for side in dose.shape)  # edges may be burnt
+    told = dose[middle][usable[middle]] if usable[middle].any() else dose[usable]
+    limits = [float(p) for p in np.percentile(told, (0.5, 99.7))]
+    high = limits[1] if limits[1] > limits[0] else limits[0] + 1.0
+    panel.show(np.where(usable, dose, limits[0]), title, "Dose (Gy)", "magma", (limits[0], high))
+    hidden: Any = np.ma.masked_array(np.ones(dose.shape), usable)
+    place: Any = {"extent": panel.scale.extent(dose.shape), "interpolation": "nearest"}
+    panel.axes.imshow(hidden, cmap="Greys", vmin=0.0, vmax=4.0, aspect="equal", **place)
+
+
+def _draw_overlay(panel: Panel, doses: FloatArray, usable: BoolArray) -> None:
+    """The fine structure of three films as red, green and blue: those that show most of it."""
+    from scipy.ndimage import gaussian_filter
+
+    logarithms = [
+        np.where(used, np.log(np.maximum(dose, 1e-30)), np.log(np.median(dose[used])))
+        if used.any()
+        else np.zeros(dose.shape)
+        for dose, used in zip(doses, usable, strict=True)
+    ]
+    fine = [gaussian_filter(one, _FINE) - gaussian_filter(one, _COARSE) for one in logarithms]
+    inner = np.s_[fine[0].shape[0] // 8 : -(fine[0].shape[0] // 8)]
+    alike = [_correlation(one[inner], other[inner]) for one, other in pairwise(fine)]
+    first = int(np.argmax([min(alike[k : k + 2]) for k in range(len(alike) - 1)]))
+    planes = []
+    for k in range(first, first + 3):
+        size = float(np.percentile(np.abs(fine[k]), 98)) or 1.0
+        planes.append(np.clip(0.5 + fine[k] / size / 2, 0, 1))
+    place: Any = {"extent": panel.scale.extent(doses.shape[1:]), "interpolation": "nearest"}
+    panel.axes.imshow(np.stack(planes, axis=-1), aspect="equal", **place)
+    panel.axes.set_title(f"Films {first + 1}, {first + 2}, {first + 3} in red, green, blue")
+    panel.axes.set_xlabel(f"x ({panel.scale.unit})")
+    panel.few_ticks()
+
+
+def _correlation(one: FloatArray, other: FloatArray) -> float:
+    if not (one.any() and other.any()):
+        return -1.0
+    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])

@@ -1,0 +1,100 @@
+"""How a fit was made, kept with its result: `FitProvenance`, with a `FitOrigin` for each image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from napari_shadowinv.options import Noise
+from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.preprocessing.recipe import Origin, Provenance, Recipe
+
+_CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+# Characters, of all masks and of the table: HDF5 keeps no attribute longer than 64,000.
+_LONGEST_MASKS, _LONGEST_FIDUCIALS = 36_000, 9_000
+
+
+class FitOrigin(BaseModel):
+    """Where an image of a fit came from, and what was known about it.
+
+    Attributes
+    ----------
+    image, source : Origin
+        The files, or arrays; `source` is None if it was not measured.
+    mask, source_mask : int or None
+        Places among the masks of the `FitProvenance`.
+    setup : Setup or None
+        The experiment, with the pixels as recorded.
+    strength, gain, psf, noise
+        As given for this image; None where the recipe counts.
+    notes : tuple of str
+        What the steps found and did.
+    """
+
+    model_config = _CONFIG
+    image: Origin
+    source: Origin | None = None
+    mask: int | None = None
+    source_mask: int | None = None
+    setup: Setup | None = None
+    strength: tuple[float, ...] | None = None
+    gain: float | None = None
+    psf: float | None = None
+    noise: Noise | None = None
+    notes: tuple[str, ...] = ()
+
+
+class FitProvenance(BaseModel):
+    """How a fit was made, so that it can be made again.
+
+    Attributes
+    ----------
+    version : str
+        Of the package.
+    recipe : Recipe
+        Steps, estimate of the source and choices of the fit; setups and masks are the images'.
+    images : tuple of FitOrigin
+        The images, in their order.
+    masks : tuple of Origin
+        All masks of images and sources, each once.
+    fiducials : Origin or None
+        The table of known displacements.
+    fiducial_rows : tuple or None
+        Its rows, if they are not too many.
+    start : Provenance or None
+        The inversion that the fit refines: its image, source and masks are those of the fit.
+    """
+
+    model_config = _CONFIG
+    version: str
+    recipe: Recipe
+    images: tuple[FitOrigin, ...]
+    masks: tuple[Origin, ...] = ()
+    fiducials: Origin | None = None
+    fiducial_rows: tuple[tuple[float, float, float, float, float], ...] | None = None
+    start: Provenance | None = None
+
+    @classmethod
+    def of(cls, attributes: Mapping[str, Any]) -> FitProvenance | None:
+        """Read it from a dataset's attributes; None if they do not tell, or as no version does."""
+        try:
+            return cls.model_validate_json(attributes.get("provenance", ""))
+        except ValidationError:
+            return None
+
+
+def short_masks(masks: Iterable[Origin]) -> tuple[Origin, ...]:
+    """Masks as they can be kept: those that no longer fit without their pixels."""
+    room, kept = _LONGEST_MASKS, []
+    for mask in masks:
+        room -= len(mask.pixels or "")
+        kept.append(mask if room >= 0 else mask.model_copy(update={"pixels": None}))
+    return tuple(kept)
+
+
+def short_fiducials(rows: Iterable[Iterable[float]]) -> list[list[float]] | None:
+    """Rows of a table as they can be kept; None if they are too many."""
+    listed = [[float(value) for value in row] for row in rows]
+    return listed if len(str(listed)) <= _LONGEST_FIDUCIALS else None

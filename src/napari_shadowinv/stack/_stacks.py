@@ -1,0 +1,228 @@
+"""What is known of many shots before any is worked on: `Stack`, `TableStack`, `FitStack`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from napari_shadowinv._typing import AnyArray
+from napari_shadowinv.inversion import count_sites
+from napari_shadowinv.inversion.labels import fit_labels, variable_labels
+from napari_shadowinv.io.store import OWN_SETUPS
+from napari_shadowinv.options import FitChoices
+from napari_shadowinv.pipeline import Inputs
+from napari_shadowinv.pipeline._fit import usual_fields
+from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe
+from napari_shadowinv.stack._discovery import Shots
+from napari_shadowinv.stack._fit_work import FitWork
+from napari_shadowinv.stack._references import ArrayShot, Shot, checksum
+from napari_shadowinv.stack._tables import RowShot, RowWork
+from napari_shadowinv.stack._worker import Beam, Work
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import Setup
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Everything about a stack that is known before any shot is inverted."""
+
+    shots: Shots
+    inputs: Inputs  # recipe, masks, and where they came from
+    beam: Beam | None  # source, after all steps, and mask of all shots; None if each has its own
+    sources: Shots | None  # one for each shot, if these were measured
+    variables: tuple[str, ...]
+    warm_start: int = 1  # shots in a group, each initialised from the one before
+    reader: str = ""  # name of what reads the files
+
+    @property
+    def recipe(self) -> Recipe:
+        return self.inputs.recipe
+
+    @cached_property
+    def moved(self) -> Radiograph:
+        """Masks and setup after the steps that move pixels; its image means nothing."""
+        return self.recipe.moved(self.inputs.shot)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.moved.shape
+
+    @property
+    def setup(self) -> Setup | None:
+        return self.moved.setup
+
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        height, width = self.shape
+        # Where each shot has its own, there are sites only if they do not depend on it.
+        beam = self.beam or Beam.of(self.shape, None, self.moved.mask)
+        sites = count_sites(beam.image, self.recipe.options, mask=beam.mask)
+        return {"shot": len(self.shots), "y": height, "x": width, "component": 2, "site": sites}
+
+    @property
+    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+        """Dimensions and labels of all variables that its shots can have."""
+        return variable_labels(self.setup)
+
+    @property
+    def options_text(self) -> str:
+        """The options, without what does not affect the results."""
+        return self.recipe.options.model_dump_json(exclude={"threads"})
+
+    @property
+    def fit_text(self) -> str:
+        """The choices of a fit, but for its options; empty where shots are inverted."""
+        return ""
+
+    @property
+    def setup_texts(self) -> dict[str, str]:
+        """The setup that all shots share, or that each has its own."""
+        setup = "" if self.setup is None else self.setup.model_dump_json()
+        return {OWN_SETUPS: "", "setup": setup}
+
+    @property
+    def setups(self) -> list[str] | None:
+        """The setup of each shot after the steps, as JSON; None unless they have their own."""
+        return None
+
+    def source_text(self, shots: int | None) -> str:
+        """The source of so many shots."""
+        estimate = self.recipe.estimate
+        if self.sources is not None:
+            return f"one for each shot: {', '.join(self.sources.names[:shots])}"
+        if self.beam is not None and self.beam.source is not None:
+            return f"sha256 {checksum(self.beam.source)}"
+        if self.beam is None and estimate is not None:
+            return f"estimated from each shot: {estimate.model_dump_json()}"
+        return "uniform"
+
+    def is_shared(self, name: str) -> bool:
+        """Whether all shots have one such variable together."""
+        return (
+            self.beam is not None
+            and name in ("sites", "site_mass", "source", "mask")
+            and not (name == "source" and self.beam.source is None)
+        )
+
+    def source_of(self, index: int) -> Shot | None:
+        """Reference to the measured source of one shot; None if it is shared, or estimated."""
+        return None if self.sources is None else self.sources.items[index]
+
+    def chosen(self, order: Sequence[int]) -> Stack:
+        """Return the stack with its shots, and their sources, in another order."""
+        sources = None if self.sources is None else self.sources.chosen(order)
+        return replace(self, shots=self.shots.chosen(order), sources=sources)
+
+    def work(self, variables: tuple[str, ...]) -> Work | FitWork:
+        """Return what the task of each shot needs to know to make some variables."""
+        return Work(self.shots.shape, self.inputs, variables)
+
+    def changed(self, index: int, origin: dict[str, Any]) -> str:
+        """Name what of a shot is not what its report says; empty if nothing."""
+        if not self.shots.items[index].unchanged(origin):
+            return self.shots.label(index)
+        source = None if self.sources is None else self.source_of(index)
+        if source is not None and not source.unchanged(origin["source"]):
+            return f"the source of {self.shots.label(index)}"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class TableStack(Stack):
+    """A stack of rows of a table: shots may have their own setup, source and mask.
+
+    The beam is that of rows without source and mask, and None if any has one. Nothing is shared, as
+    a row that is added later may have its own; `setup`, of the first row, gives the units.
+    """
+
+    common: AnyArray | None = None  # measured source of rows without one, as recorded
+    estimate: Estimate | None = None  # the same, if it is estimated
+
+    @property
+    def setup_texts(self) -> dict[str, str]:
+        return {OWN_SETUPS: "a row for each shot"}
+
+    def source_text(self, shots: int | None) -> str:
+        if self.common is not None:
+            return f"sha256 {checksum(self.common)}"
+        return super().source_text(shots) if self.estimate is not None else "uniform"
+
+    def is_shared(self, name: str) -> bool:
+        return False
+
+    def source_of(self, index: int) -> Shot | None:
+        if self._shot(index).row.source is not None or self.beam is not None:
+            return None
+        alone = None if self.common is None else ArrayShot(self.common)
+        return super().source_of(index) or alone
+
+    @property
+    def setups(self) -> list[str] | None:
+        if self.setup is None:
+            return None
+        recorded = (self._shot(index).setup for index in range(len(self.shots)))
+        bare = replace(self.inputs.shot, mask=None, source_mask=None)
+        moved = (self.recipe.moved(replace(bare, setup=setup)).setup for setup in recorded)
+        return ["" if setup is None else setup.model_dump_json() for setup in moved]
+
+    def work(self, variables: tuple[str, ...]) -> RowWork:
+        return RowWork(self.shots.shape, self.inputs, variables, self.estimate)
+
+    def changed(self, index: int, origin: dict[str, Any]) -> str:
+        difference = self._shot(index).difference(origin)
+        if difference:
+            return f"the row of {self.shots.label(index)} ({difference})"
+        return super().changed(index, origin)
+
+    def _shot(self, index: int) -> RowShot:
+        shot = self.shots.items[index]
+        assert isinstance(shot, RowShot)
+        return shot
+
+
+@dataclass(frozen=True, eq=False)
+class FitStack(Stack):
+    """A stack that is fitted; its beam is as recorded, as the fit takes the steps itself."""
+
+    given: Recipe = field(default_factory=Recipe)  # with setup and choices as they were given
+
+    @property
+    def choices(self) -> FitChoices:
+        return self.given.fit or FitChoices()
+
+    @property
+    def bends(self) -> str:
+        """The field that is fitted to each shot."""
+        setups = None if self.setup is None else [self.setup]
+        (name,) = self.choices.fields or usual_fields(setups)
+        return name
+
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        height, width = self.shape
+        return {"shot": len(self.shots), "y": height, "x": width, "component": 2}
+
+    @property
+    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+        return fit_labels(self.bends, self.setup)
+
+    @property
+    def options_text(self) -> str:
+        return self.choices.options.model_dump_json(exclude={"threads"})
+
+    @property
+    def fit_text(self) -> str:
+        return self.choices.model_dump_json(exclude={"options"}, exclude_none=True)
+
+    def is_shared(self, name: str) -> bool:
+        return False
+
+    def work(self, variables: tuple[str, ...]) -> FitWork:
+        shot = self.inputs.shot
+        choices = self.choices.model_copy(update={"fields": (self.bends,)})
+        cleared = {"source": self.given.estimate, "mask": None, "source_mask": None, "fit": choices}
+        recipe = self.given.model_copy(update=cleared)
+        return FitWork(recipe, self.shape, self.setup, variables, shot.mask, shot.source_mask)

@@ -1,0 +1,52 @@
+"""The command as tests run it, in this process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+from typer.testing import CliRunner, Result
+
+from napari_shadowinv.cli import app
+
+
+def shadowinv(*arguments: object) -> Result:
+    """What the command makes of some arguments."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def flat(text: str) -> str:
+    """Text without its line breaks, which depend on the terminal."""
+    return " ".join(text.split())
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """All files of a folder."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def interrupted(folder: Path, preparation: str, arguments: list[str]) -> tuple[int, str]:
+    """Run the command in its own process, and press Ctrl-C when it has said "now"."""
+    script = textwrap.dedent(preparation) + "\nfrom napari_shadowinv.cli import app\napp()\n"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, *arguments],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "now" in line:
+                process.send_signal(signal.SIGINT)
+                break
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    return process.returncode, errors

@@ -1,0 +1,84 @@
+"""Facts about marks on films: they are found, and exposure is not taken for one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from scipy.ndimage import gaussian_filter
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.film import Calibration, find_films, straightened
+from napari_shadowinv.film.marks import usable_pixels
+
+SHAPE = (200, 320)
+
+
+@pytest.fixture
+def calibration() -> Calibration:
+    doses = np.geomspace(0.5, 5000, 25)
+    density = np.log10(1 + doses[:, None] / [15.0, 40.0, 150.0])
+    return Calibration(doses, 40_000 / 10**density, np.full(3, 40_000.0))
+
+
+@pytest.fixture
+def film(calibration: Calibration) -> FloatArray:
+    """Exposed with a sharp front, with noise."""
+    y, x = np.indices(SHAPE)
+    doses = 3 + 400 * np.exp(-((y - 60) ** 2 + (x - 150) ** 2) / 2 / 40**2)
+    doses += np.where(np.hypot(y - 100, x - 200) < 50, 150, 0)
+    planes = np.stack(
+        [40_000 / 10 ** calibration.optical_density(doses, one) for one in ("red", "green", "blue")]
+    )
+    noise = 1 + 0.012 * np.random.default_rng(0).normal(size=planes.shape)
+    return np.moveaxis(planes * noise, 0, -1)
+
+
+def test_exposure_is_no_mark(film: FloatArray, calibration: Calibration) -> None:
+    usable = usable_pixels(film, calibration)
+    assert not usable[:6].any()
+    assert not usable[:, -6:].any()
+    assert usable[6:-6, 6:-6].mean() > 0.995
+
+
+def test_marks_are_found(film: FloatArray, calibration: Calibration) -> None:
+    ink, scratch, hole = np.zeros((3, *SHAPE), bool)
+    ink[170:188, 20:26] = ink[176:182, 20:50] = True
+    scratch[170:172, 200:280] = True
+    hole[40:48, 240:250] = True
+    film[ink] *= [0.06, 0.06, 0.6]  # a blue pen, as measured
+    film[scratch] *= 0.6  # it scatters light
+    film[hole] = 64_000
+    usable = usable_pixels(film, calibration, rim=0)
+    for mark in (ink, hole):
+        assert not usable[mark].any()
+    assert not usable[gaussian_filter(scratch.astype(float), 0.5) > 0.6].any()
+    near = gaussian_filter((ink | scratch | hole).astype(float), 3) > 0.002
+    assert usable[~near].mean() > 0.995
+
+
+@pytest.mark.parametrize("letter", "CGLMQ")
+def test_the_writing_on_real_films_is_found(shared_data: Path, letter: str) -> None:
+    folder = shared_data / "rcf"
+    kind, table = ("HDV2", "HDV2_3") if letter < "M" else ("EBT3", "EBT3_2")
+    blank = tifffile.imread(folder / f"{kind}.tif")
+    unexposed = straightened(blank, find_films(blank)[0])[60:-60, 60:-60].reshape(-1, 3)
+    scan = tifffile.imread(folder / f"RCF_18{letter}.tif")
+    film = straightened(scan, find_films(scan)[0])
+    usable = usable_pixels(
+        film,
+        Calibration.from_csv(folder / f"{table}_calibration.csv"),
+        background=np.median(unexposed, axis=0),
+    )
+    # Letter and number in the lower corners; nothing in the middle.
+    assert (~usable[220:280, 20:90]).mean() > 0.1
+    assert (~usable[220:280, 510:575]).mean() > 0.1
+    assert usable[50:220, 90:500].mean() > 0.985
+
+
+def test_a_film_without_colours_is_refused(calibration: Calibration) -> None:
+    with pytest.raises(InputError, match=r"the scan has shape \(20, 30\)"):
+        usable_pixels(np.ones((20, 30)), calibration)

@@ -1,0 +1,107 @@
+"""Facts about films laid on each other: they come to lie as they were moved apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.film import check_orientation, moved_corners, register, straightened
+
+SHAPE = (150, 210)
+RNG = np.random.default_rng(3)
+LARGE = ndimage.gaussian_filter(RNG.normal(size=(260, 320)), 30) * 60
+FINE = ndimage.gaussian_filter(RNG.normal(size=(260, 320)), 3) * 1.5
+
+
+def film(shift: tuple[float, float], turn: float = 0.0, noise: int | None = None) -> np.ndarray:
+    """What is `shift` further down and right than on a film that lies as it should, turned."""
+    y, x = np.indices(SHAPE, dtype=float)
+    y, x = y - (SHAPE[0] - 1) / 2 - shift[0], x - (SHAPE[1] - 1) / 2 - shift[1]
+    c, s = np.cos(turn), np.sin(turn)
+    at = [c * y + s * x + 129.5, -s * y + c * x + 159.5]
+    seen = ndimage.map_coordinates(LARGE + FINE, at, order=3)
+    return seen + 0.05 * np.random.default_rng(noise).normal(size=SHAPE) * (noise is not None)
+
+
+ALL = np.ones(SHAPE, dtype=bool)
+
+
+def test_films_are_found_to_lie_as_they_do() -> None:
+    shifts = np.array([(0, 0), (2.3, -1.4), (-3.2, 0.6), (0.4, 3.9)])
+    turns = np.array([0.0, 0.006, -0.004, 0.002])
+    films = [film(tuple(shift), turn, k) for k, (shift, turn) in enumerate(zip(shifts, turns))]  # noqa: B905
+    poses = register(films, [ALL] * 4, spread=5.0)
+    np.testing.assert_allclose(poses.shifts - poses.shifts[0], shifts, atol=0.15)
+    np.testing.assert_allclose(poses.turns - poses.turns[0], turns, atol=5e-4)
+    assert poses.by_images.all()
+    assert poses.closure < 0.15
+    assert (poses.errors < 0.3).all()
+    # Only where all lie together is left to the edges.
+    np.testing.assert_allclose(poses.shifts.mean(axis=0), 0, atol=1e-9)
+
+
+def test_edges_that_images_agree_with_are_kept() -> None:
+    films = [film((0, 0), noise=1), film((0.9, -0.5), 0.003, noise=2), film((0.3, 0.4), noise=3)]
+    poses = register(films, [ALL] * 3)
+    np.testing.assert_array_equal(poses.shifts, 0)
+    np.testing.assert_array_equal(poses.turns, 0)
+    assert poses.by_images.all()
+    moved = register([films[0], film((2.9, -0.5), noise=2), films[2]], [ALL] * 3)
+    assert np.abs(moved.shifts).max() > 1
+
+
+def test_what_is_masked_does_not_count() -> None:
+    one, other = film((0, 0), noise=1), film((1.5, -2.5), noise=2)
+    usable = ALL.copy()
+    usable[60:100, 30:90] = False
+    marked = np.where(usable, other, 9.0)
+    poses = register([one, marked], [ALL, usable])
+    np.testing.assert_allclose(poses.shifts[1] - poses.shifts[0], [1.5, -2.5], atol=0.2)
+
+
+def test_films_that_show_nothing_alike_stay_at_their_edges() -> None:
+    noise = np.random.default_rng(5).normal(size=(3, *SHAPE))
+    films = [film((0, 0), noise=7), film((2.0, 0.0), noise=8), 0.3 * noise[0]]
+    poses = register(films, [ALL] * 3)
+    assert list(poses.by_images) == [True, True, False]
+    np.testing.assert_array_equal(poses.shifts[2], 0)
+    assert poses.errors[2] > 2.5
+    assert np.isnan(poses.closure)
+
+
+def test_moved_corners_cut_the_film_where_it_shows_the_same() -> None:
+    shift, turn = (2.4, -1.7), 0.02
+    scan = np.pad(film(shift, turn), 40, mode="edge")
+    corners = np.array([(39.5, 39.5), (39.5, 249.5), (189.5, 249.5), (189.5, 39.5)])
+    cut = straightened(scan, moved_corners(corners, shift, turn, 1.0), shape=SHAPE)
+    inner = np.s_[20:-20, 20:-20]
+    np.testing.assert_allclose(cut[inner], film((0, 0))[inner], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("way", "message"),
+    [
+        (np.s_[::-1, ::-1], "turned = 180"),
+        (np.s_[:, ::-1], r"left to right: give its layer mirrored = true$"),
+        (np.s_[::-1], "mirrored = true, turned = 180"),
+    ],
+)
+def test_a_film_the_other_way_round_is_told(way: tuple[slice, ...], message: str) -> None:
+    films = [film((0, 0)), film((1.0, 2.0), noise=1), film((0, 1.0), noise=2)[way]]
+    names = ["film 4", "film 5", "film 6"]
+    with pytest.raises(InputError, match=f"film 6 does not lie as film 5 does.*{message}"):
+        check_orientation(films, [ALL] * 3, names)
+    check_orientation(films[:2], [ALL] * 2, names[:2])
+
+
+def test_of_a_symmetric_beam_nothing_is_said() -> None:
+    y, x = np.indices(SHAPE) - np.array(SHAPE).reshape(2, 1, 1) / 2 + 0.5
+    beam = -(y**2 + x**2) / 3000
+    check_orientation([beam, beam[::-1]], [ALL] * 2, ["film 1", "film 2"])
+
+
+def test_other_shapes_are_refused() -> None:
+    with pytest.raises(InputError, match=r"images have shape .*expected both as \(films, height"):
+        register(np.zeros((2, 30, 30)), np.ones((2, 30, 31), bool))

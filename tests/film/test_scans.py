@@ -1,0 +1,137 @@
+"""Facts about films on a scan: they are found where they were laid, and turned upright."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.film.scans import find_films, read_corners, straightened, write_corners
+
+Array = NDArray[np.float64]
+
+
+def laid(middle: tuple[float, float], size: tuple[float, float], degrees: float) -> Array:
+    """Corners of a film, turned clockwise."""
+    angle = np.deg2rad(degrees)
+    down, right = (
+        np.array([np.cos(angle), -np.sin(angle)]),
+        np.array([np.sin(angle), np.cos(angle)]),
+    )
+    half = np.array(size) / 2
+    signs = ((-1, -1), (-1, 1), (1, 1), (1, -1))
+    return np.array([middle + half[0] * v * down + half[1] * u * right for v, u in signs])
+
+
+def scanned(films: list[Array], shape: tuple[int, int] = (300, 420), seed: int = 0) -> Any:
+    """A bright bed with films on it whose brightness grows to the right, 16 bits."""
+    rng = np.random.default_rng(seed)
+    planes = np.full((*shape, 3), 64_000.0)
+    places = np.moveaxis(np.indices(shape), 0, -1)
+    for corners in films:
+        top_left, top_right, _, bottom_left = corners
+        inside = np.ones(shape, bool)
+        for start, end in ((top_left, top_right), (top_left, bottom_left)):
+            share = (places - start) @ (end - start) / ((end - start) ** 2).sum()
+            inside &= (share >= 0) & (share <= 1)
+            along = share if end is top_right else None
+            if along is not None:
+                grey = 20_000 + 10_000 * along
+        planes[inside] = (grey[..., None] * [1.0, 1.1, 0.9])[inside]
+    return (planes + rng.normal(0, 300, planes.shape)).clip(0, 65_535).astype(np.uint16)
+
+
+@pytest.mark.parametrize("degrees", [-3.0, 0.0, 0.7, 2.0])
+def test_a_film_is_found_where_it_was_laid(degrees: float) -> None:
+    corners = laid((140.0, 200.0), (120.0, 230.0), degrees)
+    (found,) = find_films(scanned([corners]))
+    np.testing.assert_allclose(found, corners, atol=0.5)
+
+
+def test_notches_dust_and_writing_do_not_move_a_film() -> None:
+    corners = laid((140.0, 200.0), (120.0, 230.0), 1.5)
+    scan = scanned([corners])
+    scan[70:100, 180:186] = 64_000  # a notch from above
+    scan[180:204, 290:320] = 64_000  # a corner that was cut off
+    scan[150:170, 100:110] = 3_000  # writing
+    scan[20:23, 20:23] = scan[280, 300:310] = 9_000  # dust
+    (found,) = find_films(scan)
+    np.testing.assert_allclose(found, corners, atol=0.6)
+
+
+def test_many_films_come_in_the_order_of_reading() -> None:
+    middles = [(70.0, 90.0), (64.0, 300.0), (215.0, 110.0), (222.0, 310.0)]
+    films = [laid(middle, (90.0, 150.0), turn) for middle, turn in zip(middles, (2, -1, 0, 1))]  # noqa: B905
+    found = find_films(scanned([films[k] for k in (3, 0, 2, 1)]))
+    assert len(found) == 4
+    np.testing.assert_allclose(found, films, atol=0.6)
+
+
+def test_a_film_turned_upright_is_as_it_was() -> None:
+    corners = laid((140.0, 200.0), (120.0, 230.0), 2.5)
+    film = straightened(scanned([corners]), corners)
+    assert film.shape == (120, 230, 3)
+    grey = film[..., 0] / (20_000 + 10_000 * (np.arange(230) + 0.5) / 230)
+    assert abs(grey[3:-3, 3:-3] - 1).max() < 0.06
+    # No gradient from the top to the bottom is left.
+    np.testing.assert_allclose(grey[5:30].mean(), grey[-30:-5].mean(), rtol=2e-3)
+
+
+def test_real_films_lie_where_they_were_found_by_hand(shared_data: Path) -> None:
+    folder = shared_data / "rcf"
+    table = (folder / "Corner_Positions_Rectangle.csv").read_text().splitlines()
+    rows = {row[1]: row[2:] for row in csv.reader(table) if row[0] == "19"}
+    away = []
+    for number, letter in enumerate("ABCDEFGHIJKLMNOPQ"):
+        (found,) = find_films(tifffile.imread(folder / f"RCF_18{letter}.tif"))
+        by_hand = [float(rows[name][number]) for name in ("Y1", "X1", "Y2", "X2")]
+        away.append(found[:2].ravel() - by_hand)
+        height = np.hypot(*(found[3] - found[0]))
+        assert height == pytest.approx(296, abs=3)
+    assert np.abs(away).max() < 10
+    assert np.sqrt(np.mean(np.square(away))) < 3.5
+
+
+def test_a_scan_without_films_is_refused() -> None:
+    with pytest.raises(InputError, match="no film was found on the scan"):
+        find_films(scanned([]))
+    with pytest.raises(InputError, match=r"the scan has shape \(20, 30\)"):
+        find_films(np.ones((20, 30)))
+
+
+def test_corners_in_another_order_are_refused() -> None:
+    corners = laid((140.0, 200.0), (120.0, 230.0), 0)
+    with pytest.raises(InputError, match="in the direction of reading"):
+        straightened(np.ones((300, 420)), corners[::-1])
+    with pytest.raises(InputError, match=r"corners have shape \(3, 2\)"):
+        straightened(np.ones((300, 420)), corners[:3])
+
+
+def test_corners_come_back_from_a_table(tmp_path: Path) -> None:
+    films = {"A": laid((140, 200), (120, 230), 1), "B": laid((40, 50), (20, 30), -1)}
+    path = tmp_path / "corners.csv"
+    write_corners(path, films)
+    again = read_corners(path)
+    assert list(again) == ["A", "B"]
+    for name, corners in films.items():
+        np.testing.assert_allclose(again[name], corners, atol=0.006)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("film,y1\nA,1", "has the columns film, y1: expected film, y1, x1"),
+        ("film,y1,x1,y2,x2,y3,x3,y4,x4\nA,1,2", "line 2 has A, 1, 2: expected a film and eight"),
+    ],
+)
+def test_other_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "corners.csv"
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        read_corners(path)

@@ -1,0 +1,113 @@
+"""Facts about spectra that are unfolded from doses: what made the doses comes back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.film import Pack, Response
+from napari_shadowinv.film.unfolding import unfold
+
+SHAPE = (6, 7)
+
+
+@pytest.fixture(scope="module")
+def response() -> Response:
+    filters = ["40 um Al", *["150 um Mylar"] * 3, "300 um Mylar", *["250 um Fe"] * 3]
+    layers = [{"film": "HDV2", "filters": one} for one in filters]
+    return Response.of(Pack.model_validate({"layers": layers}))
+
+
+def doses_of(response: Response, spectrum: np.ndarray) -> np.ndarray:
+    """Of a spectrum (protons per m² and MeV) in every pixel."""
+    dose = np.trapezoid(spectrum * response.doses, response.energies, axis=1)
+    return dose[:, None, None] * np.ones(SHAPE)
+
+
+def falling(response: Response, temperature: float) -> np.ndarray:
+    """Protons per m² and MeV, exponential to the last."""
+    return 1e14 * np.exp(-response.energies / temperature)
+
+
+@pytest.mark.parametrize(("temperature", "within"), [(8.0, 0.01), (12.0, 0.01), (40.0, 0.03)])
+def test_a_falling_spectrum_comes_back(
+    response: Response, temperature: float, within: float
+) -> None:
+    spectrum = falling(response, temperature)
+    doses = doses_of(response, spectrum)
+    found = unfold(doses, np.full(doses.shape, 0.01), response)
+    truth = np.interp([band.peak for band in response.bands], response.energies, spectrum)
+    np.testing.assert_allclose(found.fluence[:, 2, 3], truth, rtol=within)
+    np.testing.assert_allclose(found.fluence, found.fluence[:, :1, :1] * np.ones(SHAPE))
+
+
+def test_each_layer_shows_protons_of_the_energy_that_is_told(response: Response) -> None:
+    spectrum = falling(response, 10.0)
+    # What a magnetic and an electric field add in a pixel, to the first order.
+    for power in (0.5, 1.0):
+        bent = spectrum * (1 + 0.3 * (response.energies / 3) ** -power)
+        doses = np.stack([doses_of(response, one)[:, 0, 0] for one in (spectrum, bent)], axis=1)
+        doses = np.repeat(doses[:, None], 5, axis=1)
+        found = unfold(doses, np.full(doses.shape, 0.01), response)
+        seen = found.fluence[:, 0, 1] / found.fluence[:, 0, 0] - 1
+        np.testing.assert_allclose(seen, 0.3 * (found.energies / 3) ** -power, rtol=0.06)
+
+
+def test_the_last_film_shows_faster_protons_than_stop_in_it(response: Response) -> None:
+    doses = doses_of(response, falling(response, 10.0))
+    found = unfold(doses, np.full(doses.shape, 0.01), response)
+    peaks = np.array([band.peak for band in response.bands])
+    np.testing.assert_allclose(found.energies[:-2], peaks[:-2], rtol=0.03)
+    assert found.energies[-1] > 1.03 * peaks[-1]
+
+
+def test_errors_are_those_of_noisy_doses(response: Response) -> None:
+    doses = doses_of(response, falling(response, 15.0))[:, :1, :1] * np.ones((1, 50, 60))
+    noise = 1 + 0.03 * np.random.default_rng(0).normal(size=doses.shape)
+    errors = np.full(doses.shape, 0.03)
+    found = unfold(doses * noise, errors, response, curvature=10)
+    truth = unfold(doses, errors, response, curvature=10).fluence
+    away = (found.fluence - truth) / found.error
+    np.testing.assert_allclose(away.std(axis=(1, 2)), 1, atol=0.15)
+    assert abs(away.mean(axis=(1, 2))).max() < 0.15
+
+
+def test_nothing_is_negative(response: Response) -> None:
+    doses = np.random.default_rng(1).uniform(0, 10, (8, *SHAPE))
+    found = unfold(doses, np.full(doses.shape, 0.05), response)
+    assert (found.fluence >= 0).all()
+    assert (found.error > 0).all()
+
+
+def test_a_film_that_tells_nothing_is_bridged(response: Response) -> None:
+    doses = doses_of(response, falling(response, 15.0))
+    errors = np.full(doses.shape, 0.01)
+    errors[3, 2, 2] = np.inf
+    found = unfold(doses, errors, response)
+    assert found.fluence[3, 2, 2] == pytest.approx(found.fluence[3, 0, 0], rel=0.02)
+    assert found.error[3, 2, 2] > 3 * found.error[3, 0, 0]
+
+
+def test_twice_the_dose_is_twice_the_fluence(response: Response) -> None:
+    doses = (
+        np.random.default_rng(2).uniform(5, 10, (8, *SHAPE)) * np.arange(9, 1, -1)[:, None, None]
+    )
+    errors = np.full(doses.shape, 0.02)
+    one, two = unfold(doses, errors, response), unfold(2 * doses, errors, response)
+    np.testing.assert_allclose(two.fluence, 2 * one.fluence, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("doses", "message"),
+    [
+        (
+            np.ones((7, 3, 3)),
+            r"doses have shape \(7, 3, 3\).*expected both as \(8, height, width\)",
+        ),
+        (-np.ones((8, 3, 3)), "doses are negative"),
+    ],
+)
+def test_other_doses_are_refused(response: Response, doses: np.ndarray, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        unfold(doses, np.full(doses.shape, 0.1), response)

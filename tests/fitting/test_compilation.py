@@ -1,0 +1,98 @@
+"""The compiler is waited for once, and that is told."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import InversionCancelled
+from napari_shadowinv.fitting import FitOptions, compilation, fit
+from napari_shadowinv.fitting.compilation import ensure_compiled, is_compiled
+
+
+def printed(script: str, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, **environment},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+def test_a_fit_tells_that_it_compiles_and_can_be_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[Any] = []
+    images = np.ones((2, 32, 32))
+    keywords: dict[str, Any] = {
+        "strengths": [1, 0.5],
+        "noise": 0.1,
+        "options": FitOptions(samples=0, steps=1),
+    }
+    monkeypatch.setattr(compilation, "is_compiled", lambda: False)
+    fit(images, **keywords, on_progress=told.append)
+    assert [news.stage for news in told[:4]] == ["compile"] * 3 + ["fit"]
+    assert [news.step for news in told[:3]] == [0, 1, 2]
+    assert "once, for" in told[0].message
+    told.clear()
+    with pytest.raises(InversionCancelled):
+        ensure_compiled(told.append, should_stop=lambda: len(told) == 2)
+    assert len(told) == 2
+    monkeypatch.undo()
+    assert is_compiled()
+    fit(images, **keywords, on_progress=told.append)
+    assert told[2].stage == "fit"
+
+
+def test_code_of_other_kernels_is_no_reason_not_to_compile(tmp_path: Path) -> None:
+    script = """
+import os, time
+from pathlib import Path
+from napari_shadowinv.fitting import _ray_kernels as kernels
+from napari_shadowinv.fitting.compilation import is_compiled
+
+folder = Path(kernels.collect.stats.cache_path)
+folder.mkdir(parents=True, exist_ok=True)
+version = "py{0.major}{0.minor}".format(__import__("sys").version_info)
+answers = [is_compiled()]
+for when in (0.0, time.time()):
+    for name in ("deposit", "gather", "boxes", "collect"):
+        path = folder / f"_ray_kernels.{name}-1.{version}.nbi"
+        path.touch()
+        os.utime(path, (when, when))
+    answers.append(is_compiled())
+print(answers)
+"""
+    # The middle one is of a source that has changed since.
+    assert printed(script, NUMBA_CACHE_DIR=str(tmp_path)) == "[False, False, True]"
+
+
+def test_it_leaves_nothing_to_compile_for_a_fit() -> None:
+    script = """
+import sys
+from pathlib import Path
+from typing import Any
+import numpy as np
+from napari_shadowinv.fitting import FitOptions, compilation, fit
+from napari_shadowinv.inversion import compilation as of_transport
+
+compilation.is_compiled = of_transport.is_compiled = lambda: False
+compilation.ensure_compiled()
+compilation.is_compiled = of_transport.is_compiled = lambda: True
+kernels = {
+    function
+    for name, module in list(sys.modules.items()) if name.startswith("napari_shadowinv")
+    for function in vars(module).values() if hasattr(function, "signatures")
+}
+compiled = {kernel: len(kernel.signatures) for kernel in kernels}
+y, x = np.indices((36, 48)) / 10
+image = 1 + 0.1 * np.sin(y) * np.cos(x)
+keywords = {"noise": 0.02, "options": FitOptions(samples=2, steps=2, align="affine")}
+fit([image, 1 + 0.5 * (image - 1)], strengths=[1, 0.5], **keywords)
+print([kernel.py_func.__name__ for kernel in kernels if len(kernel.signatures) > compiled[kernel]])
+"""
+    assert printed(script) == "[]"

@@ -1,0 +1,258 @@
+"""Scans of CR-39, written here byte by byte as the description in `cpsa` tells."""
+
+import struct
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from command_line import flat, shadowinv
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io import read, read_cpsa, read_radiograph, read_tracks
+from napari_shadowinv.io.cpsa import as_text
+
+PIXEL = 0.5  # µm; a frame of 800 × 400 px is 400 × 200 µm
+WIDTH, HEIGHT = 800, 400
+# diameter (0.01 px), eccentricity, contrast, mean contrast, x, y
+Track = tuple[int, int, int, int, int, int]
+Frame = tuple[int, int, list[Track]]  # column, row, tracks
+ROUND: Track = (1000, 5, 20, 21, 100, 50)
+
+
+def frame_bytes(number: int, frame: Frame, pitch: float = 1.0) -> bytes:
+    column, row, tracks = frame
+    # The stage's x grows from column to column, y falls from row to row, in 0.1 µm.
+    x = round(30_000 + pitch * 4000 * column)
+    y = round(90_000 - pitch * 2000 * row)
+    head = struct.pack("<10i", number, x, y, len(tracks), 7, 8, 9, 55, column, row)
+    kinds = "hBBBhh"
+    values = zip(*tracks, strict=True)
+    return head + b"".join(
+        struct.pack(f"<{len(tracks)}{kind}", *column)
+        for kind, column in zip(kinds, values, strict=False)
+    )
+
+
+def save(
+    path: Path, shape: tuple[int, int], frames: Iterable[Frame], pitch: float = 1.0, **told: Any
+) -> Path:
+    fields = {
+        "version": -104,
+        "columns": shape[0],
+        "rows": shape[1],
+        "bins": 0,
+        "pixel": PIXEL,
+        "per_bin": 0.5,
+        "border": 85,
+        "contrast": 75,
+        "eccentricity": 40,
+        "moments": 2,
+        "width": WIDTH,
+        "height": HEIGHT,
+        **told,
+    }
+    content = b"".join(frame_bytes(n, frame, pitch) for n, frame in enumerate(frames, 1))
+    trailer = struct.pack("<i", -1) + b"Scan of shot 17\n\xb5m"
+    path.write_bytes(struct.pack("<4i2f6i", *fields.values()) + content + trailer)
+    return path
+
+
+def snake(columns: int, rows: int, tracks: Callable[[int, int], list[Track]]) -> list[Frame]:
+    """Frames in the order in which a stage moves, every second row backwards."""
+    return [
+        (column, row, tracks(column, row))
+        for row in range(rows)
+        for column in (range(columns) if row % 2 == 0 else range(columns - 1, -1, -1))
+    ]
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    """Six by six frames with ten tracks each, at random, of three kinds."""
+    rng = np.random.default_rng(3)
+
+    def tracks(column: int, row: int) -> list[Track]:
+        kinds = [(600, 3, 10), (1400, 3, 10), (1400, 30, 60)]
+        return [
+            (*kinds[i % 3], 0, int(rng.integers(1, WIDTH)), int(rng.integers(1, HEIGHT)))
+            for i in range(12)
+        ]
+
+    return save(tmp_path / "scan.cpsa", (6, 6), snake(6, 6, tracks))
+
+
+def test_a_track_has_the_place_and_the_size_that_its_bytes_tell(tmp_path: Path) -> None:
+    tracks = [ROUND, (640, 40, 99, 98, 0, HEIGHT)]
+    path = save(tmp_path / "a.cpsa", (2, 2), snake(2, 2, lambda c, r: tracks * (c > r)))
+    found = read_tracks(path)
+    assert len(found) == 2
+    np.testing.assert_allclose(found.size, (400e-6, 800e-6))
+    # The upper right frame: x counts from its right edge to the left, y from its lower edge up.
+    np.testing.assert_allclose(found.x, [800e-6 - 100 * 0.5e-6, 800e-6], atol=1e-12)
+    np.testing.assert_allclose(found.y, [200e-6 - 50 * 0.5e-6, 0.0], atol=1e-12)
+    np.testing.assert_allclose(found.diameter, [10 * PIXEL, 6.4 * PIXEL], rtol=1e-6)
+    np.testing.assert_array_equal(found.eccentricity, [5, 40])
+    np.testing.assert_array_equal(found.contrast, [20, 99])
+
+
+def test_frames_lie_where_their_places_say(tmp_path: Path) -> None:
+    frames = snake(4, 3, lambda c, r: [ROUND] * (1 + c + 10 * r))
+    shot = read_cpsa(save(tmp_path / "a.cpsa", (4, 3), frames), bin=200)
+    counts = shot.image.reshape(3, 1, 4, 2).sum(axis=(1, 3))
+    np.testing.assert_array_equal(counts, 1 + np.arange(4) + 10 * np.arange(3)[:, None])
+    # 100 px of 800 from the right edge.
+    np.testing.assert_array_equal(shot.image[:, ::2], 0)
+    assert shot.metadata["geometry"] == {"detector_pixel_size": pytest.approx(200e-6)}
+    assert not shot.warnings[1:]
+
+
+def test_ranges_choose_tracks_and_are_kept(scan: Path) -> None:
+    assert read_radiograph(scan).image.sum() == 36 * 12
+    assert "all 432 tracks are counted" in read_radiograph(scan).warnings[0]
+    for ranges, share in (
+        ({"diameter": (4, None)}, 2 / 3),
+        ({"diameter": (None, 3)}, 1 / 3),  # both ends count
+        ({"contrast": (None, 40)}, 2 / 3),
+        ({"diameter": (4, 12), "eccentricity": (0, 15)}, 1 / 3),
+    ):
+        shot = read_cpsa(scan, bin=200, **ranges)
+        assert shot.image.sum() == shot.metadata["tracks"] == 432 * share
+        assert not shot.warnings
+        # As the command and a result's provenance name them.
+        again = read_radiograph(scan, variable=shot.metadata["variable"])
+        np.testing.assert_array_equal(again.image, shot.image)
+        assert again.metadata == shot.metadata
+
+
+def test_a_usual_bin_holds_fifty_tracks_on_average(scan: Path) -> None:
+    shot = read_cpsa(scan)
+    assert shot.image.shape == (2, 4)
+    assert shot.image.sum() == 432  # 54 in each
+    assert shot.metadata["geometry"]["detector_pixel_size"] == pytest.approx(600e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "ranges"),
+    [
+        ("diameter=4:12 contrast=:40 bin=300", {"diameter": (4, 12), "contrast": (None, 40)}),
+        ("eccentricity=0.1: bin=300", {"eccentricity": (0.1, None)}),
+    ],
+)
+def test_ranges_are_written_as_one_types_them(text: str, ranges: dict[str, Any]) -> None:
+    assert as_text(**ranges, bin=300) == text
+    assert as_text() is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "4:12", "diameter=4", "diameter=4:5:6", "diameter=a:b", "size=3:4", "bin=", "bin=x"),
+        *("diameter=4:5 diameter=6:7", "diameter=4:5 and more", "diameter=9:4", "bin=-3"),
+        *("bin=nan", "bin=1e9", "bin=1e-4", "contrast=nan:", "diameter=1e5:"),
+    ],
+)
+def test_impossible_ranges_are_told(scan: Path, text: str) -> None:
+    with pytest.raises(InputError, match="expected") as error:
+        read(scan, variable=text)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("ends", [(1,), (1, 2, 3), ("a", 2), 3])
+def test_a_range_of_two_numbers_is_wanted(scan: Path, ends: Any) -> None:
+    with pytest.raises(InputError, match=r"diameter is .* expected"):
+        read_cpsa(scan, diameter=ends)
+
+
+def test_gaps_between_frames_are_told(tmp_path: Path) -> None:
+    frames = snake(4, 4, lambda c, r: [ROUND])
+    path = save(tmp_path / "a.cpsa", (4, 4), frames, pitch=1.2)
+    assert any("overlap or leave gaps" in text for text in read_radiograph(path).warnings)
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"version": 104}, "its version is 104, expected a negative number"),
+        ({"columns": 0}, "gives 0 × 6 frames"),
+        ({"rows": -1}, "gives 6 × -1 frames"),
+        ({"columns": 2**31 - 1, "rows": 2**31 - 1}, "expected at most 500000"),
+        ({"columns": 500, "rows": 1000}, "implies 20000048 bytes"),
+        ({"columns": 7}, "damaged"),
+        ({"pixel": float("nan")}, "of nan µm"),
+        ({"pixel": -1.0}, "of -1 µm"),
+        ({"width": 0}, "of 0 × 400 pixels"),
+        ({"columns": 9, "rows": 4}, "expected each place of 9 × 4 once"),
+    ],
+)
+def test_headers_that_cannot_be_are_refused(tmp_path: Path, told: Any, words: str) -> None:
+    path = save(tmp_path / "a.cpsa", (6, 6), snake(6, 6, lambda c, r: [ROUND]), **told)
+    start = time.perf_counter()
+    with pytest.raises(FileFormatError, match=words):
+        read(path)
+    assert time.perf_counter() - start < 1
+
+
+def test_wherever_a_file_is_cut_it_is_told(tmp_path: Path, scan: Path) -> None:
+    whole = scan.read_bytes()
+    end = len(whole) - len(struct.pack("<i", -1) + b"Scan of shot 17\n\xb5m")
+    cut = tmp_path / "cut.cpsa"
+    for length in (1, 47, 48, 60, 88, 95, end // 2, end - 1):
+        cut.write_bytes(whole[:length])
+        with pytest.raises(FileFormatError, match="truncated"):
+            read_tracks(cut)
+    cut.write_bytes(whole[:end])  # the trailer is not needed
+    assert len(read_tracks(cut)) == 432
+
+
+def test_frames_twice_or_with_too_many_tracks_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.cpsa", (2, 2), [(0, 0, []), (1, 0, []), (1, 0, []), (0, 1, [])])
+    with pytest.raises(FileFormatError, match=r"frame 3 is at column 1, row 0 .* once"):
+        read_tracks(path)
+    good = bytearray(save(path, (2, 2), snake(2, 2, lambda c, r: [])).read_bytes())
+    for hits, words in ((-1, "with -1 tracks"), (2**31 - 1, "implies")):
+        struct.pack_into("<i", good, 48 + 12, hits)
+        path.write_bytes(good)
+        with pytest.raises(FileFormatError, match=words):
+            read_tracks(path)
+
+
+def test_a_scan_larger_than_the_memory_is_refused(
+    scan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SHADOWINV_MAX_GB", "1e-6")
+    with pytest.raises(FileFormatError, match="expands to"):
+        read_tracks(scan)
+
+
+def test_other_files_are_no_scans(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.ones((4, 4)))
+    with pytest.raises(FileFormatError, match="is no CR-39 scan"):
+        read_cpsa(path, diameter=(1, 2))
+    with pytest.raises(InputError, match="nor a CR-39 scan"):
+        read(path, variable="bin=3")
+    empty = save(tmp_path / "none.cpsa", (2, 2), snake(2, 2, lambda c, r: []))
+    with pytest.raises(InputError, match="no track lies within the ranges"):
+        read(empty)
+
+
+def test_the_command_inverts_a_scan_and_makes_it_again(
+    scan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(scan.parent)
+    chosen = "diameter=:12 contrast=:40 bin=100"
+    done = shadowinv("invert", scan, "--variable", chosen, "--out", "a.shadowinv")
+    assert done.exit_code == 0, done.output
+    image = read_cpsa(scan, diameter=(None, 12), contrast=(None, 40), bin=100).image
+    assert image.shape == (12, 24)
+    np.testing.assert_allclose(read(Path("a.shadowinv"))["residual"].shape, image.shape)
+    again = shadowinv("rerun", "a.shadowinv")
+    assert again.exit_code == 0, again.output
+    told = flat(shadowinv("info", scan, "--variable", chosen).output)
+    assert "tracks in CR-39" in told
+    assert "288 of 432 tracks counted in bins of 100 µm" in told
+    assert "detector pixel size (m)" in told
+    assert "all 432 tracks are counted" in flat(shadowinv("info", scan).output)

@@ -1,0 +1,174 @@
+"""A fit as layers: what is shown of it, saved, and shown again when its file is opened."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.components import ViewerModel
+
+from napari_shadowinv import ProtonSetup, read, write
+from napari_shadowinv._napari.fit_layers import fit_layers
+from napari_shadowinv._napari.frame import Frame
+from napari_shadowinv._napari.layer_metadata import (
+    Result,
+    displacement_of,
+    mark_of,
+    result_of,
+    role_of,
+    slot_of,
+    unit_of,
+)
+from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv.fitting import Fit, FitOptions, Verdict, fit
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.projection import transferred_displacement
+
+SHAPE = (48, 64)
+LENGTHS = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2, "pixel_size": 1.5e-6}
+SETUPS = tuple(ProtonSetup(energy=energy, **LENGTHS) for energy in (20.0, 3.0))
+MAGNETIC = gaussian_blob(SHAPE, 10.0, 8.0, (22.0, 35.0)).displacement
+ELECTRIC = gaussian_blob(SHAPE, 7.0, 7.0, (28.0, 24.0)).displacement
+WHY = "2 different fields explain the images about as well"
+
+
+def image(setup: ProtonSetup, *, electric: bool) -> Any:
+    moved = transferred_displacement(MAGNETIC, SETUPS[0], setup, deflector="magnetic field")
+    if electric:
+        moved = moved + transferred_displacement(
+            ELECTRIC, SETUPS[0], setup, deflector="electric field"
+        )
+    noise = np.random.default_rng(int(setup.energy)).normal(0, 0.01, SHAPE)
+    return synthetic_image(moved) + noise
+
+
+def found(fields: tuple[str, ...]) -> Fit:
+    """A fit with a second answer, and with doubts."""
+    images = [image(setup, electric=len(fields) > 1) for setup in SETUPS]
+    options = FitOptions(steps=3, samples=2)
+    best = fit(images, setups=SETUPS, fields=fields, noise=0.01, options=options)
+    (first, *_) = best.basins
+    other = replace(first, start="from near", distance=0.5, displacement=first.displacement / 2)
+    doubts = {"verdict": Verdict.SEVERAL, "explanation": WHY}
+    return replace(best, basins=(first, other), **doubts)
+
+
+@pytest.fixture(scope="module")
+def doubtful() -> Fit:
+    return found(("B",))
+
+
+@pytest.fixture(scope="module")
+def two_fields() -> Fit:
+    return found(("B", "E"))
+
+
+def opened(viewer: ViewerModel, path: Path) -> dict[str, Any]:
+    viewer.layers.clear()
+    viewer.open(str(path), plugin="napari-shadowinv")
+    slots = [slot_of(layer) for layer in viewer.layers]
+    assert len(set(slots)) == len(slots)
+    return dict(zip(slots, viewer.layers, strict=True))
+
+
+def shown(viewer: ViewerModel, content: Fit, **place: Any) -> dict[str, Any]:
+    """The layers of a fit as the widget adds them."""
+    result = Result(content, content.setups[0], {"mask_origin": "painted"})
+    layers = add_layers(viewer, fit_layers(result, Frame(**place), "pack fit"))
+    return {slot_of(layer): layer for layer in layers}
+
+
+def test_a_file_of_the_command_shows_all_of_a_fit(
+    viewer: ViewerModel, two_fields: Fit, tmp_path: Path, told: list[str]
+) -> None:
+    layers = opened(viewer, write(tmp_path / "pack.shadowinv", two_fields))
+    in_each = ["potential", "field y", "field x", "field", "uncertainty", "arrows"]
+    of_fields = ["field arrows", *(f"{role}{part}" for role in in_each for part in ("", " E"))]
+    of_answers = [f"{role} {name} 1" for role in ("field", "arrows") for name in "BE"]
+    of_images = ["image", "reprojection", "residual"]
+    assert set(layers) == {*of_fields, *of_answers, *of_images}
+    assert {slot for slot, layer in layers.items() if layer.visible} == {"field", "arrows"}
+    for slot in of_images:
+        assert layers[slot].data.shape == (2, *SHAPE)
+        assert tuple(map(str, layers[slot].units)) == ("pixel", "micrometer", "micrometer")
+        assert tuple(layers[slot].scale) == pytest.approx((1, 1.5, 1.5))
+    np.testing.assert_array_equal(layers["reprojection"].data, two_fields.reprojection)
+    np.testing.assert_array_equal(layers["image"].data, two_fields.images)
+    for slot, one in zip(("field", "field E"), two_fields.fields, strict=True):
+        np.testing.assert_array_equal(displacement_of(layers[slot]), one.displacement)
+    assert unit_of(layers["field"]).endswith("T·m")
+    assert unit_of(layers["field E"]).endswith("V")
+    assert unit_of(layers["uncertainty E"]) == unit_of(layers["field E"])
+    assert "from near" in layers["field B 1"].name
+    half = np.abs(displacement_of(layers["field B 1"])).max() / np.abs(MAGNETIC).max()
+    assert half == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_verdict_cannot_be_missed(
+    viewer: ViewerModel, doubtful: Fit, tmp_path: Path, told: list[str]
+) -> None:
+    layers = opened(viewer, write(tmp_path / "pack.shadowinv", doubtful))
+    assert told == [f"pack.shadowinv: the fit's verdict is 'one of several': {WHY}"]
+    for layer in layers.values():
+        assert mark_of(layer)["verdict"] == "one of several"
+        assert mark_of(layer)["explanation"] == WHY
+    assert layers["field"].name.startswith("pack (one of several) |∫B×dz|")
+    good = replace(doubtful, verdict=Verdict.DETERMINED, explanation="all starts lead to one")
+    layers = opened(viewer, write(tmp_path / "good.shadowinv", good))
+    assert len(told) == 1
+    assert mark_of(layers["field"])["verdict"] == "determined"
+    assert layers["field"].name.startswith("good |∫B×dz|")
+
+
+def test_warnings_of_a_saved_inversion_are_told(
+    viewer: ViewerModel, solved: Inversion, tmp_path: Path, told: list[str]
+) -> None:
+    report = replace(solved.report, warnings=("it did not converge",))
+    opened(viewer, write(tmp_path / "shot.shadowinv", replace(solved, report=report)))
+    assert told == ["shot.shadowinv: it did not converge"]
+
+
+def test_any_layer_stands_for_the_fit_when_it_is_saved(
+    viewer: ViewerModel, two_fields: Fit, tmp_path: Path, told: list[str]
+) -> None:
+    turned = {"translate": (3.0, 4.0), "rotate": ((0.0, -1.0), (1.0, 0.0))}
+    layers = shown(viewer, two_fields, **turned)
+    layers["field E"].colormap = "viridis"
+    layers["residual"].visible = True
+    path = tmp_path / "pack.shadowinv"
+    for kept in (["residual", "field E"], ["field E"]):
+        viewer.layers.selection = {layers[slot] for slot in kept}
+        viewer.layers.save(str(path), selected=True, plugin="napari-shadowinv")
+        assert read(path).attrs["mask_origin"] == "painted"
+        again = Fit.from_dataset(read(path))
+        for one, other in zip(again.fields, two_fields.fields, strict=True):
+            np.testing.assert_array_equal(one.displacement, other.displacement)
+        viewer.layers.clear()
+        reopened = opened(viewer, path)
+        assert {slot for slot, one in reopened.items() if one.visible} <= set(kept)
+        assert reopened["field E"].colormap.name == "viridis"
+        assert tuple(reopened["field"].translate) == (3, 4)
+        np.testing.assert_array_equal(reopened["field"].rotate, turned["rotate"])
+        assert result_of(reopened["field"]).attributes["mask_origin"] == "painted"
+        viewer.layers.clear()
+        layers = shown(viewer, two_fields, **turned)
+        layers["field E"].colormap = "viridis"
+    assert not [text for text in told if "changed" in text]
+
+
+def test_a_beam_is_shown_once_unless_images_have_different_ones(doubtful: Fit) -> None:
+    def beam(content: Fit) -> Any:
+        layers = fit_layers(Result(content), Frame(), "a")
+        return next((data for data, about, _ in layers if role_of(about) == "source"), None)
+
+    assert beam(doubtful) is None
+    uneven = 1 + np.arange(SHAPE[1]) * np.ones(SHAPE) / 100
+    same = np.stack([uneven, 1.3 * uneven])
+    np.testing.assert_array_equal(beam(replace(doubtful, source=same)), uneven)
+    other = np.stack([uneven, uneven[:, ::-1]])
+    np.testing.assert_array_equal(beam(replace(doubtful, source=other)), other)

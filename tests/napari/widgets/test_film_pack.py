@@ -1,0 +1,319 @@
+"""The widget that turns the scans of a film pack into fluences; a window only where it counts."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.components import ViewerModel
+from qtpy.QtCore import Qt
+from qtpy.QtWidgets import QFileDialog
+from simulated_pack import Truth
+
+from napari_shadowinv import read, write
+from napari_shadowinv._napari.layer_metadata import role_of, setup_of, usable_of
+from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv._napari.packs import BY_HAND, film_layers, pack_frame, pack_of
+from napari_shadowinv._napari.widgets import _pack_work
+from napari_shadowinv._napari.widgets.film_pack import FilmPack
+from napari_shadowinv._napari.widgets.fit_images import FitImages
+from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.film import read_corners
+
+PATIENCE = 60_000  # ms
+
+
+@pytest.fixture
+def tool(viewer: ViewerModel, qtbot: Any) -> Any:
+    made = FilmPack(viewer)
+    qtbot.addWidget(made)
+    return made
+
+
+@pytest.fixture
+def wait(qtbot: Any) -> Callable[[Any], None]:
+    def until_at_rest(tool: Any) -> None:
+        qtbot.waitUntil(
+            lambda: not (tool.panel.runner.running or tool.results.busy or tool.fit_images.busy),
+            timeout=PATIENCE,
+        )
+        qtbot.wait(20)
+
+    return until_at_rest
+
+
+@pytest.fixture
+def evaluated(viewer: ViewerModel, tool: Any, pack_dataset: Any, tmp_path: Path) -> Any:
+    """The widget with a result that was opened from a file."""
+    viewer.open(write(tmp_path / "trio.shadowinv", pack_dataset), plugin="napari-shadowinv")
+    return tool
+
+
+def of_role(viewer: Any, role: str) -> Any:
+    (found,) = [layer for layer in viewer.layers if role_of(layer) == role]
+    return found
+
+
+def scratch_of(tool: Any) -> list[Path]:
+    return list(Path(tool._scratch.name).rglob("*"))
+
+
+def test_a_run_shows_the_fluences_of_the_films(
+    window: Any, open_widget: Any, film_pack: Truth, pack_dataset: Any, wait: Callable[[Any], None]
+) -> None:
+    tool = open_widget("Film pack")
+    tool.path.edit.setText(str(film_pack.pack))
+    tool.panel.button.click()
+    wait(tool)
+    assert [layer.name for layer in window.layers] == [
+        "trio dose (Gy)",
+        "trio fluence (1/(m² MeV))",
+        "trio unusable",
+    ]
+    fluence = of_role(window, "fluence")
+    np.testing.assert_array_equal(fluence.data, pack_dataset["fluence"].values)
+    assert window.layers.selection.active is fluence
+    assert tool.packs.layer is fluence
+    first, _, last = (f"{energy:.3g}" for energy in pack_dataset["energy"].values)
+    assert tool.report.texts()["Films"] == f"3, {first} to {last} MeV"
+    used = pack_dataset["usable"].values
+    means = [plane[one].astype(float).mean() for plane, one in zip(fluence.data, used, strict=True)]
+    np.testing.assert_allclose(tool.plot.shown.fluence, means)
+    # The same pack again takes the place of its result.
+    tool.panel.button.click()
+    wait(tool)
+    assert len(window.layers) == 3
+
+
+def test_the_spectrum_follows_the_region(evaluated: Any, pack_dataset: Any, qtbot: Any) -> None:
+    tool = evaluated
+    tool._draw_region()
+    scale = tool.packs.layer.scale[1:]
+    assert tool.regions.layer.name.endswith("region")
+
+    def mean(rows: slice, columns: slice) -> list[float]:
+        used = pack_dataset["usable"].values[:, rows, columns]
+        fluence = pack_dataset["fluence"].values[:, rows, columns]
+        return [one[here].astype(float).mean() for one, here in zip(fluence, used, strict=True)]
+
+    region = tool.regions.layer
+    np.testing.assert_allclose(region.scale, scale)
+    region.add_rectangles([[19.6, 29.6], [49.4, 59.4]])
+    qtbot.waitUntil(
+        lambda: np.allclose(tool.plot.shown.fluence, mean(np.s_[20:50], np.s_[30:60])), timeout=5000
+    )
+    region.data = [region.data[0] + [10, 20]]
+    qtbot.waitUntil(
+        lambda: np.allclose(tool.plot.shown.fluence, mean(np.s_[30:60], np.s_[50:80])), timeout=5000
+    )
+
+
+def test_corners_are_shown_dragged_and_used(
+    viewer: ViewerModel, evaluated: Any, pack_dataset: Any, wait: Callable[[Any], None], qtbot: Any
+) -> None:
+    tool = evaluated
+    of_role(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
+    viewer.dims.set_current_step(0, 1)
+    tool.show_corners.click()
+    known = pack_dataset["corners"].values
+    np.testing.assert_allclose(tool.corners.polygon.data[0], known[1], atol=1e-4)
+    assert tool.corners.scan.rgb
+    assert tool.corners.corners(pack_dataset) is None
+    moved = known[1] + [[-2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]
+    tool.corners.polygon.data = [moved]
+    viewer.dims.set_current_step(0, 2)
+    qtbot.waitUntil(lambda: tool.corners.scan.name == "scan of film 3", timeout=5000)
+    np.testing.assert_allclose(tool.corners.polygon.data[0], known[2], atol=1e-4)
+    tool.run_again.click()
+    wait(tool)
+    dataset = tool._chosen()[1]
+    assert dataset is not pack_dataset
+    table = read_corners(pack_of(dataset).corners)
+    np.testing.assert_allclose(table["1"], known[0], atol=0.006)
+    np.testing.assert_allclose(table["2"], moved, atol=0.006)
+    assert list(table) == ["1", "2", "3"]
+    # Marks stay in their places, although the films are a pixel higher now.
+    height = dataset.sizes["y"]
+    assert height == pack_dataset.sizes["y"] + 1
+    spot = dataset["usable"].values[0, 38:46, 48:57]
+    assert spot.sum() == spot.size - 20
+    marks = tool._partner(tool.packs.layer, "unusable")
+    assert (marks.data[0, 38:46, 48:57][~spot] == BY_HAND).all()
+    assert not tool.corners.shown
+    assert not any(role_of(layer) in ("scan", "corners") for layer in viewer.layers)
+
+
+def test_a_polygon_that_is_no_film_is_one_sentence(viewer: ViewerModel, evaluated: Any) -> None:
+    tool = evaluated
+    tool.show_corners.click()
+    polygon = tool.corners.polygon
+    polygon.data = [polygon.data[0][[0, 2, 1, 3]]]
+    before = len(viewer.layers)
+    tool.run_again.click()
+    assert "do not go around a film" in tool.panel.status.text()
+    polygon.data = [polygon.data[0][:3]]
+    tool.run_again.click()
+    assert "with 3 corners: expected one polygon with the four" in tool.panel.status.text()
+    assert len(viewer.layers) == before
+    assert not tool.panel.runner.running
+
+
+def test_painted_pixels_are_not_used(
+    viewer: ViewerModel,
+    evaluated: Any,
+    pack_dataset: Any,
+    wait: Callable[[Any], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tool = evaluated
+    tool.paint.click()
+    marks = of_role(viewer, "unusable")
+    assert marks.visible
+    assert marks.mode == "paint"
+    assert marks.selected_label == BY_HAND
+    spot = np.s_[1, 30:36, 40:48]
+    assert pack_dataset["usable"].values[spot].all()
+    marks.data[spot] = BY_HAND
+    tool.run_again.click()
+    wait(tool)
+    dataset = tool._chosen()[1]
+    usable = dataset["usable"].values
+    assert not usable[spot].any()
+    assert usable[0, 30:36, 40:48].all()
+    marks = tool._partner(tool.packs.layer, "unusable")
+    assert (marks.data[spot] == BY_HAND).all()
+    assert (marks.data == BY_HAND).sum() == 48
+    # What was corrected goes with a file.
+    file = tmp_path / "mended.shadowinv"
+    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (str(file), ""))
+    tool.save.click()
+    again = read(file)
+    np.testing.assert_array_equal(again["usable"].values, usable)
+    mask = pack_of(again).layers[1].mask
+    assert mask == tmp_path / "mended_mask_02.tif"
+    assert not read(mask).image[30:36, 40:48].any()
+    # Rubbed out, they count again.
+    marks.data[spot] = 0
+    tool.run_again.click()
+    wait(tool)
+    assert tool._chosen()[1]["usable"].values[spot].all()
+
+
+def test_cancelling_leaves_nothing(
+    viewer: ViewerModel,
+    evaluated: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    wait: Callable[[Any], None],
+    qtbot: Any,
+) -> None:
+    written: list[list[Path]] = []
+
+    def endless(pack: Any, *, on_progress: Any, should_stop: Any) -> Any:
+        written.append(scratch_of(tool))
+        while not should_stop():
+            time.sleep(0.01)
+        raise InversionCancelled
+
+    tool = evaluated
+    monkeypatch.setattr(_pack_work, "run_film", endless)
+    of_role(viewer, "unusable").data[0, 30:40, 30:40] = BY_HAND
+    before = list(viewer.layers)
+    tool.run_again.click()
+    qtbot.waitUntil(lambda: bool(written), timeout=PATIENCE)
+    assert [path.name for path in written[0] if path.is_file()] == ["mask_01.tif"]
+    tool.panel.button.click()
+    wait(tool)
+    qtbot.waitUntil(lambda: not scratch_of(tool), timeout=PATIENCE)
+    assert tool.panel.status.text() == "Cancelled."
+    assert list(viewer.layers) == before
+
+
+def test_mistakes_are_one_sentence_in_the_widget(
+    viewer: ViewerModel, tool: Any, film_pack: Truth, tmp_path: Path, wait: Callable[[Any], None]
+) -> None:
+    scan = film_pack.files[0]
+    (tmp_path / "odd.toml").write_text("layer = 3\n")
+    lost = tmp_path / "lost.toml"
+    lost.write_text(film_pack.pack.read_text())
+    for name in ("HDV2.csv", "unexposed.tif"):
+        shutil.copy(film_pack.folder / name, tmp_path)
+    for path, said in (
+        ("", "No pack is selected"),
+        (tmp_path / "none.toml", "none.toml"),
+        (scan, "expected a TOML file"),
+        (tmp_path / "odd.toml", "did you mean 'layers'"),
+        (lost, "film_01.tif does not exist"),
+    ):
+        tool.path.edit.setText(str(path))
+        tool.panel.button.click()
+        wait(tool)
+        text = tool.panel.status.text()
+        assert said in text
+        assert "internal error" not in text
+    assert not viewer.layers
+
+
+def test_films_become_images_that_can_be_fitted(
+    viewer: ViewerModel, evaluated: Any, qtbot: Any, pack_dataset: Any, wait: Callable[[Any], None]
+) -> None:
+    evaluated.to_fit.click()
+    wait(evaluated)
+    images = [layer for layer in viewer.layers if role_of(layer) == "shot"]
+    assert [layer.name for layer in images] == [
+        f"film {k}, {energy:.3g} MeV" for k, energy in enumerate(pack_dataset["energy"].values, 1)
+    ]
+    fit = FitImages(viewer)
+    qtbot.addWidget(fit)
+    fit.source.picker.set_kind("unknown")
+    job = fit.request()
+    for shot, layer in zip(job.shots, images, strict=True):
+        np.testing.assert_array_equal(shot.mask, usable_of(layer))
+        assert shot.setup == setup_of(layer)
+    invert = InvertShot(viewer)
+    qtbot.addWidget(invert)
+    invert.image.layer = images[1]
+    request = invert.request()
+    np.testing.assert_array_equal(request.shot.mask, pack_dataset["usable"].values[1])
+    assert request.recipe.setup == setup_of(images[1])
+
+
+def test_layers_are_written_with_a_table(
+    evaluated: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: list[str]
+) -> None:
+    folder = tmp_path / "layers"
+    monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_, **__: str(folder))
+    evaluated.write.click()
+    with (folder / "layers.csv").open(newline="") as file:
+        assert [row["file"] for row in csv.DictReader(file)] == [
+            "layer_01.tif",
+            "layer_02.tif",
+            "layer_03.tif",
+        ]
+    evaluated.write.click()
+    assert "exists" in evaluated.panel.status.text()
+
+
+def test_without_a_setup_films_know_how_strongly_they_are_displaced(
+    viewer: ViewerModel, pack_dataset: Any, qtbot: Any
+) -> None:
+    bare = pack_dataset.drop_vars("time_of_flight")
+    del bare.attrs["setups"]
+    add_layers(viewer, film_layers(bare, pack_frame(bare), "trio"))
+    fit = FitImages(viewer)
+    qtbot.addWidget(fit)
+    fit.source.picker.set_kind("unknown")
+    strengths = pack_dataset["strength"].values
+    told = [shot.strength[0] for shot in fit.request().shots]
+    np.testing.assert_allclose(told, strengths)
+    # The first that is used is the reference, whatever the pack's first film is.
+    fit.images.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
+    told = [shot.strength[0] for shot in fit.request().shots]
+    np.testing.assert_allclose(told, strengths[1:] / strengths[1])

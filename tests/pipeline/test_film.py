@@ -1,0 +1,301 @@
+"""Facts about a pack from its scans to fluences, and sentences for what is wrong with it."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from scipy import ndimage
+from simulated_pack import Truth, simulate
+
+from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
+from napari_shadowinv.film import read_corners, write_corners
+from napari_shadowinv.film.scans import upright
+from napari_shadowinv.io import read, read_toml, write
+from napari_shadowinv.pipeline import read_pack, run_film, write_layers
+from napari_shadowinv.pipeline.shot_table import ShotRow, rows_of
+
+SHAPE, COUNT = (120, 160), 4
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
+    folder = tmp_path_factory.mktemp("pack")
+    return simulate(folder, layers=COUNT, shape=SHAPE, seed=4, slips=2.0, b_peak=2.0, e_peak=1.0)
+
+
+@pytest.fixture(scope="module")
+def dataset(truth: Truth):
+    return run_film(read_pack(truth.pack))
+
+
+@pytest.fixture
+def changed(truth: Truth, tmp_path: Path) -> Callable[..., Path]:
+    """The pack with something else in its file, or before it; its scans are those of `truth`."""
+
+    def write_pack(*replaced: tuple[str, str], first: str = "") -> Path:
+        text = truth.pack.read_text()
+        for old, new in replaced:
+            assert old in text
+            text = text.replace(old, new, 1)
+        for file in truth.folder.glob("*.[tc]*"):
+            if not (tmp_path / file.name).exists():
+                (tmp_path / file.name).symlink_to(file)
+        pack = tmp_path / "changed.toml"
+        pack.write_text(f"{first}\n{text}")
+        return pack
+
+    return write_pack
+
+
+def on_films(truth: Truth, dataset, plane: Callable[[int], np.ndarray], layer: int) -> np.ndarray:
+    """What is true on a film's pixels, as the dataset's pixels lie on it."""
+    axes, middle, _ = upright(dataset["corners"].values[layer])
+    place = truth.placements[layer]
+    scale = truth.scene.magnifications[layer] / truth.scene.magnifications[0]
+    steps = np.moveaxis(np.indices((dataset.sizes["y"], dataset.sizes["x"]), dtype=float), 0, -1)
+    steps -= (np.array(steps.shape[:2]) - 1) / 2
+    on_scan = scale * steps @ axes + middle
+    at = (on_scan - np.array(place.middle)) @ np.array(place.axes).T
+    at += truth.scene.middle + np.array(place.slip)
+    return ndimage.map_coordinates(plane(layer), np.moveaxis(at, -1, 0), order=3, mode="nearest")
+
+
+def test_doses_are_those_that_the_films_saw(truth: Truth, dataset) -> None:
+    scales = truth.scene.magnifications / truth.scene.magnifications[0]
+    for layer in range(COUNT):
+        usable = dataset["usable"].values[layer]
+        assert usable[20:-20, 20:-20].mean() > 0.85
+        # As on the first film: behind it the same protons cover more.
+        told = dataset["dose"].values[layer] / scales[layer] ** 2
+        error = dataset["dose_error"].values[layer] / dataset["dose"].values[layer]
+        ratio = (told / on_films(truth, dataset, truth.dose, layer))[usable]
+        assert ratio.mean() == pytest.approx(1, abs=0.005)
+        assert (ratio - 1).std() == pytest.approx(np.sqrt((error[usable] ** 2).mean()), rel=0.3)
+
+
+def test_fluences_are_those_of_the_beam(truth: Truth, dataset) -> None:
+    scene = truth.scene
+    scales = scene.magnifications / scene.magnifications[0]
+    for layer in range(COUNT - 1):
+        usable = dataset["usable"].values[layer]
+        true = on_films(truth, dataset, scene.fluence, layer) * scales[layer] ** 2
+        away = dataset["fluence"].values[layer] - true
+        assert abs(away[usable].mean()) < 0.02 * true.mean()
+        told = dataset["fluence_error"].values[layer]
+        assert (away / told)[usable].std() == pytest.approx(1, abs=0.35)
+    np.testing.assert_allclose(dataset["peak"], scene.energies, rtol=1e-3)
+    assert (dataset["energy_low"] < dataset["peak"]).all()
+    assert (dataset["peak"] <= dataset["energy_high"]).all()
+
+
+def test_films_lie_on_each_other(truth: Truth, dataset) -> None:
+    places = []
+    for layer, place in enumerate(truth.placements):
+        axes, middle, _ = upright(dataset["corners"].values[layer])
+        away = np.array(place.axes) @ (middle - np.array(place.middle)) + np.array(place.slip)
+        places.append(away)
+        turned = np.arctan2(axes[0, 1], axes[0, 0]) - np.arctan2(*place.axes[0][::-1])
+        assert abs(turned) < 0.012
+    assert (np.abs(np.array(places) - np.mean(places, axis=0)) < 0.6).all()
+    # The edges alone leave them where the pack left them.
+    slips = np.array([place.slip for place in truth.placements])
+    assert np.abs(slips - slips.mean(axis=0)).max() > 1.5
+    assert dataset["by_images"].values.all()
+    assert "which fields displace, too" in dataset.attrs["warnings"]
+
+
+def test_the_setups_know_energy_depth_and_pixel(truth: Truth, dataset, tmp_path: Path) -> None:
+    table = write_layers(dataset, tmp_path / "layers")[-1]
+    rows = rows_of(table, ShotRow)
+    assert [row.file.name for row in rows] == [f"layer_{k:02d}.tif" for k in range(1, COUNT + 1)]
+    for layer, row in enumerate(rows):
+        setup = read_toml(row.setup)
+        assert setup["energy"] == pytest.approx(dataset["energy"].values[layer])
+        assert setup["pixel_size"] == pytest.approx(truth.scene.pixel_size, rel=1e-3)
+        assert setup["object_image_distance"] == pytest.approx(truth.scene.distances[layer])
+        used = dataset["usable"].values[layer]
+        np.testing.assert_array_equal(read(row.mask).image > 0, used)
+        image = read(row.file).image
+        np.testing.assert_allclose(image[used], dataset["fluence"].values[layer][used], rtol=1e-6)
+    first, last = dataset["time_of_flight"].values[[0, -1]]
+    assert 0.4e-9 < first < 0.42e-9
+    assert last < first
+
+
+def test_layers_in_pradformat_hold_their_setups(truth: Truth, dataset, tmp_path: Path) -> None:
+    table = write_layers(dataset, tmp_path / "layers", form="pradformat")[-1]
+    for layer, row in enumerate(rows_of(table, ShotRow)):
+        found = read(row.file)
+        used = dataset["usable"].values[layer]
+        np.testing.assert_array_equal(found.image[used], dataset["fluence"].values[layer][used])
+        assert found.setup.energy == pytest.approx(dataset["energy"].values[layer])
+        assert found.setup.object_pixel_size == pytest.approx(truth.scene.pixel_size, rel=1e-3)
+        assert row.setup is None
+    bare = dataset.copy()
+    del bare.attrs["setups"]
+    with pytest.raises(InputError, match="pradformat needs a setup"):
+        write_layers(bare, tmp_path / "other", form="pradformat")
+
+
+def test_it_is_written_and_read(dataset, tmp_path: Path) -> None:
+    path = write(tmp_path / "pack.shadowinv", dataset)
+    again = read(path)
+    assert again.attrs == dataset.attrs
+    for name in dataset.variables:
+        np.testing.assert_array_equal(again[name], dataset[name])
+    with pytest.raises(FileFormatError, match=r"pack.h5.*expected"):
+        write(tmp_path / "pack.h5", dataset)
+
+
+def test_one_scan_of_all_films(truth: Truth, dataset, changed) -> None:
+    scans = [tifffile.imread(file) for file in truth.files]
+    rows = [np.concatenate(scans[k : k + 2], axis=1) for k in (0, 2)]
+    pack = changed(
+        *[(f'file = "film_{k:02d}.tif"\n', "") for k in range(1, COUNT + 1)],
+        first='scan = "all.tif"',
+    )
+    whole = pack.parent / "all.tif"
+    dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
+    tifffile.imwrite(whole, np.concatenate(rows), photometric="rgb", **dots)
+    found = run_film(read_pack(pack))
+    inner = np.s_[:, 20:-20, 20:-20]
+    one, other = found["dose"].values[inner], dataset["dose"].values[inner]
+    assert np.median(np.abs(one / other - 1)) < 0.01
+    missing = pack.read_text().replace("[[layers]]", '[[layers]]\nfilm = "HDV2"\n\n[[layers]]', 1)
+    pack.write_text(missing)
+    with pytest.raises(InputError, match="shows 4 films, the pack has 5 layers"):
+        run_film(read_pack(pack))
+
+
+def test_a_lost_film_is_bridged(truth: Truth, dataset, changed) -> None:
+    pack = read_pack(changed(('file = "film_02.tif"', "exclude = true")))
+    found = run_film(pack)
+    assert not found["usable"].values[1].any()
+    assert np.isnan(found["dose"].values[1]).all()
+    inner = np.s_[30:-30, 30:-30]
+    kept, bridged = dataset["fluence"].values[1][inner], found["fluence"].values[1][inner]
+    assert abs(np.median(bridged / kept) - 1) < 0.15
+    assert np.isnan(found["corners"].values[1]).all()
+
+
+@pytest.mark.parametrize("way", [np.s_[::-1, ::-1], np.s_[:, ::-1]])
+def test_films_laid_another_way_round(truth: Truth, dataset, changed, way) -> None:
+    pack = changed()
+    scan = tifffile.imread(truth.files[1])[way]
+    (pack.parent / "film_02.tif").unlink()
+    dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
+    tifffile.imwrite(pack.parent / "film_02.tif", scan, photometric="rgb", **dots)
+    told = "turned = 180" if len(way) == 2 and way[0].step == -1 else "mirrored = true"
+    with pytest.raises(InputError, match=f"film [23] does not lie as film [12] does.*{told}"):
+        run_film(read_pack(pack))
+    right = changed(('file = "film_02.tif"', f'file = "film_02.tif"\n{told}'))
+    found = run_film(read_pack(right))
+    np.testing.assert_allclose(found["dose"], dataset["dose"], rtol=1e-3)
+    # Corners are those on the scan as it is.
+    height, width = scan.shape[:2]
+    sizes = np.array([height, width]) - 1
+    flips = np.array([way[0].step == -1, True])
+    there = np.where(flips, sizes - found["corners"].values[1], found["corners"].values[1])
+    want = dataset["corners"].values[1]
+    gap = np.linalg.norm(there[:, None] - want[None], axis=-1).min(axis=1)
+    assert gap.max() < 0.1
+
+
+def test_corners_from_a_table(truth: Truth, dataset, changed, tmp_path: Path) -> None:
+    write_corners(
+        tmp_path / "corners.csv", {str(k + 1): one for k, one in enumerate(truth.corners)}
+    )
+    pack = read_pack(changed(first='corners = "corners.csv"\nalign = "edges"'))
+    found = run_film(pack)
+    np.testing.assert_allclose(found["corners"], truth.corners, atol=0.01)
+    assert not found["by_images"].values.any()
+    write_corners(tmp_path / "corners.csv", {"7": truth.corners[0]})
+    with pytest.raises(InputError, match="corners of a film '7': expected numbers of layers"):
+        run_film(pack)
+    assert read_corners(tmp_path / "corners.csv").keys() == {"7"}
+
+
+def test_layers_from_a_table(truth: Truth, dataset, changed) -> None:
+    entries = read_toml(truth.pack)
+    pack = changed()
+    with (pack.parent / "layers.csv").open("w", newline="") as file:
+        lines = csv.writer(file)
+        lines.writerow(["film", "filters", "file"])
+        lines.writerows(
+            [one["film"], "; ".join(one.get("filters", [])), one["file"]]
+            for one in entries["layers"]
+        )
+    text = pack.read_text()
+    pack.write_text('layers = "layers.csv"\n' + text[: text.index("[[layers]]")])
+    assert read_pack(pack).layers == read_pack(changed()).layers
+
+
+def test_it_can_be_cancelled(truth: Truth) -> None:
+    with pytest.raises(InversionCancelled):
+        run_film(read_pack(truth.pack), should_stop=lambda: True)
+
+
+def grey(scan: np.ndarray) -> np.ndarray:
+    return scan[..., 0]
+
+
+def eight_bits(scan: np.ndarray) -> np.ndarray:
+    return (scan // 257).astype(np.uint8)
+
+
+def bright(scan: np.ndarray) -> np.ndarray:
+    return np.full_like(scan, 64_000)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (grey, "film_01.tif is no picture in colour"),
+        (eight_bits, "film_01.tif has 8 bits per channel, its unexposed film 16"),
+        (bright, "no film was found on the scan"),
+        (lambda scan: np.concatenate([scan, scan]), "film_01.tif shows 2 films, expected one"),
+        (lambda scan: scan[::2, ::2], "expected films of one size; correct its corners"),
+    ],
+)
+def test_other_scans_are_told(truth: Truth, changed, spoil, message: str) -> None:
+    pack = changed()
+    scan = spoil(tifffile.imread(truth.files[0]))
+    (pack.parent / "film_01.tif").unlink()
+    kind = "rgb" if scan.ndim == 3 else "minisblack"
+    dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
+    tifffile.imwrite(pack.parent / "film_01.tif", scan, photometric=kind, **dots)
+    with pytest.raises((InputError, FileFormatError), match=re.escape(message)):
+        run_film(read_pack(pack))
+
+
+def test_a_film_that_is_too_dark_is_told(truth: Truth, changed) -> None:
+    table = 'calibration = "HDV2.csv"\ndose_range = [0.0, 300.0]'
+    found = run_film(read_pack(changed(('calibration = "HDV2.csv"', table))))
+    assert "film 1 is darker than its calibration reaches over" in found.attrs["warnings"]
+    inside = found["usable"].values[0]
+    assert found["dose"].values[0][inside].max() <= 301
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('file = "film_02.tif"', 'file = "lost.tif"', "lost.tif does not exist"),
+        ('file = "film_02.tif"', 'file = "film_01.tif"', "same content as the scan of film 1"),
+        ('file = "film_02.tif"', "", "layer 2 has no file: give it, or a 'scan' of all films"),
+        ('film = "HDV2"', 'film = "HD-V2"', "of type 'HD-V2': did you mean 'HDV2'?"),
+        ('"13 um Al"', '"13 Al"', "expected thickness, unit (um or mm) and material"),
+        ('calibration = "HDV2.csv"\n', "", "films of type 'HDV2' have no calibration"),
+        ('kind = "proton"', 'kind = "optical"', "setup is not one of protons"),
+        ('kind = "proton"', 'kind = "proton"\nenergy = 3', "the setup has an energy"),
+        ("[setup]", "[setups]", "unknown key 'setups', did you mean 'setup'?"),
+    ],
+)
+def test_other_packs_are_told(truth: Truth, changed, old: str, new: str, message: str) -> None:
+    with pytest.raises((InputError, FileFormatError), match=re.escape(message)):
+        run_film(read_pack(changed((old, new))))

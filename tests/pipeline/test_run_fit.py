@@ -1,0 +1,173 @@
+"""A recipe applied to several images of one object: the same as doing each step by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from napari_shadowinv import Fit, InputError, ProtonSetup, fit
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.io import read, write
+from napari_shadowinv.options import FitChoices, FitOptions
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.pipeline import FitShot, read_recipe, run_fit, write_recipe
+from napari_shadowinv.pipeline._fit import gathered_fit
+from napari_shadowinv.preprocessing import (
+    Bin,
+    Crop,
+    FitProvenance,
+    LowPassEstimate,
+    MeasuredSource,
+    Origin,
+    Recipe,
+    low_pass_source,
+)
+
+SHAPE = (84, 92)
+SETUPS = [
+    ProtonSetup(
+        energy=energy, source_object_distance=0.01, object_image_distance=0.3, pixel_size=1e-5
+    )
+    for energy in (14.7, 5.0)
+]
+RATIO = SETUPS[0].momentum / SETUPS[1].momentum
+HASTY = FitOptions(samples=0, steps=3, spacing=0.25, threads=1)
+STEPS = (Crop(y=(4, 84), x=(0, 80)), Bin(factor=2))
+
+
+@pytest.fixture(scope="module")
+def images() -> list[FloatArray]:
+    truth = gaussian_blob(SHAPE, 40.0, 9.0, (42, 40)).displacement
+    noise = np.random.default_rng(0).normal(0, 0.02, (2, *SHAPE))
+    return [synthetic_image(s * truth) + n for s, n in zip((1.0, RATIO), noise, strict=True)]
+
+
+def binned(values: FloatArray) -> FloatArray:
+    return np.asarray(values[4:84, :80].reshape(40, 2, 40, 2).sum(axis=(1, 3)))
+
+
+def assert_same_fields(one: Fit, other: Fit) -> None:
+    for first, second in zip(one.fields, other.fields, strict=True):
+        np.testing.assert_array_equal(first.potential, second.potential)
+        np.testing.assert_array_equal(first.displacement, second.displacement)
+    np.testing.assert_array_equal(one.reprojection, other.reprojection)
+
+
+def test_it_is_a_fit_of_what_the_steps_make(images: list[FloatArray]) -> None:
+    mask = np.ones(SHAPE, bool)
+    mask[10:14, 20:24] = False
+    source = np.full(SHAPE, 1.0)
+    choices = FitChoices(noise=0.04, source_size=1e-5, gains="free", options=HASTY)
+    shots = [
+        FitShot(image, setup, source=source, mask=mask)
+        for image, setup in zip(images, SETUPS, strict=True)
+    ]
+    found = run_fit(Recipe(steps=STEPS, fit=choices), shots)
+    after = [setup.model_copy(update={"pixel_size": 2e-5}) for setup in SETUPS]
+    spread = 1e-5 * (1 - 1 / SETUPS[0].magnification) / 2e-5
+    by_hand = fit(
+        np.stack([binned(image) for image in images]),
+        setups=after,
+        source=np.full((40, 40), 4.0),
+        noise=0.04,
+        psf=[spread, spread],
+        mask=binned(mask) == 4,
+        gains="free",
+        options=HASTY,
+    )
+    assert_same_fields(found, by_hand)
+    assert found.setups == tuple(after)
+
+
+def test_provenance_is_complete_and_survives_its_file(
+    tmp_path: Path, images: list[FloatArray]
+) -> None:
+    paths = [tmp_path / f"{name}.tif" for name in "ab"]
+    for path, image in zip(paths, images, strict=True):
+        tifffile.imwrite(path, image.astype(np.float32))
+    mask = np.random.default_rng(1).random(SHAPE) > 0.1
+    shots = [
+        FitShot(paths[0], SETUPS[0], mask=mask, noise="poisson", gain=1.0),
+        FitShot(paths[1], SETUPS[1], mask=mask, noise="poisson", gain=1.5, psf=0.5),
+    ]
+    recipe = Recipe(steps=(Crop(y=(0, 40), x=(0, 48)),), fit=FitChoices(options=HASTY))
+    found = run_fit(recipe, shots, fiducials=[[5, 6, 0.1, 0.2, 0.5]])
+    write(tmp_path / "fit.shadowinv", found)
+    again = Fit.from_dataset(read(tmp_path / "fit.shadowinv"))  # type: ignore[arg-type]
+    made = again.provenance
+    assert made is not None
+    assert made == found.provenance
+    assert made.recipe.fit == FitChoices(fields=("B",), options=HASTY)
+    assert made.recipe.steps == recipe.steps
+    assert [one.image.file for one in made.images] == ["a.tif", "b.tif"]
+    assert [one.gain for one in made.images] == [1.0, 1.5]
+    assert [one.psf for one in made.images] == [None, 0.5]
+    assert [one.noise for one in made.images] == ["poisson", "poisson"]
+    assert [one.setup for one in made.images] == SETUPS
+    # Kept once, because it is the same.
+    assert [one.mask for one in made.images] == [0, 0]
+    np.testing.assert_array_equal(made.masks[0].mask(), mask)
+    assert made.fiducial_rows == ((5, 6, 0.1, 0.2, 0.5),)
+
+
+def test_what_does_not_fit_into_an_attribute_is_not_kept_in_part() -> None:
+    rng = np.random.default_rng(2)
+    shots = [
+        FitShot(rng.normal(10, 1, (400, 400)), mask=rng.random((400, 400)) > 0.4, strength=(k,))
+        for k in (1.0, 2.0, 3.0)
+    ]
+    rows = np.column_stack([rng.uniform(0, 390, (900, 2)), np.zeros((900, 2)), np.ones(900)])
+    inputs = gathered_fit(Recipe(), shots, fiducials=rows)
+    made = inputs.provenance
+    assert [mask.pixels is None for mask in made.masks] == [False, True, True]
+    assert made.fiducial_rows is None
+    assert made.fiducials == Origin()
+    assert len(made.model_dump_json()) < 60_000
+    np.testing.assert_array_equal(inputs.keywords["mask"], [shot.mask for shot in shots])
+
+
+def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[FloatArray]) -> None:
+    recipe = Recipe(steps=STEPS, source=LowPassEstimate(width=20))
+    inputs = gathered_fit(recipe, [FitShot(image, strength=(1.0,)) for image in images])
+    expected = [low_pass_source(binned(image), width=20) for image in images]
+    np.testing.assert_allclose(inputs.keywords["source"], expected)
+    assert inputs.provenance.recipe.source == LowPassEstimate(width=20)
+
+
+def test_an_unknown_beam_takes_no_source(images: list[FloatArray]) -> None:
+    unknown = Recipe(fit=FitChoices(beam="unknown"))
+    inputs = gathered_fit(unknown, [FitShot(image, strength=(1.0,)) for image in images])
+    assert inputs.keywords["source"] == "unknown"
+    said = gathered_fit(Recipe(), [FitShot(image, source="unknown") for image in images])
+    assert said.choices.beam == "unknown"
+    with pytest.raises(InputError, match="has no unknown source"):
+        gathered_fit(Recipe(), [FitShot(images[0], source="unknown"), FitShot(images[1])])
+    both = unknown.model_copy(update={"source": LowPassEstimate()})
+    with pytest.raises(InputError, match="a source and a fit with an unknown beam"):
+        gathered_fit(both, [images[0]])
+
+
+CHOICES = (
+    FitChoices(),
+    FitChoices(fields=("B", "E"), beam="unknown", gains="free", noise="poisson"),
+    FitChoices(noise=3.5, psf=0.0, options=FitOptions(align="affine", smoothness=2.0)),
+    FitChoices(source_size=1e-5, resolution=3e-5, options=FitOptions(threads=2, seed=7)),
+)
+
+
+@pytest.mark.parametrize("choices", CHOICES)
+def test_its_section_survives_a_file(tmp_path: Path, choices: FitChoices) -> None:
+    recipe = Recipe(steps=STEPS, source=MeasuredSource(file=tmp_path / "beam.tif"), fit=choices)
+    write_recipe(tmp_path / "recipe.toml", recipe)
+    assert read_recipe(tmp_path / "recipe.toml") == recipe
+
+
+def test_an_inversion_is_not_made_as_a_fit() -> None:
+    made: dict[str, Any] = {"provenance": '{"version": "1", "recipe": {}, "image": {}}'}
+    assert FitProvenance.of(made) is None
+    assert FitProvenance.of({}) is None

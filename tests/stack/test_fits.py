@@ -1,0 +1,288 @@
+"""Stacks that are fitted: one fit for each shot, alone or of several images, in one store."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+from store_content import content
+
+from command_line import flat, shadowinv
+from napari_shadowinv import InputError, Recipe, run_stack, synthetic_image
+from napari_shadowinv.io import read
+from napari_shadowinv.io.store import StackStore
+from napari_shadowinv.options import FitChoices, FitOptions
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.setup import ProtonSetup
+from napari_shadowinv.pipeline import FitShot, run_fit, write_recipe
+from napari_shadowinv.preprocessing import Bin
+from napari_shadowinv.stack import invert_stack
+
+SHAPE = (48, 48)
+SETUPS = [
+    ProtonSetup(
+        energy=energy, source_object_distance=0.01, object_image_distance=0.3, pixel_size=1e-5
+    )
+    for energy in (14.7, 5.0)
+]
+RATIO = SETUPS[0].momentum / SETUPS[1].momentum
+HASTY = FitOptions(samples=0, steps=5, spacing=0.25)
+CHOICES = FitChoices(noise=0.02, options=HASTY)
+
+
+def truth(index: int) -> Any:
+    return gaussian_blob(SHAPE, 20.0 + 5 * index, 7.0, (22, 20 + index)).displacement
+
+
+def image(index: int, strength: float = 1.0) -> Any:
+    noise = np.random.default_rng(index).normal(0, 0.02, SHAPE)
+    return synthetic_image(strength * truth(index)) + noise
+
+
+@pytest.fixture
+def images() -> Any:
+    return np.stack([image(index) for index in range(3)])
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A table of two shots, each at two energies, and its files."""
+    monkeypatch.chdir(tmp_path)
+    lines = ["shot,file,energy,setup"]
+    for index in range(2):
+        for name, strength, setup in (("low", 1.0, SETUPS[0]), ("high", RATIO, SETUPS[1])):
+            tifffile.imwrite(f"{name}{index}.tif", image(index, strength).astype(np.float32))
+            lines.append(f"s{index},{name}{index}.tif,{setup.energy},setup.toml")
+    known = {name: value for name, value in SETUPS[0].model_dump().items() if value is not None}
+    del known["energy"]
+    text = [f"{key} = {json.dumps(value)}" for key, value in known.items()]
+    Path("setup.toml").write_text("\n".join(text))
+    Path("shots.csv").write_text("\n".join(lines))
+    write_recipe(Path("r.toml"), Recipe(fit=CHOICES))
+    return tmp_path
+
+
+def test_each_shot_of_an_array_is_fitted_alone(images: Any, out: Path) -> None:
+    recipe = Recipe(setup=SETUPS[0], fit=CHOICES)
+    store = run_stack(images, out, recipe=recipe, scheduler="synchronous", dtype="float64")
+    assert store["status"].values.tolist() == [1, 1, 1]
+    for index, plane in enumerate(images):
+        alone = run_fit(recipe, [plane])
+        shot = store.isel(shot=index)
+        np.testing.assert_array_equal(shot["displacement"], alone.fields[0].displacement)
+        np.testing.assert_array_equal(shot["potential"], alone.fields[0].potential)
+        in_si = SETUPS[0].path_integrated_b(alone.fields[0].displacement)
+        np.testing.assert_array_equal(shot["path_integrated_b"], in_si)
+        report = json.loads(str(shot["report"].values))
+        assert report["verdict"] == str(shot["verdict"].values) == str(alone.verdict)
+        assert report["chi2"] == float(shot["chi2"]) == alone.chi2[0]
+        assert report["seconds"] == float(shot["seconds"]) > 0
+    assert "path_integrated_e" not in store
+    assert "caustic" not in store
+    assert "flux_residual" not in store
+
+
+def test_the_store_does_not_depend_on_workers(images: Any, tmp_path: Path) -> None:
+    recipe = Recipe(steps=(Bin(factor=1),), fit=CHOICES)
+    found = []
+    for name, engine in (("one", "synchronous"), ("two", "threads")):
+        path = tmp_path / f"{name}.shadowinv.zarr"
+        run_stack(images, path, recipe=recipe, scheduler=engine, workers=2)
+        found.append({key: one for key, one in content(path).items() if "potential" in key})
+    assert found[0]
+    assert found[0] == found[1]
+
+
+def test_a_shot_fails_alone_and_the_rest_is_resumed(images: Any, out: Path) -> None:
+    recipe = Recipe(fit=CHOICES)
+    spoilt = images.copy()
+    spoilt[1] = 0
+    first = run_stack(spoilt, out, recipe=recipe, scheduler="synchronous")
+    assert first["status"].values.tolist() == [1, 2, 1]
+    assert "no flux" in StackStore(out).report(1)["reason"]
+    before = content(out)
+    seen: list[str] = []
+    again = run_stack(
+        spoilt,
+        out,
+        recipe=recipe,
+        scheduler="synchronous",
+        on_progress=lambda news: seen.append(news.engine),
+    )
+    assert seen == ["nothing to do"]
+    assert again["verdict"].values[1] == ""
+    assert content(out) == before
+    other = Recipe(fit=CHOICES.model_copy(update={"psf": 1.0}))
+    with pytest.raises(InputError, match=r"different fit \(psf: None there, 1.0 now\)"):
+        run_stack(spoilt, out, recipe=other, scheduler="synchronous")
+    with pytest.raises(InputError, match="different fit"):
+        run_stack(spoilt, out, scheduler="synchronous", variables=("potential", "displacement"))
+
+
+def test_error_bars_are_stored_if_they_are_made(images: Any, out: Path) -> None:
+    options = HASTY.model_copy(update={"samples": 2})
+    recipe = Recipe(fit=CHOICES.model_copy(update={"options": options}))
+    store = run_stack(images[:1], out, recipe=recipe, scheduler="synchronous")
+    assert store["displacement_uncertainty"].attrs["units"] == "px"
+    assert float(store["displacement_uncertainty"].min()) > 0
+    assert float(store["uncertainty"][0]) == run_fit(recipe, [images[0]]).report.uncertainty
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "two fields": ({"fields": ("B", "E")}, "B, E, and a store holds one"),
+    "warm start": ({"warm_start": 4}, "fits start on their own"),
+    "variable": ({"variables": ("caustic",)}, "no variable 'caustic' of a fit"),
+    "step": ({"steps": [{"step": "low-pass"}]}, "what the forward model is fitted to"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_done_is_refused_before_anything_is_written(
+    images: Any, out: Path, name: str
+) -> None:
+    told, words = REFUSED[name]
+    fields, steps = told.pop("fields", None), told.pop("steps", ())
+    recipe = Recipe(steps=steps, fit=CHOICES.model_copy(update={"fields": fields}))
+    with pytest.raises(InputError, match=words):
+        run_stack(images, out, recipe=recipe, scheduler="synchronous", **told)
+    assert not out.exists()
+
+
+def test_a_lazy_stack_does_not_fit(images: Any) -> None:
+    with pytest.raises(InputError, match="invert_stack inverts: use run_stack"):
+        invert_stack(images, recipe=Recipe(fit=CHOICES))
+
+
+# Several images of each shot
+
+
+def test_images_of_one_object_are_fitted_together(folder: Path, out: Path) -> None:
+    recipe = Recipe(fit=CHOICES)
+    store = run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous", dtype="float64")
+    assert store["name"].values.tolist() == ["s0", "s1"]
+    for index in range(2):
+        shots = [
+            FitShot(folder / f"{name}{index}.tif", setup)
+            for name, setup in zip(("low", "high"), SETUPS, strict=True)
+        ]
+        alone = run_fit(recipe, shots)
+        field = store["displacement"].values[index]
+        np.testing.assert_array_equal(field, alone.fields[0].displacement)
+        assert np.abs(field - truth(index)).max() < 0.3
+        report = StackStore(out).report(index)
+        assert [one["image"]["file"] for one in report["images"]] == [
+            f"low{index}.tif",
+            f"high{index}.tif",
+        ]
+        assert report["chi2_images"] == alone.chi2.tolist()
+    assert "path_integrated_b" in store
+    np.testing.assert_allclose(store["x_si"], np.arange(48) * SETUPS[0].object_pixel_size)
+
+
+def test_a_table_that_changed_is_told_and_grows(folder: Path, out: Path) -> None:
+    recipe = Recipe(fit=CHOICES)
+    run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+    text = Path("shots.csv").read_text()
+    for name in ("low", "high"):
+        tifffile.imwrite(f"{name}2.tif", tifffile.imread(f"{name}1.tif") * np.float32(2))
+    more = [f"s2,{name}2.tif,{energy},setup.toml" for name, energy in (("low", 14.7), ("high", 5))]
+    Path("shots.csv").write_text("\n".join([text, *more]))
+    choices = CHOICES.model_copy(update={"noise": None})
+    with pytest.raises(InputError, match="different fit"):
+        run_stack("shots.csv", out, recipe=Recipe(fit=choices), scheduler="synchronous")
+    store = run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+    assert store["name"].values.tolist() == ["s0", "s1", "s2"]
+    Path("shots.csv").write_text(
+        Path("shots.csv").read_text().replace("s1,high1.tif,5.0", "s1,high1.tif,6")
+    )
+    with pytest.raises(InputError, match=r"shot 1 \(s1\) has changed"):
+        run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+    Path("shots.csv").write_text(text)
+    tifffile.imwrite("low0.tif", image(5).astype(np.float32))
+    with pytest.raises(InputError, match="different shots"):
+        run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+    Path("shots.csv").write_text("\n".join([text, *more]))
+    with pytest.raises(InputError, match=r"shot 0 \(s0\) has changed"):
+        run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+
+
+def test_a_shot_with_another_setup_fails_alone(folder: Path, out: Path) -> None:
+    text = Path("shots.csv").read_text()
+    Path("shots.csv").write_text(text.replace("s1,low1.tif,14.7", "s1,low1.tif,13"))
+    store = run_stack("shots.csv", out, recipe=Recipe(fit=CHOICES), scheduler="synchronous")
+    assert store["status"].values.tolist() == [1, 2]
+    assert "setup of its first image differs" in StackStore(out).report(1)["reason"]
+
+
+# The command
+
+
+def test_the_command_fits_tells_and_exports(folder: Path) -> None:
+    arguments = ("batch", "shots.csv", "--fit", "--recipe", "r.toml", "--scheduler", "threads")
+    out = "night.shadowinv.zarr"
+    result = shadowinv(*arguments, "--out", out)
+    assert result.exit_code in (0, 3), result.output
+    store = StackStore(Path(out))
+    verdicts = [report["verdict"] for report in store.reports()]
+    assert result.exit_code == (0 if set(verdicts) == {"determined"} else 3)
+    assert "verdicts" in result.stdout
+    told = flat(shadowinv("info", out).stdout)
+    assert "noise = 0.02" in told
+    assert "fields = ['B']" in told
+    assert f"{verdicts.count('determined')} determined" in told
+    table = flat(shadowinv("status", out, "--all").stdout)
+    assert "verdict" in table
+    assert "χ²" in table
+
+    assert shadowinv("export", out, "--format", "csv").exit_code == 0
+    with Path("night.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["verdict"] for row in rows] == verdicts
+    assert float(rows[0]["chi2"]) == store.report(0)["chi2"]
+    assert "flux_residual" not in rows[0]
+    exported = shadowinv("export", out, "--format", "tiff", "--variables", "path_integrated_b")
+    assert exported.exit_code == 0, exported.output
+    assert Path("night", "0000_s0_path_integrated_b_y.tif").exists()
+    refused = shadowinv("export", out, "--format", "pradformat", "--out", "other")
+    assert refused.exit_code == 2
+    assert "holds fits, expected inversions for pradformat" in refused.stderr
+    assert not Path("other").exists()
+    dataset = read(Path(out))
+    assert isinstance(dataset, xr.Dataset)
+    again = shadowinv(*arguments, "--out", out, "--resume")
+    assert "nothing to do" in again.stdout
+
+
+@pytest.fixture
+def refused(folder: Path) -> Callable[..., None]:
+    def run(*arguments: object, names: tuple[str, ...]) -> None:
+        before = {path.name for path in folder.iterdir()}
+        result = shadowinv("batch", *arguments, "--out", "x.shadowinv.zarr")
+        assert result.exit_code == 2, result.output
+        (line,) = result.stderr.splitlines()
+        for name in names:
+            assert name in line
+        assert {path.name for path in folder.iterdir()} == before
+
+    return run
+
+
+def test_mistakes_are_told_in_a_sentence(refused: Callable[..., None]) -> None:
+    refused("low*.tif", "--fit", "--tolerance", 1e-3, names=("--tolerance", "[fit.options]"))
+    Path("shots.csv").write_text("file,psf\nlow0.tif,1\n")
+    refused("shots.csv", "--fit", names=("row 1 does not say which shot", "column 'shot'"))
+    Path("shots.csv").write_text("shot,file\n1,low0.tif\n1,high0.tif\n2,low1.tif\n")
+    single = shadowinv("fit", "shots.csv")
+    assert single.exit_code == 2
+    assert "several shots, expected one object: fit each with shadowinv batch --fit" in flat(
+        single.stderr
+    )
+    Path("shots.csv").write_text("shot,file\n1,gone.tif\n")
+    refused("shots.csv", "--fit", names=("none of 1 shots can be read", "gone.tif"))

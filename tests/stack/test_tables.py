@@ -1,0 +1,371 @@
+"""Tables of shots that are inverted: each with its own energy, gain, mask and source."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import tomli_w
+
+from command_line import flat, shadowinv
+from napari_shadowinv import (
+    InputError,
+    InversionOptions,
+    Recipe,
+    invert,
+    invert_stack,
+    read,
+    run,
+    run_stack,
+    synthetic_image,
+    write,
+)
+from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.io.store import DONE, FAILED, StackStore
+from napari_shadowinv.physics.phantoms import toroid
+from napari_shadowinv.physics.setup import BeamSetup, OpticalSetup, ProtonSetup
+from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, shot_rows
+from napari_shadowinv.preprocessing import Bin, PolynomialEstimate, Provenance
+from napari_shadowinv.stack import read_shot
+from napari_shadowinv.stack._spec import describe_stack
+
+SHAPE = (64, 64)
+SETUP = ProtonSetup(
+    energy=14.7, source_object_distance=0.01, object_image_distance=0.3, pixel_size=1e-5
+)
+ENERGIES = (5.0, 14.7, 30.0)
+PEAK, SIGMA = 25.0, 100e-6  # MG µm and m
+OPTIONS = InversionOptions(tolerance=1e-3)
+
+
+def at(energy: float) -> ProtonSetup:
+    return SETUP.model_copy(update={"energy": energy})
+
+
+def beam() -> Any:
+    """A beam that is brighter on one side."""
+    return 1 + 0.3 * np.indices(SHAPE)[1] / SHAPE[1]
+
+
+def written_setup(path: str, setup: BeamSetup) -> None:
+    Path(path).write_text(tomli_w.dumps(setup.model_dump(exclude_none=True)))
+
+
+def table(*rows: str, header: str = "file,energy", name: str = "pack.csv") -> Path:
+    Path(name).write_text("\n".join([header, *rows]))
+    return Path(name)
+
+
+@pytest.fixture
+def pack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: None) -> Path:
+    """One toroid on three films, a table of them, and the setup."""
+    monkeypatch.chdir(tmp_path)
+    for number, energy in enumerate(ENERGIES):
+        displacement = toroid(SHAPE, at(energy), PEAK, SIGMA).displacement
+        np.save(f"film{number}.npy", synthetic_image(displacement, beam()))
+    np.save("beam.npy", beam())
+    written_setup("setup.toml", SETUP)
+    return table(*(f"film{k}.npy,{energy}" for k, energy in enumerate(ENERGIES)))
+
+
+def inverted(shots: Any, out: Path, **more: Any) -> Any:
+    """The store of a table, made in this process."""
+    arguments = {"setup": SETUP, "options": OPTIONS, "source": "beam.npy"} | more
+    return run_stack(shots, out, scheduler="synchronous", dtype="float64", **arguments)
+
+
+def test_one_field_at_three_energies_is_one_field_in_si(pack: Path, out: Path) -> None:
+    store = inverted(pack, out)
+    assert store["energy"].values.tolist() == list(ENERGIES)
+    assert store["energy"].attrs["units"] == "MeV"
+    field = store["path_integrated_b"].values
+    phantom = toroid(SHAPE, SETUP, PEAK, SIGMA)
+    true = SETUP.path_integrated_b(phantom.displacement)
+    strongest = np.hypot(*true).max()
+    for one in field:
+        assert np.hypot(*(one - true)).max() < 0.03 * strongest
+    # In px they are as different as the momenta.
+    peaks = np.hypot(*store["displacement"].values.swapaxes(0, 1)).max(axis=(1, 2))
+    assert peaks[0] / peaks[2] == pytest.approx(at(30.0).momentum / at(5.0).momentum, rel=0.03)
+    lazy = invert_stack(pack, setup=SETUP, options=OPTIONS, source="beam.npy")
+    np.testing.assert_allclose(lazy["path_integrated_b"], field, rtol=1e-9, atol=1e-12 * strongest)
+    for stack in (store, lazy):
+        assert [setup_from_dataset(stack.isel(shot=k)) for k in range(3)] == list(map(at, ENERGIES))
+        assert stack["y_si"].values[:, 1].tolist() == [SETUP.object_pixel_size] * 3
+
+
+def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
+    usable = np.ones(SHAPE, bool)
+    usable[5:9, 40:50] = False
+    np.save("mask.npy", usable.astype(np.uint8))
+    np.save("other.npy", beam()[:, ::-1])
+    header = "file,energy,gain,mask,source"
+    rows = ("film0.npy,5,1.25,mask.npy,", "film1.npy,,,,other.npy")
+    free = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
+    recipe = Recipe(steps=(Bin(factor=2),), setup=SETUP, options=free)
+    pack = table(*rows, header=header)
+    store = run_stack(pack, out, recipe=recipe, source=beam(), dtype="float64")
+    alone = run(
+        recipe.model_copy(update={"setup": at(5.0)}),
+        np.load("film0.npy") / 1.25,
+        source=beam(),
+        mask=usable,
+    )
+    other = run(recipe, "film1.npy", source="other.npy")
+    for k, expected in enumerate((alone, other)):
+        np.testing.assert_array_equal(store["displacement"][k], expected.displacement)
+        in_si = expected.to_dataset()["path_integrated_b"]
+        np.testing.assert_allclose(store["path_integrated_b"][k], in_si, rtol=1e-12)
+        made = Provenance.of({"provenance": json.dumps(StackStore(out).report(k)["provenance"])})
+        assert made is not None
+        assert made.setup == expected.setup
+        assert made.recipe.setup == at((5.0, 14.7)[k])
+        assert made.image.file == f"film{k}.npy"
+    assert made.source is not None
+    assert made.source.file == "other.npy"
+    assert "source other.npy" in flat(shadowinv("status", out).stdout)
+    first = StackStore(out).report(0)["provenance"]
+    assert first["gain"] == 1.25
+    assert first["mask"]["file"] == "mask.npy"
+
+
+def test_images_of_uniform_beams_are_relative_to_their_mean(pack: Path, out: Path) -> None:
+    usable = np.ones(SHAPE)
+    usable[:4] = 0
+    np.save("mask.npy", usable)
+    pack = table("film0.npy,", "film1.npy,mask.npy", header="file,mask")
+    store = inverted(pack, out, source=None, setup=None, variables=("image", "displacement"))
+    files = run_stack(
+        ["film0.npy"], out.with_name("f.shadowinv.zarr"), options=OPTIONS, variables=("image",)
+    )
+    np.testing.assert_allclose(store["image"][0], files["image"][0], rtol=1e-6)
+    assert float(store["image"][1].values[4:].mean()) == pytest.approx(1, rel=1e-9)
+    assert "setup" not in store
+    alone = invert(np.load("film1.npy"), mask=usable > 0, options=OPTIONS)
+    np.testing.assert_allclose(store["displacement"][1], alone.displacement, atol=1e-9)
+
+
+def test_the_source_of_rows_without_one_may_be_estimated(pack: Path, out: Path) -> None:
+    estimate = PolynomialEstimate(degree=1)
+    store = inverted(pack, out, source=estimate, variables=("source",))
+    alone = run(Recipe(source=estimate, setup=SETUP, options=OPTIONS), "film1.npy")
+    np.testing.assert_array_equal(store["source"][1], alone.source)
+
+
+class TestResuming:
+    def test_a_changed_energy_is_noticed(self, pack: Path, out: Path) -> None:
+        inverted(pack, out)
+        table("film0.npy,5", "film1.npy,14.7", "film2.npy,31")
+        told = r"row of shot 2 \(film2.npy\) \(energy: 30.0 there, 31.0 now\) has changed"
+        with pytest.raises(InputError, match=told):
+            inverted(pack, out)
+
+    def test_a_changed_setup_is_noticed(self, pack: Path, out: Path) -> None:
+        inverted(pack, out)
+        nearer = SETUP.model_copy(update={"object_image_distance": 0.2})
+        with pytest.raises(InputError, match=r"object_image_distance: 0.3 there, 0.2 now"):
+            inverted(pack, out, setup=nearer)
+
+    def test_other_things_that_changed_are_noticed(self, pack: Path, out: Path) -> None:
+        inverted(pack, out)
+        with pytest.raises(InputError, match="different source image"):
+            inverted(pack, out, source=beam()[:, ::-1])
+        with pytest.raises(InputError, match="different table of shots"):
+            inverted([f"film{k}.npy" for k in range(3)], out)
+        np.save("film1.npy", beam())
+        with pytest.raises(InputError, match=r"shot 1 \(film1.npy\) has changed"):
+            inverted(pack, out)
+
+    def test_rows_that_were_added_are_inverted(self, pack: Path, out: Path) -> None:
+        table("film0.npy,5")
+        inverted(pack, out)
+        np.save("mask.npy", np.ones(SHAPE))
+        table("film0.npy,5,", "film1.npy,14.7,mask.npy", header="file,energy,mask")
+        store = inverted(pack, out)
+        assert store["status"].values.tolist() == [DONE, DONE]
+        assert store["energy"].values.tolist() == [5.0, 14.7]
+
+    def test_a_row_is_mended_and_redone(self, pack: Path, out: Path) -> None:
+        np.save("mask.npy", np.ones((8, 8)))
+        table("film0.npy,5,", "film1.npy,7,mask.npy", header="file,energy,mask")
+        assert inverted(pack, out)["status"].values.tolist() == [DONE, FAILED]
+        table("film0.npy,5", "film1.npy,14.7")
+        store = inverted(pack, out, redo_failed=True)
+        assert setup_from_dataset(store.isel(shot=1)) == at(14.7)
+        assert store["energy"].values.tolist() == [5.0, 14.7]
+
+
+def test_excluded_shots_are_not_there(pack: Path, out: Path) -> None:
+    rows = ("film0.npy,5,", "gone.npy,-1,yes", "film1.npy,14.7,no", "film2.npy,30,1")
+    pack = table(*rows[:1], "gone.npy,9,yes", *rows[2:], header="file,energy,exclude")
+    store = inverted(pack, out)
+    assert store["name"].values.tolist() == ["film0.npy", "film1.npy"]
+    assert store["energy"].values.tolist() == [5.0, 14.7]
+
+
+def test_a_fit_leaves_excluded_images_out(pack: Path) -> None:
+    rows = ("a,film1.npy,14.7,", "a,gone.npy,9,true", "a,film2.npy,30,", "b,film0.npy,5,yes")
+    pack = table(*rows, header="shot,file,energy,exclude")
+    used = ["film1.npy", "film2.npy"]
+    assert [row.file.name for row in shot_rows([pack], {}, {})] == used
+    assert {
+        name: [row.file.name for row in rows] for name, rows in rows_by_shot(pack, {}).items()
+    } == {"a": used}
+
+
+def test_columns_that_only_fits_use_are_told(pack: Path, out: Path) -> None:
+    pack = table("film1.npy,14.7,1,poisson", header="file,energy,psf,noise")
+    inverted(pack, out)
+    (told,) = StackStore(out).report(0)["warnings"]
+    assert told == (
+        "the table has psf, noise, which an inversion does not use: fit the image to use it"
+    )
+
+
+def test_one_shot_fails_where_its_files_do(pack: Path, out: Path) -> None:
+    np.save("small.npy", np.ones((8, 9)))
+    np.save("mask.npy", np.ones((8, 8)))
+    rows = ("film0.npy,5,", "small.npy,5,", "film1.npy,14.7,mask.npy", "gone.npy,5,")
+    pack = table(*rows, "film2.npy,30,no_mask.npy", header="file,energy,mask")
+    store = inverted(pack, out)
+    assert store["status"].values.tolist() == [DONE, FAILED, FAILED, FAILED, FAILED]
+    reasons = [report.get("reason", "") for report in StackStore(out).reports()]
+    assert "image has shape (8, 9), expected (64, 64)" in reasons[1]
+    assert "mask.npy: mask has shape (8, 8), image (64, 64): they must match" in reasons[2]
+    assert "gone.npy" in reasons[3]
+    assert "no_mask.npy" in reasons[4]
+    assert np.isnan(store["path_integrated_b"][1]).all()
+
+
+def test_a_store_has_the_units_of_one_kind_of_beam(pack: Path, out: Path) -> None:
+    light = OpticalSetup(wavelength=810e-9, object_image_distance=0.01, pixel_size=1e-6)
+    written_setup("light.toml", light)
+    pack = table("film1.npy,setup.toml", "film2.npy,light.toml", header="file,setup")
+    store = inverted(pack, out, setup=None)
+    assert store["status"].values.tolist() == [DONE, FAILED]
+    told = StackStore(out).report(1)["reason"]
+    assert told.startswith("it has a setup of kind 'optical', and the first row of its table")
+
+
+MISTAKES: dict[str, tuple[str, Sequence[str], tuple[str, ...]]] = {
+    "no column for the file": ("energy", ["5"], ("has no column 'file'",)),
+    "an unknown column": ("file,enrgy", ["film0.npy,5"], ("did you mean 'energy'?",)),
+    "a strange value": ("file,exclude", ["film0.npy,maybe"], ("row 1", "'exclude' is 'maybe'")),
+    "nothing left": (
+        "file,exclude",
+        ["film0.npy,yes", "film1.npy,1"],
+        ("pack.csv excludes all of its 2 images", "column 'exclude'"),
+    ),
+    "energies without a setup": (
+        "file,energy",
+        ["film0.npy,5", "film1.npy,14.7"],
+        ("film0.npy has an energy of 5 MeV and no setup", "--setup"),
+    ),
+    "an unknown source": ("file,source", ["film0.npy,unknown"], ("row 1", "only a fit can find")),
+    "files that are missing": ("file", ["gone.npy", "lost.npy"], ("none of 2 shots can be read",)),
+    "an image twice": ("file", ["film0.npy", "film0.npy"], ("film0.npy twice",)),
+    "a setup that is missing": ("file,setup", ["film0.npy,no.toml"], ("no.toml",)),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_told_in_a_sentence(name: str, pack: Path) -> None:
+    header, rows, words = MISTAKES[name]
+    table(*rows, header=header)
+    result = shadowinv("batch", "pack.csv", "--out", "x.shadowinv.zarr")
+    assert result.exit_code == 2, result.output
+    (line,) = result.stderr.splitlines()
+    for word in words:
+        assert word in line
+    assert not Path("x.shadowinv.zarr").exists()
+
+
+def test_the_command_inverts_a_table(pack: Path, out: Path) -> None:
+    flags = ("--setup", "setup.toml", "--source", "beam.npy", "--tolerance", 1e-3)
+    arguments = ("batch", "pack.csv", *flags, "--out", out, "--scheduler", "threads")
+    assert shadowinv(*arguments, "--quiet").exit_code == 0
+    assert "energies 5, 14.7, 30 MeV" in flat(shadowinv("status", out).stdout)
+    listed = shadowinv("status", out, "--all").stdout.splitlines()
+    assert [line.split()[4] for line in listed if "film" in line] == ["5", "14.7", "30"]
+    assert shadowinv("export", out, "--format", "pradformat", "--out", "h5").exit_code == 0
+    for index, energy in enumerate(ENERGIES):
+        found = read(Path(f"h5/{index:04d}_film{index}.h5"))
+        assert setup_from_dataset(found).energy == pytest.approx(energy)
+        made = Provenance.of(found.attrs)
+        assert made is not None
+        assert made.image.file == f"film{index}.npy"
+        assert made.recipe.setup == at(energy)
+    assert shadowinv("export", out, "--format", "csv", "--out", "t.csv").exit_code == 0
+    with Path("t.csv").open(encoding="utf-8") as file:
+        assert [float(row["energy (MeV)"]) for row in csv.DictReader(file)] == list(ENERGIES)
+    assert "nothing to do" in shadowinv(*arguments, "--resume").stdout
+
+
+def test_films_at_their_own_distance_have_pixels_of_their_own(pack: Path, out: Path) -> None:
+    far = SETUP.model_copy(update={"object_image_distance": 0.6})
+    written_setup("far.toml", far)
+    pack = table("film1.npy,14.7,", "film2.npy,30,far.toml", header="file,energy,setup")
+    inverted(pack, out)
+    done = shadowinv("export", out, "--format", "tiff", "--out", "tiff", "--variables", "potential")
+    assert done.exit_code == 0, done.output
+    sizes = []
+    for path in sorted(Path("tiff").iterdir()):
+        with tifffile.TiffFile(path) as file:
+            number, per = file.pages[0].tags["XResolution"].value
+            sizes.append(per / number)
+    ratio = SETUP.object_pixel_size / far.object_pixel_size
+    assert sizes[0] / sizes[1] == pytest.approx(ratio, rel=1e-3)
+    movie = shadowinv("movie", out, "-o", "movie.gif")
+    assert movie.exit_code == 0, movie.output
+    places = read(out)["x_si"]
+    assert float(places[0, 1] / places[1, 1]) == pytest.approx(ratio, rel=1e-12)
+
+
+def test_a_row_is_made_again_by_its_provenance(pack: Path) -> None:
+    known = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
+    pack = table("film0.npy,5,1.25,beam.npy", header="file,energy,gain,source")
+    stack = describe_stack(
+        pack,
+        variables=None,
+        source=None,
+        mask=None,
+        recipe=Recipe(setup=SETUP, options=known),
+        options=None,
+        setup=None,
+        filters=(),
+        source_mask=None,
+        reader=read_shot,
+        warm_start=1,
+    )
+    work = stack.work(("potential",))
+    inversion = work.invert(stack.shots.items[0].load()[0], stack.beam, workers=1)
+    write("film0.shadowinv", inversion)
+    again = shadowinv("rerun", "film0.shadowinv", "--out", "again.shadowinv")
+    assert again.exit_code == 0, again.output
+    assert "none: the same result, bit for bit" in flat(again.stdout)
+    for name in ("film0.shadowinv", "again.shadowinv"):
+        assert "gain 1.25, by which" in flat(shadowinv("info", name).stdout)
+
+
+def test_rows_may_be_given_in_python(pack: Path, out: Path) -> None:
+    rows = [ShotRow(file=Path("film1.npy")), ShotRow(file=Path("film2.npy"), energy=30.0)]
+    store = inverted([*rows, ShotRow(file=Path("gone.npy"), exclude=True)], out)
+    assert store["energy"].values.tolist() == [14.7, 30.0]
+
+
+def test_workers_elsewhere_are_told_all_of_a_row(pack: Path, out: Path) -> None:
+    np.save("mask.npy", np.ones(SHAPE))
+    pack = table("film0.npy,5,mask.npy", "film2.npy,30,", header="file,energy,mask")
+    arguments = {"setup": SETUP, "options": OPTIONS, "source": beam(), "dtype": "float64"}
+    here = run_stack(pack, out, scheduler="synchronous", **arguments)
+    other = out.with_name("other.shadowinv.zarr")
+    there = run_stack(pack, other, scheduler="processes", workers=1, **arguments)
+    assert there["status"].values.tolist() == [DONE, DONE]
+    np.testing.assert_array_equal(there["displacement"], here["displacement"])
+    np.testing.assert_array_equal(there["path_integrated_b"], here["path_integrated_b"])

@@ -1,0 +1,118 @@
+"""Facts about `shadowinv film`: what it writes, and how it refuses."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulated_pack import Truth, simulate
+
+from command_line import content, flat, shadowinv
+from napari_shadowinv import read
+from napari_shadowinv.cli import _film_command
+from napari_shadowinv.film import read_corners
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
+    folder = tmp_path_factory.mktemp("pack")
+    return simulate(folder, layers=3, shape=(90, 120), seed=2, b_peak=2.0, e_peak=0.0)
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_pack_from_scans_to_files_for_a_fit(truth: Truth, here: Path) -> None:
+    options = ["--layers", "layers", "--save-corners", "corners.csv"]
+    ended = shadowinv("film", truth.pack, *options)
+    assert ended.exit_code == 0, ended.output
+    names = {"pack.shadowinv", "pack.png", "corners.csv"}
+    assert content(here).keys() == names
+    assert "Film pack" in flat(ended.output)
+    dataset = read("pack.shadowinv")
+    for energy in dataset["energy"].values:
+        assert f"{energy:.4g}" in ended.output
+    corners = read_corners("corners.csv")
+    np.testing.assert_allclose(list(corners.values()), dataset["corners"], atol=0.006)
+    listed = (here / "layers" / "layers.csv").read_text().splitlines()
+    assert len(listed) == 4
+    inverted = shadowinv("batch", "layers/layers.csv", "--out", "all.shadowinv.zarr", "-q")
+    assert inverted.exit_code in (0, 3), inverted.output
+    store = read("all.shadowinv.zarr")
+    assert store.sizes["shot"] == 3
+
+    before = content(here)
+    again = shadowinv("film", truth.pack)
+    assert again.exit_code == 2
+    assert "pack.shadowinv exists" in flat(again.output)
+    elsewhere = shadowinv("film", truth.pack, "--layers", "layers", "--out", "other.shadowinv")
+    assert elsewhere.exit_code == 2
+    assert "layers.csv exists" in flat(elsewhere.output)
+    assert content(here) == before
+
+
+def test_it_is_made_again_and_described(truth: Truth, here: Path) -> None:
+    assert shadowinv("film", truth.pack, "-q").output == ""
+    told = flat(shadowinv("info", "pack.shadowinv").output)
+    assert "film pack of shadowinv" in told
+    assert "3 of 90 × 120 px" in told
+    again = shadowinv("rerun", "pack.shadowinv")
+    assert again.exit_code == 0, again.output
+    assert "the same result, bit for bit" in flat(again.output)
+    one, other = read("pack.shadowinv"), read("pack_again.shadowinv")
+    np.testing.assert_array_equal(one["fluence"], other["fluence"])
+    for command, out in (("invert", "x.shadowinv"), ("fit", "x.shadowinv"), ("forward", "x.tif")):
+        refused = shadowinv(command, "pack.shadowinv", "--out", out)
+        assert refused.exit_code == 2
+        assert "film pack" in flat(refused.output), refused.output
+
+
+def test_without_distances_the_table_tells_strengths(truth: Truth, here: Path) -> None:
+    text = truth.pack.read_text()
+    text = re.sub(r"\[setup\].*?(?=\[films)", "", text, flags=re.DOTALL)
+    pack = truth.folder / "no_setup.toml"
+    pack.write_text(text)
+    ended = shadowinv("film", pack, "--layers", "layers", "-q")
+    assert ended.exit_code == 0, ended.output
+    header, first, second, _ = (here / "layers" / "layers.csv").read_text().splitlines()
+    assert header == "file,mask,strength"
+    assert first.endswith(",1")
+    energies = read("no_setup.shadowinv")["energy"].values
+    assert float(second.split(",")[-1]) == pytest.approx(
+        (energies[0] / energies[1]) ** 0.5, rel=2e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "written", "message"),
+    [
+        ("lost.toml", None, "lost.toml does not exist: expected a TOML file"),
+        ("bad.toml", "layers = 3", "'layers' is 3"),
+        ("bad.toml", "[[layers]\n", "is not valid TOML"),
+        ("bad.toml", '[[layers]]\nfilm = "EBT4"\n', "did you mean 'EBT3'?"),
+        ("bad.toml", '[[layers]]\nfilm = "EBT3"\n', "layer 1 has no file"),
+    ],
+)
+def test_what_is_wrong_is_told_and_nothing_is_left(
+    here: Path, name: str, written: str | None, message: str
+) -> None:
+    if written is not None:
+        (here / name).write_text(written)
+    before = content(here)
+    ended = shadowinv("film", name)
+    assert ended.exit_code == 2
+    assert message in flat(ended.output), ended.output
+    assert "Traceback" not in ended.output
+    assert content(here) == before
+
+
+def test_a_cancelled_run_leaves_nothing(truth: Truth, here: Path, monkeypatch) -> None:
+    monkeypatch.setattr(_film_command, "interrupted", lambda: True)
+    ended = shadowinv("film", truth.pack)
+    assert ended.exit_code == 130
+    assert content(here) == {}
