@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 import xarray as xr
+from matplotlib.figure import Figure
 
 from command_line import content, flat, interrupted, shadowinv
 from napari_shadowinv.cli._flags import fit_recipe_of
@@ -50,7 +51,15 @@ PAIR = ("fit", "a.tif", "b.tif", "--energies", "14.7,5", "--setup", "setup.toml"
 
 
 @pytest.fixture
-def given(monkeypatch: pytest.MonkeyPatch, make_fit: Callable[..., Fit]) -> dict[str, Any]:
+def empty_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write figures without drawing them, which would take longer than the fit."""
+    monkeypatch.setattr("napari_shadowinv.plotting.fit_figure", lambda *_, **__: Figure())
+
+
+@pytest.fixture
+def given(
+    monkeypatch: pytest.MonkeyPatch, make_fit: Callable[..., Fit], empty_figure: None
+) -> dict[str, Any]:
     """What the command gives to `fit`, which then does no work."""
     seen: dict[str, Any] = {}
 
@@ -393,14 +402,17 @@ def test_info_tells_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
 # Making it again
 
 
-def test_a_fit_is_made_again_bit_for_bit(folder: Path, refused: Callable[..., None]) -> None:
+def test_a_fit_is_made_again_bit_for_bit(
+    folder: Path, refused: Callable[..., None], empty_figure: None
+) -> None:
     mask = np.full(SHAPE, 255, np.uint8)
     mask[:9, :7] = 0
     tifffile.imwrite("mask.tif", mask)
     tifffile.imwrite("beam.tif", np.full(SHAPE, 1000, np.float32))
     steps = ("--crop-y", "2:46", "--crop-x", "0:54", "--hot-pixels", 8)
     known = ("--mask", "mask.tif", "--source", "beam.tif", "--psf", 0.3, "--noise", 20)
-    result = shadowinv(*PAIR, *steps, *known, "--samples", 2, "--steps", 5, "--gains", "1,1.01")
+    quick = ("--samples", 2, "--steps", 5, "--spacing", 0.25)
+    result = shadowinv(*PAIR, *steps, *known, *quick, "--gains", "1,1.01")
     assert result.exit_code in (0, 3), result.output
     # A mask whose pixels are kept need not be there any more.
     Path("mask.tif").unlink()
@@ -434,8 +446,9 @@ def test_a_fit_is_made_again_bit_for_bit(folder: Path, refused: Callable[..., No
     assert "nothing" not in told
 
 
-def test_a_fit_of_an_older_version_is_told(make_fit: Callable[..., Fit], folder: Path) -> None:
-    assert shadowinv("fit", "a.tif", "--bin", 1, "--samples", 0, "--steps", 1).exit_code in (0, 3)
+def test_a_fit_of_an_older_version_is_told(empty_figure: None) -> None:
+    quick = ("--samples", 0, "--steps", 1, "--spacing", 0.5, "--smoothness", 10)
+    assert shadowinv("fit", "a.tif", "--bin", 1, *quick).exit_code in (0, 3)
     fit, _ = fit_in("a_fit.shadowinv")
     assert fit.provenance is not None
     older = fit.provenance.model_copy(update={"version": "0.0.1"})
@@ -445,7 +458,7 @@ def test_a_fit_of_an_older_version_is_told(make_fit: Callable[..., Fit], folder:
     assert "the same result, bit for bit" in told
 
 
-def test_known_displacements_and_own_masks_are_taken_again() -> None:
+def test_known_displacements_and_own_masks_are_taken_again(empty_figure: None) -> None:
     rng = np.random.default_rng(3)
     for name in ("one", "two"):  # too complex to be kept with the result
         tifffile.imwrite(f"{name}.tif", (rng.random((400, 600)) > 0.15).astype(np.uint8))
@@ -454,8 +467,9 @@ def test_known_displacements_and_own_masks_are_taken_again() -> None:
     Path("shots.csv").write_text("\n".join(lines))
     rows = ["y,x,dy,dx,sigma", *(f"{k % 30}.25,{k % 40}.5,0,0,10" for k in range(1000))]
     Path("mesh.csv").write_text("\n".join(rows))
-    quick = ("--crop-y", "9:57", "--crop-x", "8:64", "--samples", 0, "--steps", 1)
-    result = shadowinv("fit", "shots.csv", "--fiducials", "mesh.csv", *quick)
+    quick = ("--samples", 0, "--steps", 1, "--spacing", 0.5, "--smoothness", 10)
+    part = ("--crop-y", "9:49", "--crop-x", "8:56")
+    result = shadowinv("fit", "shots.csv", "--fiducials", "mesh.csv", *part, *quick)
     assert result.exit_code in (0, 3), result.output
     made = provenance_in("image_one_fit.shadowinv")
     assert made.fiducial_rows is None
@@ -561,8 +575,8 @@ def test_the_recipe_on_the_page_works(given: dict[str, Any]) -> None:
 # Choices of fields compared
 
 
-def test_fields_are_compared_and_the_likeliest_is_written() -> None:
-    quick = ("--noise", 20, "--samples", 0, "--steps", 5)
+def test_fields_are_compared_and_the_likeliest_is_written(empty_figure: None) -> None:
+    quick = ("--noise", 20, "--samples", 0, "--steps", 5, "--spacing", 0.25, "--smoothness", 10)
     result = shadowinv(*PAIR, "--compare", *quick)
     assert result.exit_code in (0, 3), result.output
     told = flat(result.stdout)

@@ -24,8 +24,9 @@ SETUPS = [ProtonSetup(energy=energy, **LENGTHS) for energy in (5, 7, 10, 14, 20)
 STRENGTHS = [SETUPS[0].momentum / setup.momentum for setup in SETUPS]
 TRUTH = gaussian_blob(SHAPE, 40.0, 8.0, (28, 33)).displacement
 FACTORS = (1.0, 1.0, 1.0, 1.25, 1.25)
-HASTY = FitOptions(samples=0, steps=3, spacing=0.25)
-RECIPE = Recipe(fit=FitChoices(noise=NOISE, options=FitOptions(samples=2)))
+HASTY = FitOptions(samples=0, steps=3, spacing=0.5)
+PLAIN = FitOptions(samples=0, spacing=0.2)
+RECIPE = Recipe(fit=FitChoices(noise=NOISE, options=PLAIN))
 
 
 def shots_of(factors: tuple[float, ...], **changes: Any) -> list[FitShot]:
@@ -62,7 +63,7 @@ def test_windows_follow_the_strength_of_the_object(windows: FitWindows) -> None:
 
 def test_a_window_is_the_fit_of_its_images(windows: FitWindows) -> None:
     images = np.stack([np.asarray(shot.image) for shot in shots_of(FACTORS)[1:3]])
-    alone = fit(images, setups=SETUPS[1:3], noise=NOISE, options=FitOptions(samples=2))
+    alone = fit(images, setups=SETUPS[1:3], noise=NOISE, options=PLAIN)
     np.testing.assert_array_equal(
         windows.fits[1].fields[0].displacement, alone.fields[0].displacement
     )
