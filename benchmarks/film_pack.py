@@ -4,7 +4,8 @@
     python benchmarks/film_pack.py --chain [--seeds 3] [--bin 3]
 
 With --chain: how far the fields and the beam, by a fit of all layers, are from the truth, as the
-steps from the scans to the layers are added one by one.
+steps from the scans to the layers are added one by one; and of a pack whose films have slipped by up
+to 6 px, laid on each other by what they show, or by three holes read to 0.3 px.
 
 The scans are those of tests/film/simulated_pack.py: rays counted where an exact formula puts them,
 on films that lie askew. For each film: the energy of its protons and its doses; the protons that
@@ -220,6 +221,34 @@ def chain(folder: Path, seed: int, given: argparse.Namespace) -> None:
         print(f"| {seed} | {name} | {' | '.join(cells)} |", flush=True)
     cells = fitted(truth, whole, given.bin, "shift")
     print(f"| {seed} | … and by the fit | {' | '.join(cells)} |", flush=True)
+    slipped = simulate(
+        folder / f"{seed}_slipped", layers=8, shape=(300, 400), seed=seed, slips=6.0, **choices
+    )
+    pack = read_pack(slipped.pack)
+    ways = {
+        "films that slipped, laid by what they show": pack,
+        "films that slipped, laid by fiducials": pack.model_copy(
+            update={"fiducials": fiducials(slipped, seed)}
+        ),
+    }
+    for name, way in ways.items():
+        cells = fitted(slipped, Images.of(slipped, run_film(way)), given.bin, "none")
+        print(f"| {seed} | {name} | {' | '.join(cells)} |", flush=True)
+
+
+def fiducials(truth: Truth, seed: int) -> Path:
+    """A table of three holes through the pack, as one reads them off the scans."""
+    rng = np.random.default_rng(seed)
+    sides = np.array(truth.scene.shape)
+    path = truth.folder / "fiducials.csv"
+    lines = ["film,name,y,x"]
+    for number, place in enumerate(truth.placements, 1):
+        for name, at in (("left", (-0.4, -0.45)), ("right", (-0.38, 0.45)), ("low", (0.42, 0.1))):
+            on_scan = place.on_scan(np.array(at) * sides - np.array(place.slip))
+            y, x = on_scan + rng.normal(0, 0.3, 2)
+            lines.append(f"{number},{name},{y:.2f},{x:.2f}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
 
 
 def main() -> None:

@@ -221,6 +221,84 @@ def test_corners_from_a_table(truth: Truth, dataset, changed, tmp_path: Path) ->
     assert read_corners(tmp_path / "corners.csv").keys() == {"7"}
 
 
+def write_fiducials(path: Path, truth: Truth, films: range, *, mirrored: int = -1) -> None:
+    """Three marks through the pack, where they are on the scans; one film lies on its face."""
+    through = {"left": (-30.0, -50.0), "right": (-20.0, 55.0), "low": (40.0, 5.0)}
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["film", "name", "y", "x"])
+        for layer in films:
+            place = truth.placements[layer]
+            for name, at in through.items():
+                y, x = place.on_scan(np.array(at) - np.array(place.slip))
+                x = place.shape[1] - 1 - x if layer == mirrored else x
+                rows.writerow([layer + 1, name, f"{y:.3f}", f"{x:.3f}"])
+
+
+def places_of(truth: Truth, dataset) -> np.ndarray:
+    """Where the middles of the upright films are in the pack, px, and how they are turned."""
+    places = []
+    for layer, place in enumerate(truth.placements[: dataset.sizes["layer"]]):
+        axes, middle, _ = upright(dataset["corners"].values[layer])
+        away = np.array(place.axes) @ (middle - np.array(place.middle)) + np.array(place.slip)
+        turn = np.arctan2(axes[0, 1], axes[0, 0]) - np.arctan2(*place.axes[0][::-1])
+        places.append([*away, turn])
+    return np.array(places)
+
+
+def test_films_are_laid_on_each_other_by_fiducials(truth: Truth, changed, tmp_path: Path) -> None:
+    write_fiducials(tmp_path / "fiducials.csv", truth, range(COUNT))
+    found = run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
+    places = places_of(truth, found)
+    assert (np.abs(places - places.mean(axis=0)) < [0.05, 0.05, 5e-4]).all()
+    assert (found["shift_error"].values < 0.5).all()
+    # They tell what fields displace from films that slipped.
+    assert not found["by_images"].values.any()
+    assert found.attrs["warnings"] == "[]"
+
+
+def test_films_without_fiducials_are_told(truth: Truth, changed, tmp_path: Path) -> None:
+    write_fiducials(tmp_path / "fiducials.csv", truth, range(COUNT - 1))
+    found = run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
+    places = places_of(truth, found)[:-1]
+    assert np.ptp(places[:, :2], axis=0).max() < 0.1
+    assert f"films {COUNT} have no fiducials: laid by their edges" in found.attrs["warnings"]
+    np.testing.assert_array_equal(found["shift"][-1], 0)
+
+
+def test_fiducials_of_a_film_on_its_face(truth: Truth, changed, tmp_path: Path) -> None:
+    table, first = tmp_path / "fiducials.csv", 'fiducials = "fiducials.csv"'
+    write_fiducials(table, truth, range(COUNT))
+    before = run_film(read_pack(changed(first=first)))["corners"].values[1]
+    scan = tifffile.imread(truth.files[1])
+    (tmp_path / "film_02.tif").unlink()
+    tifffile.imwrite(tmp_path / "film_02.tif", scan[:, ::-1], photometric="rgb")
+    write_fiducials(table, truth, range(COUNT), mirrored=1)
+    said = ('file = "film_02.tif"', 'file = "film_02.tif"\nmirrored = true')
+    pack = read_pack(changed(said, first=f"{first}\npixel_size = 84.667e-6"))
+    mirrored = run_film(pack)["corners"].values[1]
+    as_before = mirrored[[1, 0, 3, 2]] * [1, -1] + [0, scan.shape[1] - 1]
+    np.testing.assert_allclose(as_before, before, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("9,left,1,1", "a mark on film 9: expected numbers of layers, from 1 to 4"),
+        ("1,left,1,1", "the mark 'left' twice on film 1"),
+        ("1,new,1,one", "row 13: 'x' is 'one'"),
+    ],
+)
+def test_other_fiducials_are_told(
+    truth: Truth, changed, tmp_path: Path, row: str, message: str
+) -> None:
+    write_fiducials(tmp_path / "fiducials.csv", truth, range(COUNT))
+    with (tmp_path / "fiducials.csv").open("a") as file:
+        file.write(f"{row}\n")
+    with pytest.raises(InputError, match=re.escape(message)):
+        run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
+
+
 def test_layers_from_a_table(truth: Truth, dataset, changed) -> None:
     entries = read_toml(truth.pack)
     pack = changed()

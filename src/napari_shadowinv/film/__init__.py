@@ -4,7 +4,8 @@
 - where a film has no marks: `usable_pixels`
 - doses: `Calibration`, `dose`, `combined_dose`, `net_optical_density`
 - packs, and what each film sees of protons of which energy: `Pack`, `Response`
-- how the films of a pack lie on each other: `register`, `moved_corners`, `check_orientation`
+- how the films of a pack lie on each other: `register`, `poses_by_fiducials`, `moved_corners`,
+  `check_orientation`
 - fluences at each energy from the doses of all films: `unfold`
 - CR-39: `Tracks`, `TrackImage`
 - image plates: `fuji_luminescence`, `ge_luminescence`, `fading`
@@ -19,6 +20,7 @@ from napari_shadowinv.film.calibration import (
     net_optical_density,
     unexposed_pixel,
 )
+from napari_shadowinv.film.fiducials import poses_by_fiducials
 from napari_shadowinv.film.image_plates import (
     Luminescence,
     fading,
@@ -60,6 +62,7 @@ __all__ = [
     "ge_luminescence",
     "moved_corners",
     "net_optical_density",
+    "poses_by_fiducials",
     "read_corners",
     "register",
     "straightened",

@@ -210,6 +210,12 @@ class Pack(BaseModel):
         title="Corners",
         description="Table (.csv) of films on their scans, by number: film, y1, x1, … y4, x4.",
     )
+    fiducials: Path | None = Field(
+        default=None,
+        title="Fiducials",
+        description="Table (.csv) of marks through the whole pack on the films' scans: film, name, "
+        "y, x.",
+    )
     pixel_size: float | None = Field(
         default=None,
         gt=0,
@@ -226,7 +232,7 @@ class Pack(BaseModel):
     align: Literal["images", "edges"] = Field(
         default="images",
         title="Align",
-        description="By what films show alike, or by their edges alone.",
+        description="By what films show alike, or by their edges alone; not where fiducials tell.",
     )
 
     @model_validator(mode="before")
@@ -271,7 +277,7 @@ class Pack(BaseModel):
     @property
     def files(self) -> list[Path]:
         """All files that it names."""
-        named = [self.scan, self.corners]
+        named = [self.scan, self.corners, self.fiducials]
         named += [file for layer in self.layers for file in (layer.file, layer.mask)]
         named += [file for one in self.films.values() for file in (one.calibration, one.unexposed)]
         named += [matter.table for matter in self.materials.values()]

@@ -156,4 +156,4 @@ def _with_files(pack: Pack, moved: Callable[[Path], Path]) -> Pack:
         "materials": {name: of(one, "table") for name, one in pack.materials.items()},
         "layers": tuple(of(layer, "file", "mask") for layer in pack.layers),
     }
-    return Pack.model_validate({**dict(of(pack, "scan", "corners")), **changes})
+    return Pack.model_validate({**dict(of(pack, "scan", "corners", "fiducials")), **changes})
