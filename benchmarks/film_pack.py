@@ -4,8 +4,8 @@
     python benchmarks/film_pack.py --chain [--seeds 3] [--bin 3]
 
 With --chain: how far the fields and the beam, by a fit of all layers, are from the truth, as the
-steps from the scans to the layers are added one by one; and of a pack whose films have slipped by up
-to 6 px, laid on each other by what they show, or by three holes read to 0.3 px.
+steps from the scans to the layers are added one by one; and of a pack whose films have slipped by
+up to 6 px, laid on each other by what they show, or by three holes read to 0.3 px.
 
 The scans are those of tests/film/simulated_pack.py: rays counted where an exact formula puts them,
 on films that lie askew. For each film: the energy of its protons and its doses; the protons that

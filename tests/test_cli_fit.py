@@ -296,7 +296,8 @@ TABLES = {
     "file,noise\na.tif,loud\n": ("row 1", "'noise' is 'loud': expected 'poisson'"),
     "file,strength\na.tif,1\nb.tif,\n": ("b.tif has no strength, other images have",),
     "file,source\na.tif,unknown\nb.tif,\n": ("b.tif has no unknown source",),
-    "file,noise\na.tif,poisson\nb.tif,3\n": ("'poisson' in some images",),
+    "file,noise\na.tif,poisson\nb.tif,3\n": ("'poisson' in some images and a number in others",),
+    "file,noise\na.tif,poisson\nb.tif,proportional\n": ("and 'proportional' in others",),
     "file,strength\na.tif,1 2\nb.tif,2\n": ("strengths have 2, 1 numbers",),
 }
 

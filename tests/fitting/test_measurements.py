@@ -102,7 +102,7 @@ def nearly_all_masked() -> FloatArray:
         ({"source": np.ones((40, 50))}, r"source has shape \(40, 50\): expected \(40, 51\)"),
         ({"source": -np.ones(SIZE)}, "source has pixels that are negative or not finite"),
         ({"source": np.full(SIZE, np.nan)}, "source has pixels that are negative or not finite"),
-        ({"noise": "gauss"}, "noise is 'gauss': expected 'poisson', standard deviations or None"),
+        ({"noise": "gauss"}, "noise is 'gauss': expected 'poisson' or 'proportional', standard"),
         ({"noise": 0}, "noise is not positive everywhere"),
         ({"noise": np.full(SIZE, np.nan)}, "noise is not positive everywhere"),
         ({"noise": []}, "noise is not positive everywhere"),
@@ -217,6 +217,23 @@ def test_counts_vary_by_their_root() -> None:
     assert made.counted
     noise = made.units[:, None, None] / np.sqrt(made.scene.weights[:, :, :51])
     np.testing.assert_allclose(noise, 10, rtol=0.1)
+
+
+def test_noise_that_is_a_share_of_each_pixel() -> None:
+    y, x = np.indices(SIZE)
+    beam = np.exp(y / 12)  # 27 times as bright below
+    hole = (y > 12) & (y < 20) & (x > 20) & (x < 30)
+    chance = np.random.default_rng(4).normal(size=(2, *SIZE))
+    shots = beam * (1 + np.array([0.03, 0.06])[:, None, None] * chance)
+    shots[:, hole] = 0
+    made = given(images=shots, noise="proportional", source=beam, mask=~hole)
+    assert not made.counted
+    used = made.scene.weights[:, :40, :51] > 0
+    noise = made.units[:, None, None] / np.sqrt(np.where(used, made.scene.weights[:, :40, :51], 1))
+    for k, share in enumerate((0.03, 0.06)):
+        told = (noise[k] / beam)[used[k] & (noise[k] > 0.006 * made.units[k])]
+        assert np.median(told) == pytest.approx(share, rel=0.05)
+        assert np.abs(told / share - 1).max() < 0.25
 
 
 def test_noise_beyond_what_the_model_can_explain_is_not_believed() -> None:

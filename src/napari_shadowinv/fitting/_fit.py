@@ -36,7 +36,7 @@ from napari_shadowinv.fitting.search import (
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import judged
 from napari_shadowinv.inversion import invert
-from napari_shadowinv.options import FitOptions, InversionOptions
+from napari_shadowinv.options import FitOptions, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.physics.setup import Setup
@@ -61,7 +61,7 @@ def fit(
     setups: Sequence[Setup] | None = None,
     fields: Sequence[str] = ("B",),
     source: ArrayLike | Literal["unknown"] | None = None,
-    noise: ArrayLike | Literal["poisson"] | None = None,
+    noise: ArrayLike | KindOfNoise | None = None,
     psf: Any = 0.0,
     mask: ArrayLike | None = None,
     gains: ArrayLike | Literal["known", "free"] = "known",
@@ -92,9 +92,11 @@ def fit(
         The undisturbed beam, (H, W) or one for each image, in the units of the images; or
         "unknown": a smooth beam is fitted, the same for all images but for gains. Default:
         uniform, with the mean of each image.
-    noise : array_like or "poisson", optional
+    noise : array_like, "poisson" or "proportional", optional
         Standard deviation of the noise: one number, one an image, or one a pixel. "poisson" if
-        the images are counts. Default: estimated from differences of neighbouring pixels.
+        the images are counts; "proportional" if it is a share of each pixel, as that of film, which
+        is estimated. Default: estimated from differences of neighbouring pixels, and the same in
+        all of them.
     psf : float or array_like, default 0
         Standard deviation in px of the point spread, or a kernel with odd sides; one, or one for
         each image. See `point_spread`.

@@ -19,7 +19,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.unknowns import Fiducials
-from napari_shadowinv.options import FIELDS, FitOptions
+from napari_shadowinv.options import FIELDS, KINDS_OF_NOISE, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import Setup
 
@@ -38,7 +38,8 @@ _SMALLEST_SIDE = 32
 _NORMAL_MAD = 1.4826
 _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
 _LEAST_COUNTS = 1.0
-_SMOOTHED = 5  # px, over which counts are averaged for their first standard deviation
+_SMOOTHED = 5  # px, over which images are averaged for the standard deviation of their noise
+_DARKEST = 1e-3  # of an image's mean
 _SAME = _ALIKE = 1e-6
 _OTHER_UNITS = 3.0  # an image's mean brightness over its source's
 _FREE_SHARE = 0.1  # of the shorter side
@@ -80,7 +81,7 @@ def measured(
     setups: Sequence[Setup] | None,
     fields: Sequence[str],
     source: ArrayLike | Literal["unknown"] | None,
-    noise: ArrayLike | Literal["poisson"] | None,
+    noise: ArrayLike | KindOfNoise | None,
     psf: Any,
     mask: ArrayLike | None,
     gains: ArrayLike | Literal["known", "free"],
@@ -137,7 +138,7 @@ def measured(
     )
     spread = np.linalg.norm(matrix, axis=1)
     single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
-    return Measured(scene, (height, width), units, factors, isinstance(noise, str), single)
+    return Measured(scene, (height, width), units, factors, _is(noise, "poisson"), single)
 
 
 _SAME_STRENGTH = 1.08  # images that differ by less tell no more than one
@@ -407,11 +408,16 @@ def _checked_source(source: Any, data: FloatArray, used: BoolArray) -> FloatArra
 def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
     """Standard deviation of each pixel's noise."""
     if isinstance(noise, str):
-        if noise != "poisson":
-            raise InputError(f"noise is {noise!r}: expected 'poisson', standard deviations or None")
+        if noise not in KINDS_OF_NOISE:
+            raise InputError(
+                f"noise is {noise!r}: expected {' or '.join(map(repr, KINDS_OF_NOISE))}, standard "
+                "deviations or None"
+            )
+        means = np.stack([_smoothed(*plane) for plane in zip(data, used, strict=True)])
+        if noise == "proportional":
+            return _shares(data, used, means)[:, None, None] * means
         if (data[used] < 0).any():
             raise InputError("images have negative pixels, so they are no counts: give the noise")
-        means = np.stack([uniform_filter(plane, _SMOOTHED) for plane in np.where(used, data, 0)])
         return np.asarray(np.sqrt(np.maximum(means, _LEAST_COUNTS)))
     if noise is None:
         levels = [estimated_noise(plane, use) for plane, use in zip(data, used, strict=True)]
@@ -427,6 +433,29 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
             "the images"
         )
     return np.array(np.broadcast_to(sigma, data.shape))
+
+
+def _is(value: object, kind: str) -> bool:
+    return isinstance(value, str) and value == kind
+
+
+def _smoothed(image: FloatArray, used: BoolArray) -> FloatArray:
+    """Means over the used pixels around each, at least a part of that of all."""
+    sums = uniform_filter(np.where(used, image, 0.0), _SMOOTHED)
+    means = np.divide(
+        sums, uniform_filter(used.astype(np.float64), _SMOOTHED), out=sums * 0, where=used
+    )
+    return np.asarray(np.maximum(means, _DARKEST * image[used].mean()))
+
+
+def _shares(data: FloatArray, used: BoolArray, means: FloatArray) -> FloatArray:
+    """Standard deviation of the noise over the mean, one for each image."""
+    return np.array(
+        [
+            estimated_noise(image / mean, use)
+            for image, mean, use in zip(data, means, used, strict=True)
+        ]
+    )
 
 
 def _checked_psf(psf: Any, count: int, size: tuple[int, int]) -> list[float | FloatArray]:

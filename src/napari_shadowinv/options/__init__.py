@@ -7,7 +7,23 @@ in a window, and is saved with each result: there is no second list of defaults.
 - what can deflect a beam, by name: `FIELDS`
 """
 
-from napari_shadowinv.options.fitting import FIELDS, FitChoices, FitOptions, Noise
+from napari_shadowinv.options.fitting import (
+    FIELDS,
+    KINDS_OF_NOISE,
+    FitChoices,
+    FitOptions,
+    KindOfNoise,
+    Noise,
+)
 from napari_shadowinv.options.inversion import MAX_DEFAULT_SITES, InversionOptions
 
-__all__ = ["FIELDS", "MAX_DEFAULT_SITES", "FitChoices", "FitOptions", "InversionOptions", "Noise"]
+__all__ = [
+    "FIELDS",
+    "KINDS_OF_NOISE",
+    "MAX_DEFAULT_SITES",
+    "FitChoices",
+    "FitOptions",
+    "InversionOptions",
+    "KindOfNoise",
+    "Noise",
+]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
     BaseModel,
@@ -13,7 +13,7 @@ from pydantic import (
     model_validator,
 )
 
-__all__ = ["FIELDS", "FitChoices", "FitOptions", "Noise"]
+__all__ = ["FIELDS", "KINDS_OF_NOISE", "FitChoices", "FitOptions", "KindOfNoise", "Noise"]
 
 FIELDS = {
     "B": "magnetic field",
@@ -145,19 +145,21 @@ class FitOptions(BaseModel):
 
 
 def _noise(value: Any) -> Any:
-    if value is None or value == "poisson":
+    if value is None or value in KINDS_OF_NOISE:
         return value
     try:
         deviation = float(value)
     except (TypeError, ValueError):
         deviation = 0.0
     if not 0 < deviation < float("inf"):
-        raise ValueError("expected 'poisson' or the standard deviation in a pixel")
+        raise ValueError("expected 'poisson', 'proportional' or the standard deviation in a pixel")
     return deviation
 
 
-Noise = Annotated[Literal["poisson"] | float, BeforeValidator(_noise)]
-"""The noise of an image: that of counts, or a standard deviation."""
+KindOfNoise = Literal["poisson", "proportional"]
+KINDS_OF_NOISE = get_args(KindOfNoise)
+Noise = Annotated[KindOfNoise | float, BeforeValidator(_noise)]
+"""The noise of an image: that of counts, a share of each pixel, or a standard deviation."""
 
 
 class FitChoices(BaseModel):
@@ -202,10 +204,11 @@ class FitChoices(BaseModel):
         default=None,
         title="Noise",
         description=(
-            "'poisson' if images are counts, or the standard deviation in a pixel after all "
-            "steps. Default: estimated from the images."
+            "'poisson' if images are counts; 'proportional' if noise is a share of each pixel, as "
+            "that of film; or the standard deviation in a pixel after all steps. Default: "
+            "estimated from the images, the same in all pixels."
         ),
-        json_schema_extra={"metavar": "poisson|NUMBER"},
+        json_schema_extra={"metavar": "poisson|proportional|NUMBER"},
     )
     psf: float | None = Field(
         default=None,

@@ -21,7 +21,7 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, compare, fit, point_spread
 from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.options import FIELDS, FitChoices
+from napari_shadowinv.options import FIELDS, FitChoices, KindOfNoise
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline._run import Inputs, Shot, gathered, radiograph_of
@@ -74,8 +74,8 @@ class FitShot:
         How many times brighter than its source the image is.
     psf : float, optional
         Standard deviation of the point spread in px after all steps.
-    noise : float or "poisson", optional
-        Standard deviation in a pixel after all steps, or that of counts.
+    noise : float, "poisson" or "proportional", optional
+        Standard deviation in a pixel after all steps, that of counts, or a share of each pixel.
     """
 
     image: Shot
@@ -86,7 +86,7 @@ class FitShot:
     strength: tuple[float, ...] | None = None
     gain: float | None = None
     psf: float | None = None
-    noise: Literal["poisson"] | float | None = None
+    noise: KindOfNoise | float | None = None
 
     @property
     def beam_unknown(self) -> bool:
@@ -187,11 +187,13 @@ class FitInputs:
         known = _of_all(self.names, each, "noise")
         if known is None:
             return None
-        if len({isinstance(one, str) for one in known}) > 1:
+        kinds = {repr(one) if isinstance(one, str) else "a number" for one in known}
+        if len(kinds) > 1:
             raise InputError(
-                "noise is 'poisson' in some images and a number in others: give numbers for all"
+                f"noise is {' in some images and '.join(sorted(kinds))} in others: give the same "
+                "for all, or numbers"
             )
-        return "poisson" if isinstance(known[0], str) else known
+        return known[0] if isinstance(known[0], str) else known
 
     def _spread(self, k: int) -> float:
         """Standard deviation of an image's point spread in px."""

@@ -93,7 +93,8 @@ class ShotRow(BaseModel):
     noise: Noise | None = Field(
         default=None,
         title="Noise",
-        description="poisson for counts, or the standard deviation in a pixel, after --bin.",
+        description="poisson for counts, proportional for a share of each pixel, or the standard "
+        "deviation in a pixel, after --bin.",
     )
     shot: str | None = Field(
         default=None,

@@ -25,7 +25,11 @@ _TITLES = {
     "phase": "refractive index (phase)",
 }
 BOTH = " and "
-NOISES = {"": "estimated from each image", "poisson": "of counts (Poisson)"}
+NOISES = {
+    "": "estimated from each image",
+    "poisson": "of counts (Poisson)",
+    "proportional": "a share of each pixel (film)",
+}
 
 
 class BeamPicker(forms.RowPicker):
