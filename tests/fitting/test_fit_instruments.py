@@ -104,6 +104,14 @@ def test_a_shifted_image_is_brought_back(
     assert error(result) < 0.04
 
 
+def test_an_image_is_shifted_no_further_than_it_may_be(shots: list[FloatArray]) -> None:
+    images = noisy([shots[0], shot(1, frame=(1.2, 1, 0, -2.0, 0, 1))], NOISE)
+    options = FitOptions(samples=0, steps=30, spacing=0.25, align="shift", align_spread=1e-3)
+    found = fit(images, strengths=STRENGTHS, noise=NOISE, options=options)
+    assert np.abs(found.frames[1][[0, 3]]).max() < 0.5
+    assert found.verdict == Verdict.MISFIT
+
+
 def test_a_turned_and_magnified_image_is_brought_back() -> None:
     """Two objects apart tell how one image is turned, which a round one does not."""
     pair = together(bump(3.0, 4.5, (18, 36)), bump(-1.4, 5, (31, 17)))

@@ -267,7 +267,9 @@ def test_one_kernel_is_for_all_images_and_kernels_may_differ_in_size() -> None:
 
 @pytest.mark.parametrize(("align", "free"), [("none", 0), ("shift", 2), ("affine", 6)])
 def test_alignment_frees_the_numbers_of_a_frame(align: Any, free: int) -> None:
-    assert given(options=FitOptions(align=align)).scene.free_frames.sum() == free
+    made = given(options=FitOptions(align=align, align_spread=0.3)).scene
+    assert made.free_frames.sum() == free
+    assert made.prior.frame_weights[0] == pytest.approx(1 / 0.3**2)
 
 
 def test_a_free_edge_has_a_wider_strip_and_fades() -> None:

@@ -145,6 +145,10 @@ def test_gains_frames_and_beam_are_held_with_their_spreads(prior: Prior) -> None
         moved = nothing(prior)
         moved.frames[1, number] += change
         assert free.value_and_slope(moved)[0] == pytest.approx(0.5)
+    known = replace(free, shift_spread=0.2)
+    moved = nothing(prior)
+    moved.frames[1, 0] += 0.2 / 2
+    assert known.value_and_slope(moved)[0] == pytest.approx(0.5)
     brighter = nothing(prior)
     brighter.gains[2] = 1
     assert free.value_and_slope(brighter)[0] == pytest.approx(0.5)

@@ -49,6 +49,8 @@ class Scene:
         Whether the gains are unknown.
     free_frames : ndarray of bool, shape (6,)
         Which numbers of a frame are unknown, but for the first image.
+    shift_spread : float
+        See `Prior`.
     blur : float
         Standard deviation in px by which residuals are blurred.
     spacing : float
@@ -72,6 +74,7 @@ class Scene:
     beam_spread: float = 0.3
     free_gains: bool = False
     free_frames: BoolArray = field(default_factory=lambda: np.zeros(6, bool))
+    shift_spread: float = 5.0
     fiducials: Fiducials | None = None
     blur: float = 0.0
     spacing: float = 0.25
@@ -110,6 +113,7 @@ class Scene:
             beam_spread=self.beam_spread,
             fiducials=self.fiducials,
             bin=self.bin,
+            shift_spread=self.shift_spread,
         )
 
     def nothing(self) -> Unknowns:

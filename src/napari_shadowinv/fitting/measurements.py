@@ -133,6 +133,7 @@ def measured(
         beam_modes=options.beam_modes if unknown else 0,
         free_gains=free_gains or unknown,
         free_frames=_ALIGNED[options.align],
+        shift_spread=options.align_spread,
         fiducials=_checked_fiducials(fiducials, (height, width)),
         threads=options.threads,
     )

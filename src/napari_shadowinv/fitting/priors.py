@@ -25,7 +25,7 @@ __all__ = ["POWERS", "Prior"]
 POWERS = (4, 6)  # of the wave number squared: |∇⁴φ|² and |∇⁶φ|²
 
 _GAIN_WEIGHT = 1.0  # 1 / s² of their logarithm
-_SHIFT_SPREAD, _STRETCH_SPREAD = 5.0, 0.05  # px of the recorded image, and shares
+_STRETCH_SPREAD = 0.05  # of turns, magnifications and shears
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,8 @@ class Prior:
         Displacements known at points.
     bin : int
         Side of a pixel in those of the recorded images.
+    shift_spread : float
+        Standard deviation of an image's shift, px of the recorded image.
     """
 
     rays: RayModel
@@ -61,6 +63,7 @@ class Prior:
     beam_spread: float
     fiducials: Fiducials | None
     bin: int
+    shift_spread: float = 5.0
 
     def value_and_slope(self, unknowns: Unknowns) -> tuple[float, Unknowns]:
         """Return the sum of all terms, and its derivatives."""
@@ -153,7 +156,7 @@ class Prior:
     @cached_property
     def frame_weights(self) -> FloatArray:
         """1 / s² of a frame's numbers."""
-        shift, stretch = _SHIFT_SPREAD / self.bin, _STRETCH_SPREAD
+        shift, stretch = self.shift_spread / self.bin, _STRETCH_SPREAD
         return 1 / np.array([shift, stretch, stretch, shift, stretch, stretch]) ** 2
 
     @cached_property

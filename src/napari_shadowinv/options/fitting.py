@@ -84,6 +84,15 @@ class FitOptions(BaseModel):
             "also rotation, magnification and shear ('affine')."
         ),
     )
+    align_spread: float = Field(
+        default=5.0,
+        gt=0,
+        title="Shift (px)",
+        description=(
+            "How far later images are shifted, about: standard deviation in px after all steps. "
+            "Fields displace what images show, too; a small one leaves that to the fields."
+        ),
+    )
     beam_modes: int = Field(
         default=8,
         ge=2,
