@@ -20,6 +20,9 @@ MOST_RAYS = 64  # along a cell's side
 
 _ONE = np.uint32(1)  # unsigned, for which no index counts from the end
 _FAST = {"contract", "reassoc", "nsz"}  # sums in an order that suits the processor
+# A part that is compiled by itself, too, may sum in another order there, and which of both a
+# process calls depends on whether it compiled them or found them compiled.
+_PART = {"nogil": True, "error_model": "numpy", "fastmath": _FAST, "inline": "always"}
 
 
 def spline_tables(places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -30,7 +33,7 @@ def spline_tables(places: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.stack(values), np.stack(slopes) / KNOT
 
 
-@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(**_PART)
 def _slopes_of_row(
     potential: FloatArray,
     row: int,
@@ -64,7 +67,7 @@ def _slopes_of_row(
         )
 
 
-@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(**_PART)
 def _share(place: float, steepness: float) -> tuple[float, float]:
     """What the next pixel gets of a ray between two pixels' middles, and how fast that grows."""
     t = min(max((place - 0.5) * steepness + 0.5, 0.0), 1.0)
@@ -73,7 +76,7 @@ def _share(place: float, steepness: float) -> tuple[float, float]:
     return (part if t < 0.5 else 1 - part), 4 * nearer * steepness
 
 
-@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(**_PART)
 def _land(
     slopes: FloatArray,
     m: int,
@@ -101,13 +104,13 @@ def _land(
         shares[1, b], shares[3, b] = _share(u - j, steepness)
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(**_PART)
 def _first_pixels_share(a: int, n: int) -> float:
     """How much of part `a` of `n` of a cell's side lies in the first of its two pixels."""
     return min(max(n / 2 - a, 0.0), 1.0)
 
 
-@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(**_PART)
 def _flux_of_row(
     beam: FloatArray, row: int, column: int, a: int, n: int, m: int, out: FloatArray
 ) -> None:
@@ -161,7 +164,7 @@ def deposit(
                         image[i1, j1] += below * right
 
 
-@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(**_PART)
 def _add_moments(
     to_y: FloatArray,
     to_x: FloatArray,
@@ -184,7 +187,7 @@ def _add_moments(
         moments[5] += in_u * landed_x
 
 
-@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(**_PART)
 def _add_to_beam(
     bright: FloatArray, row: int, column: int, a: int, n: int, m: int, of_beam: FloatArray
 ) -> None:
