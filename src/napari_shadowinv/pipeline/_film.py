@@ -116,9 +116,8 @@ def run_film(
         replace(film, corners=moved_corners(film.corners, shift, turn, scales[film.number - 1]))
         for film, shift, turn in zip(films, poses.shifts, poses.turns, strict=True)
     ]
-    doses = (
-        edges if not poses.shifts.any() and not poses.turns.any() else in_parallel(doses_of, laid)
-    )
+    moved = poses.shifts.any() or poses.turns.any()
+    doses = in_parallel(doses_of, laid) if moved else edges
     planes = _planes(len(pack.layers), shape, laid, doses)
     # Per area of the first film: behind it the same protons cover more.
     planes["dose"] *= scales[:, None, None] ** 2

@@ -94,8 +94,11 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
         calibration, background, bits = calibrations[layer.film]
         _check_bits(layer.file or pack.scan, scan, bits)
         mask = None if layer.mask is None else read_radiograph(layer.mask).image > 0
-        marks = {one.name: np.array([one.y, one.x]) for one in fiducials.get(number, [])}
-        marks = _places_as_they_lay(marks, scan, layer.turned, layer.mirrored)
+        lay = scan, layer.turned, layer.mirrored
+        marks = {
+            one.name: _where_it_lay(np.array([one.y, one.x]), *lay)
+            for one in fiducials.get(number, [])
+        }
         scan, corners = as_it_lay(scan, corners, layer.turned, layer.mirrored)
         return Film(number, scan, corners, calibration, background, mask, marks)
 
@@ -203,22 +206,17 @@ def as_it_lay(
     scan: Scan, corners: FloatArray, turned: int, mirrored: bool
 ) -> tuple[Scan, FloatArray]:
     """Scan and corners of a film that was laid on the scanner another way round."""
-    height, width = scan.pixels.shape[:2]
-    pixels = scan.pixels
+    pixels, corners = scan.pixels, _where_it_lay(corners, scan, turned, mirrored)
     if mirrored:
-        pixels, corners = pixels[:, ::-1], corners[[1, 0, 3, 2]] * [1, -1] + [0, width - 1]
+        pixels, corners = pixels[:, ::-1], corners[[1, 0, 3, 2]]
     if turned == 180:
-        pixels = pixels[::-1, ::-1]
-        corners = np.array([height - 1, width - 1]) - corners[[2, 3, 0, 1]]
+        pixels, corners = pixels[::-1, ::-1], corners[[2, 3, 0, 1]]
     return scan._replace(pixels=pixels), corners
 
 
-def _places_as_they_lay(
-    places: dict[str, FloatArray], scan: Scan, turned: int, mirrored: bool
-) -> dict[str, FloatArray]:
-    """Places on a scan of a film that was laid on the scanner another way round."""
-    last = np.array(scan.pixels.shape[:2]) - 1.0
-    for name, place in places.items():
-        there = np.array([place[0], last[1] - place[1]]) if mirrored else place
-        places[name] = last - there if turned == 180 else there
-    return places
+def _where_it_lay(places: FloatArray, scan: Scan, turned: int, mirrored: bool) -> FloatArray:
+    """Places (y, x) on the scan of such a film."""
+    last = np.array(scan.pixels.shape[:2]) - 1
+    if mirrored:
+        places = places * [1, -1] + [0, last[1]]
+    return np.asarray(last - places if turned == 180 else places)
