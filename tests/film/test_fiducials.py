@@ -39,6 +39,7 @@ def test_shifts_and_turns_are_those_of_the_marks() -> None:
     shifts = poses.shifts * np.array(scales)[:, None]
     np.testing.assert_allclose(shifts - shifts.mean(axis=0), SHIFTS, atol=2e-3)
     np.testing.assert_allclose(poses.errors, 0.3 / np.sqrt(3))
+    assert poses.closure < 1e-3
     # Moved so, the films' frames lie at the same place against the marks.
     for (marks, corners), shift, turn, scale in zip(
         films, poses.shifts, poses.turns, scales, strict=True
@@ -58,6 +59,21 @@ def test_one_mark_tells_a_shift_and_none_leaves_the_edges() -> None:
     assert poses.turns[1] == pytest.approx(poses.turns[0])
     np.testing.assert_array_equal(poses.shifts[2], 0)
     np.testing.assert_allclose(poses.errors, [0.3, 0.3, 3.0])
+    assert np.isnan(poses.closure), "nothing checks one mark a film"
+
+
+def test_marks_that_are_read_badly_tell_it_by_how_far_they_contradict_each_other() -> None:
+    rng = np.random.default_rng(0)
+    closures = []
+    for _ in range(40):
+        films = [scanned(layer) for layer in range(3)]
+        for marks, _ in films:
+            for name in marks:
+                marks[name] = marks[name] + rng.normal(0, 1.5, 2)
+        poses = poses_by_fiducials(*map(list, zip(*films, strict=True)), [1.0] * 3, NAMES)
+        closures.append(poses.closure)
+        np.testing.assert_allclose(poses.errors, max(poses.closure, 0.3) / np.sqrt(3))
+    assert np.sqrt(np.mean(np.square(closures))) == pytest.approx(1.5, rel=0.15)
 
 
 def test_marks_that_tell_nothing_or_another_thing_are_refused() -> None:

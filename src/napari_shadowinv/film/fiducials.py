@@ -78,15 +78,19 @@ def poses_by_fiducials(
                 f"fiducials: a mark on {name} is {misfit.max():.0f} px from where the marks of all "
                 "films tell: correct its name or its place"
             )
+    # What the marks' coordinates tell beyond their common places and each film's pose.
+    poses = [len(one) and min(3, 1 + len(one)) for one in there]
+    spare = 2 * sum(map(len, there)) - 2 * len(shared) - sum(poses) + max(poses)
     every = np.concatenate(misfits)
-    error = max(_LEAST_ERROR, float(np.sqrt((every**2).mean() / 2)))
+    closure = float(np.sqrt((every**2).sum() / spare)) if spare > 0 else float("nan")
+    error = float(np.fmax(_LEAST_ERROR, closure))
     errors = np.array([error / np.sqrt(len(one)) if one else EDGES for one in there])
     return Poses(
         shifts / np.asarray(scales, np.float64)[:, None],
         turns,
         errors,
         np.zeros(count, dtype=bool),
-        float("nan"),
+        closure,
     )
 
 

@@ -54,7 +54,8 @@ class Poses(NamedTuple):
     by_images : ndarray of bool, shape (n,)
         Whether films beside it show the same; else only its edges tell.
     closure : float
-        How far the comparisons of films contradict each other: r.m.s. in px, NaN if none can.
+        How far the comparisons of films, or their fiducials, contradict each other: r.m.s. along
+        an axis in px, NaN if none can.
     """
 
     shifts: FloatArray
@@ -130,6 +131,11 @@ def register(
             if pair is not None and np.abs(pair.shift).max() < likely:
                 pairs.append(pair)
     poses = _settled(pairs, edges)
+    if pairs:
+        # How far edges were off where images tell it is how far they can be where these do not.
+        off = float(np.sqrt(np.mean(poses.shifts[poses.by_images] ** 2)))
+        by_edges = np.maximum(poses.errors, off)
+        poses = poses._replace(errors=np.where(poses.by_images, poses.errors, by_edges))
     if not pairs or max(np.abs(pair.shift).max() for pair in pairs) > _AS_EDGES:
         return poses
     return poses._replace(

@@ -11,7 +11,7 @@ Corners are in px of the scan, (y, x), from the film's top left in the direction
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,10 @@ _DUST = 2  # px
 _ENDS = 0.08  # of a side, at its ends, do not count for its place: corners are cut and bent
 _NEAR = 0.04  # of the film's size: how far from a side its border may be
 _ROUNDS, _OUTLIERS = 8, 2.5
+_ACROSS, _BLURRED, _STEP = 6.0, 2.0, 0.5  # px from a side that are searched, and that it blurs
+_FINEST = 0.1  # px: a point of a side that is closer to its line is no outlier
+_Line = tuple[float, float]  # offset and slope
+
 _HEADER = ["film", "y1", "x1", "y2", "x2", "y3", "x3", "y4", "x4"]
 
 
@@ -71,7 +75,7 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
     for number in wanted:
         top, left = (one.start for one in slices[number - 1])
         film = ndimage.binary_fill_holes(labels[slices[number - 1]] == number)
-        found.append(_rectangle(film) + np.array([top, left]))
+        found.append(_sharpened(values, _rectangle(film) + np.array([top, left])))
     return _in_reading_order(found)
 
 
@@ -173,16 +177,9 @@ def _rectangle(film: BoolArray) -> FloatArray:
         for axis in (0, 1):
             for edge in (low[axis], high[axis]):
                 lines.append(_side(turned, axis, edge, low, high))
-        (top, bottom), (left, right) = lines[:2], lines[2:]
-        corners = [
-            _meeting(top, left),
-            _meeting(top, right),
-            _meeting(bottom, right),
-            _meeting(bottom, left),
-        ]
         # From the middle of the border's pixels to their outer edge.
         outward = 0.5 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
-        places = (np.array(corners) + outward) @ axes
+        places = (_meetings(lines) + outward) @ axes
         (axes, _, _) = upright(places)
     return places
 
@@ -201,29 +198,81 @@ def _axes_of_smallest_box(hull: FloatArray) -> FloatArray:
     return np.stack([down, [-down[1], down[0]]])
 
 
-def _side(
-    turned: FloatArray, axis: int, edge: float, low: FloatArray, high: FloatArray
-) -> tuple[float, float]:
+def _side(turned: FloatArray, axis: int, edge: float, low: FloatArray, high: FloatArray) -> _Line:
     """Offset and slope of the line along a side, which most of its pixels agree on."""
     size = (high - low)[1 - axis]
     along, across = turned[:, 1 - axis], turned[:, axis]
     inner = np.abs(along - (low + high)[1 - axis] / 2) < (0.5 - _ENDS) * size
     near = np.abs(across - edge) < _NEAR * max(high - low)
-    along, across = along[inner & near], across[inner & near]
+    return _line(along[inner & near], across[inner & near], 0.5)
+
+
+def _line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
+    """The line that most points agree on; those closer than `usual` are no outliers."""
     used = np.ones(along.size, bool)
     slope = offset = 0.0
     for _ in range(_ROUNDS):
         slope, offset = np.polyfit(along[used], across[used], 1)
         away = np.abs(across - offset - slope * along)
-        used = away <= max(_OUTLIERS * 1.5 * np.median(away), 0.5)
+        used = away <= max(_OUTLIERS * 1.5 * np.median(away), usual)
     return float(offset), float(slope)
 
 
-def _meeting(row: tuple[float, float], column: tuple[float, float]) -> tuple[float, float]:
-    """Where a line y = a + b x meets a line x = c + d y."""
-    (a, b), (c, d) = row, column
-    y = (a + b * c) / (1 - b * d)
-    return y, c + d * y
+def _meetings(lines: Sequence[_Line]) -> FloatArray:
+    """The corners of a film, from its top, bottom, left and right side."""
+    top, bottom, left, right = lines
+    corners = []
+    for (a, b), (c, d) in ((top, left), (top, right), (bottom, right), (bottom, left)):
+        y = (a + b * c) / (1 - b * d)
+        corners.append((y, c + d * y))
+    return np.array(corners)
+
+
+def _sharpened(scan: AnyArray, corners: FloatArray) -> FloatArray:
+    """Corners to a part of a pixel, from how much of each pixel at the sides is film.
+
+    The border of a mask lies in steps of a pixel, which only a film that is turned averages out.
+    """
+    axes, middle, size = upright(corners)
+    darkest = scan.min(axis=-1).astype(np.float64)
+    lines = []
+    for axis in (0, 1):
+        half, length = size[axis] / 2, (1 - 2 * _ENDS) * size[1 - axis]
+        along = np.arange(-length / 2, length / 2)
+        for sign in (-1, 1):
+
+            def seen(across: FloatArray) -> FloatArray:
+                """The scan on lines across the side, from inside outwards."""
+                places = np.empty((*across.shape, 2))
+                places[..., axis] = sign * (half + across)  # noqa: B023
+                places[..., 1 - axis] = along[:, None]  # noqa: B023
+                at = np.moveaxis(places @ axes + middle, -1, 0)
+                return np.asarray(ndimage.map_coordinates(darkest, at, order=1, mode="nearest"))
+
+            edge, clear = _edge(seen, along.size)
+            if clear.mean() < 0.5:
+                return corners
+            offset, slope = _line(along[clear], edge[clear], _FINEST)
+            lines.append((sign * (half + offset), sign * slope))
+    return np.asarray(middle + _meetings(lines) @ axes)
+
+
+def _edge(seen: Callable[[FloatArray], FloatArray], count: int) -> tuple[FloatArray, BoolArray]:
+    """Where lines cross the edge from film to bed, and which of them do so clearly."""
+    across = np.tile(np.arange(-_ACROSS, _ACROSS + _STEP, _STEP), (count, 1))
+    values = seen(across)
+    bed, film = values[:, -1], values[:, 0]
+    inside = values < ((bed + film) / 2)[:, None]
+    last = inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)
+    clear = (film < _DARKER * bed) & inside.any(axis=1) & (last < inside.shape[1] - 1)
+    about = across[0, last] + _STEP / 2
+    # Pixels are means over their squares: what they lack to the bed tells the edge exactly.
+    near = np.arange(-_BLURRED, _BLURRED + _STEP, _STEP)
+    values = seen(about[:, None] + near)
+    bed, film = values[:, -1:], values[:, :1]
+    clear &= film[:, 0] < _DARKER * bed[:, 0]
+    shares = np.divide(bed - values, bed - film, out=np.zeros_like(values), where=clear[:, None])
+    return about - _BLURRED + np.trapezoid(shares, dx=_STEP, axis=1), clear
 
 
 def upright(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -251,15 +251,22 @@ def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, align: str) 
         for film, one in zip(films, doses, strict=True)
         if one.too_dark > _DARK
     ]
-    loose = [film.number for film, error in zip(films, poses.errors, strict=True) if error >= EDGES]
-    if loose and len(films) > 1:
+    at_edges = poses.errors >= EDGES
+    if at_edges.any() and len(films) > 1:
+        loose = [film.number for film, one in zip(films, at_edges, strict=True) if one]
         why = "show too little in common with those beside them"
         if any(film.fiducials for film in films):
             why = "have no fiducials"
         elif align == "edges":
             why = "are not compared with each other"
         found.append(
-            f"films {', '.join(map(str, loose))} {why}: laid by their edges, to some {EDGES:.0f} px"
+            f"films {', '.join(map(str, loose))} {why}: laid by their edges, to some "
+            f"{poses.errors[at_edges].max():.0f} px"
+        )
+    if any(film.fiducials for film in films) and not np.isfinite(poses.closure):
+        found.append(
+            "each film has one fiducial, so that nothing tells a mark that was read wrongly: give "
+            "two or more that go through all films"
         )
     furthest = float(np.abs(poses.shifts).max())
     if furthest > 0 and poses.by_images.any():
