@@ -264,7 +264,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--protons", type=float, default=2e6, help="in a pixel of the object")
-    parser.add_argument("--bin", type=int, default=4, help="pixels that are summed for the fit")
+    parser.add_argument("--bin", type=int, default=3, help="pixels that are summed for the fit")
     parser.add_argument("--chain", action="store_true", help="fit fields, which takes long")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -31,7 +32,7 @@ from napari_shadowinv._napari.widgets._qt import column, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_together
 from napari_shadowinv.fitting import Fit, Verdict
 
-_DRAW_EVERY = 500  # ms
+_DRAW_EVERY, _DRAW_SHARE = 500, 10  # ms, and at least so many times what drawing takes
 _WIDEST_BLUR = 100.0  # px
 
 
@@ -164,7 +165,11 @@ class FitView(QWidget):
     def _draw(self) -> None:
         job = self._panel.runner.tag
         if isinstance(job, FitJob):
+            begun = time.perf_counter()
             self.curve.show_steps(list(job.course.history))
+            # A slow screen must not keep the fit and the window waiting.
+            spent = 1000 * (time.perf_counter() - begun)
+            self._drawing.setInterval(max(_DRAW_EVERY, round(_DRAW_SHARE * spent)))
 
     def _on_end(self, outcome: Any) -> None:
         self._drawing.stop()
