@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from napari_shadowinv.geometry.interpolation import BLOCK
 from napari_shadowinv.inversion.readout import read_centroids, read_dual
 from napari_shadowinv.transport.sites import plan_levels
+from napari_shadowinv.transport.solvers import potential_surface
 
 SHAPE = (40, 50)
 
@@ -65,12 +65,13 @@ def test_the_mean_integration_lies_between_the_two_orders(level):
     np.testing.assert_allclose(by_order["mean"], (by_order["y"] + by_order["x"]) / 2, atol=1e-12)
 
 
-def test_reading_in_parts_changes_no_bit(level, monkeypatch):
+def test_reading_tile_by_tile_is_reading_pixel_by_pixel(level):
     larger = replace(level, shape=(120, 90))
     given = (larger, 2 * standing_wave(level.sites), -gradient(level.sites))
-    at_once, shares = read_dual(*given), []
-    monkeypatch.setattr("napari_shadowinv.inversion.readout._PART", 2 * BLOCK)
-    in_parts = read_dual(*given, on_share=shares.append)
-    assert shares == [2 * BLOCK / 10800, 4 * BLOCK / 10800, 1.0]
-    for one, other in zip(at_once, in_parts, strict=True):
-        np.testing.assert_array_equal(one, other)
+    shares = []
+    potential, _ = read_dual(*given, on_share=shares.append)
+    assert shares == [32 / 120, 64 / 120, 96 / 120, 1.0]
+    pixels = np.indices(larger.shape, dtype=float).reshape(2, -1).T
+    each = potential_surface(*given)(pixels).reshape(larger.shape)
+    difference = potential - each
+    np.testing.assert_allclose(difference, difference[0, 0], atol=1e-11)

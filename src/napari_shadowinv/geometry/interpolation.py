@@ -29,6 +29,7 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 __all__ = ["BLOCK", "CloughTocher", "arrays_of", "fit_gradients", "locate", "with_mirror_images"]
 
 BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
+_KEPT, _PATCH = 512, 31  # triangles that are remembered, by their numbers; numbers of each
 
 
 def with_mirror_images(
@@ -145,75 +146,62 @@ def _edge_ordinates(
 
 
 @njit(nogil=True, cache=True)
-def _patch(
-    p: FloatArray, f: FloatArray, g: FloatArray, y: float, x: float
-) -> tuple[float, float, float]:
-    """Return value and gradient at (y, x) of the surface over the triangle p."""
+def _fill_patch(p: FloatArray, f: FloatArray, g: FloatArray, patch: FloatArray) -> None:
+    """Work out what `_value` needs of the surface over the triangle p.
+
+    Three barycentric coordinates as a y + b x + c; then ordinates: at each vertex, along the edge
+    opposite to it near its two ends, inside that edge's patch, on the way from the vertex to
+    the centre, beside the centre; and at the centre.
+    """
     cy = (p[0, 0] + p[1, 0] + p[2, 0]) / 3
     cx = (p[0, 1] + p[1, 1] + p[2, 1]) / 3
     double_area = (p[1, 0] - p[0, 0]) * (p[2, 1] - p[0, 1]) - (p[1, 1] - p[0, 1]) * (
         p[2, 0] - p[0, 0]
     )
-    bary = np.empty(3)
-    slope = np.empty((3, 2))  # gradient of each barycentric coordinate
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
-        bary[k] = ((p[i, 0] - y) * (p[j, 1] - x) - (p[i, 1] - x) * (p[j, 0] - y)) / double_area
-        slope[k, 0] = (p[i, 1] - p[j, 1]) / double_area
-        slope[k, 1] = (p[j, 0] - p[i, 0]) / double_area
-
-    # ordinates: along edge k (opposite vertex k) near its two ends, and inside its patch
-    near_first, near_second, inside = np.empty(3), np.empty(3), np.empty(3)
-    to_centre, by_centre = np.empty(3), np.empty(3)
+        patch[k] = (p[i, 1] - p[j, 1]) / double_area
+        patch[3 + k] = (p[j, 0] - p[i, 0]) / double_area
+        patch[6 + k] = p[i, 0]
+        patch[9 + k] = p[i, 1]
+        patch[12 + k] = f[k]
+        patch[15 + k], patch[18 + k], patch[21 + k] = _edge_ordinates(p, f, g, i, j, cy, cx)
+        patch[24 + k] = f[k] + (g[k, 0] * (cy - p[k, 0]) + g[k, 1] * (cx - p[k, 1])) / 3
     for k in range(3):
-        near_first[k], near_second[k], inside[k] = _edge_ordinates(
-            p, f, g, (k + 1) % 3, (k + 2) % 3, cy, cx
-        )
-        to_centre[k] = f[k] + (g[k, 0] * (cy - p[k, 0]) + g[k, 1] * (cx - p[k, 1])) / 3
-    for k in range(3):
-        by_centre[k] = (to_centre[k] + inside[(k + 1) % 3] + inside[(k + 2) % 3]) / 3
-    centre = (by_centre[0] + by_centre[1] + by_centre[2]) / 3
+        inside = patch[21 + (k + 1) % 3] + patch[21 + (k + 2) % 3]
+        patch[27 + k] = (patch[24 + k] + inside) / 3
+    patch[30] = (patch[27] + patch[28] + patch[29]) / 3
 
-    k = int(np.argmin(bary))  # the patch that holds the point
-    i, j = (k + 1) % 3, (k + 2) % 3
-    u, v, w = bary[i] - bary[k], bary[j] - bary[k], 3 * bary[k]
+
+@njit(nogil=True, cache=True)
+def _value(patch: FloatArray, y: float, x: float) -> tuple[float, float]:
+    """Return the value at (y, x) of the surface over a triangle, and the point's least coordinate.
+
+    That is negative where the triangle does not hold the point.
+    """
+    b0 = patch[0] * (y - patch[6]) + patch[3] * (x - patch[9])
+    b1 = patch[1] * (y - patch[7]) + patch[4] * (x - patch[10])
+    b2 = patch[2] * (y - patch[8]) + patch[5] * (x - patch[11])
+    # k is the part that holds the point.
+    if b0 <= b1 and b0 <= b2:
+        i, j, k, least, u, v = 1, 2, 0, b0, b1 - b0, b2 - b0
+    elif b1 <= b2:
+        i, j, k, least, u, v = 2, 0, 1, b1, b2 - b1, b0 - b1
+    else:
+        i, j, k, least, u, v = 0, 1, 2, b2, b0 - b2, b1 - b2
+    w = 3 * least
+    first, second, inside = patch[15 + k], patch[18 + k], patch[21 + k]
+    centre_i, centre_j = patch[24 + i], patch[24 + j]
+    beside_i, beside_j = patch[27 + i], patch[27 + j]
+    uu, vv, ww, uv, uw, vw = u * u, v * v, w * w, 2 * u * v, 2 * u * w, 2 * v * w
     # de Casteljau: quadratics towards i, j and the centre, then their blend
-    to_i = (
-        f[i] * u * u
-        + 2 * near_first[k] * u * v
-        + near_second[k] * v * v
-        + 2 * to_centre[i] * u * w
-        + 2 * inside[k] * v * w
-        + by_centre[i] * w * w
-    )
-    to_j = (
-        near_first[k] * u * u
-        + 2 * near_second[k] * u * v
-        + f[j] * v * v
-        + 2 * inside[k] * u * w
-        + 2 * to_centre[j] * v * w
-        + by_centre[j] * w * w
-    )
-    to_c = (
-        to_centre[i] * u * u
-        + 2 * inside[k] * u * v
-        + to_centre[j] * v * v
-        + 2 * by_centre[i] * u * w
-        + 2 * by_centre[j] * v * w
-        + centre * w * w
-    )
-    value = u * to_i + v * to_j + w * to_c
-    dy = 3 * (
-        (slope[i, 0] - slope[k, 0]) * to_i
-        + (slope[j, 0] - slope[k, 0]) * to_j
-        + 3 * slope[k, 0] * to_c
-    )
-    dx = 3 * (
-        (slope[i, 1] - slope[k, 1]) * to_i
-        + (slope[j, 1] - slope[k, 1]) * to_j
-        + 3 * slope[k, 1] * to_c
-    )
-    return value, dy, dx
+    to_i = patch[12 + i] * uu + first * uv + second * vv
+    to_i += centre_i * uw + inside * vw + beside_i * ww
+    to_j = first * uu + second * uv + patch[12 + j] * vv
+    to_j += inside * uw + centre_j * vw + beside_j * ww
+    to_c = centre_i * uu + inside * uv + centre_j * vv
+    to_c += beside_i * uw + beside_j * vw + patch[30] * ww
+    return u * to_i + v * to_j + w * to_c, least
 
 
 @njit(nogil=True, cache=True)
@@ -228,32 +216,45 @@ def _evaluate_blocks(
     gradients: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Evaluate blocks `start` to `stop` of the queries: value, ∂/∂y, ∂/∂x."""
+    """Evaluate blocks `start` to `stop` of the queries."""
     n = values.shape[0]
     p, f, g = np.empty((3, 2)), np.empty(3), np.empty((3, 2))
+    patches = np.empty((_KEPT, _PATCH))
+    kept = np.empty(_KEPT, np.int64)
     for block in range(start, stop):
-        t = 0
+        # Nothing is left from the block before, so that it does not matter who has worked on it.
+        t, patch = 0, patches[0]
+        kept[:] = -1
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
             y, x = queries[q]
+            if kept[t % _KEPT] == t:
+                out[q], least = _value(patch, y, x)
+                if least >= 0:
+                    continue
             t = locate(vertices, neighbors, points, t, y, x)
-            outside = -1
+            slot = t % _KEPT
+            patch = patches[slot]
+            if kept[slot] == t:
+                out[q], _ = _value(patch, y, x)
+                continue
+            outside = False
             for k in range(3):
                 a = vertices[t, k]
                 if a >= n:
-                    outside = k
-                    continue
+                    outside = True
+                    break
                 p[k], f[k], g[k] = points[a], values[a], gradients[a]
-            if outside < 0:
-                out[q, 0], out[q, 1], out[q, 2] = _patch(p, f, g, y, x)
+            if not outside:
+                _fill_patch(p, f, g, patch)
+                kept[slot] = t
+                out[q], _ = _value(patch, y, x)
                 continue
             nearest = _nearest_corner(vertices[t], points, n, y, x)
             if nearest >= 0:
-                out[q, 1] = gradients[nearest, 0]
-                out[q, 2] = gradients[nearest, 1]
-                out[q, 0] = (
+                out[q] = (
                     values[nearest]
-                    + out[q, 1] * (y - points[nearest, 0])
-                    + out[q, 2] * (x - points[nearest, 1])
+                    + gradients[nearest, 0] * (y - points[nearest, 0])
+                    + gradients[nearest, 1] * (x - points[nearest, 1])
                 )
 
 
@@ -277,7 +278,7 @@ class CloughTocher:
     >>> sites = np.array([[0.0, 0.0], [0.0, 3.0], [3.0, 0.0], [3.0, 4.0]])
     >>> upwards = np.tile([1.0, 0.0], (4, 1))
     >>> surface = CloughTocher(RegularTriangulation(sites), sites[:, 0], upwards)
-    >>> surface(np.array([[1.0, 2.0], [-1.0, 1.0]]))[0]
+    >>> surface(np.array([[1.0, 2.0], [-1.0, 1.0]]))
     array([ 1., -1.])
     """
 
@@ -294,15 +295,15 @@ class CloughTocher:
         self._gradients = np.ascontiguousarray(gradients, dtype=np.float64)
         self._threads = available_threads(threads)
 
-    def __call__(self, queries: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return values, shape (m,), and gradients, shape (m, 2), at points (y, x).
+    def __call__(self, queries: FloatArray) -> FloatArray:
+        """Return values, shape (m,), at points (y, x).
 
         Neighbours in the list should be neighbours in the plane. Outside the sites' hull the
         nearest hull site is continued linearly.
         """
         queries = np.ascontiguousarray(queries, dtype=np.float64)
-        out = np.zeros((len(queries), 3))
+        out = np.zeros(len(queries))
         surface = (*arrays_of(self._triangulation), self._values, self._gradients)
         blocks = -(-len(queries) // BLOCK)
         in_ranges(_evaluate_blocks, blocks, self._threads, queries, *surface, out, smallest=2)
-        return out[:, 0], out[:, 1:]
+        return out

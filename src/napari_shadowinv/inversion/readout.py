@@ -29,7 +29,7 @@ __all__ = ["read_centroids", "read_dual", "read_out"]
 
 OnShare = Callable[[float], None]
 
-_PART = 64 * BLOCK  # pixels
+_TILE = 32, BLOCK // 32  # pixels that share one walk
 
 
 def read_out(
@@ -54,15 +54,24 @@ def read_dual(
 ) -> tuple[FloatArray, FloatArray]:
     """Read the potential off the weights, half of which it is at the sites, and differentiate."""
     surface = potential_surface(level, weights, site_displacement, threads=threads)
+    height, width = level.shape
     potential = np.empty(level.shape)
-    count = potential.size
-    # Whole blocks of the surface's queries, so that the parts change nothing.
-    for first in range(0, count, _PART):
-        part = np.arange(first, min(first + _PART, count))
-        rows, columns = np.divmod(part.astype(np.float64), level.shape[1])
-        potential.ravel()[part[0] : part[-1] + 1] = surface(np.column_stack([rows, columns]))[0]
+    rows = np.arange(_TILE[0], dtype=np.float64)
+    columns = np.arange(width, dtype=np.float64)
+    # Tile by tile: neighbours in both directions lie on the same few triangles.
+    cuts = np.arange(_TILE[1], width, _TILE[1])
+    for top in range(0, height, _TILE[0]):
+        strip = potential[top : top + _TILE[0]]
+        tiles = [
+            np.stack(np.meshgrid(top + rows[: len(strip)], part, indexing="ij"), axis=-1)
+            for part in np.split(columns, cuts)
+        ]
+        values = surface(np.concatenate([tile.reshape(-1, 2) for tile in tiles]))
+        ends = np.cumsum([tile[..., 0].size for tile in tiles])[:-1]
+        for part, tile in zip(np.split(values, ends), np.split(strip, cuts, axis=1), strict=True):
+            tile[:] = part.reshape(tile.shape)
         if on_share is not None:
-            on_share((first + len(part)) / count)
+            on_share((top + len(strip)) / height)
     potential -= border_mean(potential)
     # No flux crosses the border, so beyond it the potential is its mirror image.
     gradient = np.array(np.gradient(np.pad(potential, 1, mode="symmetric")))

@@ -94,12 +94,9 @@ def solve(
             weights = np.zeros(len(level.sites))
             if number > 0:
                 last, coarse = solutions[-1], levels[number - 1]
-                weights = (
-                    2
-                    * potential_surface(
-                        coarse, last.weights, last.displacement, threads=options.threads
-                    )(level.sites)[0]
-                )
+                weights = 2 * potential_surface(
+                    coarse, last.weights, last.displacement, threads=options.threads
+                )(level.sites)
             solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > _STALLED and len(levels) > 1:
