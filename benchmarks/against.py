@@ -1,0 +1,165 @@
+"""Speed and error of two versions: this one against another, installed in an environment of its own.
+
+    python benchmarks/against.py OLD_PYTHON [--repeat 5] [--only burner] [--threads 2]
+
+OLD_PYTHON is the interpreter of an environment with the other version. Both run the same work, one
+after the other in turn, each in one process that has done it once before. A row for each work: the
+median seconds of both, how many times as fast this version is (median of the ratios of
+neighbouring runs, and their range), and the displacement's L2 error in both, in per cent: against
+the truth, or for real frames against this version's with one site a pixel.
+
+Images are those of the reference toroid, and of the burner's frames where they are present.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FRAMES = 6  # of the stream
+Work = dict[str, Any]
+
+
+def works(folder: Path) -> dict[str, Work]:
+    """What is to be done, by name; images are written into a folder."""
+    from PIL import Image
+
+    from reference import DATA, toroid_case
+
+    found: dict[str, Work] = {}
+    for peak, noise in ((97, False), (97, True), (194, True)):
+        case = toroid_case(peak, noise)
+        name = f"{peak}{' noise' if noise else ''}"
+        np.save(folder / f"{name}.npy", np.maximum(case.image, 0.0))
+        np.save(folder / f"{name} truth.npy", case.displacement)
+        found[name] = {"image": name, "truth": f"{name} truth"}
+        if noise:
+            found[f"{name}, 40,000 sites"] = {**found[name], "n_sites": 40_000}
+    files = sorted((DATA / "burner").rglob("*.bmp"))
+    if not files:
+        return found
+    frames = [np.asarray(Image.open(file).convert("F"), np.float64) for file in files]
+    frames = frames[: FRAMES + 1]
+    np.save(folder / "beam.npy", frames[0])
+    np.save(folder / "frame.npy", frames[3])
+    binned = [frame.reshape(464, 2, 576, 2).sum(axis=(1, 3)) for frame in frames]
+    np.save(folder / "binned.npy", np.stack(binned))
+    burner = {"image": "frame", "source": "beam", "truth": "finest"}
+    found["burner"] = burner
+    for n_sites in (66_816, 1_069_056):
+        one = {**burner, "n_sites": n_sites}
+        found[f"burner, {n_sites:,} sites"] = one
+        found[f"burner, {n_sites:,} sites, read-out"] = {**one, "stage": "read-out"}
+    found["burner, a frame of a stream"] = {"stream": "binned"}
+    return found
+
+
+def worker() -> None:
+    """Do what is asked for line by line, and tell the seconds, and the error where there is one."""
+    from napari_shadowinv import InversionOptions, invert, plan_sites
+
+    def inverted(work: Work, folder: Path) -> tuple[float, float]:
+        known = {
+            key: np.load(folder / f"{work[key]}.npy") for key in ("image", "source") if key in work
+        }
+        chosen = {key: work[key] for key in ("n_sites", "threads") if work.get(key)}
+        options = InversionOptions(**chosen)
+        begun = time.perf_counter()
+        found = invert(**known, options=options)
+        seconds = time.perf_counter() - begun
+        if "stage" in work:
+            seconds = found.report.seconds[work["stage"]]
+        truth = folder / f"{work['truth']}.npy"
+        if not truth.exists():
+            np.save(truth, found.displacement)
+        true = np.load(truth)
+        return seconds, float(np.linalg.norm(found.displacement - true) / np.linalg.norm(true))
+
+    def streamed(work: Work, folder: Path) -> tuple[float, float]:
+        beam, *frames = np.load(folder / f"{work['stream']}.npy")
+        options = InversionOptions(threads=work.get("threads"))
+        plan = plan_sites(beam, options)
+        last = invert(frames[0], plan=plan, options=options)
+        begun = time.perf_counter()
+        for frame in frames[1:]:
+            last = invert(frame, plan=plan, options=options, start=last)
+        return (time.perf_counter() - begun) / (len(frames) - 1), float("nan")
+
+    for line in sys.stdin:
+        work = json.loads(line)
+        done = streamed if "stream" in work else inverted
+        print(json.dumps(done(work, Path(work["folder"]))), flush=True)
+
+
+class Version:
+    """A process that works with one version of the package."""
+
+    def __init__(self, python: str) -> None:
+        command = [python, __file__, "--worker"]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def does(self, work: Work) -> tuple[float, float]:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(work) + "\n")
+        self._process.stdin.flush()
+        answer = self._process.stdout.readline()
+        if not answer:
+            sys.exit(f"the worker of {self._process.args} has ended: see its message above")
+        seconds, error = json.loads(answer)
+        return seconds, error
+
+    def close(self) -> None:
+        self._process.communicate()
+
+
+def row(name: str, work: Work, old: Version, new: Version, repeat: int) -> str:
+    error = new.does(work)[1], old.does(work)[1]
+    pairs = [(old.does(work)[0], new.does(work)[0]) for _ in range(repeat)]
+    before, now = np.median(pairs, axis=0)
+    ratios = np.array([one / other for one, other in pairs])
+    errors = " | ".join("" if np.isnan(one) else f"{100 * one:.2f}" for one in (error[1], error[0]))
+    times = f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
+    return f"| {name} | {before:.3f} | {now:.3f} | {times} | {errors} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("old", nargs="?", help="interpreter of the other version's environment")
+    parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--only", default="", help="rows whose name contains this")
+    parser.add_argument("--threads", type=int, help="default: all cores")
+    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.worker:
+        worker()
+        return
+    if given.old is None:
+        parser.error("give the interpreter of the other version's environment")
+    with tempfile.TemporaryDirectory() as folder:
+        chosen = {name: work for name, work in works(Path(folder)).items() if given.only in name}
+        old, new = Version(given.old), Version(sys.executable)
+        common = {"folder": folder, "threads": given.threads}
+        if any(work.get("truth") == "finest" for work in chosen.values()):
+            finest = {"image": "frame", "source": "beam", "truth": "finest", "n_sites": 1_069_056}
+            new.does({**finest, **common})
+        print("| work | s before | s now | times as fast | error before, % | error now, % |")
+        print(f"|{'---|' * 6}")
+        for name, work in chosen.items():
+            print(row(name, {**work, **common}, old, new, given.repeat), flush=True)
+        old.close()
+        new.close()
+
+
+if __name__ == "__main__":
+    main()
