@@ -1,4 +1,4 @@
-"""Speed and error of two versions: this one against another, installed in an environment of its own.
+"""Speed of two versions, and their errors.
 
     python benchmarks/against.py OLD_PYTHON [--repeat 5] [--only burner] [--threads 2]
 

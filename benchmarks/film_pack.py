@@ -168,7 +168,7 @@ def setups_of(dataset: Any, energies: FloatArray) -> list[Any]:
 def fitted(
     truth: Truth, images: Images, binned: int, align: str, spread: float = 20.0
 ) -> list[str]:
-    """How far fields and beam by a fit of all layers are from the truth, in %.
+    """How far fields and beam by a fit of all layers are from the truth, and are told to be, in %.
 
     With an `align` other than "none" films may be shifted by about `spread` px of the scan.
     """
@@ -204,7 +204,8 @@ def fitted(
     source = fit.source[0]
     beam_error = np.std(source / source.mean() / (beam / beam.mean()) - 1)
     chi2 = f"{fit.chi2.min():.2f} to {fit.chi2.max():.2f}"
-    figures = [f"{100 * error:.1f}" for error in (*errors, beam_error)]
+    told = fit.report.uncertainty
+    figures = [f"{100 * error:.1f}" for error in (*errors, beam_error, told)]
     return [*figures, chi2, str(fit.verdict), f"{seconds:.0f}"]
 
 
@@ -269,8 +270,8 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if given.chain:
-            print("| seed | steps | B (%) | E (%) | beam (%) | χ² | verdict | s |")
-            print(f"|{'---|' * 8}")
+            print("| seed | steps | B (%) | E (%) | beam (%) | told ± (%) | χ² | verdict | s |")
+            print(f"|{'---|' * 9}")
             for seed in range(given.seeds):
                 chain(Path(folder), seed, given)
             return

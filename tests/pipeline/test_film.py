@@ -14,7 +14,7 @@ from scipy import ndimage
 from simulated_pack import Truth, simulate
 
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
-from napari_shadowinv.film import read_corners, write_corners
+from napari_shadowinv.film import Pack, read_corners, write_corners
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.io import read, read_toml, write
 from napari_shadowinv.pipeline import read_pack, run_film, write_layers
@@ -180,8 +180,8 @@ def test_a_lost_film_is_bridged(truth: Truth, dataset, changed) -> None:
     assert np.isnan(found["dose"].values[1]).all()
     inner = np.s_[30:-30, 30:-30]
     kept, bridged = dataset["fluence"].values[1][inner], found["fluence"].values[1][inner]
-    assert abs(np.median(bridged / kept) - 1) < 0.15
-    assert np.isnan(found["corners"].values[1]).all()
+    # Frames may differ by a pixel, as films behind the first are scaled down to it.
+    assert abs(np.median(bridged) / np.median(kept) - 1) < 0.15
 
 
 @pytest.mark.parametrize("way", [np.s_[::-1, ::-1], np.s_[:, ::-1]])
@@ -255,6 +255,22 @@ def test_films_are_laid_on_each_other_by_fiducials(truth: Truth, changed, tmp_pa
     # They tell what fields displace from films that slipped.
     assert not found["by_images"].values.any()
     assert found.attrs["warnings"] == "[]"
+
+
+def test_deeper_films_are_magnified_about_the_axis(truth: Truth, changed, tmp_path: Path) -> None:
+    """What goes through the pack lies behind each other; rays from the source spread about it."""
+    write_fiducials(tmp_path / "fiducials.csv", truth, range(COUNT))
+    axis = np.array([-200.0, 500.0])
+    first = f'fiducials = "fiducials.csv"\naxis = {axis.tolist()}'
+    scales = truth.scene.magnifications / truth.scene.magnifications[0]
+
+    away = axis - (np.array(truth.scene.shape) - 1) / 2
+    places = places_of(truth, run_film(read_pack(changed(first=first))))[:, :2]
+    apart = places - (1 - scales)[:, None] * away
+    assert (np.abs(apart - apart.mean(axis=0)) < 0.05).all()
+    assert np.abs(places - places.mean(axis=0)).max() > 1
+    with pytest.raises(ValueError, match="axis is given and no setup"):
+        Pack.model_validate({"layers": [{"film": "HDV2"}], "axis": [1, 2]})
 
 
 def test_films_without_fiducials_are_told(truth: Truth, changed, tmp_path: Path) -> None:

@@ -216,6 +216,13 @@ class Pack(BaseModel):
         description="Table (.csv) of marks through the whole pack on the films' scans: film, name, "
         "y, x.",
     )
+    axis: tuple[float, float] | None = Field(
+        default=None,
+        title="Axis (px)",
+        description="Where the normal of the films through the source meets the first film, y and "
+        "x from its top left corner when upright; deeper films are magnified about it. Default: "
+        "the film's middle.",
+    )
     pixel_size: float | None = Field(
         default=None,
         gt=0,
@@ -259,6 +266,8 @@ class Pack(BaseModel):
             raise ValueError("the setup has an energy: leave it out, films see one each")
         if self.setup is not None:
             self.setups(np.ones(len(self.layers)), 1e-4)
+        elif self.axis is not None:
+            raise ValueError("axis is given and no setup: without it nothing tells magnifications")
         return self
 
     @property

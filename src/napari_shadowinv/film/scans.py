@@ -237,8 +237,9 @@ def _sharpened(scan: AnyArray, corners: FloatArray) -> FloatArray:
     darkest = scan.min(axis=-1).astype(np.float64)
     lines = []
     for axis in (0, 1):
-        half, length = size[axis] / 2, (1 - 2 * _ENDS) * size[1 - axis]
-        along = np.arange(-length / 2, length / 2)
+        half = size[axis] / 2
+        count = round((1 - 2 * _ENDS) * size[1 - axis])
+        along = np.arange(count) - (count - 1) / 2
         for sign in (-1, 1):
 
             def seen(across: FloatArray) -> FloatArray:
@@ -249,7 +250,7 @@ def _sharpened(scan: AnyArray, corners: FloatArray) -> FloatArray:
                 at = np.moveaxis(places @ axes + middle, -1, 0)
                 return np.asarray(ndimage.map_coordinates(darkest, at, order=1, mode="nearest"))
 
-            edge, clear = _edge(seen, along.size)
+            edge, clear = _edge(seen, count)
             if clear.mean() < 0.5:
                 return corners
             offset, slope = _line(along[clear], edge[clear], _FINEST)

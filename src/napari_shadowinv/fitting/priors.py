@@ -156,7 +156,9 @@ class Prior:
     @cached_property
     def frame_weights(self) -> FloatArray:
         """1 / s² of a frame's numbers."""
-        shift, stretch = self.shift_spread / self.bin, _STRETCH_SPREAD
+        shift = self.shift_spread / self.bin
+        # Where images lie well, their corners do, too.
+        stretch = min(_STRETCH_SPREAD, shift / (max(self.rays.size) / 4))
         return 1 / np.array([shift, stretch, stretch, shift, stretch, stretch]) ** 2
 
     @cached_property

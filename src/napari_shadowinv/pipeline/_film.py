@@ -110,13 +110,19 @@ def run_film(
         report("dose", film.number - 1, len(pack.layers), film.name)
         return _doses(film, shape, scales[film.number - 1], pack.rim)
 
+    # Marks through the pack lie behind each other, what the films show lies on rays.
+    marked = any(film.fiducials for film in films)
+    if not marked:
+        films = _about_axis(films, pack.axis, scales)
     edges = in_parallel(doses_of, films)
     poses = _poses(films, edges, pack.align, scales, report)
     laid = [
         replace(film, corners=moved_corners(film.corners, shift, turn, scales[film.number - 1]))
         for film, shift, turn in zip(films, poses.shifts, poses.turns, strict=True)
     ]
-    moved = poses.shifts.any() or poses.turns.any()
+    if marked:
+        laid = _about_axis(laid, pack.axis, scales)
+    moved = any((film.corners != one.corners).any() for film, one in zip(films, laid, strict=True))
     doses = in_parallel(doses_of, laid) if moved else edges
     planes = _planes(len(pack.layers), shape, laid, doses)
     # Per area of the first film: behind it the same protons cover more.
@@ -134,6 +140,21 @@ def run_film(
     warnings = _warnings(laid, doses, poses, pack.align)
     setups = pack.setups(spectra.energies, pixel)
     return _dataset(pack, response, spectra.energies, setups, pixel, planes, by_film, warnings)
+
+
+def _about_axis(
+    films: list[Film], axis: tuple[float, float] | None, scales: FloatArray
+) -> list[Film]:
+    """Films whose corners are moved so that their scales are about the axis, not their middles."""
+    if axis is None:
+        return films
+    away = np.array(axis) - (upright(films[0].corners)[2] - 1) / 2
+    moved = []
+    for film in films:
+        scale = scales[film.number - 1]
+        corners = moved_corners(film.corners, (1 / scale - 1) * away, 0.0, scale)
+        moved.append(replace(film, corners=corners))
+    return moved
 
 
 def _pixel_size(pack: Pack, scans: list[Scan]) -> float | None:
