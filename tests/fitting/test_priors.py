@@ -187,3 +187,12 @@ def test_met_fiducials_pull_at_nothing(prior: Prior) -> None:
         one.value_and_slope(tilted)[1] for one in (met, replace(prior, fiducials=None))
     )
     np.testing.assert_allclose(with_them.potentials, without.potentials, atol=1e-9)
+
+
+def test_images_that_are_hardly_shifted_are_hardly_turned(prior: Prior) -> None:
+    """By a turn of one standard deviation, halfway to their sides, they move as by a shift."""
+    near, far = (replace(prior, shift_spread=spread) for spread in (0.05, 5.0))
+    shift, turn = 1 / np.sqrt(near.frame_weights[:2])
+    assert shift == pytest.approx(0.05 / prior.bin)
+    assert turn * max(SIZE) / 4 == pytest.approx(shift)
+    assert 1 / np.sqrt(far.frame_weights[1]) == pytest.approx(0.05)
