@@ -113,7 +113,7 @@ def run_film(
     # Marks through the pack lie behind each other, what the films show lies on rays.
     marked = any(film.fiducials for film in films)
     if not marked:
-        films = _about_axis(films, pack.axis, scales)
+        films = _about_axis(films, pack, scales)
     edges = in_parallel(doses_of, films)
     poses = _poses(films, edges, pack.align, scales, report)
     laid = [
@@ -121,7 +121,7 @@ def run_film(
         for film, shift, turn in zip(films, poses.shifts, poses.turns, strict=True)
     ]
     if marked:
-        laid = _about_axis(laid, pack.axis, scales)
+        laid = _about_axis(laid, pack, scales)
     moved = any((film.corners != one.corners).any() for film, one in zip(films, laid, strict=True))
     doses = in_parallel(doses_of, laid) if moved else edges
     planes = _planes(len(pack.layers), shape, laid, doses)
@@ -136,24 +136,24 @@ def run_film(
     )
     planes["dose_error"] *= planes["dose"]
     planes |= {"fluence": spectra.fluence, "fluence_error": spectra.error}
-    by_film = _by_film(pack, laid, poses)
+    by_film = _by_film(pack, _about_axis(laid, pack, scales, back=True), poses)
     warnings = _warnings(laid, doses, poses, pack.align)
     setups = pack.setups(spectra.energies, pixel)
     return _dataset(pack, response, spectra.energies, setups, pixel, planes, by_film, warnings)
 
 
 def _about_axis(
-    films: list[Film], axis: tuple[float, float] | None, scales: FloatArray
+    films: list[Film], pack: Pack, scales: FloatArray, *, back: bool = False
 ) -> list[Film]:
-    """Films whose corners are moved so that their scales are about the axis, not their middles."""
-    if axis is None:
+    """Films whose corners are moved so that their scales are about the axis, or moved back."""
+    if pack.axis is None:
         return films
-    away = np.array(axis) - (upright(films[0].corners)[2] - 1) / 2
+    away = np.array(pack.axis) - (upright(films[0].corners)[2] - 1) / 2
     moved = []
     for film in films:
         scale = scales[film.number - 1]
-        corners = moved_corners(film.corners, (1 / scale - 1) * away, 0.0, scale)
-        moved.append(replace(film, corners=corners))
+        shift = (scale - 1 if back else 1 - scale) / scale * away
+        moved.append(replace(film, corners=moved_corners(film.corners, shift, 0.0, scale)))
     return moved
 
 
