@@ -30,8 +30,6 @@ __all__ = ["count_sites", "invert", "plan_sites"]
 
 # Steps of the read-out: up to the first number the potential, then the re-projection.
 _READ, _STEPS = 30, 100
-# Of a pixel in the re-projection; four times as many change it by 4 to 15 % of the residual.
-_RAYS = 4
 
 
 def plan_sites(
@@ -288,7 +286,6 @@ def _read_fields(
         return synthetic_image(
             displacement,
             source,
-            rays_per_pixel=_RAYS,
             threads=options.threads,
             on_progress=lambda news: tell(news.step / (news.total or 1), first, last),
         )

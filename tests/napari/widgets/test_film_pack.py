@@ -126,18 +126,20 @@ def test_corners_are_shown_dragged_and_used(
     np.testing.assert_allclose(tool.corners.polygon.data[0], known[1], atol=1e-4)
     assert tool.corners.scan.rgb
     assert tool.corners.corners(pack_dataset) is None
-    moved = known[1] + [[-2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]
-    tool.corners.polygon.data = [moved]
+    moved = known + np.array([[-2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    tool.corners.polygon.data = [moved[1]]
     viewer.dims.set_current_step(0, 2)
     qtbot.waitUntil(lambda: tool.corners.scan.name == "scan of film 3", timeout=5000)
     np.testing.assert_allclose(tool.corners.polygon.data[0], known[2], atol=1e-4)
+    tool.corners.polygon.data = [moved[2]]
     tool.run_again.click()
     wait(tool)
     dataset = tool._chosen()[1]
     assert dataset is not pack_dataset
     table = read_corners(pack_of(dataset).corners)
     np.testing.assert_allclose(table["1"], known[0], atol=0.006)
-    np.testing.assert_allclose(table["2"], moved, atol=0.006)
+    np.testing.assert_allclose(table["2"], moved[1], atol=0.006)
+    np.testing.assert_allclose(table["3"], moved[2], atol=0.006)
     assert list(table) == ["1", "2", "3"]
     # Marks stay in their places, although the films are a pixel higher now.
     height = dataset.sizes["y"]
