@@ -273,19 +273,22 @@ def _deposit_band(
     upper = np.empty((2, corners))
     lower = np.empty((2, corners))
     line = np.empty((2, coefficients.shape[2]))
+    columns = np.arange(corners) / tiles
     for a in range(first * tiles, last * tiles + 1):
         upper, lower = lower, upper
         _land(coefficients, start_y[a], weights_y[a], start_x, weights_x, line, lower)
+        at = a / tiles - top
         for b in range(corners):
-            lower[0, b] += a / tiles - top
-            lower[1, b] += b / tiles
+            lower[0, b] += at
+            lower[1, b] += columns[b]
         if a == first * tiles:
             continue
         row = (a - 1) // tiles
-        for b in range(corners - 1):
-            share = flux[row, b // tiles] / (tiles * tiles)
+        for column in range(flux.shape[1]):
+            share = flux[row, column] / (tiles * tiles)
             if share > 0:
-                _deposit_tile(window, share, upper, lower, b)
+                for b in range(column * tiles, (column + 1) * tiles):
+                    _deposit_tile(window, share, upper, lower, b)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -326,6 +329,15 @@ def _deposit_tile(
     y1, x1 = upper[0, b + 1], upper[1, b + 1]
     y2, x2 = lower[0, b + 1], lower[1, b + 1]
     y3, x3 = lower[0, b], lower[1, b]
+    if min(y0, y1, y2, y3) > 0 and min(x0, x1, x2, x3) > 0:
+        # Half of the tiles lie in one pixel.
+        i, j = int(y0), int(x0)
+        within = i == int(y1) and i == int(y2) and i == int(y3)
+        within = within and j == int(x1) and j == int(x2) and j == int(x3)
+        if within:
+            if i < window.shape[0] and j < window.shape[1]:
+                window[i, j] += share
+            return
     one = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
     other = (x2 - x0) * (y3 - y0) - (y2 - y0) * (x3 - x0)
     if one * other >= 0:
@@ -363,13 +375,14 @@ def _deposit(window: FloatArray, share: float, double_area: float, corners: Corn
         if left < 0:
             before = _area_left(i, 0.0, corners)
         for j in range(j0, j1 + 1):
+            if inside and i == i1 and j == j1:
+                window[i, j] += rest
+                return
             area = _area_left(i, j + 1.0, corners)
             amount = min(max(scale * (area - before), 0.0), rest)
             window[i, j] += amount
             rest -= amount
             before = area
-    if inside:
-        window[i1, j1] += rest
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -400,15 +413,19 @@ def _area_left(row: int, cut: float, corners: Corners) -> float:
 @njit(nogil=True, cache=True, error_model="numpy")
 def _edge_integral(row: int, cut: float, ya: float, xa: float, yb: float, xb: float) -> float:
     """Integral of min(x - cut, 0) dy along an edge, where it is within the row."""
+    u, v = xa - cut, xb - cut
+    if u >= 0 and v >= 0:
+        return 0.0
     start = min(max(ya, row), row + 1.0)
     end = min(max(yb, row), row + 1.0)
     if start == end:
         return 0.0
-    slope = (xb - xa) / (yb - ya)
-    u = xa + (start - ya) * slope - cut
-    v = xa + (end - ya) * slope - cut
-    if u >= 0 and v >= 0:
-        return 0.0
+    if start != ya or end != yb:
+        slope = (xb - xa) / (yb - ya)
+        u += (start - ya) * slope
+        v = xa + (end - ya) * slope - cut
+        if u >= 0 and v >= 0:
+            return 0.0
     if u <= 0 and v <= 0:
         return 0.5 * (u + v) * (end - start)
     return 0.5 * min(u, v) ** 2 / -abs(u - v) * (end - start)
