@@ -242,8 +242,9 @@ def chain(folder: Path, seed: int, given: argparse.Namespace) -> None:
         whole = Images.of(slipped, run_film(way))
         cells = fitted(slipped, whole, given.bin, "none")
         print(f"| {seed} | {name} | {' | '.join(cells)} |", flush=True)
-    cells = fitted(slipped, whole, given.bin, "shift", 0.2)
-    print(f"| {seed} | … and by the fit, within 0.2 px | {' | '.join(cells)} |", flush=True)
+    for way, name in (("shift", "by the fit"), ("affine", "turned by it")):
+        cells = fitted(slipped, whole, given.bin, way, 0.2)
+        print(f"| {seed} | … and {name}, within 0.2 px | {' | '.join(cells)} |", flush=True)
 
 
 def fiducials(truth: Truth, seed: int) -> Path:
