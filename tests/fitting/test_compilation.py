@@ -77,7 +77,7 @@ import sys
 from pathlib import Path
 from typing import Any
 import numpy as np
-from napari_shadowinv.fitting import FitOptions, _ray_kernels, compilation, fit
+from napari_shadowinv.fitting import FitOptions, compilation, fit
 from napari_shadowinv.inversion import compilation as of_transport
 
 compilation.is_compiled = of_transport.is_compiled = lambda: False

@@ -315,3 +315,16 @@ def test_independent_forward_model_agrees_at_caustics() -> None:
     expected = np.load(TOROID_DATA / "dm194.npy").reshape(20, 10, 20, 10).mean(axis=(1, 3))
     image = blurred_by_one_pixel(synthetic_image(field)).reshape(20, 10, 20, 10).mean(axis=(1, 3))
     np.testing.assert_allclose(image, expected, atol=0.02)
+
+
+@pytest.mark.parametrize("far", [1e3, 1e12, 1e30, -1e30])
+def test_rays_may_land_further_away_than_whole_numbers_reach(far: float) -> None:
+    displacement = np.zeros((2, 12, 12))
+    displacement[0] = far * np.arange(-6, 6)
+    landed = synthetic_image(displacement).sum()
+    # Of each row, a width of 12 / far lands in the image.
+    if far == 1e3:
+        assert landed == pytest.approx(144 / far)
+    assert 0 <= landed < 144
+    displacement[:] = far
+    assert synthetic_image(displacement).sum() == 0

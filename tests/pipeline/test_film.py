@@ -178,10 +178,12 @@ def test_a_lost_film_is_bridged(truth: Truth, dataset, changed) -> None:
     found = run_film(pack)
     assert not found["usable"].values[1].any()
     assert np.isnan(found["dose"].values[1]).all()
+    kept, bridged = dataset["fluence"].values[1], found["fluence"].values[1]
+    if len(kept) == len(bridged) + 1:  # films behind the first are smaller on it
+        kept = (kept[1:] + kept[:-1]) / 2
     inner = np.s_[30:-30, 30:-30]
-    kept, bridged = dataset["fluence"].values[1][inner], found["fluence"].values[1][inner]
-    # Frames may differ by a pixel, as films behind the first are scaled down to it.
-    assert abs(np.median(bridged) / np.median(kept) - 1) < 0.15
+    assert abs(np.median(bridged[inner] / kept[inner]) - 1) < 0.15
+    assert np.isnan(found["corners"].values[1]).all()
 
 
 @pytest.mark.parametrize("way", [np.s_[::-1, ::-1], np.s_[:, ::-1]])

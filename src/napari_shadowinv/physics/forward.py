@@ -329,14 +329,14 @@ def _deposit_tile(
     y1, x1 = upper[0, b + 1], upper[1, b + 1]
     y2, x2 = lower[0, b + 1], lower[1, b + 1]
     y3, x3 = lower[0, b], lower[1, b]
-    if min(y0, y1, y2, y3) > 0 and min(x0, x1, x2, x3) > 0:
+    height, width = window.shape
+    inside = min(y0, y1, y2, y3) > 0 and max(y0, y1, y2, y3) < height
+    if inside and min(x0, x1, x2, x3) > 0 and max(x0, x1, x2, x3) < width:
         # Half of the tiles lie in one pixel.
         i, j = int(y0), int(x0)
         within = i == int(y1) and i == int(y2) and i == int(y3)
-        within = within and j == int(x1) and j == int(x2) and j == int(x3)
-        if within:
-            if i < window.shape[0] and j < window.shape[1]:
-                window[i, j] += share
+        if within and j == int(x1) and j == int(x2) and j == int(x3):
+            window[i, j] += share
             return
     one = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
     other = (x2 - x0) * (y3 - y0) - (y2 - y0) * (x3 - x0)
