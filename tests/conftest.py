@@ -14,6 +14,7 @@ from hypothesis import settings
 
 from napari_shadowinv.fitting import Basin, Fit, FitOptions, FitReport, FittedField, Verdict
 from napari_shadowinv.inversion import Inversion, Report
+from napari_shadowinv.inversion.budget import ErrorEstimate, Errors
 from napari_shadowinv.inversion.trust import image_residual
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -49,6 +50,15 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         "levels": ((4, 10, 0.1), (17, 21, 1 / 3000)),
         "seconds": {"prepare": 0.1, "sites": 0.2, "transport": 1.0, "read-out": 0.1},
         "warnings": ("1 negative pixel was set to zero",),
+        "sites_reason": "as given",
+        "errors": Errors(
+            peak=float(np.hypot(*blob.displacement).max()),
+            rms=float(np.sqrt((blob.displacement**2).sum(axis=0).mean())),
+            discretisation=ErrorEstimate(0.01, 0.02),
+            noise=ErrorEstimate(0.1, 0.05),
+            solver=ErrorEstimate(1e-5, 2e-5),
+            beam=ErrorEstimate(2.0, 1.0),
+        ),
         "image_residual": image_residual(image, reprojection, np.ones(shape, dtype=bool)),
     }
     return Inversion(

@@ -21,7 +21,7 @@ from napari_shadowinv import (
     uncertainty,
     write,
 )
-from napari_shadowinv.inversion import error_bars
+from napari_shadowinv.inversion import _sampling
 from napari_shadowinv.inversion.error_bars import _RunningMoments
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.poisson import border_mean
@@ -64,11 +64,14 @@ def gaussian_shot(clean, rng):
     [(poisson_shot, "poisson"), (gaussian_shot, 0.15)],
     ids=["Poisson", "Gaussian"],
 )
-def test_error_bars_of_one_shot_are_the_scatter_of_many(phantom, clean, plan, shot, noise):
+@pytest.mark.parametrize(("method", "n"), [("linear", 200), ("resolve", 20)])
+def test_error_bars_of_one_shot_are_the_scatter_of_many(
+    phantom, clean, plan, shot, noise, method, n
+):
     """And about two thirds of them hold the truth, as one standard deviation should."""
     rng = np.random.default_rng(11)
     shots = [shot(clean, rng) for _ in range(30)]
-    found = uncertainty(shots[0], plan=plan, noise=noise, options=OPTIONS)
+    found = uncertainty(shots[0], n, plan=plan, noise=noise, method=method, options=OPTIONS)
     others = [invert(other, plan=plan, options=OPTIONS) for other in shots]
     true = phantom.potential - border_mean(phantom.potential)
     for std, fields, truth in (
@@ -119,11 +122,11 @@ def test_an_array_gives_each_pixel_its_own_noise(clean, plan):
 
 @pytest.mark.parametrize("noise", [0.02, 0.2])
 def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, clean, plan, noise):
-    loose = uncertainty(clean, 6, plan=plan, noise=noise, options=OPTIONS)
-    monkeypatch.setattr(error_bars, "_SAMPLE_SHARE", 0.0)
-    exact = uncertainty(
-        clean, 6, plan=plan, noise=noise, options=OPTIONS.model_copy(update={"tolerance": 1e-6})
-    )
+    asked = {"plan": plan, "noise": noise, "method": "resolve"}
+    loose = uncertainty(clean, 6, **asked, options=OPTIONS)
+    monkeypatch.setattr(_sampling, "_SAMPLE_SHARE", 0.0)
+    strict = OPTIONS.model_copy(update={"tolerance": 1e-6})
+    exact = uncertainty(clean, 6, **asked, options=strict)
     assert loose.tolerance > 1e-3 > exact.tolerance
     assert sum(loose.iterations) < sum(exact.iterations)
     for name in ("potential_std", "displacement_std"):
@@ -149,6 +152,27 @@ def test_neither_threads_nor_later_samples_change_a_bit(counts, plan):
     assert fewer.residuals == one.residuals[:3]
     other = uncertainty(counts, 3, plan=plan, options=InversionOptions(seed=1))
     assert not np.allclose(other.potential_std, fewer.potential_std, rtol=1e-3)
+
+
+def test_the_linear_response_to_little_noise_is_that_of_solving_again(clean, plan):
+    asked = {
+        "plan": plan,
+        "noise": 0.005,
+        "options": OPTIONS.model_copy(update={"tolerance": 1e-7}),
+    }
+    linear = uncertainty(clean, 5, **asked)
+    solved = uncertainty(clean, 5, **asked, method="resolve")
+    assert linear.nonlinearity < 0.05
+    assert solved.nonlinearity == 0
+    for name in ("potential_std", "displacement_std"):
+        one, other = getattr(linear, name), getattr(solved, name)
+        assert np.linalg.norm(one - other) < 0.05 * np.linalg.norm(other)
+
+
+def test_noise_too_strong_for_a_linear_response_is_told(clean, plan):
+    found = uncertainty(clean, 5, plan=plan, noise=1.5, options=OPTIONS)
+    assert found.nonlinearity > 0.3
+    assert any("method='resolve'" in warning for warning in found.warnings)
 
 
 def test_running_moments_are_those_of_all_values_at_once():
@@ -188,7 +212,7 @@ def test_samples_that_do_not_converge_are_counted(clean):
     options = InversionOptions(max_iterations=1, negative="clip")
     found = uncertainty(clean, 2, noise=0.5, options=options)
     assert found.converged == (False, False)
-    assert found.warnings[0].startswith("2 of 2 samples did not converge")
+    assert found.warnings[0].startswith("2 of 2 samples that were solved did not converge")
 
 
 def test_progress_comes_from_the_callers_thread_and_counts_the_samples(counts):
@@ -200,7 +224,7 @@ def test_progress_comes_from_the_callers_thread_and_counts_the_samples(counts):
 
     uncertainty(counts, 3, on_progress=listen)
     stages = list(dict.fromkeys(progress.stage for progress in seen))
-    assert stages == ["sites", "prepare", "transport", "read-out", "samples"]
+    assert stages == ["prepare", "sites", "transport", "read-out", "samples"]
     assert threads == {threading.get_ident()}
     assert (seen[-1].step, seen[-1].total) == (3, 3)
 

@@ -51,15 +51,6 @@ def test_sites_default_to_the_pixels_up_to_a_limit():
         number_of_sites((20, 30), InversionOptions(n_sites=10**13))
 
 
-def test_fewer_sites_than_pixels_are_told_of():
-    image = np.ones((1000, 1001))
-    (warning,) = prepare(image, None, InversionOptions()).warnings
-    assert "1,000,000 sites for 1,001,000 pixels" in warning
-    assert "n_sites = 1,001,000" in warning
-    assert prepare(image, None, InversionOptions(n_sites=5000)).warnings == ()
-    assert prepare(image[:, 1:], None, InversionOptions()).warnings == ()
-
-
 @pytest.mark.parametrize(("rows", "said"), [(3, False), (5, True)])
 def test_a_mask_over_much_of_the_image_is_told(rows, said):
     mask = np.ones((20, 30), bool)

@@ -7,7 +7,7 @@ import pytest
 
 from napari_shadowinv.inversion.readout import read_centroids, read_dual
 from napari_shadowinv.transport.sites import plan_levels
-from napari_shadowinv.transport.solvers import potential_surface
+from napari_shadowinv.transport.solvers import LevelSolution
 
 SHAPE = (40, 50)
 
@@ -33,10 +33,22 @@ def gradient(points):
     )
 
 
-def test_the_potential_is_half_the_weights_up_to_the_border(level):
-    potential, displacement = read_dual(
-        level, 2 * standing_wave(level.sites), -gradient(level.sites)
+def surface_of(level):
+    solution = LevelSolution(
+        2 * standing_wave(level.sites),
+        0.0,
+        0,
+        True,
+        level=level,
+        threads=None,
+        flux=level.mass,
+        displacement=-gradient(level.sites),
     )
+    return solution.surface
+
+
+def test_the_potential_is_half_the_weights_up_to_the_border(level):
+    potential, displacement = read_dual(surface_of(level), SHAPE)
     pixels = np.indices(SHAPE).reshape(2, -1).T.astype(float)
     expected = standing_wave(pixels).reshape(SHAPE)
     difference = potential - expected
@@ -67,11 +79,11 @@ def test_the_mean_integration_lies_between_the_two_orders(level):
 
 def test_reading_tile_by_tile_is_reading_pixel_by_pixel(level):
     larger = replace(level, shape=(120, 90))
-    given = (larger, 2 * standing_wave(level.sites), -gradient(level.sites))
+    surface = surface_of(larger)
     shares = []
-    potential, _ = read_dual(*given, on_share=shares.append)
+    potential, _ = read_dual(surface, larger.shape, on_share=shares.append)
     assert shares == [32 / 120, 64 / 120, 96 / 120, 1.0]
     pixels = np.indices(larger.shape, dtype=float).reshape(2, -1).T
-    each = potential_surface(*given)(pixels).reshape(larger.shape)
+    each = surface(pixels).reshape(larger.shape)
     difference = potential - each
     np.testing.assert_allclose(difference, difference[0, 0], atol=1e-11)

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.physics.units import PREFIXED_UNITS, shown_fields, shown_potential
+from napari_shadowinv.physics.units import (
+    PREFIXED_UNITS,
+    shown_fields,
+    shown_potential,
+    with_errors,
+)
 
 
 def test_peak_is_told_in_both_units(proton_setup: ProtonSetup) -> None:
@@ -13,7 +19,29 @@ def test_peak_is_told_in_both_units(proton_setup: ProtonSetup) -> None:
         np.array([97.0, 0.0]).reshape(2, 1, 1), "MG um"
     )
     (field,) = shown_fields([displacement], proton_setup)
-    assert field.peak_text == "peak |∫B×dz| 9.7 mT·m (97 MG·µm)"
+    assert field.peak_text() == "peak |∫B×dz| 9.7 mT·m (97 MG·µm)"
+    told = field.peak_text({"noise": 2.1 / 97, "discretisation": 0.2 / 97})
+    assert told == (
+        "peak |∫B×dz| 9.70 ± 0.21 (noise) ± 0.02 (discretisation) mT·m "
+        "(97.0 ± 2.1 (noise) ± 0.2 (discretisation) MG·µm)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "errors", "written"),
+    [
+        (0.0312, {}, "0.0312"),
+        (
+            14.2,
+            {"noise": 0.1, "discretisation": 1e-5},
+            "14.2 ± 1.4 (noise) ± 0.0001 (discretisation)",
+        ),
+        (5.0, {"noise": 30.0}, "5 ± 150 (noise)"),
+        (5.0, {"noise": 0.0}, "5"),
+    ],
+)
+def test_a_number_has_the_figures_that_its_errors_allow(value, errors, written) -> None:
+    assert with_errors(value, errors) == written
 
 
 def test_light_is_shown_by_its_deflection(optical_setup: OpticalSetup) -> None:

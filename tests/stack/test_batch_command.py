@@ -189,7 +189,7 @@ def test_nothing_is_written_among_the_files_of_a_store(store):
 
 
 def test_a_store_whose_reports_are_lost_or_damaged_is_told(store):
-    assert "n_sites = 100, floor" in flat(shadowinv("status", store).stdout)
+    assert "n_sites = 100, accuracy" in flat(shadowinv("status", store).stdout)
     (chunk, *_) = sorted(path for path in (store / "report" / "c").rglob("*") if path.is_file())
     chunk.unlink()
     result = shadowinv("status", store)

@@ -294,9 +294,9 @@ def test_the_first_run_ever_compiles_before_its_shots(night, out, monkeypatch):
     told = []
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     night.run(out, scheduler="synchronous", on_progress=told.append)
-    assert "minute" in told[0].compiling
+    assert "minute" in told[0].preparing
     assert told[0].engine == ""
-    assert not any(news.compiling for news in told[1:])
+    assert not any(news.preparing for news in told[1:])
     assert told[-1].done == 6
     with pytest.raises(InversionCancelled):
         night.run(out, overwrite=True, should_stop=lambda: True)

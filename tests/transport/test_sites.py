@@ -91,14 +91,9 @@ def test_all_levels_stop_when_asked_to(threads):
         asked.append(True)
         return len(asked) > 3
 
+    plan = plan_levels(gaussian_beam(), 4000, lloyd_iterations=1_000_000, threads=threads)
     with pytest.raises(InversionCancelled):
-        plan_levels(
-            gaussian_beam(),
-            4000,
-            lloyd_iterations=1_000_000,
-            threads=threads,
-            report=Reporter(None, soon),
-        )
+        plan.levels.heard_by(Reporter(None, soon)).made(threads)
 
 
 def test_levels_do_not_depend_on_threads():

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _LOOKS = "napari_layers"
 
 # Attributes that the dataset of a result makes anew.
-_OWN_ATTRIBUTES = {_LOOKS, "format", "options", "report", "image_residual"}
+_OWN_ATTRIBUTES = {_LOOKS, "format", "options", "report", "image_residual", "errors_si"}
 _OWN_ATTRIBUTES |= {"setup", "provenance", "package_version", "created"}
 _OWN_ATTRIBUTES |= {"verdict", "explanation", "folded", "fields", "setups"}
 

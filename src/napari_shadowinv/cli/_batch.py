@@ -154,8 +154,8 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
         task = bars.add_task("starting", total=None, rate="", left="", failed="", last="")
 
         def show(news: RunProgress) -> None:
-            if news.compiling:
-                bars.update(task, description=f"compiling, {news.compiling}")
+            if news.preparing:
+                bars.update(task, description=news.preparing)
                 return
             ledger.note(news)
             outcome = news.outcome

@@ -30,6 +30,8 @@ _REPORTED = {
     "converged": "converged",
     "flux_residual": "residual",
     "image_residual": "image_residual",
+    "noise_error (px)": "noise_error",
+    "discretisation_error (px)": "discretisation_error",
     "iterations": "iterations",
     "reason": "reason",
 }

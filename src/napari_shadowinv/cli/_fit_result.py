@@ -228,8 +228,8 @@ def _field_text(fit: Fit, field: FittedField) -> str:
 
     (pixels,) = shown_fields([field.displacement], None)
     row, column = pixels.peak
-    told = f"{pixels.peak_text}, at y = {row}, x = {column} px"
+    told = f"{pixels.peak_text()}, at y = {row}, x = {column} px"
     if not fit.setups:
         return told
     (shown,) = shown_fields([field.displacement], fit.setups[0], FIELDS[field.name])
-    return f"{shown.peak_text}; {told}"
+    return f"{shown.peak_text()}; {told}"

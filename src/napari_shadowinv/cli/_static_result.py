@@ -178,7 +178,7 @@ def windows_table(found: FitWindows) -> Table:
             "" if energies is None else f"{energies[w]:.4g} MeV",
             "" if times is None else f"{times[w] * 1e12:.4g} ps",
             ", ".join(f"{value:.3g}" for value in fit.chi2),
-            *[shown[w].peak_text for shown in peaks],
+            *[shown[w].peak_text() for shown in peaks],
             str(fit.verdict),
         )
     return table

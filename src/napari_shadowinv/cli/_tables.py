@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from napari_shadowinv._typing import AnyArray, FloatArray
     from napari_shadowinv.cli._rerun import Again
     from napari_shadowinv.inversion import Inversion, Report
+    from napari_shadowinv.inversion.budget import Errors
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Provenance, Radiograph
 
@@ -80,7 +81,7 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
     verdict = "converged" if report.converged else "NOT converged"
     free = {"flux left": report.flux_left, "flux entered": report.flux_entered}
     return [
-        ("sites", f"{report.n_sites:,}"),
+        ("sites", f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; ")),
         (
             "flux residual",
             f"{report.residual:.2g} of a cell, tolerance {report.tolerance:.2g}: {verdict}",
@@ -98,20 +99,22 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
             for name, shares in free.items()
             if shares
         ],
-        *peak_rows(inversion.displacement, setup),
+        *peak_rows(inversion.displacement, setup, inversion.errors),
+        *([] if inversion.errors is None else inversion.errors.rows(inversion.options)),
     ]
 
 
-def peak_rows(displacement: FloatArray, setup: Setup | None) -> Rows:
+def peak_rows(displacement: FloatArray, setup: Setup | None, errors: Errors | None = None) -> Rows:
     """The strongest point, in pixels and where there is a setup in SI units."""
+    of_peak = {} if errors is None else errors.of_peak
     from napari_shadowinv.physics.units import shown_fields
 
     (pixels,) = shown_fields([displacement], None)
     row, column = pixels.peak
-    rows = [("displacement", f"{pixels.peak_text}, at y = {row}, x = {column} px")]
+    rows = [("displacement", f"{pixels.peak_text(of_peak)}, at y = {row}, x = {column} px")]
     if setup is not None:
         (field,) = shown_fields([displacement], setup)
-        rows.append(("field", field.peak_text))
+        rows.append(("field", field.peak_text(of_peak)))
     return rows
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -15,15 +16,17 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import normalise
+from napari_shadowinv.inversion.budget import Budget
+from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, prepare
 from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.inversion.result import Inversion, Report
-from napari_shadowinv.inversion.trust import doubts, image_residual
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.inversion.trust import doubts, image_residual, is_coarse
+from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.margin import Margin, edge_flux
-from napari_shadowinv.transport.sites import SitePlan, plan_levels
+from napari_shadowinv.transport.sites import Levels, SitePlan, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fitted_flux, solve
 
 __all__ = ["count_sites", "invert", "plan_sites"]
@@ -37,10 +40,13 @@ def plan_sites(
     options: InversionOptions | None = None,
     *,
     mask: ArrayLike | None = None,
+    measured: bool = True,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> SitePlan:
     """Place the sites over a source, once for all images that share it.
+
+    Where their number follows from the accuracy, they are placed as inversions need them.
 
     Parameters
     ----------
@@ -48,6 +54,9 @@ def plan_sites(
         The undisturbed beam.
     options : InversionOptions, optional
         Those of the solver and the read-out do not matter.
+    measured : bool, optional
+        Whether the source was recorded. If it is an estimate, the errors of an inversion tell
+        what another beam would do.
     mask, on_progress, should_stop
         As of `invert`.
 
@@ -72,21 +81,23 @@ def plan_sites(
         lloyd_tolerance=options.lloyd_tolerance,
         seed=options.seed,
         threads=options.threads,
-        report=Reporter(on_progress, should_stop),
     )
+    if not options.is_adaptive:
+        plan.levels.heard_by(Reporter(on_progress, should_stop)).made(options.threads)
     return replace(
         plan,
         source=ground.beam * ground.unit,
         mask=ground.mask,
         margin=ground.margin,
         unit=ground.unit,
+        measured=measured,
     )
 
 
 def count_sites(
     source: ArrayLike, options: InversionOptions, *, mask: ArrayLike | None = None
 ) -> int:
-    """Return how many sites `plan_sites` would place, those in a margin included."""
+    """Return how many sites `plan_sites` places at most, those in a margin included."""
     if options.boundary != "free":
         height, width = np.shape(source)
         return normalise.number_of_sites((height, width), options)
@@ -121,7 +132,7 @@ def _ground(source: ArrayLike, options: InversionOptions, mask: ArrayLike | None
 def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
     start = time.perf_counter()
     yield
-    seconds[stage] = time.perf_counter() - start
+    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
 def invert(
@@ -208,41 +219,95 @@ def invert(
                 prepared.source,
                 options,
                 mask=mask,
+                measured=source is not None,
                 on_progress=on_progress,
                 should_stop=should_stop,
             )
+        levels = plan.levels.heard_by(report)
     with _timed("transport", seconds):
         if plan.margin is not None and options.flux == "fit":
-            image_flux = fitted_flux(
-                plan.levels, prepared.floored_image, plan.margin, options, report
-            )
+            image_flux = fitted_flux(levels, prepared.floored_image, plan.margin, options, report)
             scale = prepared.flux_scale / image_flux
             prepared = prepare(image, source, options, mask, flux_scale=scale)
-        weights = None if start is None else _weights_of(start, plan)
-        solutions = solve(
-            plan.levels, prepared.floored_image, options, report, start=weights, margin=plan.margin
+        unscaled = replace(
+            prepared, image=prepared.image / prepared.unit, source=prepared.source / prepared.unit
         )
-    with _timed("read-out", seconds):
-        fields = _read_fields(plan, prepared, solutions[-1], options, report)
-    level = plan.levels[-1]
-    jacobian = jacobian_determinant(fields.displacement)
+        noise = ImageNoise(unscaled, options)
+        budget = Budget(plan, prepared, noise, options)
+        if start is not None:
+            levels = _up_to(start, levels, plan.margin_width)
+    adaptive = options.is_adaptive and start is None
+    solutions: list[LevelSolution] = []
+    coarse = 0
+    while True:
+        with _timed("transport", seconds):
+            solutions = solve(
+                levels,
+                prepared.floored_image,
+                options,
+                report,
+                start=None if start is None else start.weights,
+                margin=plan.margin,
+                needed=budget.needed if adaptive else None,
+                solved=solutions,
+            )
+        answer = solutions[-1]
+        with _timed("read-out", seconds):
+            fields = _read_fields(plan, prepared, answer, options, report)
+        more = adaptive and answer.converged and len(answer.weights) < levels.counts[-1]
+        if not more or not is_coarse(unscaled, fields.reprojection, noise):
+            break
+        coarse = len(answer.weights)
+    with _timed("errors", seconds):
+        errors = budget.errors(solutions, fields.displacement) if answer.converged else None
+    told = _report(unscaled, noise, solutions, fields, seconds, options)
+    finest = adaptive and len(answer.weights) == levels.counts[-1]
+    if finest and errors is not None and told.warnings == prepared.warnings:
+        told = replace(told, warnings=(*told.warnings, *filter(None, [budget.missed(errors)])))
+    reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,
         source=prepared.source,
         potential=fields.potential,
         displacement=fields.displacement,
-        sites=level.sites - plan.margin_width,
-        weights=solutions[-1].weights,
-        site_mass=level.mass * plan.unit,
-        site_flux=solutions[-1].flux * plan.unit,
-        site_displacement=solutions[-1].displacement,
-        reprojection=fields.reprojection,
-        residual=np.where(prepared.mask, prepared.image - fields.reprojection, 0.0),
-        caustic=(jacobian < options.caustic_jacobian) & prepared.mask,
+        sites=answer.level.sites - plan.margin_width,
+        weights=answer.weights,
+        site_mass=answer.level.mass * plan.unit,
+        site_flux=answer.flux * plan.unit,
+        site_displacement=answer.displacement,
+        reprojection=reprojection,
+        residual=np.where(prepared.mask, prepared.image - reprojection, 0.0),
+        caustic=(fields.jacobian < options.caustic_jacobian) & prepared.mask,
         mask=prepared.mask,
-        report=_report(prepared, plan, solutions, fields, jacobian, seconds, options),
+        report=replace(
+            told,
+            sites_reason=_reason(answer, levels, budget, options, start, coarse),
+            errors=errors,
+        ),
         options=options,
     )
+
+
+def _reason(
+    answer: LevelSolution,
+    levels: Levels,
+    budget: Budget,
+    options: InversionOptions,
+    start: Inversion | None,
+    coarse: int,
+) -> str:
+    """Say why there are so many sites."""
+    if start is not None:
+        return "as many as in the inversion that it started from"
+    if options.n_sites is not None:
+        return "as given"
+    if coarse:
+        return f"with {coarse:,} the re-projection missed structures of the image"
+    if budget.reason:
+        return budget.reason
+    if levels.counts[-1] < MAX_DEFAULT_SITES:
+        return "one for each pixel, the most that are placed unless more are asked for"
+    return "the most that are placed unless more are asked for"
 
 
 def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:
@@ -262,14 +327,20 @@ def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:
         )
 
 
-class _Fields(NamedTuple):
+@dataclass(frozen=True)
+class _Fields:
     """What is read off the weights, at the image's pixels."""
 
     potential: FloatArray
     displacement: FloatArray
-    reprojection: FloatArray
+    reprojection: FloatArray  # in units of the source's `power_of_two`
     flux_left: dict[str, float]
     flux_entered: dict[str, float]
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """Determinant of the map's Jacobian."""
+        return jacobian_determinant(self.displacement)
 
 
 def _read_fields(
@@ -291,7 +362,7 @@ def _read_fields(
         )
 
     tell(0, 0, _READ)
-    potential, displacement = read_out(plan, solution, options, lambda share: tell(share, 0, _READ))
+    potential, displacement = read_out(solution, options, lambda share: tell(share, 0, _READ))
     source = prepared.source / prepared.unit
     left: dict[str, float] = {}
     entered: dict[str, float] = {}
@@ -308,50 +379,50 @@ def _read_fields(
     return _Fields(
         np.ascontiguousarray(inner - border_mean(inner)),
         np.ascontiguousarray(plan.within(displacement)),
-        np.ascontiguousarray(reprojection) * prepared.unit,
+        np.ascontiguousarray(reprojection),
         left,
         entered,
     )
 
 
-def _weights_of(start: Inversion, plan: SitePlan) -> FloatArray:
-    """Return the weights to start from, if they belong to the finest sites of this plan."""
-    level = plan.levels[-1]
-    found, expected = start.sites + plan.margin_width, level.sites
-    if found.shape != expected.shape or np.abs(found - expected).max() > 1e-3 * level.spacing:
-        raise InputError(
-            f"start has {len(found):,} sites that differ from the {len(expected):,} sites of "
-            "this inversion: compute both with the same plan, source, mask and options"
-        )
-    return start.weights
+def _up_to(start: Inversion, levels: Levels, margin_width: int) -> Levels:
+    """Return the levels up to that of an inversion to start from, if its sites are the same."""
+    found = start.sites + margin_width
+    if len(found) <= levels.counts[-1]:
+        up_to = levels.up_to(len(found))
+        level = up_to[-1]
+        if np.abs(found - level.sites).max() <= 1e-3 * level.spacing:
+            return up_to
+    raise InputError(
+        f"start has {len(found):,} sites that differ from the {levels.counts[-1]:,} sites of "
+        "this inversion: compute both with the same plan, source, mask and options"
+    )
 
 
 def _report(
     prepared: Prepared,
-    plan: SitePlan,
+    noise: ImageNoise,
     solutions: list[LevelSolution],
     fields: _Fields,
-    jacobian: FloatArray,
     seconds: dict[str, float],
     options: InversionOptions,
 ) -> Report:
     finest = solutions[-1]
-    image, source = prepared.image / prepared.unit, prepared.source / prepared.unit
-    reprojection = fields.reprojection / prepared.unit
     found: tuple[str, ...] = (
         f"not converged: flux residual {finest.residual:.2g} per cell, tolerance "
         f"{options.tolerance:.2g}; {finest.reason}",
     )
     if finest.converged:
-        scaled = replace(prepared, image=image, source=source)
-        n_sites = len(finest.weights)
-        found = doubts(scaled, fields.displacement, reprojection, jacobian, n_sites, options)
+        moves, n_sites = fields.displacement, len(finest.weights)
+        found = doubts(
+            prepared, noise, moves, fields.reprojection, fields.jacobian, n_sites, options
+        )
     return Report(
         converged=finest.converged,
         iterations=sum(solution.iterations for solution in solutions),
         residual=finest.residual,
         tolerance=options.tolerance,
-        n_sites=len(plan.levels[-1].sites),
+        n_sites=len(finest.weights),
         floor=options.floor,
         floored_pixels=prepared.floored_pixels,
         clipped_pixels=prepared.clipped_pixels,
@@ -364,5 +435,5 @@ def _report(
         flux_scale=prepared.flux_scale,
         flux_left=fields.flux_left,
         flux_entered=fields.flux_entered,
-        image_residual=image_residual(image, reprojection, prepared.mask),
+        image_residual=image_residual(prepared.image, fields.reprojection, prepared.mask),
     )

@@ -4,8 +4,9 @@
 - result: `Uncertainty`
 
 The noise is added to the image once more, again and again, and each such sample is inverted
-on the same sites, from the weights of the image itself. The scatter of the samples is the
-scatter that repeated shots of the same object would have (the parametric bootstrap).
+on the same sites: by the linear response of the image's own transport, or by solving it anew from
+its weights. The scatter of the samples is the scatter that repeated shots of the same object would
+have (the parametric bootstrap).
 
 References
 ----------
@@ -21,26 +22,23 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.inversion._drawing import noise_of
 from napari_shadowinv.inversion._invert import invert, plan_sites
+from napari_shadowinv.inversion._sampling import Resolving, Responding, Sample
 from napari_shadowinv.inversion.labels import dataset_from_field, label
 from napari_shadowinv.inversion.normalise import prepare
-from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.poisson import border_mean
-from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan
-from napari_shadowinv.transport.solvers import LevelSolution, solve
 
 if TYPE_CHECKING:
     import xarray
@@ -49,11 +47,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Uncertainty", "uncertainty"]
 
-Draw = Callable[[np.random.Generator], FloatArray]
-
-_SAMPLE_SHARE = 0.2  # of the noise's flux errors that a sample may leave unsolved
-_LOOSEST_TOLERANCE = 0.1
-_MOST_QUANTA = 1e18  # numpy draws no larger Poisson numbers
+_CHECKED = 3  # linear samples that are solved, too
+_LINEAR_ENOUGH = 0.3  # of their change
 _POLL_SECONDS = 0.1
 _BYTES_PER_SITE, _BYTES_PER_PIXEL = 700, 150  # measured peaks of one sample, rounded up
 
@@ -75,10 +70,16 @@ class Uncertainty:
         Number of samples. The deviations themselves are known to 1 / √(2 (n - 1)): 16 % for 20.
     noise : str
         The noise that was assumed.
+    method : {"linear", "resolve"}
+        How samples were inverted.
+    nonlinearity : float
+        Of linear samples: how far they are from solutions, as a share of what the noise changes
+        (r.m.s. over the image); 0 where all were solved.
     tolerance : float
-        Largest relative flux error of a cell that was allowed in a sample.
+        Largest relative flux error of a cell that was allowed in a sample that was solved.
     iterations, residuals, converged : tuple of int, of float, of bool
-        Of each sample: solver steps, largest relative flux error of a cell, tolerance met.
+        Of each sample that was solved, which of linear ones are the first few: solver steps,
+        largest relative flux error of a cell, tolerance met.
     warnings : tuple of str
         Reasons to doubt the deviations.
     """
@@ -90,6 +91,8 @@ class Uncertainty:
     displacement_std: FloatArray
     n: int
     noise: str
+    method: str
+    nonlinearity: float
     tolerance: float
     iterations: tuple[int, ...]
     residuals: tuple[float, ...]
@@ -113,7 +116,8 @@ class Uncertainty:
             ``…_std`` beside each potential, displacement and field. How the samples were made is
             a JSON text in the attribute ``uncertainty``.
         """
-        samples = ("n", "noise", "tolerance", "iterations", "residuals", "converged", "warnings")
+        samples: tuple[str, ...] = ("n", "noise", "method", "nonlinearity", "tolerance")
+        samples += ("iterations", "residuals", "converged", "warnings")
         history = json.dumps({name: getattr(self, name) for name in samples})
         dataset = self.inversion.to_dataset(
             setup, attributes={"uncertainty": history, **(attributes or {})}
@@ -139,12 +143,13 @@ class Uncertainty:
 
 def uncertainty(
     image: ArrayLike,
-    n: int = 20,
+    n: int = 200,
     *,
     source: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     noise: Literal["poisson"] | float | ArrayLike = "poisson",
     gain: float | None = None,
+    method: Literal["linear", "resolve"] = "linear",
     options: InversionOptions | None = None,
     plan: SitePlan | None = None,
     on_progress: OnProgress | None = None,
@@ -177,6 +182,11 @@ def uncertainty(
         value v then scatters by √(gain · v). Default: 1 for an image of whole numbers, which are
         taken as counts; any other image needs it.
 
+    method : {"linear", "resolve"}
+        ``"linear"``: by the linear response of the transport, which a few samples that are solved
+        as well check. ``"resolve"``: solve the transport of each sample, which takes many times as
+        long; for caustics and strong noise.
+
     Returns
     -------
     Uncertainty
@@ -184,7 +194,7 @@ def uncertainty(
     Raises
     ------
     InputError
-        If the image cannot be inverted, or `n`, `noise` or `gain` make no sense with it.
+        If the image cannot be inverted, or `n`, `noise`, `gain` or `method` make no sense.
     InversionCancelled
         If `should_stop` returned true.
 
@@ -192,17 +202,24 @@ def uncertainty(
     --------
     >>> counts = np.random.default_rng(0).poisson(400, (24, 24))
     >>> found = uncertainty(counts, n=4)
-    >>> found.potential_std.shape, found.converged
-    ((24, 24), (True, True, True, True))
+    >>> found.potential_std.shape, found.n, found.converged
+    ((24, 24), 4, (True, True, True))
     """
     options = options or InversionOptions()
     if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 2:
         raise InputError(f"n is {n!r}, expected a whole number of samples, at least 2")
-    draw, described = _noise_of(image, noise, gain, mask if plan is None else plan.mask)
+    if method not in ("linear", "resolve"):
+        raise InputError(f"method is {method!r}, expected 'linear' or 'resolve'")
+    draw, described = noise_of(image, noise, gain, mask if plan is None else plan.mask)
     if plan is None:
         beam = prepare(image, source, options, mask).source
         plan = plan_sites(
-            beam, options, mask=mask, on_progress=on_progress, should_stop=should_stop
+            beam,
+            options,
+            mask=mask,
+            measured=source is not None,
+            on_progress=on_progress,
+            should_stop=should_stop,
         )
         source = mask = None
     inversion = invert(
@@ -219,22 +236,53 @@ def uncertainty(
     # The threads are shared out among the samples; what noise drives below zero is clipped.
     threads = max(1, available_threads(options.threads) // workers)
     clipping = options.model_copy(update={"threads": threads, "negative": "clip"})
-    sampling = _Sampling(plan, inversion.weights, draw, clipping)
-    sampling = sampling.to_tolerance_of_noise(seeds[0])
+    levels = plan.levels.up_to(len(inversion.weights))
+    resolving = Resolving(replace(plan, levels=levels), inversion.weights, draw, clipping)
+    resolving = resolving.to_tolerance_of_noise(seeds[0])
+    report = Reporter(on_progress, should_stop)
     potential, displacement = _RunningMoments(), _RunningMoments()
-    solutions: list[LevelSolution] = []
+    went: list[tuple[int, float, bool]] = []
+    checked: list[FloatArray] = []
+    off = _Share()
 
-    def keep(sample: _Sample) -> None:
+    def add(sample: Sample) -> None:
         potential.add(sample.potential)
         displacement.add(sample.displacement)
-        solutions.append(sample.solution)
 
-    _in_order(sampling.sample, seeds, workers, keep, Reporter(on_progress, should_stop))
+    def keep_solution(sample: Sample) -> None:
+        found = sample.solution  # which is large, and not kept
+        went.append((found.iterations, found.residual, found.converged))
+        if method == "resolve":
+            add(sample)
+        else:
+            checked.append(sample.displacement)
+
+    def keep_linear(sample: Sample) -> None:
+        add(sample)
+        if potential.count <= len(checked):
+            exact = checked[potential.count - 1]
+            off.add(sample.displacement - exact, exact - inversion.displacement)
+
+    if method == "resolve":
+        _in_order(resolving.sample, seeds, workers, keep_solution, report)
+    else:
+        quietly = Reporter(None, should_stop)
+        _in_order(resolving.sample, seeds[:_CHECKED], workers, keep_solution, quietly)
+        clean = prepare(image, plan.source, clipping, plan.mask).floored_image
+        responding = Responding(resolving, inversion, clean)
+        _in_order(responding.sample, seeds, workers, keep_linear, report)
     warnings = inversion.report.warnings
-    if failed := sum(not solution.converged for solution in solutions):
+    if off.value > _LINEAR_ENOUGH:
         warnings = (
-            f"{failed} of {len(solutions)} samples did not converge: the deviations are "
-            "unreliable where the samples scatter most",
+            f"the response to noise is not linear: samples that were solved differ by "
+            f"{off.value:.0%} of what the noise changes; use method='resolve'",
+            *warnings,
+        )
+    iterations, residuals, converged = zip(*went, strict=True)
+    if failed := converged.count(False):
+        warnings = (
+            f"{failed} of {len(converged)} samples that were solved did not converge: the "
+            "deviations are unreliable where the samples scatter most",
             *warnings,
         )
     return Uncertainty(
@@ -245,145 +293,47 @@ def uncertainty(
         displacement_std=displacement.std,
         n=int(n),
         noise=described,
-        tolerance=sampling.options.tolerance,
-        iterations=tuple(solution.iterations for solution in solutions),
-        residuals=tuple(solution.residual for solution in solutions),
-        converged=tuple(solution.converged for solution in solutions),
+        method=method,
+        nonlinearity=off.value,
+        tolerance=resolving.options.tolerance,
+        iterations=iterations,
+        residuals=residuals,
+        converged=converged,
         warnings=warnings,
     )
-
-
-class _Sample(NamedTuple):
-    """One noisy image, inverted."""
-
-    potential: FloatArray
-    displacement: FloatArray
-    solution: LevelSolution
-
-
-@dataclass(frozen=True)
-class _Sampling:
-    """Everything that the samples share."""
-
-    plan: SitePlan
-    start: FloatArray
-    draw: Draw
-    options: InversionOptions
-
-    def sample(self, seed: np.random.SeedSequence, report: Reporter) -> _Sample:
-        """Invert one noisy image, without what the image alone needs (re-projection, caustics)."""
-        image = self._image(seed)
-        plan = self.plan
-        solution = solve(
-            plan.levels, image, self.options, report, start=self.start, margin=plan.margin
-        )[-1]
-        potential, displacement = (
-            plan.within(values) for values in read_out(plan, solution, self.options)
-        )
-        return _Sample(potential - border_mean(potential), displacement, solution)
-
-    def to_tolerance_of_noise(self, seed: np.random.SeedSequence) -> _Sampling:
-        """Ask of the solver no more than what matters beside the flux errors that noise makes."""
-        # What it leaves unsolved is white, and moves the field far less than the flux that it
-        # did move: where a fifth is left in the worst cell, a sample's field is within 3 % of
-        # its change, and the deviation of many within 0.2 %.
-        level = self.plan.levels[-1]
-        objective = TransportObjective(
-            level.triangulation.copy(),
-            level.mass,
-            Density.from_image(self._image(seed)),
-            threads=self.options.threads,
-        )
-        by_noise = objective.residual(objective.diagram(self.start))
-        loosest = min(_SAMPLE_SHARE * by_noise, _LOOSEST_TOLERANCE)
-        tolerance = max(loosest, self.options.tolerance)
-        return replace(self, options=self.options.model_copy(update={"tolerance": tolerance}))
-
-    def _image(self, seed: np.random.SeedSequence) -> FloatArray:
-        noisy = self.draw(np.random.default_rng(seed))
-        return prepare(noisy, self.plan.source, self.options, self.plan.mask).floored_image
 
 
 class _RunningMoments:
     """Mean and standard deviation of arrays that are not kept."""
 
     def __init__(self) -> None:
-        self._count = 0
+        self.count = 0
         self.mean = self._squares = np.zeros(())
 
     def add(self, values: FloatArray) -> None:
-        self._count += 1
+        self.count += 1
         before = values - self.mean
-        self.mean = self.mean + before / self._count
+        self.mean = self.mean + before / self.count
         self._squares = self._squares + before * (values - self.mean)
 
     @property
     def std(self) -> FloatArray:
-        return np.asarray(np.sqrt(self._squares / (self._count - 1)))
+        return np.asarray(np.sqrt(self._squares / (self.count - 1)))
 
 
-def _noise_of(
-    image: ArrayLike, noise: object, gain: float | None, mask: ArrayLike | None
-) -> tuple[Draw, str]:
-    """Return what draws a noisy image, and what to call it; the image itself is checked later."""
-    values = np.asarray(image)
-    if values.dtype.kind not in "buif":
-        raise InputError(f"image has values of type {values.dtype}, expected real numbers")
-    usable = np.isfinite(values)
-    if mask is not None and np.shape(mask) == values.shape:
-        usable &= np.asarray(mask, dtype=bool)
-    values = np.where(usable, values, 0.0)
-    if isinstance(noise, str):
-        if noise != "poisson":
-            raise InputError(
-                f"noise is {noise!r}, expected 'poisson', a standard deviation or an array of them"
-            )
-        return _poisson(values, gain)
-    if gain is not None:
-        raise InputError(
-            f"gain is {gain!r} and noise a standard deviation: gain belongs to noise='poisson'"
-        )
-    return _gaussian(values, np.asarray(noise), usable)
+class _Share:
+    """Length of one vector relative to another, both of which come in parts."""
 
+    def __init__(self) -> None:
+        self._part = self._whole = 0.0
 
-def _poisson(values: FloatArray, gain: float | None) -> tuple[Draw, str]:
-    if gain is None:
-        if np.any(values != np.rint(values)):
-            raise InputError(
-                "image has values that are not whole numbers, so they are not counts: give the "
-                "gain (image units per detected quantum), or the noise as a standard deviation"
-            )
-        gain = 1.0
-    if not (np.isreal(gain) and 0 < gain < np.inf):
-        raise InputError(f"gain is {gain!r}, expected a positive number: image units")
-    quanta = np.maximum(values, 0) / gain
-    if quanta.max(initial=0) > _MOST_QUANTA:
-        raise InputError(
-            f"gain is {gain:g} and the brightest pixel {values.max():g}: that is more than "
-            f"{_MOST_QUANTA:g} quanta in a pixel, expected fewer: check the unit of the gain"
-        )
-    return lambda rng: gain * rng.poisson(quanta), f"Poisson, gain {gain:g}"
+    def add(self, part: FloatArray, whole: FloatArray) -> None:
+        self._part += float((part**2).sum())
+        self._whole += float((whole**2).sum())
 
-
-def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[Draw, str]:
-    if sigma.dtype.kind not in "uif":
-        raise InputError(
-            f"noise has values of type {sigma.dtype}, expected 'poisson', a standard deviation "
-            "or an array of them"
-        )
-    if sigma.ndim > 0 and sigma.shape != values.shape:
-        raise InputError(
-            f"noise has shape {sigma.shape}, image {values.shape}: they must match, or give one "
-            "number for all pixels"
-        )
-    deviation = np.where(usable, sigma, 0.0)
-    if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
-        raise InputError(
-            "noise is zero everywhere, or somewhere negative or not finite: expected standard "
-            "deviations in the image's units"
-        )
-    described = f"Gaussian, {sigma:g}" if sigma.ndim == 0 else "Gaussian, pixel by pixel"
-    return lambda rng: values + deviation * rng.normal(size=values.shape), described
+    @property
+    def value(self) -> float:
+        return (self._part / self._whole) ** 0.5 if self._whole > 0 else 0.0
 
 
 def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
@@ -397,16 +347,16 @@ def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
 
 
 def _in_order(
-    work: Callable[[np.random.SeedSequence, Reporter], _Sample],
+    work: Callable[[np.random.SeedSequence, Reporter], Sample],
     seeds: list[np.random.SeedSequence],
     workers: int,
-    keep: Callable[[_Sample], None],
+    keep: Callable[[Sample], None],
     report: Reporter,
 ) -> None:
     """Work on a few seeds at once and hand over the samples in the order of the seeds."""
     # Only this thread reports and asks whether to stop: what listens need not expect others.
     abandoned = Event()
-    waiting: deque[Future[_Sample]] = deque()
+    waiting: deque[Future[Sample]] = deque()
     done = 0
 
     def keep_first() -> None:

@@ -125,7 +125,7 @@ def _warnings(
     ratio: float, clipped: int, floored: int, usable: BoolArray, options: InversionOptions
 ) -> tuple[str, ...]:
     warnings = []
-    size, pixels = int(usable.sum()), usable.size
+    size = int(usable.sum())
     if abs(ratio - 1) > _NOTABLE_FLUX_CHANGE:
         warnings.append(
             f"the image's flux is {ratio:.3g} times the source's; it was scaled to match"
@@ -143,11 +143,6 @@ def _warnings(
         warnings.append(
             f"the mask excludes {excluded:.1%} of the pixels: the field there is only a smooth "
             "continuation. To hide the object from a source estimate, use a source mask instead"
-        )
-    if options.n_sites is None and pixels > MAX_DEFAULT_SITES:
-        warnings.append(
-            f"{MAX_DEFAULT_SITES:,} sites for {pixels:,} pixels, the default maximum: n_sites = "
-            f"{pixels:,} resolves single pixels but needs more time and memory"
         )
     return tuple(warnings)
 
@@ -234,7 +229,7 @@ def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
 
 
 def number_of_sites(shape: tuple[int, int], options: InversionOptions) -> int:
-    """Return the sites to use for an image; an `InputError` if they would not fit in memory."""
+    """Return the most sites to use for an image; an `InputError` if they do not fit in memory."""
     wanted = options.n_sites
     n_sites = min(shape[0] * shape[1], MAX_DEFAULT_SITES) if wanted is None else wanted
     memory = physical_memory()

@@ -17,13 +17,13 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry.interpolation import BLOCK
+from napari_shadowinv.geometry.interpolation import BLOCK, CloughTocher
 from napari_shadowinv.geometry.natural_neighbor import natural_neighbor
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
-from napari_shadowinv.transport.sites import Level, SitePlan
-from napari_shadowinv.transport.solvers import LevelSolution, potential_surface
+from napari_shadowinv.transport.sites import Level
+from napari_shadowinv.transport.solvers import LevelSolution
 
 __all__ = ["read_centroids", "read_dual", "read_out"]
 
@@ -33,29 +33,21 @@ _TILE = 32, BLOCK // 32  # pixels that share one walk
 
 
 def read_out(
-    plan: SitePlan,
-    solution: LevelSolution,
-    options: InversionOptions,
-    on_share: OnShare | None = None,
+    solution: LevelSolution, options: InversionOptions, on_share: OnShare | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Read the finest level by the options' way; `on_share` is told what share is done, 0 to 1."""
-    level, moves = plan.levels[-1], solution.displacement
+    """Read a solution by the options' way; `on_share` is told what share is done, 0 to 1."""
     if options.readout == "centroid":
-        return read_centroids(level, moves, options.threads, integration=options.integration)
-    return read_dual(level, solution.weights, moves, options.threads, on_share)
+        moves, integration = solution.displacement, options.integration
+        return read_centroids(solution.level, moves, options.threads, integration=integration)
+    return read_dual(solution.surface, solution.level.shape, on_share)
 
 
 def read_dual(
-    level: Level,
-    weights: FloatArray,
-    site_displacement: FloatArray,
-    threads: int | None = None,
-    on_share: OnShare | None = None,
+    surface: CloughTocher, shape: tuple[int, int], on_share: OnShare | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Read the potential off the weights, half of which it is at the sites, and differentiate."""
-    surface = potential_surface(level, weights, site_displacement, threads=threads)
-    height, width = level.shape
-    potential = np.empty(level.shape)
+    """Read the potential off the surface through the sites, and differentiate it."""
+    height, width = shape
+    potential = np.empty((height, width))
     rows = np.arange(_TILE[0], dtype=np.float64)
     columns = np.arange(width, dtype=np.float64)
     # Tile by tile: neighbours in both directions lie on the same few triangles.

@@ -13,6 +13,7 @@ import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.labels import FORMAT, VARIABLES, dataset_from_field, label
 from napari_shadowinv.inversion.trust import image_residual
 from napari_shadowinv.options import InversionOptions
@@ -51,7 +52,7 @@ class Report:
     levels : tuple of (int, int, float)
         Sites, solver steps and final residual of each level, coarse to fine.
     seconds : dict of str to float
-        Time of each stage: prepare, sites, transport, read-out.
+        Time of each stage: prepare, sites, transport, read-out, errors.
     warnings : tuple of str
         Reasons to doubt the result.
     flux_scale : float
@@ -59,6 +60,11 @@ class Report:
     flux_left, flux_entered : dict of str to float
         With a free boundary the flux that crossed each side of the image (top, bottom, left,
         right), as a share of the source's flux in the image; else empty.
+    sites_reason : str
+        Why there are so many sites.
+    errors : Errors or None
+        How uncertain the displacement is, and why; None if the solver did not converge, and in
+        reports of older versions.
     image_residual : float
         How far the re-projection is from the image: r.m.s. difference over the used pixels,
         as a share of the image's mean there. NaN in reports of older versions.
@@ -79,6 +85,8 @@ class Report:
     flux_left: dict[str, float] = field(default_factory=dict)
     flux_entered: dict[str, float] = field(default_factory=dict)
     image_residual: float = math.nan
+    sites_reason: str = ""
+    errors: Errors | None = None
 
 
 @dataclass(frozen=True)
@@ -144,6 +152,11 @@ class Inversion:
     provenance: Provenance | None = None
 
     @property
+    def errors(self) -> Errors | None:
+        """The error budget of its displacement; see `Report`."""
+        return self.report.errors
+
+    @property
     def setup(self) -> Setup | None:
         """The geometry of its pixels, as far as the provenance tells."""
         return None if self.provenance is None else self.provenance.setup
@@ -176,7 +189,8 @@ class Inversion:
         -------
         xarray.Dataset
             Dimensions y, x, component ("y", "x") and site. Each variable has ``units`` and
-            ``long_name``; options, report and setup are JSON texts in the attributes.
+            ``long_name``; options, report (with the errors in px) and setup are JSON texts in the
+            attributes, and ``errors_si`` those of the setup's main field.
         """
         history = {
             "format": FORMAT,
@@ -187,6 +201,12 @@ class Inversion:
         if self.provenance is not None:
             history["provenance"] = self.provenance.model_dump_json(exclude_none=True)
             setup = self.setup if setup is None else setup
+        if self.errors is not None and setup is not None:
+            field = setup.main_field
+            (unit,) = (one.unit for one in setup.si_fields if one.name == field.name)
+            factor = np.abs(setup.field_in_si(field.name, np.ones((2, 1, 1)))).max()
+            in_si = dataclasses.asdict(self.errors.scaled(float(factor)))
+            history["errors_si"] = json.dumps({"field": field.name, "unit": unit, **in_si})
         dataset = dataset_from_field(
             self.displacement, self.potential, setup, attributes=history | dict(attributes or {})
         )
@@ -214,10 +234,14 @@ class Inversion:
                 f"dataset has no {', '.join(map(repr, missing))}: expected the result of an "
                 "inversion"
             )
-        arrays = {name: np.ascontiguousarray(dataset[name].values) for name in VARIABLES}
+        arrays: dict[str, Any] = {
+            name: np.ascontiguousarray(dataset[name].values) for name in VARIABLES
+        }
         content = json.loads(dataset.attrs["report"])
         known = {field.name for field in dataclasses.fields(Report)} & content.keys()
         report = Report(**{name: _tuples(content[name]) for name in known})
+        if content.get("errors"):
+            report = replace(report, errors=Errors.of(content["errors"]))
         if math.isnan(report.image_residual):  # a file of an older version
             told = image_residual(arrays["image"], arrays["reprojection"], arrays["mask"])
             report = replace(report, image_residual=told)

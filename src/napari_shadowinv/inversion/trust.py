@@ -1,6 +1,7 @@
 """Signs in an answer that it must not be trusted, though the solver converged.
 
 - how far the re-projection is from the image: `image_residual`
+- whether more sites would bring it closer: `is_coarse`
 - what the user should know, in sentences: `doubts`
 
 Each sign was chosen to stay away from images whose field is known to come out well and to appear
@@ -40,8 +41,6 @@ measured on either side of them (200 × 200 px and the reference images):
 
 from __future__ import annotations
 
-import math
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,19 +49,20 @@ from scipy import ndimage
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 
 if TYPE_CHECKING:
+    from napari_shadowinv.inversion.noise import ImageNoise
     from napari_shadowinv.inversion.normalise import Prepared
     from napari_shadowinv.options import InversionOptions
 
-__all__ = ["doubts", "image_residual"]
+__all__ = ["doubts", "image_residual", "is_coarse"]
 
 _BRIGHT = 3.0  # times the source: there a bright line is, which pixels are too coarse for
 _LAGS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 4), (4, 0))
 _PATTERN = 0.5
 _NOTABLE_RESIDUAL = 0.05
+# Squares of residuals that more sites would make less: over those of noise, and of the mean.
+_ABOVE_NOISE, _INVISIBLE = 1.5**2, 0.025**2
+_HIDDEN, _INVISIBLE_PATTERN = 0.5**2, 0.01**2  # where neighbours are alike
 
-_CLIPPED_AT = 4.0  # in standard deviations of normal noise
-_NORMAL_MAD = 1.4826
-_NOISE_DEVIATIONS = 5.0
 _ROUNDING = 1e-6  # px, where image and source are the same
 
 _CAUSTIC = 0.2  # Jacobian; not the option, which is the user's taste
@@ -88,6 +88,7 @@ def image_residual(image: FloatArray, reprojection: FloatArray, mask: BoolArray)
 
 def doubts(
     prepared: Prepared,
+    noise: ImageNoise,
     displacement: FloatArray,
     reprojection: FloatArray,
     jacobian: FloatArray,
@@ -95,7 +96,6 @@ def doubts(
     options: InversionOptions,
 ) -> tuple[str, ...]:
     """Say in plain sentences why a converged answer must not be trusted; empty if nothing does."""
-    noise = _Noise(prepared)
     square = np.einsum("cyx,cyx->yx", displacement, displacement)
     rms = float(np.sqrt(square[prepared.mask].mean()))
     misfit = _misfit(prepared, reprojection, n_sites)
@@ -109,12 +109,37 @@ def doubts(
     return tuple(sentence for sentence in found if sentence)
 
 
+def is_coarse(prepared: Prepared, reprojection: FloatArray, noise: ImageNoise) -> bool:
+    """Whether the re-projection misses structures of the image that its noise does not hide.
+
+    Their residual is larger than the noise; or neighbouring pixels of it are alike, which of noise
+    are independent, and opposite of noise that the re-projection follows.
+    """
+    residual, counted = _apart_from_lines(prepared, reprojection)
+    share = counted.mean() * prepared.source[prepared.mask].mean() ** 2
+    if not share > 0:
+        return False
+    whole = (residual**2).mean() / share
+    alike = (residual[1:] * residual[:-1]).mean() + (residual[:, 1:] * residual[:, :-1]).mean()
+    by_noise = noise.typical**2
+    return bool(
+        whole > max(_ABOVE_NOISE * by_noise, _INVISIBLE)
+        or alike / (2 * share) > max(_HIDDEN * by_noise, _INVISIBLE_PATTERN)
+    )
+
+
+def _apart_from_lines(prepared: Prepared, reprojection: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Image minus re-projection, 0 where it does not count, and where it does."""
+    mean = prepared.source[prepared.mask].mean()
+    bright = ndimage.uniform_filter(prepared.image, 3) > _BRIGHT * np.maximum(prepared.source, mean)
+    counted = prepared.mask & ~bright
+    return np.where(counted, prepared.image - reprojection, 0.0), counted
+
+
 def _misfit(prepared: Prepared, reprojection: FloatArray, n_sites: int) -> str:
     """The re-projection misses a pattern in the image."""
     mask, mean = prepared.mask, prepared.source[prepared.mask].mean()
-    bright = ndimage.uniform_filter(prepared.image, 3) > _BRIGHT * np.maximum(prepared.source, mean)
-    counted = mask & ~bright
-    residual = np.where(counted, prepared.image - reprojection, 0.0)
+    residual, counted = _apart_from_lines(prepared, reprojection)
     share = float(np.sqrt((residual**2).sum() / max(counted.sum(), 1)) / mean)
     if share < _NOTABLE_RESIDUAL:
         return ""
@@ -144,40 +169,7 @@ def _correlation(values: FloatArray, down: int, right: int) -> float:
     return float((first * second).sum() / (values**2).sum())
 
 
-class _Noise:
-    """The relative noise of an image, from differences between neighbouring pixels."""
-
-    def __init__(self, prepared: Prepared) -> None:
-        mask = prepared.mask
-        self.shape = mask.shape[0], mask.shape[1]
-        excess = (prepared.image - prepared.source) / prepared.source[mask].mean()
-        finest = (excess[1:, 1:] - excess[1:, :-1] - excess[:-1, 1:] + excess[:-1, :-1]) / 2
-        used = mask[1:, 1:] & mask[1:, :-1] & mask[:-1, 1:] & mask[:-1, :-1]
-        differences = np.abs(finest[used]) if used.any() else np.zeros(1)
-        # With hot pixels and the finest structure.
-        self.largest = float(np.sqrt(np.mean(differences**2)))
-        limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(differences))
-        self.typical = self.largest
-        if limit > 0:
-            self.typical = float(np.sqrt(np.mean(np.minimum(differences, limit) ** 2)))
-
-    def displacements(self, level: float) -> tuple[float, float]:
-        """R.m.s. displacement of so much noise, px, and the most that chance leaves likely."""
-        mean, deviation = _response(self.shape)
-        return level * math.sqrt(mean), level * math.sqrt(mean + _NOISE_DEVIATIONS * deviation)
-
-
-@lru_cache(maxsize=8)
-def _response(shape: tuple[int, int]) -> tuple[float, float]:
-    """Mean and standard deviation of the mean square displacement by white noise of 1, px²."""
-    wave_y, wave_x = (np.pi * np.arange(length) / length for length in shape)
-    square = wave_y[:, None] ** 2 + wave_x**2
-    square[0, 0] = np.inf
-    power = 1 / square
-    return float(power.mean()), float(np.sqrt(2 * (power**2).sum()) / power.size)
-
-
-def _nothing_found(noise: _Noise, rms: float) -> str:
+def _nothing_found(noise: ImageNoise, rms: float) -> str:
     """Noise alone would have displaced as much."""
     usual, most = noise.displacements(noise.typical)
     if rms > max(most, _ROUNDING):
@@ -241,7 +233,7 @@ def _share_where_widest(jacobian: FloatArray, inner: float, outer: float, least:
     return largest
 
 
-def _cut_off(displacement: FloatArray, mask: BoolArray, noise: _Noise, rms: float) -> str:
+def _cut_off(displacement: FloatArray, mask: BoolArray, noise: ImageNoise, rms: float) -> str:
     """The field does not end at the closed edge."""
     depth = max(2, round(_INSIDE * min(mask.shape)))
     y, x = np.where(mask, displacement, np.nan)

@@ -45,6 +45,14 @@ SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
         float,
         {"units": "1", "long_name": "Image minus re-projection, r.m.s. relative to the mean"},
     ),
+    "noise_error": (
+        float,
+        {"units": "px", "long_name": "Standard error of the displacement by noise, r.m.s."},
+    ),
+    "discretisation_error": (
+        float,
+        {"units": "px", "long_name": "Error of the displacement by too few sites, r.m.s."},
+    ),
     "iterations": (int, {"units": "1", "long_name": "Solver iterations, summed over all levels"}),
     "seconds": (float, {"units": "s", "long_name": "Time its worker spent on the shot"}),
 }

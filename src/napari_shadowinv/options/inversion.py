@@ -11,6 +11,7 @@ __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
 MAX_DEFAULT_SITES = 1_000_000
 
 _MOVES_SITES: Any = {"moves_sites": True}
+_BUDGET: Any = {"panel": "Error budget (docs/uncertainty.md)"}
 _BOUNDARY: Any = {"panel": "Flux across the image edge (docs/boundary.md)"}
 
 
@@ -35,10 +36,22 @@ class InversionOptions(BaseModel):
         ge=4,
         title="Sites",
         description=(
-            "Number of sites placed over the source. Default: one per pixel, at most "
-            f"{MAX_DEFAULT_SITES:,}."
+            "Number of sites placed over the source. Default: as many as the accuracy needs, at "
+            f"most one per pixel and {MAX_DEFAULT_SITES:,}."
         ),
         json_schema_extra=_MOVES_SITES,
+    )
+    accuracy: float = Field(
+        default=0.01,
+        gt=0,
+        lt=1,
+        title="Accuracy",
+        description=(
+            "Where no number of sites is given, and the stages are 'multi' and the solver "
+            "'newton': sites are added until their discretisation error of the displacement "
+            "(r.m.s., relative) is below this, or below a fifth of what the image's noise does. "
+            "In a stack the first shots decide for all."
+        ),
     )
     floor: float = Field(
         default=1e-3,
@@ -172,6 +185,45 @@ class InversionOptions(BaseModel):
             "caustics: rays cross or nearly cross there, and the field is less certain."
         ),
     )
+    noise_level: float | None = Field(
+        default=None,
+        gt=0,
+        title="Noise level",
+        description=(
+            "Standard deviation of the image's noise, in its units, for the error budget. "
+            "Default: measured from the differences between neighbouring pixels."
+        ),
+        json_schema_extra=_BUDGET,
+    )
+    quantum: float | None = Field(
+        default=None,
+        gt=0,
+        title="Quantum",
+        description=(
+            "Image units per detected quantum, for the error budget: the noise is then that of "
+            "counting (Poisson)."
+        ),
+        json_schema_extra=_BUDGET,
+    )
+    beam_variation: float = Field(
+        default=0.05,
+        gt=0,
+        lt=1,
+        title="Beam variation",
+        description=(
+            "If the source was not measured: the error budget tells what a beam would do that "
+            "varies by so much (r.m.s., relative)."
+        ),
+        json_schema_extra=_BUDGET,
+    )
+    beam_scale: float = Field(
+        default=0.25,
+        gt=0,
+        le=1,
+        title="Beam scale",
+        description="Distance over which it varies so, in shorter sides of the image.",
+        json_schema_extra=_BUDGET,
+    )
     seed: int = Field(
         default=0,
         ge=0,
@@ -198,7 +250,17 @@ class InversionOptions(BaseModel):
                 f"solver is '{self.solver}' and boundary 'free', expected solver='newton': the "
                 "other solvers support closed boundaries only"
             )
+        if self.noise_level is not None and self.quantum is not None:
+            raise ValueError(
+                f"noise_level is {self.noise_level:g} and quantum {self.quantum:g}, expected one "
+                "of them: a quantum means the noise of counting"
+            )
         return self
+
+    @property
+    def is_adaptive(self) -> bool:
+        """Whether the number of sites follows from the accuracy."""
+        return self.n_sites is None and self.stages == "multi" and self.solver == "newton"
 
     def site_key(self) -> str:
         """Return what of the options determines where sites are placed."""

@@ -1,20 +1,30 @@
 """Fields and potentials in units whose numbers are handy to read.
 
 - the field that an experimenter asks for: `shown_fields`; the potential: `shown_potential`
+- a number with its errors: `with_errors`
 - the prefix for a number: `prefix_for`; the units that take one: `PREFIXED_UNITS`
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.physics.setup import SETUPS, Setup
 
-__all__ = ["PREFIXED_UNITS", "ShownField", "prefix_for", "shown_fields", "shown_potential"]
+__all__ = [
+    "PREFIXED_UNITS",
+    "ShownField",
+    "prefix_for",
+    "shown_fields",
+    "shown_potential",
+    "with_errors",
+]
 
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 
@@ -33,6 +43,25 @@ def prefix_for(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> t
         return 1.0, ""
     power = max((p for p in allowed if largest >= 10.0**p), default=min(allowed))
     return 10.0**-power, _PREFIXES[power]
+
+
+def with_errors(value: float, errors: Mapping[str, float]) -> str:
+    """Write a number with its errors, which are shares of it, to two figures of the largest.
+
+    >>> with_errors(97.13, {"noise": 0.0212, "discretisation": 0.0021})
+    '97.1 ± 2.1 (noise) ± 0.2 (discretisation)'
+    """
+    sizes = {name: abs(value) * share for name, share in errors.items()}
+    largest = max(sizes.values(), default=0.0)
+    if not largest > 0 or not np.isfinite(largest):
+        return f"{value:.3g}"
+    decimals = max(0, 1 - math.floor(math.log10(largest)))
+
+    def written(size: float) -> str:
+        return f"{size:.{decimals}f}" if round(size, decimals) else f"{size:.1g}"
+
+    told = [f"± {written(size)} ({name})" for name, size in sizes.items()]
+    return " ".join([f"{value:.{decimals}f}", *told])
 
 
 @dataclass(frozen=True)
@@ -57,16 +86,18 @@ class ShownField:
         row, column = np.unravel_index(np.argmax(self.magnitude), self.magnitude.shape)
         return int(row), int(column)
 
-    @property
-    def peak_text(self) -> str:
-        """The largest magnitude in words, path-integrated fields in MG·µm, too."""
+    def peak_text(self, errors: Mapping[str, float] = MappingProxyType({})) -> str:
+        """The largest magnitude in words, path-integrated fields in MG·µm, too.
+
+        Its errors are shares of it by their names.
+        """
         largest = float(self.magnitude.max())
-        text = f"peak {self.symbol} {largest:.3g} {self.unit}"
+        text = f"peak {self.symbol} {with_errors(largest, errors)} {self.unit}"
         if not self.unit.endswith("T·m"):
             return text
         prefix = self.unit.removesuffix("T·m")
         power = next(power for power, name in _PREFIXES.items() if name == prefix)
-        return f"{text} ({largest * 10.0**power / 1e-4:.3g} MG·µm)"
+        return f"{text} ({with_errors(largest * 10.0**power / 1e-4, errors)} MG·µm)"
 
 
 def shown_fields(

@@ -142,7 +142,7 @@ def _footer(inversion: Inversion, field: ShownField, columns: int) -> list[tuple
         f"{report.n_sites:,} sites",
         f"flux residual {report.residual:.1e} (tolerance {report.tolerance:.0e})",
         f"{report.iterations} steps in {sum(report.seconds.values()):.1f} s",
-        field.peak_text,
+        field.peak_text({} if inversion.errors is None else inversion.errors.of_peak),
     ]
     share = 100 * float(inversion.caustic.mean())
     if share:

@@ -176,7 +176,7 @@ def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
 
 
 def _footer(fit: Fit, shown: list[ShownField], letters: int) -> list[tuple[str, str]]:
-    facts = [field.peak_text for field in shown]
+    facts = [field.peak_text() for field in shown]
     if not np.isnan(fit.report.uncertainty):
         facts.append(f"error bars {fit.report.uncertainty:.2%} of the displacement (r.m.s.)")
     facts.append(f"gains {', '.join(f'{gain:.3g}' for gain in fit.gains)}")

@@ -15,9 +15,10 @@ from napari_shadowinv.inversion.labels import SETUPS_LABEL, variable_labels
 from napari_shadowinv.io.store import SUMMARY, with_places
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack import _spec
+from napari_shadowinv.stack._choosing import choose_sites
 from napari_shadowinv.stack._references import Reader, Shot, read_shot
 from napari_shadowinv.stack._stacks import Stack
-from napari_shadowinv.stack._worker import Beam, Work
+from napari_shadowinv.stack._worker import Beam, Work, numbers_of
 
 if TYPE_CHECKING:
     import xarray
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.preprocessing import Recipe, Step
 
 # One number for each shot, beside the arrays of an inversion.
-_NUMBERS = ("converged", "flux_residual", "image_residual", "iterations")
+_NUMBERS = {name: kind for name, (kind, _) in SUMMARY.items() if name != "seconds"}
 
 
 def invert_stack(
@@ -83,10 +84,12 @@ def invert_stack(
     -------
     xarray.Dataset
         The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
-        chunk, and ``converged``, ``flux_residual``, ``image_residual`` and ``iterations``; nothing
-        is computed yet. Sites have no dimension ``shot`` where all shots share a source, and are
-        left out with a free boundary and a source for each shot, or with masks of their own, as
-        their number then differs. Of a table, ``setup`` has that of each shot as JSON.
+        chunk, and ``converged``, ``flux_residual``, ``image_residual``, ``noise_error``,
+        ``discretisation_error`` and ``iterations``; nothing is computed yet, but for the first
+        shots where they decide how many sites all need for the accuracy. Sites have no dimension
+        ``shot`` where all shots share a source, and are left out where their number differs: with
+        a source for each shot and a free boundary or no given number, or with own masks. Of a
+        table, ``setup`` has that of each shot as JSON.
 
     Raises
     ------
@@ -125,7 +128,7 @@ def invert_stack(
         reader=reader,
         warm_start=warm_start,
     )
-    return _Graph(stack).dataset()
+    return _Graph(choose_sites(stack)).dataset()
 
 
 def _invert(
@@ -146,13 +149,9 @@ def _invert(
             inversion = work.invert(image, None, beam.load()[0], start=start)
     except InputError as error:
         raise InputError(f"{label}: {error}") from error
-    report = inversion.report
     return {
         **work.arrays(inversion),
-        "converged": np.bool_(report.converged),
-        "flux_residual": np.float64(report.residual),
-        "image_residual": np.float64(report.image_residual),
-        "iterations": np.int64(report.iterations),
+        **{name: _NUMBERS[name](value) for name, value in numbers_of(inversion).items()},
         **({"inversion": inversion} if keep else {}),
     }
 

@@ -19,13 +19,16 @@ from napari_shadowinv.stack._references import checksum
 from napari_shadowinv.stack._spec import dtype_of
 from napari_shadowinv.stack._stacks import Stack
 
+_CHOSEN = "chosen_sites"  # attribute: how many sites the first shots needed for the accuracy
 _APPENDED = "appended_at"  # attribute: where later runs began to append shots
 _INSTEAD = "use the same, overwrite the store, or choose another name"
 
 
 def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
     identity = {name: value for name, value in _identity(stack, dtype).items() if value}
-    attributes = {**_spec.attributes_of(stack), **identity}
+    attributes: dict[str, Any] = {**_spec.attributes_of(stack), **identity}
+    if stack.sites_chosen:
+        attributes[_CHOSEN] = stack.recipe.options.n_sites
     return Contents(stack.sizes, _variables(stack, dtype), _coordinates(stack), attributes)
 
 
@@ -93,6 +96,8 @@ def _sum_of(mask: BoolArray | None) -> str:
 def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
     """Return the stack in the order of its store, new shots last; refuse what does not belong."""
     stack = stack.chosen(_order(store, stack.shots.names))
+    if stack.chooses_sites and _CHOSEN in store.attributes:
+        stack = stack.with_sites(int(store.attributes[_CHOSEN]))
     found = _identity(stack, dtype, len(store.names))
     for name, value in {**found, "package_version": __version__}.items():
         before = str(store.attributes.get(name, ""))

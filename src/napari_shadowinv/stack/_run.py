@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.locking import locked
-from napari_shadowinv._system.progress import Progress, ShouldStop
+from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
 from napari_shadowinv.io.store_layout import create_store
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.stack._choosing import choose_sites
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
 from napari_shadowinv.stack._references import Reader, read_shot
 from napari_shadowinv.stack._resuming import append_shots, contents_of, resume
@@ -49,8 +50,8 @@ class RunProgress:
         Where the work is done.
     name, outcome : str, ShotOutcome or None
         The shot that has just ended, if one has, and what became of it.
-    compiling : str
-        Before all shots, after an installation: that the compiler is at work.
+    preparing : str
+        Before all shots: what is being done.
     """
 
     total: int
@@ -59,7 +60,7 @@ class RunProgress:
     engine: str
     name: str = ""
     outcome: ShotOutcome | None = None
-    compiling: str = ""
+    preparing: str = ""
 
 
 OnRunProgress = Callable[[RunProgress], None]
@@ -155,14 +156,14 @@ def run_stack(
         warm_start=warm_start,
     )
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
+
+    def prepare(what: str) -> None:
+        if on_progress is not None:
+            on_progress(RunProgress(len(stack.shots), 0, 0, "", preparing=what))
+
     if is_here(scheduler):
-
-        def tell(news: Progress) -> None:
-            if on_progress is not None:
-                on_progress(RunProgress(len(stack.shots), 0, 0, "", compiling=news.message))
-
         # Once for all workers, which would each be at it during their first shot.
-        ensure_compiled(tell, should_stop)
+        ensure_compiled(lambda news: prepare(f"compiling, {news.message}"), should_stop)
     with locked(path):
         store = StackStore(path) if path.exists() and not overwrite else None
         arrived = False
@@ -175,6 +176,9 @@ def run_stack(
         # Before a store is made: a scheduler that does not answer shall leave nothing behind.
         with engine_for(scheduler, workers, should_stop) as engine:
             if store is None:
+                if stack.chooses_sites:
+                    prepare("how many sites the first shots need")
+                stack = choose_sites(stack, should_stop)
                 store = create_store(path, contents_of(stack, kept), overwrite=overwrite)
             elif arrived:
                 store = append_shots(store, stack, kept)

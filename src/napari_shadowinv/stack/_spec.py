@@ -95,13 +95,16 @@ def describe_stack(
             "solution belongs to different sites; leave warm_start out, or give one source and "
             "mask for all shots"
         )
-    ragged = own_masks or (beam is None and inputs.recipe.options.boundary == "free")
+    options = inputs.recipe.options
+    ragged = own_masks or (beam is None and (options.boundary == "free" or options.is_adaptive))
     chosen = _checked_variables(variables, inputs.recipe, ragged=ragged)
     if not rows:
         return Stack(found, inputs, beam, own, chosen, warm_start, named)
     common = None if sources is None or own is not None else np.asarray(sources, np.float64)
     guess = wanted.estimate
-    return TableStack(found, inputs, beam, own, chosen, warm_start, named, common, guess)
+    return TableStack(
+        found, inputs, beam, own, chosen, warm_start, named, common=common, estimate=guess
+    )
 
 
 def _described(
@@ -212,7 +215,7 @@ def _fit_stack(
     # Estimates, and beams of their own, are those of each shot.
     alone = own is not None or inputs.recipe.estimate not in (None, UniformEstimate())
     beam = None if alone else Beam.of(found.shape, image, None)
-    stack = FitStack(found, inputs, beam, own, (), 1, reader, wanted)
+    stack = FitStack(found, inputs, beam, own, (), 1, reader, given=wanted)
     known = stack.labels
     if choices.options.samples < 2:
         known.pop("displacement_uncertainty")
@@ -267,8 +270,8 @@ def _checked_variables(
         hint = " (it needs a setup)" if recipe.setup is None else ""
         if name in labels:
             hint = (
-                " (sites differ between shots with a free boundary and one source per shot, or "
-                "with masks of their own)"
+                " (sites differ between shots with one source per shot and a free boundary or no "
+                "given number of sites, or with masks of their own)"
             )
         raise InputError(
             f"there is no variable {name!r}{hint}: expected one or more of {', '.join(known)}"

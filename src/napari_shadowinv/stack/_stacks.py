@@ -36,10 +36,28 @@ class Stack:
     variables: tuple[str, ...]
     warm_start: int = 1  # shots in a group, each initialised from the one before
     reader: str = ""  # name of what reads the files
+    sites_chosen: bool = False  # whether the number of sites follows from the accuracy
 
     @property
     def recipe(self) -> Recipe:
         return self.inputs.recipe
+
+    @property
+    def chooses_sites(self) -> bool:
+        """Whether the accuracy has still to decide how many sites all shots share."""
+        return self.beam is not None and self.recipe.options.is_adaptive
+
+    def with_sites(self, n_sites: int) -> Stack:
+        """Return the stack with the number of sites that the accuracy has led to."""
+        options = self.recipe.options.model_copy(update={"n_sites": n_sites})
+        provenance = self.inputs.provenance
+        recipe = provenance.recipe.model_copy(update={"options": options})
+        inputs = replace(
+            self.inputs,
+            recipe=self.recipe.model_copy(update={"options": options}),
+            provenance=provenance.model_copy(update={"recipe": recipe}),
+        )
+        return replace(self, inputs=inputs, sites_chosen=True)
 
     @cached_property
     def moved(self) -> Radiograph:
@@ -69,8 +87,11 @@ class Stack:
 
     @property
     def options_text(self) -> str:
-        """The options, without what does not affect the results."""
-        return self.recipe.options.model_dump_json(exclude={"threads"})
+        """The options as they were given, without what does not affect the results."""
+        options = self.recipe.options
+        if self.sites_chosen:
+            options = options.model_copy(update={"n_sites": None})
+        return options.model_dump_json(exclude={"threads"})
 
     @property
     def fit_text(self) -> str:
@@ -118,7 +139,7 @@ class Stack:
 
     def work(self, variables: tuple[str, ...]) -> Work | FitWork:
         """Return what the task of each shot needs to know to make some variables."""
-        return Work(self.shots.shape, self.inputs, variables)
+        return Work(self.shots.shape, self.inputs, variables, self.sites_chosen)
 
     def changed(self, index: int, origin: dict[str, Any]) -> str:
         """Name what of a shot is not what its report says; empty if nothing."""
@@ -169,7 +190,8 @@ class TableStack(Stack):
         return ["" if setup is None else setup.model_dump_json() for setup in moved]
 
     def work(self, variables: tuple[str, ...]) -> RowWork:
-        return RowWork(self.shots.shape, self.inputs, variables, self.estimate)
+        shape, chosen = self.shots.shape, self.sites_chosen
+        return RowWork(shape, self.inputs, variables, chosen, self.estimate)
 
     def changed(self, index: int, origin: dict[str, Any]) -> str:
         difference = self._shot(index).difference(origin)
@@ -188,6 +210,10 @@ class FitStack(Stack):
     """A stack that is fitted; its beam is as recorded, as the fit takes the steps itself."""
 
     given: Recipe = field(default_factory=Recipe)  # with setup and choices as they were given
+
+    @property
+    def chooses_sites(self) -> bool:
+        return False
 
     @property
     def choices(self) -> FitChoices:

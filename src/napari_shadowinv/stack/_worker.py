@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import math
 import multiprocessing
 import sys
 import threading
@@ -114,6 +115,7 @@ class Work:
     shape: tuple[int, int]  # of the shots as recorded
     inputs: Inputs  # without an image; shots inverted at once share the cores
     variables: tuple[str, ...]
+    sites_chosen: bool = False  # as the first shots needed them
 
     def invert(
         self,
@@ -167,7 +169,23 @@ class Work:
 
     def report(self, inversion: Inversion) -> dict[str, Any]:
         """Return what is told of a shot."""
-        return {**dataclasses.asdict(inversion.report), "stages": inversion.report.seconds}
+        told = {**dataclasses.asdict(inversion.report), "stages": inversion.report.seconds}
+        if self.sites_chosen:
+            told["sites_reason"] = "as many as the first shots needed for the accuracy"
+        return told | numbers_of(inversion)
+
+
+def numbers_of(inversion: Inversion) -> dict[str, Any]:
+    """Return the numbers of a shot that stand beside its arrays, by the store's names."""
+    report, errors = inversion.report, inversion.errors
+    return {
+        "converged": report.converged,
+        "flux_residual": report.residual,
+        "image_residual": report.image_residual,
+        "noise_error": math.nan if errors is None else errors.noise.rms,
+        "discretisation_error": math.nan if errors is None else errors.discretisation.rms,
+        "iterations": report.iterations,
+    }
 
 
 def _relative(image: AnyArray, mask: BoolArray | None) -> AnyArray:

@@ -32,7 +32,7 @@ from napari_shadowinv.transport.sites import Level
 __all__ = ["OpenObjective", "Solution", "TransportObjective"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """Weights of one level and how they were reached."""
 
@@ -89,7 +89,12 @@ class TransportObjective:
         The Laplacian is that of the diagram for these weights. Raises a RuntimeError where the
         cells fall into groups with no flux between them.
         """
-        return solve_laplacian(laplacian, gap, tolerance, available_threads(self.threads))
+        threads = available_threads(self.threads)
+        return solve_laplacian(laplacian, gap, tolerance, threads, ground=self.ground(weights))
+
+    def ground(self, weights: FloatArray) -> FloatArray | None:
+        """Return what a change of each weight adds to the image there, if anything."""
+        return None
 
     def in_gauge(self, weights: FloatArray) -> FloatArray:
         """Fix the constant that the weights are known up to: their mean is zero."""
@@ -141,15 +146,11 @@ class OpenObjective(TransportObjective):
         self._pixels[self._beyond] = self._beam * share
         return Density.from_image(self._pixels)
 
-    def newton_step(
-        self, laplacian: csr_array, weights: FloatArray, gap: FloatArray, tolerance: float
-    ) -> FloatArray:
-        """Take into account that more weight in the margin brings more flux."""
+    def ground(self, weights: FloatArray) -> FloatArray:
+        """More weight in the margin brings more flux."""
         excess = self._gain * weights[self._site]
         slope = self._gain * self._beam * np.exp(np.minimum(excess, 0))
-        ground = np.bincount(self._site, slope, len(weights)).astype(np.float64)
-        threads = available_threads(self.threads)
-        return solve_laplacian(laplacian, gap, tolerance, threads, ground=ground)
+        return np.bincount(self._site, slope, len(weights)).astype(np.float64)
 
     def in_gauge(self, weights: FloatArray) -> FloatArray:
         """Return the weights as they are: far outside they are zero."""

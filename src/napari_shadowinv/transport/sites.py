@@ -13,11 +13,12 @@ Quasi-Monte Carlo Methods* (SIAM, 1992), chapter 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
-from functools import cached_property
-from threading import Event
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from threading import Event, Lock
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,6 @@ from numpy.typing import NDArray
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.density import Density
@@ -34,7 +34,7 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 from napari_shadowinv.transport.margin import Margin
 
-__all__ = ["Level", "SitePlan", "lloyd", "plan_levels", "sample_sites"]
+__all__ = ["Level", "Levels", "SitePlan", "lloyd", "plan_levels", "sample_sites"]
 
 
 COARSEST = 600  # sites with which the solver can start from zero weights
@@ -98,16 +98,99 @@ class Level:
         )
 
 
+class Levels(Sequence[Level]):
+    """Levels, coarse to fine, each made when it is first asked for; a slice shares them.
+
+    >>> levels = plan_levels(np.ones((60, 60)), 3600, lloyd_iterations=2).levels
+    >>> levels.counts, len(levels[1].sites), [len(level.sites) for level in levels[:2]]
+    ((225, 900, 3600), 900, [225, 900])
+    """
+
+    def __init__(
+        self,
+        counts: tuple[int, ...],
+        make: Callable[[int, Reporter], Level],
+        made: dict[int, _Slot] | None = None,
+        report: Reporter | None = None,
+    ) -> None:
+        self.counts = counts
+        self._make = make
+        self._made = {} if made is None else made
+        self._report = report or Reporter()
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    @overload
+    def __getitem__(self, number: int) -> Level: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> Levels: ...
+
+    def __getitem__(self, number: int | slice) -> Level | Levels:
+        if isinstance(number, slice):
+            return Levels(self.counts[number], self._make, self._made, self._report)
+        return self.at(self.counts[number])
+
+    def at(self, count: int) -> Level:
+        """Return the level with so many sites."""
+        return self._level(count, self._report)
+
+    def up_to(self, count: int) -> Levels:
+        """Return the levels with fewer sites than so many, and one with just so many."""
+        counts = (*(one for one in self.counts if one < count), count)
+        return Levels(counts, self._make, self._made, self._report)
+
+    def heard_by(self, report: Reporter | None) -> Levels:
+        """Return the same levels; those still to be made will be reported."""
+        return Levels(self.counts, self._make, self._made, report)
+
+    def made(self, threads: int | None = None) -> Levels:
+        """Return the levels after all of them were made."""
+        if available_threads(threads) == 1 or len(self) == 1:
+            list(self)
+            return self
+        abandoned = Event()
+        # Beside the finest level, which takes three times as long; this thread alone reports.
+        with ThreadPoolExecutor(1) as pool:
+            others = pool.submit(list, self[:-1].heard_by(Reporter(None, abandoned.is_set)))
+            try:
+                _ = self[-1]
+                while not wait([others], timeout=_POLL).done:
+                    self._report("sites", 0, None, "coarser levels")
+            except BaseException:
+                abandoned.set()
+                raise
+            others.result()
+        return self
+
+    def _level(self, count: int, report: Reporter) -> Level:
+        slot = self._made.setdefault(count, _Slot())
+        with slot.lock:
+            if slot.level is None:
+                slot.level = self._make(count, report)
+            return slot.level
+
+
+@dataclass
+class _Slot:
+    """A level that is being made, or is there."""
+
+    lock: Any = field(default_factory=Lock, repr=False)
+    level: Level | None = None
+
+
 @dataclass(frozen=True)
 class SitePlan:
     """Everything about the sites that depends on the source alone."""
 
     source: FloatArray  # (H, W)
-    levels: tuple[Level, ...]  # coarse to fine
+    levels: Levels
     mask: BoolArray | None = None  # where the source is known; elsewhere it keeps cells together
     # Where the boundary is free, the sites cover it too, and the levels' coordinates are its.
     margin: Margin | None = None
     unit: float = 1.0  # flux of the source that the levels' masses count as 1
+    measured: bool = True  # whether the source was recorded; else it is an estimate
 
     @property
     def margin_width(self) -> int:
@@ -158,19 +241,19 @@ def lloyd(
     iterations: int,
     tolerance: float = 0.0,
     threads: int | None = None,
-    report: Callable[[int, int], None] | None = None,
+    report: Callable[[int], None] | None = None,
 ) -> tuple[PowerDiagram, int]:
     """Move each site to the centroid of its Voronoi cell, again and again.
 
     The triangulation, without weights, moves with the sites, until their r.m.s. distance from the
     centroids is below the tolerance, in units of their mean spacing. The report is told the steps
-    made and the number of sites. Returns the diagram with moments, and the steps.
+    made. Returns the diagram with moments, and the steps.
     """
     near = tolerance * _spacing(source.shape, len(triangulation.sites))
     step = 0
     while True:
         if report is not None:
-            report(step, len(triangulation.sites))
+            report(step)
         diagram = PowerDiagram(triangulation, source, with_moments=True, threads=threads)
         centroids = diagram.centroids
         away = np.sqrt(((centroids - triangulation.sites) ** 2).sum(axis=1).mean())
@@ -193,19 +276,19 @@ def plan_levels(
     lloyd_tolerance: float = 0.0,
     seed: int = 0,
     threads: int | None = None,
-    report: Reporter | None = None,
 ) -> SitePlan:
-    """Spread the sites of all levels over a source; the finest has `n_sites`, others a quarter."""
+    """Plan levels over a source; the finest has `n_sites`, others a quarter of the next."""
     density = Density.from_image(source)
     counts = [n_sites]
     while counts[-1] > COARSEST:
         counts.append(max(4, counts[-1] // RATIO))
 
-    def level(count: int, tell: Callable[[int, int], None]) -> Level:
+    def level(count: int, report: Reporter) -> Level:
+        def tell(step: int) -> None:
+            report("sites", step, lloyd_iterations, f"{count:,} sites, Lloyd relaxation")
+
         sites = sample_sites(source, count, seed)
-        triangulation = RegularTriangulation(
-            sites, region=density.region, alive=lambda: tell(0, count)
-        )
+        triangulation = RegularTriangulation(sites, region=density.region, alive=partial(tell, 0))
         diagram, steps = lloyd(
             triangulation,
             density,
@@ -217,26 +300,4 @@ def plan_levels(
         sites, masses, centroids = triangulation.sites, diagram.masses, diagram.centroids
         return Level(sites, masses, centroids, triangulation, density.shape, steps)
 
-    def tell(step: int, count: int) -> None:
-        if report is not None:
-            report("sites", step, lloyd_iterations, f"{count:,} sites, Lloyd relaxation")
-
-    if available_threads(threads) == 1:
-        return SitePlan(source, tuple(level(count, tell) for count in reversed(counts)))
-    abandoned = Event()
-
-    def give_up(step: int, count: int) -> None:
-        if abandoned.is_set():
-            raise InversionCancelled("the finest level was abandoned")
-
-    # beside the finest level, which takes three times as long; this thread alone reports
-    with ThreadPoolExecutor(1) as pool:
-        others = pool.submit(lambda: [level(count, give_up) for count in counts[:0:-1]])
-        try:
-            finest = level(n_sites, tell)
-            while not wait([others], timeout=_POLL).done:
-                tell(lloyd_iterations, n_sites)
-        except BaseException:
-            abandoned.set()
-            raise
-        return SitePlan(source, (*others.result(), finest))
+    return SitePlan(source, Levels(tuple(reversed(counts)), level))

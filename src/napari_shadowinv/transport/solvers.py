@@ -1,7 +1,8 @@
 """Finding the weights of all levels, coarse to fine.
 
 - with the solver, tolerance and limits that the options name: `solve`
-- from the weights of the sites to a smooth potential everywhere: `potential_surface`
+- an answer of one level, with a smooth potential everywhere: `LevelSolution`
+- the problem of one level: `Target`
 - the factor on an image of unknown exposure: `fitted_flux`
 
 References
@@ -12,7 +13,9 @@ Paper, section III.A ("multi-stage approach"); Q. Mérigot, Computer Graphics Fo
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -25,12 +28,14 @@ from napari_shadowinv.transport.continuation import blurred, sharpen
 from napari_shadowinv.transport.margin import Margin
 from napari_shadowinv.transport.minimise import descend, newton, with_full_cells
 from napari_shadowinv.transport.objective import OpenObjective, Solution, TransportObjective
-from napari_shadowinv.transport.sites import Level
+from napari_shadowinv.transport.sites import Level, Levels
 
-__all__ = ["LevelSolution", "fitted_flux", "potential_surface", "solve"]
+__all__ = ["LevelSolution", "Target", "fitted_flux", "solve"]
 
 
 _COARSE_TOLERANCE = 3e-2
+_HALFWAY = 2  # times the sites of a level, where the next one has four times as many
+_WORTH_HALF = 40_000  # sites from which that is worth a level of its own
 _STALLED = 0.1  # a residual above this is no solution of anything
 _WARM_STEPS = 10
 _SITES_OF_FIT = 1500
@@ -39,10 +44,12 @@ _REACH_OF_FIT = 4.0  # steps
 _SHORTEST_WARM_STEP = 0.1  # where steps must be shorter, starting afresh is faster
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LevelSolution(Solution):
     """A solution and where it moves the n sites of its level."""
 
+    level: Level
+    threads: int | None
     flux: FloatArray  # (n,): what each cell holds of the image
     # (n, 2), px: centroid of each cell in the image minus that of the same site's cell in the
     # source. (The paper, in lines 21–23 of its algorithm, subtracts the site, which is the same
@@ -55,57 +62,105 @@ class LevelSolution(Solution):
     ) -> LevelSolution:
         """Add what the cells hold to a solution that `objective` has arrived at."""
         diagram = objective.diagram(solution.weights, with_moments=True)
-        displacement = diagram.centroids - level.centroids
-        return cls(**vars(solution), flux=diagram.masses, displacement=displacement)
+        return cls(
+            **vars(solution),
+            level=level,
+            threads=objective.threads,
+            flux=diagram.masses,
+            displacement=diagram.centroids - level.centroids,
+        )
+
+    @cached_property
+    def surface(self) -> CloughTocher:
+        """A C¹ surface through the potential at the sites (px²).
+
+        In the optimum the image of site i lies at r_i - ½ ∇w, so half the weights are the
+        normalised deflection potential at the sites, and minus the displacements of the cells'
+        centroids (px) are, nearly, its gradients. No flux crosses the border of the image, so the
+        potential is level across it, and its mirror image continues it smoothly.
+        """
+        mirrored = self.level.mirrored
+        potential = 0.5 * self.weights
+        gradient = fit_gradients(self.level.triangulation, potential, -self.displacement)
+        return CloughTocher(
+            mirrored.triangulation,
+            potential[mirrored.origin],
+            mirrored.sense * gradient[mirrored.origin],
+            threads=self.threads,
+        )
+
+
+# Is told the solutions so far, and returns how many times as many sites would be enough.
+Needed = Callable[[Sequence[LevelSolution]], float]
 
 
 def solve(
-    levels: tuple[Level, ...],
+    levels: Levels,
     image: FloatArray,
     options: InversionOptions,
     report: Reporter | None = None,
     *,
     start: FloatArray | None = None,
     margin: Margin | None = None,
+    needed: Needed | None = None,
+    solved: Sequence[LevelSolution] = (),
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
     The image, shape (H, W), is positive everywhere, and has the flux of the source unless there
     is a margin. With a `start` (weights of the finest level that solve a similar image) it solves
-    on the finest level alone, if that converges. Returns one solution for each level that was
+    on the finest level alone, if that converges. After each coarser level it is asked how many
+    times as many sites are `needed`, and ended there, or with twice as many, if that is enough;
+    what was `solved` before is not solved again. Returns one solution for each level that was
     tried, and for the finest one tried afresh where a level led nowhere; the last is the answer.
     """
     if options.stages == "single":
         levels = levels[-1:]
-    target = _Target(image, margin, options)
+    target = Target.of(image, margin, options)
     if start is not None:
         nearby = _solve_from(start, levels[-1], target, report)
         if nearby is not None:
             return [nearby]
     by_newton = options.solver == "newton"
-    solutions: list[LevelSolution] = []
-    for number, level in enumerate(levels):
-        finest = level is levels[-1]
-        tolerance = options.tolerance if finest else max(options.tolerance, _COARSE_TOLERANCE)
+    solutions = list(solved)
+    coarse = max(options.tolerance, _COARSE_TOLERANCE)
+    fewest = len(solutions[-1].weights) if solutions else 0
+    finer = [count for count in levels.counts if count > fewest]
+    while finer:
+        level = levels.at(finer.pop(0))
+        finest = not finer
+        tolerance = options.tolerance if finest else coarse
         objective = target.objective(level)
-        if number == 0 and by_newton:
+        if not solutions and by_newton:
             solution = target.sharpened(level, tolerance, report)
         else:
-            weights = np.zeros(len(level.sites))
-            if number > 0:
-                last, coarse = solutions[-1], levels[number - 1]
-                weights = 2 * potential_surface(
-                    coarse, last.weights, last.displacement, threads=options.threads
-                )(level.sites)
+            weights = 2 * solutions[-1].surface(level.sites) if solutions else None
             solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > _STALLED and len(levels) > 1:
             return [*solutions, _afresh(levels[-1], target, solution if finest else None, report)]
+        if needed is None or finest:
+            continue
+        times = needed(solutions)
+        count = len(level.sites)
+        if 1 < times <= _HALFWAY and count >= _WORTH_HALF and count in levels.counts:
+            finer.insert(0, _HALFWAY * count)
+        elif times <= 1:
+            final = newton(
+                objective,
+                solution.weights,
+                tolerance=options.tolerance,
+                max_iterations=options.max_iterations,
+                report=report,
+            )
+            if final.converged:
+                final = replace(final, iterations=solution.iterations + final.iterations)
+                return [*solutions[:-1], LevelSolution.of_level(level, objective, final)]
     return solutions
 
 
 def _afresh(
-    level: Level, target: _Target, stalled: Solution | None, report: Reporter | None
+    level: Level, target: Target, stalled: Solution | None, report: Reporter | None
 ) -> LevelSolution:
     """Solve the finest level without the coarser ones, which led nowhere."""
     solution = target.sharpened(level, target.options.tolerance, report)
@@ -115,7 +170,7 @@ def _afresh(
 
 
 def fitted_flux(
-    levels: tuple[Level, ...],
+    levels: Levels,
     image: FloatArray,
     margin: Margin,
     options: InversionOptions,
@@ -127,7 +182,7 @@ def fitted_flux(
     proportion to the error, on top of what the object does. Few sites suffice to see it.
     The image comes with the flux of the source.
     """
-    few = tuple(level for level in levels if len(level.sites) <= _SITES_OF_FIT) or levels[:1]
+    few = levels[: max(1, sum(count <= _SITES_OF_FIT for count in levels.counts))]
     at_edge = np.abs(margin.edge_distance(few[-1].sites).min(axis=-1)) < few[-1].spacing
 
     def move_at_edge(trial: FloatArray) -> float:
@@ -145,7 +200,7 @@ def fitted_flux(
 
 
 def _solve_from(
-    start: FloatArray, level: Level, target: _Target, report: Reporter | None
+    start: FloatArray, level: Level, target: Target, report: Reporter | None
 ) -> LevelSolution | None:
     """Solve one level from given weights, or return None where that gets nowhere soon."""
     options = target.options
@@ -166,29 +221,34 @@ def _solve_from(
 
 
 @dataclass(frozen=True)
-class _Target:
-    """Where the flux goes."""
+class Target:
+    """Where the flux goes: the image, and what is around it."""
 
-    image: FloatArray
+    density: Density
     margin: Margin | None
     options: InversionOptions
+
+    @classmethod
+    def of(cls, image: FloatArray, margin: Margin | None, options: InversionOptions) -> Target:
+        return cls(Density.from_image(image), margin, options)
 
     def objective(self, level: Level) -> TransportObjective:
         """Pose the problem for the sites of a level."""
         threads = self.options.threads
         if self.margin is not None:
             decay_length = self.options.decay_length or self.margin.width
-            return OpenObjective(level, self.image, self.margin, decay_length, threads=threads)
-        density = Density.from_image(self.image)
-        return TransportObjective(level.triangulation.copy(), level.mass, density, threads=threads)
+            image = self.density.image
+            return OpenObjective(level, image, self.margin, decay_length, threads=threads)
+        triangulation = level.triangulation.copy()
+        return TransportObjective(triangulation, level.mass, self.density, threads=threads)
 
     def softened(self, level: Level, blur: float, factor: int) -> TransportObjective:
         """Pose it for pixels that were split, each side by a factor, then blurred by so many."""
-        pixels = split_pixels(self.image, factor)
+        pixels = split_pixels(self.density.image, factor)
         margin = self.margin and self.margin.split(factor)
         decay_length = self.options.decay_length and factor * self.options.decay_length
         options = self.options.model_copy(update={"decay_length": decay_length})
-        return _Target(blurred(pixels, blur), margin, options).objective(level)
+        return Target.of(blurred(pixels, blur), margin, options).objective(level)
 
     def sharpened(self, level: Level, tolerance: float, report: Reporter | None) -> Solution:
         """Solve a level from zero weights, by way of blurred images."""
@@ -204,37 +264,18 @@ class _Target:
 
 def _solve_level(
     objective: TransportObjective,
-    weights: FloatArray,
+    weights: FloatArray | None,
     options: InversionOptions,
     tolerance: float,
     report: Reporter | None,
 ) -> Solution:
-    """Run the solver that the options name on one level."""
+    """Run the solver that the options name on one level, from zero weights if none are given."""
     most = options.max_iterations
+    if weights is None:
+        weights = np.zeros(len(objective.mass))
     if options.solver == "newton":
         start = with_full_cells(objective, weights)
         return newton(objective, start, tolerance=tolerance, max_iterations=most, report=report)
     return descend(
         objective, weights, options.solver, tolerance=tolerance, max_iterations=most, report=report
-    )
-
-
-def potential_surface(
-    level: Level, weights: FloatArray, displacement: FloatArray, *, threads: int | None = None
-) -> CloughTocher:
-    """Lay a C¹ surface through the potential at the sites (px²).
-
-    In the optimum the image of site i lies at r_i - ½ ∇w, so half the weights are the
-    normalised deflection potential at the sites, and minus the displacements of the cells'
-    centroids (px) are, nearly, its gradients. No flux crosses the border of the image, so the
-    potential is level across it, and its mirror image continues it smoothly.
-    """
-    mirrored = level.mirrored
-    potential = 0.5 * weights
-    gradient = fit_gradients(level.triangulation, potential, -displacement)
-    return CloughTocher(
-        mirrored.triangulation,
-        potential[mirrored.origin],
-        mirrored.sense * gradient[mirrored.origin],
-        threads=threads,
     )

@@ -30,6 +30,7 @@ from napari_shadowinv._napari.widgets.line_profile import (
     sampled,
     table_text,
 )
+from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
@@ -184,10 +185,11 @@ def test_a_stack_tells_that_it_compiles(
     shot: Array, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
-    stages: list[str] = []
+    told: list[Progress] = []
     job = StackJob(shot[None], tmp_path / "a.shadowinv.zarr", Recipe(options=FEW))
-    books = job.run(lambda news: stages.append(news.stage), lambda: False)
-    assert list(dict.fromkeys(stages)) == ["prepare", "compile", "shots"]
+    books = job.run(told.append, lambda: False)
+    assert list(dict.fromkeys(news.stage for news in told)) == ["prepare", "shots"]
+    assert any(news.message.startswith("compiling, ") for news in told)
     assert books.text == "1 of 1 done"
 
 
@@ -201,7 +203,7 @@ def test_a_uniform_source_is_the_same_after_a_filter(shot: Array) -> None:
 
 def test_seconds_of_all_stages_are_told(shot: Array) -> None:
     report = run(Recipe(source=LowPassEstimate(), options=FEW), shot).report
-    assert set(report.seconds) == {"source", "prepare", "sites", "transport", "read-out"}
+    assert set(report.seconds) == {"source", "prepare", "sites", "transport", "read-out", "errors"}
     assert report.seconds["sites"] > 0
     assert not report.warnings
 

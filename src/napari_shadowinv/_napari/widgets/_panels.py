@@ -16,6 +16,7 @@ from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, wrapping_labe
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv._system.progress import Progress
+from napari_shadowinv.physics.units import shown_fields
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
@@ -182,12 +183,22 @@ def report_rows(inversion: Inversion) -> list[tuple[str, str]]:
         ("Flux residual", f"{report.residual:.2g} (tolerance {report.tolerance:.2g})"),
         ("Image residual", f"{100 * report.image_residual:.3g} % of the mean, r.m.s."),
         ("Iterations", f"{report.iterations} on {len(report.levels)} levels"),
-        ("Sites", f"{report.n_sites:,}"),
+        ("Sites", f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; ")),
+        *_error_rows(inversion),
         ("Caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
         ("Time", f"{sum(report.seconds.values()):.2f} s"),
         *stages,
         *[("Warning", text) for text in report.warnings],
     ]
+
+
+def _error_rows(inversion: Inversion) -> list[tuple[str, str]]:
+    errors = inversion.errors
+    if errors is None:
+        return []
+    (field,) = shown_fields([inversion.displacement], inversion.setup)
+    told = [(name.capitalize(), text) for name, text in errors.rows(inversion.options)]
+    return [("Field", field.peak_text(errors.of_peak)), *told]
 
 
 class ReportTable(QtWidgets.QTableWidget):

@@ -73,8 +73,8 @@ class StackJob:
         from napari_shadowinv.stack import run_stack
 
         def tell(news: RunProgress) -> None:
-            if news.compiling:
-                on_progress(Progress("compile", 0, None, news.compiling))
+            if news.preparing:
+                on_progress(Progress("prepare", 0, None, news.preparing))
                 return
             if news.outcome is None:
                 self._recall()

@@ -1,0 +1,81 @@
+"""Noise on top of an image, drawn again and again: `noise_of`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+
+__all__ = ["Draw", "noise_of"]
+
+Draw = Callable[[np.random.Generator], FloatArray]
+
+_MOST_QUANTA = 1e18  # numpy draws no larger Poisson numbers
+
+
+def noise_of(
+    image: ArrayLike, noise: object, gain: float | None, mask: ArrayLike | None
+) -> tuple[Draw, str]:
+    """Return what draws a noisy image, and what to call it; the image itself is checked later."""
+    values = np.asarray(image)
+    if values.dtype.kind not in "buif":
+        raise InputError(f"image has values of type {values.dtype}, expected real numbers")
+    usable = np.isfinite(values)
+    if mask is not None and np.shape(mask) == values.shape:
+        usable &= np.asarray(mask, dtype=bool)
+    values = np.where(usable, values, 0.0)
+    if isinstance(noise, str):
+        if noise != "poisson":
+            raise InputError(
+                f"noise is {noise!r}, expected 'poisson', a standard deviation or an array of them"
+            )
+        return _poisson(values, gain)
+    if gain is not None:
+        raise InputError(
+            f"gain is {gain!r} and noise a standard deviation: gain belongs to noise='poisson'"
+        )
+    return _gaussian(values, np.asarray(noise), usable)
+
+
+def _poisson(values: FloatArray, gain: float | None) -> tuple[Draw, str]:
+    if gain is None:
+        if np.any(values != np.rint(values)):
+            raise InputError(
+                "image has values that are not whole numbers, so they are not counts: give the "
+                "gain (image units per detected quantum), or the noise as a standard deviation"
+            )
+        gain = 1.0
+    if not (np.isreal(gain) and 0 < gain < np.inf):
+        raise InputError(f"gain is {gain!r}, expected a positive number: image units")
+    quanta = np.maximum(values, 0) / gain
+    if quanta.max(initial=0) > _MOST_QUANTA:
+        raise InputError(
+            f"gain is {gain:g} and the brightest pixel {values.max():g}: that is more than "
+            f"{_MOST_QUANTA:g} quanta in a pixel, expected fewer: check the unit of the gain"
+        )
+    return lambda rng: gain * rng.poisson(quanta), f"Poisson, gain {gain:g}"
+
+
+def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[Draw, str]:
+    if sigma.dtype.kind not in "uif":
+        raise InputError(
+            f"noise has values of type {sigma.dtype}, expected 'poisson', a standard deviation "
+            "or an array of them"
+        )
+    if sigma.ndim > 0 and sigma.shape != values.shape:
+        raise InputError(
+            f"noise has shape {sigma.shape}, image {values.shape}: they must match, or give one "
+            "number for all pixels"
+        )
+    deviation = np.where(usable, sigma, 0.0)
+    if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
+        raise InputError(
+            "noise is zero everywhere, or somewhere negative or not finite: expected standard "
+            "deviations in the image's units"
+        )
+    described = f"Gaussian, {sigma:g}" if sigma.ndim == 0 else "Gaussian, pixel by pixel"
+    return lambda rng: values + deviation * rng.normal(size=values.shape), described

@@ -1,0 +1,145 @@
+"""What small changes of flux do to the field: `LinearResponse`.
+
+The gradient of a potential that is known at the sites: `site_gradients`.
+
+Around a solved transport the weights answer a change of flux linearly, by the Hessian that
+Newton's step has: H δw = δS - δT, and the displacement by -½ ∇δw. A level of a few thousand sites
+is enough for noise, whose displacement is mostly of long waves (its spectrum falls as 1/k²); what
+finer waves add, 1 / 2π of the noise's variance for each power of e, is told without solving.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import diags_array
+from scipy.sparse.linalg import splu
+
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.transport.sites import SitePlan
+from napari_shadowinv.transport.solvers import LevelSolution, Target
+
+__all__ = ["LinearResponse", "site_gradients"]
+
+_FELT = 2.5  # a level feels what is so many times finer than its spacing, within 5 %
+_SLIVER = 0.3  # double area by the longest side's square; of an equilateral triangle 0.87
+
+
+class LinearResponse:
+    """The response of one level's solution.
+
+    Attributes
+    ----------
+    level : Level
+        The level, of n sites.
+    spacing : float
+        Distance between its sites, px.
+    flux, area : ndarray, shape (n,)
+        What each cell holds of the image, and its pixels.
+    """
+
+    def __init__(self, solution: LevelSolution, target: Target, plan: SitePlan) -> None:
+        self.level, self._plan = solution.level, plan
+        self.spacing = solution.level.spacing
+        objective = target.objective(solution.level)
+        diagram = objective.diagram(solution.weights)
+        self.flux = diagram.masses
+        ones = Density.from_image(np.ones(solution.level.shape))
+        self.area = PowerDiagram(objective.triangulation, ones, threads=solution.threads).masses
+        laplacian = diagram.laplacian()
+        ground = objective.ground(solution.weights)
+        self._grounded = ground is not None
+        # Without a ground one potential is free.
+        matrix = laplacian[1:, 1:] if ground is None else laplacian + diags_array(ground)
+        self._factors = splu(
+            matrix.tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+
+    def to(self, changes: FloatArray) -> FloatArray:
+        """Return each triangle's displacement (t, k, 2), px, by fluxes that cells gain (k, n)."""
+        potential = np.zeros(changes.shape[::-1])
+        if self._grounded:
+            potential[:] = -0.5 * self._factors.solve(changes.T)
+        else:
+            changes = changes - changes.mean(axis=1, keepdims=True)
+            potential[1:] = -0.5 * self._factors.solve(changes.T[1:])
+        corners, slopes = self._slopes
+        return np.asarray(-np.einsum("tik,tic->tkc", potential[corners], slopes))
+
+    def finer(self, variance: FloatArray, spacing: float) -> FloatArray:
+        """Return each triangle's mean square displacement, px², by waves too fine for this level.
+
+        Those are meant that sites with such a spacing feel. `variance` is that of the flux in each
+        cell, of noise that is independent between pixels.
+        """
+        powers = math.log(max(self.spacing / (_FELT * max(spacing, 1.0)), 1.0))
+        of_cell = variance * self.area / self.flux**2
+        corners, _ = self._slopes
+        return np.asarray(of_cell[corners].mean(axis=1) * powers / (2 * np.pi))
+
+    @property
+    def places(self) -> FloatArray:
+        """Middles of the triangles, px of the image, shape (t, 2)."""
+        corners, _ = self._slopes
+        return np.asarray(self.level.sites[corners].mean(axis=1) - self._plan.margin_width)
+
+    @cached_property
+    def shares(self) -> FloatArray:
+        """What share of the used image each triangle is."""
+        corners, _ = self._slopes
+        a, b, c = np.moveaxis(self.level.sites[corners], 1, 0)
+        double = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+        used = _within(self.places, self._plan)
+        return np.asarray(double * used / max((double * used).sum(), 1e-300))
+
+    @cached_property
+    def _slopes(self) -> tuple[Indices, FloatArray]:
+        """Corners of the triangles between sites, and the gradient by each corner's value."""
+        corners = self.level.triangulation.vertices
+        corners = corners[(corners < len(self.level.sites)).all(axis=1)]
+        points = self.level.sites[corners]
+        edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)
+        double = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+        # Along the border lie slivers, on which three values tell no gradient.
+        longest = (edges**2).sum(axis=2).max(axis=1)
+        good = np.abs(double) > _SLIVER * longest
+        corners, edges, double = corners[good], edges[good], double[good]
+        normal = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
+        return corners, normal / double[:, None, None]
+
+
+def site_gradients(triangulation: RegularTriangulation, values: FloatArray) -> FloatArray:
+    """Return the gradient of values at the sites, (n, 2): the mean of the triangles around each."""
+    n = len(values)
+    corners = triangulation.vertices
+    corners = corners[(corners < n).all(axis=1)]
+    points = triangulation.sites[corners]
+    edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)
+    double = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+    # The gradient times the double area, so that each triangle counts by its area.
+    normal = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
+    slope = np.einsum("ti,tic->tc", values[corners], normal) * np.sign(double)[:, None]
+    weight = np.repeat(np.abs(double), 3)
+    total = np.maximum(np.bincount(corners.ravel(), weight, n), 1e-300)
+    found = [np.bincount(corners.ravel(), np.repeat(part, 3), n) / total for part in slope.T]
+    return np.stack(found, axis=1)
+
+
+def _within(places: FloatArray, plan: SitePlan) -> BoolArray:
+    """Which places are within the image and its mask."""
+    height, width = plan.source.shape
+    rows, columns = np.rint(places).astype(np.int64).T
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    if plan.mask is None:
+        return np.asarray(inside)
+    rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
+    return np.asarray(inside & plan.mask[rows, columns])

@@ -1,0 +1,242 @@
+"""The error budget against errors that are known: scatter of repeats, finer sites, other beams."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from napari_shadowinv import InversionOptions, ProtonSetup, invert, plan_sites, synthetic_image
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion.budget import ErrorEstimate
+from napari_shadowinv.physics import phantoms
+from napari_shadowinv.stack import invert_stack, run_stack
+
+SIDE = 96
+
+
+def focusing():
+    return phantoms.gaussian_blob((SIDE, SIDE), -60.0, (9.0, 13.0), (40.0, 55.0), 0.4)
+
+
+def strong():
+    """Close to caustics: 0.9 of the strength at which they begin."""
+    return phantoms.gaussian_blob((SIDE, SIDE), 180.0, 9.5, (50.0, 45.0))
+
+
+def pair():
+    return phantoms.ellipse_pair((80, 120))
+
+
+PHANTOMS = {one.__name__: one for one in (focusing, strong, pair)}
+
+
+@pytest.fixture(scope="module", params=PHANTOMS)
+def phantom(request):
+    return PHANTOMS[request.param]()
+
+
+@pytest.fixture(scope="module")
+def image(phantom):
+    return synthetic_image(phantom.displacement)
+
+
+def rms(displacement):
+    return float(np.sqrt((displacement**2).sum(axis=0).mean()))
+
+
+def gaussian(image, rng):
+    return image + 0.05 * rng.normal(size=image.shape)
+
+
+def counting(image, rng):
+    return rng.poisson(300 * image).astype(float)
+
+
+@pytest.mark.parametrize("noise", [gaussian, counting])
+def test_noise_is_the_scatter_of_repeats(image, noise):
+    """As 50 repeats have it, within 30 %, told by each from its own pixels."""
+    rng = np.random.default_rng(3)
+    options = InversionOptions(n_sites=image.size // 4, negative="clip")
+    plan = plan_sites(np.ones(image.shape), options)
+    found = [invert(noise(image, rng), plan=plan, options=options) for _ in range(50)]
+    moves = np.array([one.displacement for one in found])
+    scatter = np.sqrt(moves.var(axis=0, ddof=1).sum(axis=0).mean())
+    place = np.unravel_index(np.hypot(*moves.mean(axis=0)).argmax(), image.shape)
+    at_peak = np.hypot(*moves[:, :, *place].T).std(ddof=1)
+    for one in found[::10]:
+        assert one.errors.noise.rms == pytest.approx(scatter, rel=0.3)
+    told = np.mean([one.errors.noise.at_peak for one in found])
+    assert told == pytest.approx(at_peak, rel=0.4)  # which 50 repeats tell to 10 %, at one pixel
+
+
+def test_given_noise_is_used_and_scales(image):
+    told = {
+        name: invert(7 * image, options=InversionOptions(n_sites=600, **given)).errors.noise.rms
+        for name, given in {
+            "weak": {"noise_level": 0.07},
+            "strong": {"noise_level": 0.21},
+            "counts": {"quantum": 0.01},
+        }.items()
+    }
+    assert told["strong"] == pytest.approx(3 * told["weak"])
+    # On average a pixel of 7 units scatters by √(0.01 · 7) = 0.26; most are near the mean.
+    assert told["counts"] == pytest.approx(told["weak"] * 0.2646 / 0.07, rel=0.25)
+
+
+@pytest.mark.parametrize("share", [8, 2])
+def test_discretisation_is_what_many_more_sites_change(image, share):
+    few, many = (
+        invert(image, options=InversionOptions(n_sites=count))
+        for count in (image.size // share, 4 * image.size)
+    )
+    true = rms(few.displacement - many.displacement)
+    assert true / 2 < few.errors.discretisation.rms < 2 * true
+
+
+def test_the_solvers_part_is_what_a_better_solution_changes(image):
+    loose, exact = (
+        invert(image, options=InversionOptions(n_sites=2000, tolerance=tolerance))
+        for tolerance in (0.02, 1e-9)
+    )
+    true = rms(loose.displacement - exact.displacement)
+    assert true / 3 < loose.errors.solver.rms < 3 * true
+    assert exact.errors.solver.rms < 1e-3 * true
+
+
+def test_an_unmeasured_beam_is_told_by_what_other_beams_do(image):
+    """Beams that are drawn here, in another way, with the same spectrum."""
+    options = InversionOptions(n_sites=900, beam_variation=0.02, beam_scale=0.2)
+    here = invert(image, options=options)
+    rng = np.random.default_rng(4)
+    length = 0.2 * min(image.shape)
+    moved = []
+    for _ in range(12):
+        white = rng.normal(size=[3 * side for side in image.shape])
+        smooth = gaussian_filter(white, length / np.sqrt(2), mode="wrap")
+        smooth = smooth[: image.shape[0], : image.shape[1]]
+        smooth -= smooth.mean()
+        beam = 1 + 0.02 * smooth / smooth.std()
+        moved.append(invert(image, source=beam, options=options).displacement - here.displacement)
+    true = float(np.sqrt(np.mean([rms(one) ** 2 for one in moved])))
+    assert here.errors.beam.rms == pytest.approx(true, rel=0.35)
+    assert here.errors.beam.rms > 10 * here.errors.noise.rms
+
+
+def test_a_measured_beam_is_not_doubted(image):
+    assert invert(image, source=np.ones(image.shape)).errors.beam is None
+    plan = plan_sites(np.ones(image.shape), measured=False)
+    assert invert(image, plan=plan).errors.beam is not None
+
+
+def test_accuracy_decides_on_the_sites_and_is_kept(image):
+    finest = invert(image, options=InversionOptions(n_sites=4 * image.size))
+    counts = []
+    for accuracy in (0.1, 0.02, 0.005):
+        found = invert(image, options=InversionOptions(accuracy=accuracy))
+        counts.append(found.report.n_sites)
+        off = rms(found.displacement - finest.displacement) / rms(finest.displacement)
+        assert off < 1.5 * accuracy
+        assert found.report.sites_reason
+    assert counts == sorted(counts)
+    assert image.size // 16 < counts[0] <= counts[2] <= image.size
+
+
+def test_noise_needs_fewer_sites():
+    clean = synthetic_image(pair().displacement)
+    noisy = clean + 0.2 * np.random.default_rng(5).normal(size=clean.shape)
+    options = InversionOptions(accuracy=1e-3, negative="clip")
+    reports = [invert(one, options=options).report for one in (clean, noisy)]
+    assert reports[1].n_sites < reports[0].n_sites
+    assert "noise" in reports[1].sites_reason
+
+
+def test_a_pattern_that_few_sites_miss_gets_more():
+    """A field of long waves is known soon; a fine pattern that lies on it needs the pixels."""
+    broad = synthetic_image(phantoms.gaussian_blob((192, 192), 250.0, 28.0).displacement)
+    y, x = np.indices(broad.shape)
+    fine = broad * (1 + 0.4 * np.cos(np.pi * x / 3) * np.cos(np.pi * y / 3))
+    options = InversionOptions(accuracy=0.2)
+    plain, patterned = (invert(one, options=options).report for one in (broad, fine))
+    assert plain.n_sites < patterned.n_sites
+    assert "missed structures" in patterned.sites_reason
+    assert patterned.warnings == ()
+
+
+def test_what_is_given_is_used_and_the_paper_has_a_site_a_pixel(image):
+    given = invert(image, options=InversionOptions(n_sites=300, accuracy=1e-6)).report
+    assert (given.n_sites, given.sites_reason) == (300, "as given")
+    small = image[:20, :24]
+    assert invert(small, options=InversionOptions.paper(max_iterations=3)).report.n_sites == 480
+
+
+def test_an_accuracy_out_of_reach_is_told():
+    image = synthetic_image(pair().displacement)
+    report = invert(image, options=InversionOptions(accuracy=1e-6)).report
+    assert report.n_sites == image.size
+    assert any("the accuracy of 0.0001 % is not reached" in text for text in report.warnings)
+
+
+def test_nothing_is_told_of_an_answer_that_is_none(image):
+    report = invert(image, options=InversionOptions(n_sites=900, max_iterations=1)).report
+    assert not report.converged
+    assert report.errors is None
+
+
+def test_a_start_has_the_sites_of_the_shot_before(image):
+    options = InversionOptions(accuracy=0.05)
+    plan = plan_sites(np.ones(image.shape), options)
+    first = invert(image, plan=plan, options=options)
+    again = invert(image, plan=plan, start=first, options=options)
+    assert again.report.n_sites == first.report.n_sites
+    assert again.report.errors.noise.rms == pytest.approx(first.report.errors.noise.rms, rel=0.1)
+
+
+def test_a_dataset_keeps_the_errors_and_has_them_in_si(image, proton_setup: ProtonSetup):
+    found = invert(image, options=InversionOptions(n_sites=900))
+    dataset = found.to_dataset(proton_setup)
+    assert Inversion.from_dataset(dataset).errors == found.errors
+    in_si = json.loads(dataset.attrs["errors_si"])
+    strongest = np.sqrt((dataset[in_si["field"]] ** 2).sum("component")).max().item()
+    assert in_si["peak"] == pytest.approx(strongest)
+    assert in_si["unit"] == dataset[in_si["field"]].attrs["units"]
+    of_px = found.errors.noise.at_peak / found.errors.peak
+    assert in_si["noise"][1] == pytest.approx(of_px * strongest)
+
+
+def test_errors_have_units():
+    budget = dataclasses.replace(
+        invert(synthetic_image(pair().displacement)).errors, beam=ErrorEstimate(3.0, 2.0)
+    )
+    twice = budget.scaled(2.0)
+    assert twice.beam == (6.0, 4.0)
+    assert twice.noise.rms == 2 * budget.noise.rms
+    assert twice.of_peak == pytest.approx(budget.of_peak)
+
+
+def test_the_first_shots_decide_for_a_stack(tmp_path):
+    """All shots have the sites that the first ones need, also those that come later."""
+    easy = synthetic_image(phantoms.gaussian_blob((64, 64), 30.0, 14.0).displacement)
+    hard = synthetic_image(phantoms.gaussian_blob((64, 64), 40.0, 4.0).displacement)
+    options = InversionOptions(accuracy=0.03)
+    alone = [invert(one, options=options).report.n_sites for one in (easy, hard)]
+    assert alone[0] < alone[1]
+    out = tmp_path / "stack.shadowinv.zarr"
+    shots = tmp_path / "shots"
+    shots.mkdir()
+    for number in range(4):
+        np.save(shots / f"{number}.npy", easy)
+    asked = {"options": options, "variables": ("displacement", "sites")}
+    store = run_stack(str(shots / "*.npy"), out, **asked)
+    assert store.sizes["site"] == alone[0]
+    np.save(shots / "4.npy", hard)
+    store = run_stack(str(shots / "*.npy"), out, **asked)
+    assert store.sizes == {**store.sizes, "shot": 5, "site": alone[0]}
+    assert (store.discretisation_error.values[:4] < store.discretisation_error.values[4]).all()
+    reasons = {json.loads(str(text))["sites_reason"] for text in store.report.values}
+    assert reasons == {"as many as the first shots needed for the accuracy"}
+    lazy = invert_stack(np.stack([easy, hard]), options=options)
+    assert lazy.sizes["site"] == alone[1]
