@@ -160,10 +160,10 @@ def test_stages_agree():
 def test_an_unsolved_image_leaves_the_solution_of_a_blurred_one(stages):
     plan = planned(UNIFORM)
     image = raised(one_pixel())
-    options = InversionOptions(stages=stages, max_iterations=30)
+    options = InversionOptions(stages=stages, max_iterations=27)
     answer = solve(plan.levels, image, options)[-1]
     assert not answer.converged
-    assert "all 30 iterations" in answer.reason
+    assert "all 27 iterations" in answer.reason
     told = re.search(r"blurred by (\S+) px", answer.reason)
     level = plan.levels[-1]
     widths = np.linspace(0.9, 1.1, 21) * float(told[1])
@@ -186,7 +186,7 @@ def test_a_solution_short_of_the_tolerance_is_better_than_that_of_a_blurred_imag
     assert "blurred" not in answer.reason
 
 
-@pytest.mark.parametrize("most", [1, 7, 25])
+@pytest.mark.parametrize("most", [1, 7, 15])
 def test_no_level_takes_more_steps_than_allowed(most):
     plan = planned(UNIFORM)
     for stages in ("single", "multi"):

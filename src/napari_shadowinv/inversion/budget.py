@@ -41,7 +41,7 @@ _SHARE_OF_NOISE = 0.2
 _NOTABLE = 0.02  # of the largest error
 
 _RESPONDING = 4500  # sites, at most, whose linear response is worked out
-_NOISE_SAMPLES, _BEAM_SAMPLES, _WAVES = 16, 8, 32
+_NOISE_SAMPLES, _BEAM_SAMPLES, _WAVES = 16, 8, 16
 _NEAR = 2.5  # site spacings
 
 
@@ -287,7 +287,7 @@ class Budget:
         """What the solver has put into wrong cells."""
         gap = solution.flux - solution.level.mass
         # Which of the few sites each of the many is near is looked up by squares.
-        size = response.spacing / 4
+        size = response.spacing / 2
         height, width = (int(side / size) + 1 for side in solution.level.shape)
         middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * size - 0.5
         nearest = KDTree(response.level.sites).query(middles)[1]

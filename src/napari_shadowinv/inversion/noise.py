@@ -25,7 +25,7 @@ __all__ = ["ImageNoise"]
 _CLIPPED_AT = 4.0  # in standard deviations of normal noise
 _NORMAL_MAD = 1.4826
 _DEVIATIONS = 5.0
-_BINS, _SAMPLES = 24, 50_000  # of brightness, and the pixels that are looked at
+_BINS, _SAMPLES = 24, 20_000  # of brightness, and the pixels that are looked at
 
 
 class ImageNoise:

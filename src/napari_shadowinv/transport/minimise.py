@@ -20,6 +20,7 @@ from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import Reporter
@@ -32,6 +33,8 @@ __all__ = ["SHORTEST_STEP", "descend", "newton", "with_full_cells"]
 
 SHORTEST_STEP = 1e-7
 
+_EVENINGS, _EVENING_SHARE = 3, 0.6
+_UNEVEN = 1.0  # largest relative flux error of a cell
 _PATIENCE = 15  # steps within which the error must halve, or the start was a bad one
 _LINEAR_TOLERANCE = 1e-2
 _SHARES_OF_START = (0.999, 0.99, 0.9, 0.5)
@@ -60,7 +63,7 @@ def newton(
     less than `shortest_step` of Newton's step would be possible.
     """
     mass = objective.mass
-    diagram = objective.diagram(weights)
+    weights, diagram = _evened_out(objective, weights)
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     errors = [_length(mass - diagram.masses)]
@@ -94,6 +97,40 @@ def newton(
     converged = residual <= tolerance
     reason = "" if converged else reason
     return Solution(objective.in_gauge(weights), residual, len(errors) - 1, converged, reason)
+
+
+def _evened_out(
+    objective: TransportObjective, weights: FloatArray
+) -> tuple[FloatArray, PowerDiagram]:
+    """Let cells that are almost empty or far too full settle with their neighbours.
+
+    A start from coarser sites has a few such cells near caustics, and they alone would keep
+    Newton's steps short for the whole image.
+    """
+    diagram = objective.diagram(weights)
+    for _ in range(_EVENINGS):
+        if objective.residual(diagram) <= _UNEVEN:
+            break
+        gap = np.clip(objective.mass - diagram.masses, -objective.mass, objective.mass)
+        stiffness = _stiffness(diagram.laplacian())
+        if not stiffness.all():
+            break
+        step = _EVENING_SHARE * gap / stiffness
+        trial = objective.diagram_if_full(weights + step)
+        if trial is None:
+            # The triangulation has followed the trial.
+            return weights, objective.diagram(weights)
+        weights, diagram = weights + step, trial
+    return weights, diagram
+
+
+def _stiffness(laplacian: csr_array) -> FloatArray:
+    """Diagonal of a Laplacian, of nodes with hardly any ties the mean of their neighbours'."""
+    diagonal = laplacian.diagonal()
+    ties = laplacian.copy()
+    ties.data = np.ones_like(ties.data)
+    around = (ties @ diagonal) / np.diff(ties.indptr)
+    return np.asarray(np.maximum(diagonal, around))
 
 
 def _damped_step(
