@@ -524,3 +524,36 @@ def test_bad_weights_are_refused() -> None:
         triangulation.update([0.0, 0.0, 0.0])
     with pytest.raises(InputError, match="infinity"):
         triangulation.update([0.0, np.inf])
+
+
+@pytest.mark.parametrize("sorted_first", [False, True])
+def test_more_sites_are_put_in_as_if_they_had_been_there(sorted_first):
+    """Beside the first ones, among them, and at their places; the order of all is that given."""
+    rng = np.random.default_rng(7)
+    first = rng.uniform(0, 10, (300, 2))
+    if sorted_first:
+        first = first[hilbert_order(first)]
+    more = np.concatenate([rng.uniform(-2, 12, (80, 2)), first[:3]])
+    before = RegularTriangulation(first)
+    known = before.vertices.copy()
+    grown = before.with_more(more)
+    everything = np.concatenate([first, more])
+    np.testing.assert_array_equal(grown.sites, everything)
+    np.testing.assert_array_equal(before.vertices, known)
+    assert grown.hidden.sum() == 3
+
+    def triangles(triangulation):
+        places = triangulation.points[triangulation.vertices]
+        inner = (triangulation.vertices < len(everything)).all(axis=1)
+        return {tuple(sorted(map(tuple, corners))) for corners in places[inner].round(9).tolist()}
+
+    assert triangles(grown) == triangles(RegularTriangulation(everything))
+    weights = rng.uniform(0, 0.05, len(everything))
+    grown.update(weights)
+    anew = RegularTriangulation(everything, weights)
+    assert triangles(grown) == triangles(anew)
+
+
+def test_no_more_sites_are_a_copy():
+    before = RegularTriangulation([[0, 0], [0, 4], [4, 0], [4, 3]])
+    np.testing.assert_array_equal(before.with_more(np.empty((0, 2))).vertices, before.vertices)

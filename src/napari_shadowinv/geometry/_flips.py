@@ -411,6 +411,21 @@ def build(mesh: Mesh, order: IntArray, first: int, last: int) -> int:
     return status
 
 
+@kernel_that_allocates
+def add(mesh: Mesh, order: IntArray) -> int:
+    """Insert sites that are in the arrays of the mesh, but not yet in its triangles."""
+    _begin(mesh, REMOVE)
+    status = DONE
+    for v in order:
+        status = insert(mesh, v, 1.0)
+        if status != DONE:
+            break
+    if status == DONE and mesh.counters[_mesh.OVERFLOW] == 1:
+        status = _sweep(mesh, np.empty(0, np.bool_))
+    _mesh.compact(mesh)
+    return status
+
+
 @kernel
 def _stay_behind(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
     """Return the corners of overturned triangles to their origins; tell if there were any."""

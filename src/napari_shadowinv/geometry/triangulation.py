@@ -269,6 +269,45 @@ class RegularTriangulation:
         twin._mesh = Mesh._make([self._mesh.points, *(array.copy() for array in self._mesh[1:])])
         return twin
 
+    def with_more(self, sites: ArrayLike) -> RegularTriangulation:
+        """Return a triangulation of these sites and, after them, others that weigh nothing.
+
+        It takes time for the others alone. They must not lie far outside the region.
+        """
+        if not np.size(sites):
+            return self.copy()
+        given = _checked_points(sites)
+        count, n = len(given), self._mesh.hidden.size
+        order = hilbert_permutation(given)
+        old = self._mesh
+        size = 6 * (n + count) + 6
+        used = 3 * old.counters[SIZE]
+
+        def grown(values: Indices, spare: int) -> Indices:
+            larger = np.empty(size, np.int32)
+            larger[:used] = values[:used] + np.where(values[:used] >= spare, count, 0)
+            return larger
+
+        twin = object.__new__(RegularTriangulation)
+        twin._region, twin._ghost_distance = self._region, self._ghost_distance
+        own = np.arange(n, dtype=np.int32) if self._order is None else self._order
+        twin._order = np.append(own, n + order).astype(np.int32)
+        counters = old.counters.copy()
+        counters[LIMIT] += 100 * count
+        twin._mesh = Mesh(
+            points=np.concatenate([old.points[:n], given[order], old.points[n:]]),
+            weights=np.concatenate([old.weights[:n], np.zeros(count), old.weights[n:]]),
+            corners=grown(old.corners, n),
+            twins=grown(old.twins, size),
+            hidden=np.append(old.hidden, np.ones(count, np.bool_)),
+            stack=np.empty(STACK_SIZE, np.int64),
+            counters=counters,
+            scratch=np.empty(16),
+        )
+        if _flips.add(twin._mesh, n + insertion_order(count)) == _flips.EXHAUSTED:
+            raise RuntimeError(twin._exhausted())
+        return twin
+
     def _build(self, alive: Callable[[], None] | None = None) -> None:
         order = insertion_order(self._mesh.hidden.size)
         for first in range(0, order.size, _PART):

@@ -32,12 +32,12 @@ from napari_shadowinv.transport.solvers import LevelSolution, Target
 
 __all__ = ["Budget", "ErrorEstimate", "Errors"]
 
-_PLACES = 64  # along the longer side, where levels are compared
+_PLACES = 48  # along the longer side, where levels are compared
 _USUAL_RATE, _RATES = 0.35, (0.25, 0.7)  # of the change between levels to the one before
 _WHOLE = 3.0  # times the sites of the level before: a whole step
 _SAFETY = 1.3
 _SOLVED = 0.1  # largest residual of a level that tells anything
-_SHARE_OF_NOISE = 0.2
+_SHARE_OF_NOISE, _MUCH_NOISE = 0.2, 0.8
 _NOTABLE = 0.02  # of the largest error
 
 _RESPONDING = 4500  # sites, at most, whose linear response is worked out
@@ -146,6 +146,7 @@ class Budget:
         self._places = _places(prepared)
         self._moves: dict[LevelSolution, FloatArray] = {}
         self._responses: dict[LevelSolution, LinearResponse] = {}
+        self._by_noise: dict[LinearResponse, tuple[FloatArray, FloatArray]] = {}
         self.reason = ""
 
     def needed(self, solutions: Sequence[LevelSolution]) -> float:
@@ -164,10 +165,13 @@ class Budget:
         if error <= allowed:
             self.reason = f"{told}, below the accuracy of {100 * self._options.accuracy:.2g} %"
             return 0.0
-        response = self._response(solved)
-        moves, finer = self._by_noise(response, solved[-1].level.spacing)
-        by_noise = (moves**2).sum(axis=2).mean(axis=1) + finer
-        noise = math.sqrt(float((by_noise * response.shares).sum()))
+        # About, in a uniform beam; where that is small enough, it need not be known better.
+        noise, _ = self._noise.displacements(self._noise.typical)
+        if error < _MUCH_NOISE * noise:
+            response = self._response(solved)
+            moves, finer = self._noisy_moves(response, solved[-1].level.spacing)
+            by_noise = (moves**2).sum(axis=2).mean(axis=1) + finer
+            noise = math.sqrt(float((by_noise * response.shares).sum()))
         if error < _SHARE_OF_NOISE * noise:
             self.reason = f"{told}, below a fifth of what the noise does ({_percent(noise, rms)})"
             return 0.0
@@ -211,7 +215,7 @@ class Budget:
             peak=float(length.max()),
             rms=float(np.sqrt(np.mean(length[mask] ** 2))),
             discretisation=discretisation,
-            noise=estimate(*self._by_noise(response, solved[-1].level.spacing)),
+            noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
             solver=estimate(response.to(self._left_by_solver(response, solved[-1]))),
             beam=None if self._plan.measured else estimate(response.to(self._beams(response))),
         )
@@ -257,17 +261,22 @@ class Budget:
         few = sum(count <= _RESPONDING for count in levels.counts)
         level = levels[max(few - 1, 0)]
         objective = self._target.objective(level)
-        weights = with_full_cells(objective, 2 * solution.surface(level.sites))
+        weights, _ = with_full_cells(objective, 2 * solution.surface(level.sites))
         return LevelSolution.of_level(level, objective, Solution(weights, math.nan, 0, False))
 
-    def _by_noise(self, response: LinearResponse, spacing: float) -> tuple[FloatArray, FloatArray]:
+    def _noisy_moves(
+        self, response: LinearResponse, spacing: float
+    ) -> tuple[FloatArray, FloatArray]:
         """Displacements by noise, and the mean square of what only sites so close feel."""
-        rng = np.random.default_rng(self._options.seed)
-        mean = self._prepared.source[self._prepared.mask].mean() / self._prepared.unit
-        brightness = response.flux / (response.area * mean)
-        variance = self._noise.variance(brightness) * mean**2 * response.area
-        drawn = np.sqrt(variance) * rng.normal(size=(_NOISE_SAMPLES, len(variance)))
-        return response.to(drawn), response.finer(variance, spacing)
+        if response not in self._by_noise:
+            rng = np.random.default_rng(self._options.seed)
+            mean = self._prepared.source[self._prepared.mask].mean() / self._prepared.unit
+            brightness = response.flux / (response.area * mean)
+            variance = self._noise.variance(brightness) * mean**2 * response.area
+            drawn = np.sqrt(variance) * rng.normal(size=(_NOISE_SAMPLES, len(variance)))
+            self._by_noise[response] = response.to(drawn), variance
+        moves, variance = self._by_noise[response]
+        return moves, response.finer(variance, spacing)
 
     def _beams(self, response: LinearResponse) -> FloatArray:
         """What a beam that is not what was assumed would add to the cells."""

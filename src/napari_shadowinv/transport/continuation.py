@@ -155,7 +155,7 @@ def _starts(
     """Yield the weights to start from, the most promising first."""
     if not solved:
         yield np.zeros(len(level.sites))
-        yield with_full_cells(objective, _same_moments(level, objective.image.image))
+        yield with_full_cells(objective, _same_moments(level, objective.image.image))[0]
         return
     last = solved[-1]
     if len(solved) > 1:

@@ -55,15 +55,21 @@ def newton(
     tolerance: float,
     max_iterations: int,
     shortest_step: float = SHORTEST_STEP,
+    fill: bool = False,
     report: Reporter | None = None,
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
 
-    It gives up where the error has not halved in many steps (the start was a bad one), and where
-    less than `shortest_step` of Newton's step would be possible.
+    Where cells may be empty at the start, they are to be filled first (`with_full_cells`). It
+    gives up where the error has not halved in many steps (the start was a bad one), and where less
+    than `shortest_step` of Newton's step would be possible.
     """
     mass = objective.mass
-    weights, diagram = _evened_out(objective, weights)
+    if fill:
+        weights, diagram = with_full_cells(objective, weights)
+    else:
+        diagram = objective.diagram(weights)
+    weights, diagram = _evened_out(objective, weights, diagram)
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     errors = [_length(mass - diagram.masses)]
@@ -100,14 +106,13 @@ def newton(
 
 
 def _evened_out(
-    objective: TransportObjective, weights: FloatArray
+    objective: TransportObjective, weights: FloatArray, diagram: PowerDiagram
 ) -> tuple[FloatArray, PowerDiagram]:
     """Let cells that are almost empty or far too full settle with their neighbours.
 
     A start from coarser sites has a few such cells near caustics, and they alone would keep
     Newton's steps short for the whole image.
     """
-    diagram = objective.diagram(weights)
     for _ in range(_EVENINGS):
         if objective.residual(diagram) <= _UNEVEN:
             break
@@ -163,8 +168,10 @@ def _length(vector: FloatArray) -> float:
     return float(np.sqrt(np.sum(vector * vector)))
 
 
-def with_full_cells(objective: TransportObjective, weights: FloatArray) -> FloatArray:
-    """Find weights near the given ones for which every cell holds some flux.
+def with_full_cells(
+    objective: TransportObjective, weights: FloatArray
+) -> tuple[FloatArray, PowerDiagram]:
+    """Find weights near the given ones for which every cell holds some flux, and their diagram.
 
     Hidden sites are lowered to where they just show; then a little of the zero weights,
     for which every cell is round and full, is mixed in.
@@ -173,8 +180,9 @@ def with_full_cells(objective: TransportObjective, weights: FloatArray) -> Float
     for share in _SHARES_OF_START:
         diagram = objective.diagram_if_full(share * shown)
         if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
-            return share * shown
-    return np.zeros(len(weights))
+            return share * shown, diagram
+    weights = np.zeros(len(weights))
+    return weights, objective.diagram(weights)
 
 
 def descend(

@@ -75,11 +75,10 @@ class Level:
         points, origin, sense = with_mirror_images(
             self.sites, self.shape, _MIRROR_BAND * self.spacing
         )
-        order = hilbert_order(points)
         return Mirrored(
-            RegularTriangulation(points[order]),
-            origin[order].astype(np.int32),
-            sense[order].astype(np.int8),
+            self.triangulation.with_more(points[len(self.sites) :]),
+            origin.astype(np.int32),
+            sense.astype(np.int8),
         )
 
     def split(self, factor: int) -> Level:

@@ -26,7 +26,7 @@ from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.transport.continuation import blurred, sharpen
 from napari_shadowinv.transport.margin import Margin
-from napari_shadowinv.transport.minimise import descend, newton, with_full_cells
+from napari_shadowinv.transport.minimise import descend, newton
 from napari_shadowinv.transport.objective import OpenObjective, Solution, TransportObjective
 from napari_shadowinv.transport.sites import Level, Levels
 
@@ -209,7 +209,8 @@ def _solve_from(
         shown = objective.triangulation.update(start, stop_when_hidden=True)
         solution = newton(
             objective,
-            start if shown else with_full_cells(objective, start),
+            start,
+            fill=not shown,
             tolerance=options.tolerance,
             max_iterations=min(_WARM_STEPS, options.max_iterations),
             shortest_step=_SHORTEST_WARM_STEP,
@@ -274,8 +275,14 @@ def _solve_level(
     if weights is None:
         weights = np.zeros(len(objective.mass))
     if options.solver == "newton":
-        start = with_full_cells(objective, weights)
-        return newton(objective, start, tolerance=tolerance, max_iterations=most, report=report)
+        return newton(
+            objective,
+            weights,
+            fill=True,
+            tolerance=tolerance,
+            max_iterations=most,
+            report=report,
+        )
     return descend(
         objective, weights, options.solver, tolerance=tolerance, max_iterations=most, report=report
     )
