@@ -63,7 +63,7 @@ def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch
         result = CliRunner().invoke(app, shlex.split(line))
         assert result.exit_code == 0, result.output
     measured = read("shot.shadowinv")
-    assert float(measured.attrs["image_residual"]) == pytest.approx(0.0536, abs=5e-4)
+    assert float(measured.attrs["image_residual"]) == pytest.approx(0.0825, abs=5e-4)
     from napari_shadowinv.inversion.labels import setup_from_dataset
 
     setup = setup_from_dataset(measured)
@@ -74,7 +74,7 @@ def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch
     assert peak(np.asarray(measured.displacement)) == pytest.approx(15.0, abs=0.1)
     uniform = invert(read("shot.tif").image, options=InversionOptions())
     assert peak(uniform.displacement) == pytest.approx(13.7, abs=0.1)
-    assert uniform.report.image_residual == pytest.approx(0.0441, abs=5e-4)
+    assert uniform.report.image_residual == pytest.approx(0.0603, abs=5e-4)
     assert any("reaches the image's edge" in text for text in uniform.report.warnings)
 
 
@@ -189,17 +189,18 @@ def test_the_table_of_sources_is_as_the_inversions_say():
     setup = phantoms.paper_setup()
     truth = phantoms.four_toroids(image.shape, setup, 0.8).displacement
     assert 1e3 * np.hypot(*setup.path_integrated_b(truth)).max() == pytest.approx(10.8, abs=0.05)
-    rows = re.findall(r"^\| ([a-z].*?) \| ([\d.]+) \| (\d+) \|", text_of("no-reference.md"), re.M)
+    pattern = r"^\| ([a-z].*?) \| ([\d.]+) \| (\d+) \| ([\d.]+) \|"
+    rows = re.findall(pattern, text_of("no-reference.md"), re.M)
     by_title = {f"estimate: {model.title}": model for model in ESTIMATES.values()}
     by_title["uniform"] = ESTIMATES["uniform"]
     assert len(rows) == 5
-    for title, peak, error in rows:
+    for title, peak, error, residual in rows:
         beam = source if title.startswith("the one") else by_title[title]().source(image, None)
         found = invert(image, source=beam)
         strength = 1e3 * np.hypot(*setup.path_integrated_b(found.displacement))
         assert strength.max() == pytest.approx(float(peak), abs=0.06), title
         wrong = 100 * np.linalg.norm(found.displacement - truth) / np.linalg.norm(truth)
         assert wrong == pytest.approx(float(error), abs=0.6), title
-        assert 100 * found.report.image_residual == pytest.approx(4.25, abs=0.1), title
+        assert 100 * found.report.image_residual == pytest.approx(float(residual), abs=0.06)
         warned = any("reaches the image's edge" in text for text in found.report.warnings)
         assert warned == title.startswith("estimate"), title

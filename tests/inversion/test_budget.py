@@ -13,6 +13,8 @@ from napari_shadowinv import InversionOptions, ProtonSetup, invert, plan_sites, 
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.budget import ErrorEstimate
 from napari_shadowinv.physics import phantoms
+from napari_shadowinv.pipeline import run
+from napari_shadowinv.preprocessing import PolynomialEstimate, Recipe
 from napari_shadowinv.stack import invert_stack, run_stack
 
 SIDE = 96
@@ -240,3 +242,18 @@ def test_the_first_shots_decide_for_a_stack(tmp_path):
     assert reasons == {"as many as the first shots needed for the accuracy"}
     lazy = invert_stack(np.stack([easy, hard]), options=options)
     assert lazy.sizes["site"] == alone[1]
+
+
+def test_every_way_to_an_inversion_knows_whether_the_beam_was_measured(tmp_path):
+    image = synthetic_image(pair().displacement)
+    options = InversionOptions(n_sites=900)
+    uniform = Recipe(options=options)
+    estimated = Recipe(options=options, source=PolynomialEstimate(degree=1))
+    assert run(uniform, image).errors.beam is not None
+    assert run(estimated, image).errors.beam is not None
+    assert run(uniform, image, source=np.ones(image.shape)).errors.beam is None
+    for given, is_measured in (({}, False), ({"source": np.ones(image.shape)}, True)):
+        out = tmp_path / f"{is_measured}.shadowinv.zarr"
+        store = run_stack(image[None], out, options=options, **given)
+        (report,) = (json.loads(str(text)) for text in store.report.values)
+        assert (report["errors"]["beam"] is None) == is_measured

@@ -454,9 +454,9 @@ def test_a_real_plume_with_its_real_reference_is_explained(shared_data):
     folder = shared_data / "burner" / "data"
     shot = read(folder / "Image_20241017221829851.bmp").binned(2)
     reference = read(folder / "Image_00000.bmp").binned(2)
-    inversion = invert(shot.image, source=reference.image)
+    options = InversionOptions(n_sites=shot.image.size)
+    inversion = invert(shot.image, source=reference.image, options=options)
     assert inversion.report.converged
-    assert inversion.report.n_sites <= 576 * 464
     unexplained = inversion.residual.std() / reference.image.mean()
     modulation = (inversion.image - reference.image).std() / reference.image.mean()
     assert unexplained < 0.01

@@ -121,7 +121,6 @@ def test_threads_that_ask_at_once_get_the_same_plan(night, plans_made):
         thread.join()
     assert len(plans_made) == 1
     assert all(plan is plans[0] for plan in plans)
-    assert all("mirrored" in vars(level) for level in plans[0].levels)  # type: ignore[attr-defined]
 
 
 def test_plans_are_told_apart_by_source_mask_and_options_not_by_threads(night, plans_made):

@@ -302,6 +302,8 @@ class CloughTocher:
         nearest hull site is continued linearly.
         """
         queries = np.ascontiguousarray(queries, dtype=np.float64)
+        if not queries.flags.writeable:  # the kernel is compiled for one type
+            queries = queries.copy()
         out = np.zeros(len(queries))
         surface = (*arrays_of(self._triangulation), self._values, self._gradients)
         blocks = -(-len(queries) // BLOCK)

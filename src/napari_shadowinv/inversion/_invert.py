@@ -82,10 +82,12 @@ def plan_sites(
         seed=options.seed,
         threads=options.threads,
     )
+    levels = plan.levels
     if not options.is_adaptive:
-        plan.levels.heard_by(Reporter(on_progress, should_stop)).made(options.threads)
+        levels = levels.heard_by(Reporter(on_progress, should_stop)).made(options.threads)
     return replace(
         plan,
+        levels=levels,
         source=ground.beam * ground.unit,
         mask=ground.mask,
         margin=ground.margin,
@@ -229,13 +231,10 @@ def invert(
             image_flux = fitted_flux(levels, prepared.floored_image, plan.margin, options, report)
             scale = prepared.flux_scale / image_flux
             prepared = prepare(image, source, options, mask, flux_scale=scale)
-        unscaled = replace(
-            prepared, image=prepared.image / prepared.unit, source=prepared.source / prepared.unit
-        )
-        noise = ImageNoise(unscaled, options)
+        noise = ImageNoise(prepared.in_units(), options)
         budget = Budget(plan, prepared, noise, options)
         if start is not None:
-            levels = _up_to(start, levels, plan.margin_width)
+            levels = _up_to(start, levels, plan.margin_width, any_count=options.is_adaptive)
     adaptive = options.is_adaptive and start is None
     solutions: list[LevelSolution] = []
     coarse = 0
@@ -255,12 +254,12 @@ def invert(
         with _timed("read-out", seconds):
             fields = _read_fields(plan, prepared, answer, options, report)
         more = adaptive and answer.converged and len(answer.weights) < levels.counts[-1]
-        if not more or not is_coarse(unscaled, fields.reprojection, noise):
+        if not more or not is_coarse(prepared.in_units(), fields.reprojection, noise):
             break
         coarse = len(answer.weights)
     with _timed("errors", seconds):
         errors = budget.errors(solutions, fields.displacement) if answer.converged else None
-    told = _report(unscaled, noise, solutions, fields, seconds, options)
+    told = _report(prepared.in_units(), noise, solutions, fields, seconds, options)
     finest = adaptive and len(answer.weights) == levels.counts[-1]
     if finest and errors is not None and told.warnings == prepared.warnings:
         told = replace(told, warnings=(*told.warnings, *filter(None, [budget.missed(errors)])))
@@ -385,10 +384,10 @@ def _read_fields(
     )
 
 
-def _up_to(start: Inversion, levels: Levels, margin_width: int) -> Levels:
+def _up_to(start: Inversion, levels: Levels, margin_width: int, *, any_count: bool) -> Levels:
     """Return the levels up to that of an inversion to start from, if its sites are the same."""
     found = start.sites + margin_width
-    if len(found) <= levels.counts[-1]:
+    if len(found) in levels.counts or (any_count and len(found) < levels.counts[-1]):
         up_to = levels.up_to(len(found))
         level = up_to[-1]
         if np.abs(found - level.sites).max() <= 1e-3 * level.spacing:

@@ -14,6 +14,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -141,13 +142,16 @@ class Budget:
         options: InversionOptions,
     ) -> None:
         self._plan, self._prepared = plan, prepared
-        self._target = Target.of(prepared.floored_image, plan.margin, options)
         self._noise, self._options = noise, options
         self._places = _places(prepared)
         self._moves: dict[LevelSolution, FloatArray] = {}
         self._responses: dict[LevelSolution, LinearResponse] = {}
         self._by_noise: dict[LinearResponse, tuple[FloatArray, FloatArray]] = {}
         self.reason = ""
+
+    @cached_property
+    def _target(self) -> Target:
+        return Target.of(self._prepared.floored_image, self._plan.margin, self._options)
 
     def needed(self, solutions: Sequence[LevelSolution]) -> float:
         """Return how many times as many sites are needed.

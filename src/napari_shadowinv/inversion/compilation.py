@@ -1,17 +1,29 @@
 """The compiler's work, done once after an installation.
 
 - do it before an inversion that somebody waits for: `ensure_compiled`
+- the half of it that needs no triangulation, for a second process: `compile_rest`
 - how often it is waited for: `how_often`
 - whether it was done: `is_compiled`; where its result is kept: `code_folder`
 """
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+
+_REST = "from napari_shadowinv.inversion.compilation import compile_rest; compile_rest()"
+_NODES = 300  # enough for a multigrid
 
 
 def ensure_compiled(
@@ -25,7 +37,69 @@ def ensure_compiled(
     Reporter(on_progress, should_stop)("compile", 0, None, how_often())
     y, x = np.indices((64, 64)) / 64  # enough sites for every kernel to be used
     uneven = np.exp(-4 * (y + x))
-    invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)
+    with _rest_beside():
+        invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)
+
+
+@contextmanager
+def _rest_beside() -> Iterator[None]:
+    """Have another process compile what this one needs last, which loads what is there by then."""
+    # Numba lets one thread of a process compile at a time.
+    executable = Path(sys.executable or "")
+    alone = available_threads(None) == 1 or not executable.stem.lower().startswith("python")
+    if alone or code_folder() is None:
+        yield
+        return
+    import numba
+
+    found: Any = numba.config
+    environment = os.environ | ({"NUMBA_CACHE_DIR": found.CACHE_DIR} if found.CACHE_DIR else {})
+    helper = subprocess.Popen(
+        [executable, "-c", _REST],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+    )
+    try:
+        yield
+    finally:
+        helper.terminate()  # what it has not done by now is done
+        helper.wait()
+
+
+def compile_rest() -> None:
+    """Compile what an inversion does with a triangulation once it is there, last things first."""
+    from scipy.spatial import Delaunay
+
+    from napari_shadowinv.geometry.density import Density
+    from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
+    from napari_shadowinv.geometry.power_diagram import PowerDiagram
+    from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.transport.linear import LaplacianSolver
+
+    synthetic_image(np.zeros((2, 8, 8)), np.ones((8, 8)))
+    sites = np.random.default_rng(0).uniform(0, 19, (_NODES, 2))
+    ghosts = 1e3 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    points = np.concatenate([sites, ghosts])
+    mesh = Delaunay(points)
+    arrays = {
+        "points": points,
+        "weights": np.zeros(len(points)),
+        "vertices": mesh.simplices.astype(np.int32),
+        "neighbors": mesh.neighbors.astype(np.int32),
+    }
+    for array in arrays.values():
+        array.flags.writeable = False  # as those of a triangulation, which is another type
+    triangulation: Any = SimpleNamespace(sites=arrays["points"][:-4], **arrays)
+    values = sites.sum(axis=1)
+    gradients = fit_gradients(triangulation, values, np.ones_like(sites))
+    CloughTocher(triangulation, values, gradients)(sites)
+    density = Density.from_image(np.ones((20, 20)))
+    for with_moments in (True, False):
+        diagram = PowerDiagram(triangulation, density, with_moments=with_moments)
+    LaplacianSolver(diagram.laplacian()).solve(diagram.masses)
 
 
 def how_often() -> str:

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,13 +34,16 @@ class Prepared:
     source: FloatArray  # 0 where masked
     # As the transport sees them, in units of `unit`: dark and masked pixels at the floor.
     floored_image: FloatArray
-    floored_source: FloatArray
     unit: float  # the source's `power_of_two`
     mask: BoolArray  # the pixels that are used
     clipped_pixels: int
     floored_pixels: int  # the clipped ones included
     flux_scale: float  # what the image was divided by
     warnings: tuple[str, ...]
+
+    def in_units(self) -> Prepared:
+        """Return the same with image and source in units of `unit`, too."""
+        return replace(self, image=self.image / self.unit, source=self.source / self.unit)
 
 
 def prepare(
@@ -101,7 +104,6 @@ def prepare(
         image=values,
         source=beam,
         floored_image=floored / unit,
-        floored_source=floored_source / unit,
         unit=unit,
         mask=usable,
         clipped_pixels=negative,

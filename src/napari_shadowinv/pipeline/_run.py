@@ -184,7 +184,8 @@ def run_prepared(
     seconds["source"] = time.perf_counter() - clock
     ensure_compiled(on_progress, should_stop)
     clock = time.perf_counter()
-    plan = cache.plan(source, shot.mask, options, on_progress, should_stop)
+    measured = inputs.recipe.estimate is None
+    plan = cache.plan(source, shot.mask, options, on_progress, should_stop, measured=measured)
     seconds["sites"] = time.perf_counter() - clock
     inversion = invert(
         shot.image,

@@ -37,16 +37,23 @@ class Cache:
         options: InversionOptions,
         on_progress: OnProgress | None = None,
         should_stop: ShouldStop | None = None,
+        *,
+        measured: bool = True,
     ) -> SitePlan:
         """Return the sites for a source, made anew only if anything about them changed."""
-        key = options.site_key()
+        key = f"{options.site_key()}{measured}"
         if self._plan is not None:
             last_key, last_source, last_mask, plan = self._plan
             if key == last_key and _alike(source, last_source) and same_array(mask, last_mask):
                 self.hits += 1
                 return plan
         plan = plan_sites(
-            source, options, mask=mask, on_progress=on_progress, should_stop=should_stop
+            source,
+            options,
+            mask=mask,
+            measured=measured,
+            on_progress=on_progress,
+            should_stop=should_stop,
         )
         # At once: a run that was cancelled may still be about to do the same.
         self._plan = key, source, mask, plan

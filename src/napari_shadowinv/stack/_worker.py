@@ -72,10 +72,14 @@ _entries_lock = threading.Lock()
 
 
 def shared_plan(
-    beam: Beam, options: InversionOptions, *, should_stop: ShouldStop | None = None
+    beam: Beam,
+    options: InversionOptions,
+    *,
+    measured: bool = True,
+    should_stop: ShouldStop | None = None,
 ) -> SitePlan:
     """Return the sites for a beam; the first in this process who asks makes them."""
-    key = beam.key + options.site_key()
+    key = f"{beam.key}{options.site_key()}{measured}"
     with _entries_lock:
         entry = _entries.setdefault(key, _Entry())
         _entries.move_to_end(key)
@@ -83,10 +87,9 @@ def shared_plan(
             _entries.popitem(last=False)
     with entry.lock:
         if entry.plan is None:
-            entry.plan = plan_sites(beam.image, options, mask=beam.mask, should_stop=should_stop)
-            for level in entry.plan.levels:
-                # Made when first asked for, which two threads would do at once.
-                _ = level.mirrored
+            entry.plan = plan_sites(
+                beam.image, options, mask=beam.mask, measured=measured, should_stop=should_stop
+            )
         return entry.plan
 
 
@@ -103,9 +106,11 @@ class _SharedSites(Cache):
         options: InversionOptions,
         on_progress: OnProgress | None = None,
         should_stop: ShouldStop | None = None,
+        *,
+        measured: bool = True,
     ) -> SitePlan:
         beam = self.beam or Beam.of(source.shape, source, mask)
-        return shared_plan(beam, options, should_stop=should_stop)
+        return shared_plan(beam, options, measured=measured, should_stop=should_stop)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from threading import Event, Lock
 from typing import Any, overload
 
@@ -69,9 +69,8 @@ class Level:
         """Mean distance between neighbours, sqrt(area of the image / n), in px."""
         return _spacing(self.shape, len(self.sites))
 
-    @cached_property
     def mirrored(self) -> Mirrored:
-        """The sites with those near the border mirrored across it; made when first asked for."""
+        """Return the sites with those near the border mirrored across it."""
         points, origin, sense = with_mirror_images(
             self.sites, self.shape, _MIRROR_BAND * self.spacing
         )
@@ -145,10 +144,11 @@ class Levels(Sequence[Level]):
         return Levels(self.counts, self._make, self._made, report)
 
     def made(self, threads: int | None = None) -> Levels:
-        """Return the levels after all of them were made."""
+        """Make all levels; what is returned has no others, and needs no source any more."""
+        complete = Levels(self.counts, _no_other, self._made)
         if available_threads(threads) == 1 or len(self) == 1:
             list(self)
-            return self
+            return complete
         abandoned = Event()
         # Beside the finest level, which takes three times as long; this thread alone reports.
         with ThreadPoolExecutor(1) as pool:
@@ -161,7 +161,7 @@ class Levels(Sequence[Level]):
                 abandoned.set()
                 raise
             others.result()
-        return self
+        return complete
 
     def _level(self, count: int, report: Reporter) -> Level:
         slot = self._made.setdefault(count, _Slot())
@@ -169,6 +169,10 @@ class Levels(Sequence[Level]):
             if slot.level is None:
                 slot.level = self._make(count, report)
             return slot.level
+
+
+def _no_other(count: int, report: Reporter) -> Level:
+    raise LookupError(f"there is no level of {count:,} sites")
 
 
 @dataclass

@@ -70,6 +70,10 @@ class LevelSolution(Solution):
             displacement=diagram.centroids - level.centroids,
         )
 
+    def forget_surface(self) -> None:
+        """Let go of the surface, which is large; it is made again if it is asked for."""
+        vars(self).pop("surface", None)
+
     @cached_property
     def surface(self) -> CloughTocher:
         """A C¹ surface through the potential at the sites (px²).
@@ -79,7 +83,7 @@ class LevelSolution(Solution):
         centroids (px) are, nearly, its gradients. No flux crosses the border of the image, so the
         potential is level across it, and its mirror image continues it smoothly.
         """
-        mirrored = self.level.mirrored
+        mirrored = self.level.mirrored()
         potential = 0.5 * self.weights
         gradient = fit_gradients(self.level.triangulation, potential, -self.displacement)
         return CloughTocher(
@@ -134,7 +138,10 @@ def solve(
         if not solutions and by_newton:
             solution = target.sharpened(level, tolerance, report)
         else:
-            weights = 2 * solutions[-1].surface(level.sites) if solutions else None
+            weights = None
+            if solutions:
+                weights = 2 * solutions[-1].surface(level.sites)
+                solutions[-1].forget_surface()
             solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > _STALLED and len(levels) > 1:
