@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv import InversionOptions, ProtonSetup, invert, plan_sites, synthetic_image
+from napari_shadowinv import (
+    InputError,
+    InversionOptions,
+    ProtonSetup,
+    invert,
+    plan_sites,
+    synthetic_image,
+)
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.budget import ErrorEstimate
 from napari_shadowinv.physics import phantoms
@@ -175,6 +182,22 @@ def test_what_is_given_is_used_and_the_paper_has_a_site_a_pixel(image):
     assert invert(small, options=InversionOptions.paper(max_iterations=3)).report.n_sites == 480
 
 
+def test_the_number_of_a_plan_is_used_and_else_that_of_the_options(image):
+    beam = np.ones(image.shape)
+    given = plan_sites(beam, InversionOptions(n_sites=1500))
+    assert invert(image, plan=given).report.n_sites == 1500
+    assert invert(image, plan=given).report.sites_reason == "as given"
+    usual = plan_sites(beam)
+    few = InversionOptions(n_sites=700)
+    found = invert(image, plan=usual, options=few)
+    assert found.report.n_sites == 700
+    alone = invert(image, source=beam, options=few)
+    np.testing.assert_array_equal(found.sites, alone.sites)
+    np.testing.assert_allclose(found.displacement, alone.displacement, atol=1e-3)
+    with pytest.raises(InputError, match="700 sites that differ"):
+        invert(image, plan=given, start=found)
+
+
 def test_an_accuracy_out_of_reach_is_told():
     image = synthetic_image(pair().displacement)
     report = invert(image, options=InversionOptions(accuracy=1e-6)).report
@@ -257,3 +280,11 @@ def test_every_way_to_an_inversion_knows_whether_the_beam_was_measured(tmp_path)
         store = run_stack(image[None], out, options=options, **given)
         (report,) = (json.loads(str(text)) for text in store.report.values)
         assert (report["errors"]["beam"] is None) == is_measured
+
+
+def test_threads_change_neither_the_answer_nor_its_errors(image):
+    noisy = counting(image, np.random.default_rng(6))
+    one, two = (invert(noisy, options=InversionOptions(threads=count)) for count in (1, 2))
+    np.testing.assert_array_equal(one.displacement, two.displacement)
+    assert one.errors == two.errors
+    assert one.report.sites_reason == two.report.sites_reason

@@ -164,7 +164,8 @@ def invert(
     options : InversionOptions, optional
         The defaults suit most images.
     plan : SitePlan, optional
-        Sites prepared by `plan_sites`, in place of `source` and `mask`.
+        Sites prepared by `plan_sites`, in place of `source` and `mask`. A number of sites that it
+        was made with is used, whatever the options say of it.
     start : Inversion, optional
         Inversion of a similar image (the previous shot, another filter) on the same sites. The
         solver starts from its weights and, if the images are similar, needs only a few
@@ -234,8 +235,10 @@ def invert(
         noise = ImageNoise(prepared.in_units(), options)
         budget = Budget(plan, prepared, noise, options)
         if start is not None:
-            levels = _up_to(start, levels, plan.margin_width, any_count=options.is_adaptive)
-    adaptive = options.is_adaptive and start is None
+            levels = _up_to(start, levels, plan.margin_width)
+        elif not options.is_adaptive and not levels.is_complete:
+            levels = levels.up_to(_ground(plan.source, options, plan.mask).n_sites)
+    adaptive = options.is_adaptive and not levels.is_complete and start is None
     solutions: list[LevelSolution] = []
     coarse = 0
     while True:
@@ -280,7 +283,7 @@ def invert(
         mask=prepared.mask,
         report=replace(
             told,
-            sites_reason=_reason(answer, levels, budget, options, start, coarse),
+            sites_reason=_reason(answer, levels, budget, adaptive, start, coarse),
             errors=errors,
         ),
         options=options,
@@ -291,14 +294,14 @@ def _reason(
     answer: LevelSolution,
     levels: Levels,
     budget: Budget,
-    options: InversionOptions,
+    adaptive: bool,
     start: Inversion | None,
     coarse: int,
 ) -> str:
     """Say why there are so many sites."""
     if start is not None:
         return "as many as in the inversion that it started from"
-    if options.n_sites is not None:
+    if not adaptive:
         return "as given"
     if coarse:
         return f"with {coarse:,} the re-projection missed structures of the image"
@@ -384,10 +387,10 @@ def _read_fields(
     )
 
 
-def _up_to(start: Inversion, levels: Levels, margin_width: int, *, any_count: bool) -> Levels:
+def _up_to(start: Inversion, levels: Levels, margin_width: int) -> Levels:
     """Return the levels up to that of an inversion to start from, if its sites are the same."""
     found = start.sites + margin_width
-    if len(found) in levels.counts or (any_count and len(found) < levels.counts[-1]):
+    if len(found) in levels.counts or not (levels.is_complete or len(found) > levels.counts[-1]):
         up_to = levels.up_to(len(found))
         level = up_to[-1]
         if np.abs(found - level.sites).max() <= 1e-3 * level.spacing:

@@ -116,6 +116,11 @@ class Levels(Sequence[Level]):
         self._made = {} if made is None else made
         self._report = report or Reporter()
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether there are no others than those that `counts` names."""
+        return self._make is _no_other
+
     def __len__(self) -> int:
         return len(self.counts)
 
