@@ -113,8 +113,9 @@ class Errors:
             rows.append(
                 (
                     "beam",
-                    f"not measured: if it varies by {options.beam_variation:.2g} (r.m.s.) over "
-                    f"{options.beam_scale:.2g} of the image's side, the displacement is off by "
+                    f"not measured: if it varies by {100 * options.beam_variation:.2g} % (r.m.s.) "
+                    f"over {options.beam_scale:.2g} of the image's shorter side, the "
+                    f"displacement is off by "
                     f"{_percent(self.beam.rms, self.rms)} (r.m.s.), its peak by "
                     f"{_percent(self.beam.at_peak, self.peak)}",
                 )
