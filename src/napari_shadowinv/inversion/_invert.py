@@ -283,7 +283,7 @@ def invert(
         mask=prepared.mask,
         report=replace(
             told,
-            sites_reason=_reason(answer, levels, budget, adaptive, start, coarse),
+            sites_reason=_reason(levels, budget, adaptive, start, coarse),
             errors=errors,
         ),
         options=options,
@@ -291,12 +291,7 @@ def invert(
 
 
 def _reason(
-    answer: LevelSolution,
-    levels: Levels,
-    budget: Budget,
-    adaptive: bool,
-    start: Inversion | None,
-    coarse: int,
+    levels: Levels, budget: Budget, adaptive: bool, start: Inversion | None, coarse: int
 ) -> str:
     """Say why there are so many sites."""
     if start is not None:

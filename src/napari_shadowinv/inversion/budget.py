@@ -85,12 +85,16 @@ class Errors:
     @property
     def of_peak(self) -> dict[str, float]:
         """The errors at the peak that matter, by name, as shares of the peak."""
-        found = {"noise": self.noise, "discretisation": self.discretisation, "solver": self.solver}
-        known = {name: one.at_peak for name, one in found.items() if not math.isnan(one.at_peak)}
-        least = _NOTABLE * max(known.values(), default=0.0)
+        least = _NOTABLE * max((one.at_peak for one in self._known.values()), default=0.0)
         if not self.peak > 0:
             return {}
-        return {name: one / self.peak for name, one in known.items() if one > least}
+        shares = {name: one.at_peak / self.peak for name, one in self._known.items()}
+        return {name: share for name, share in shares.items() if share > least / self.peak}
+
+    @property
+    def _known(self) -> dict[str, ErrorEstimate]:
+        found = {"noise": self.noise, "discretisation": self.discretisation, "solver": self.solver}
+        return {name: one for name, one in found.items() if not math.isnan(one.rms)}
 
     def scaled(self, factor: float) -> Errors:
         """Return the same in another unit, of which a displacement of 1 px is `factor`."""
@@ -102,11 +106,8 @@ class Errors:
 
     def rows(self, options: InversionOptions) -> list[tuple[str, str]]:
         """Say in words what is not known of the displacement: names and texts."""
-        found = {"noise": self.noise, "discretisation": self.discretisation, "solver": self.solver}
         told = ", ".join(
-            f"{name} {_percent(one.rms, self.rms)}"
-            for name, one in found.items()
-            if not math.isnan(one.rms)
+            f"{name} {_percent(one.rms, self.rms)}" for name, one in self._known.items()
         )
         rows = [("errors", f"{told} of the displacement (r.m.s.)")]
         if self.beam is not None:
@@ -114,9 +115,8 @@ class Errors:
                 (
                     "beam",
                     f"not measured: if it varies by {100 * options.beam_variation:.2g} % (r.m.s.) "
-                    f"over {options.beam_scale:.2g} of the image's shorter side, the "
-                    f"displacement is off by "
-                    f"{_percent(self.beam.rms, self.rms)} (r.m.s.), its peak by "
+                    f"over {options.beam_scale:.2g} of the image's shorter side, the displacement "
+                    f"is off by {_percent(self.beam.rms, self.rms)} (r.m.s.), its peak by "
                     f"{_percent(self.beam.at_peak, self.peak)}",
                 )
             )

@@ -104,34 +104,37 @@ class LinearResponse:
     @cached_property
     def _slopes(self) -> tuple[Indices, FloatArray]:
         """Corners of the triangles between sites, and the gradient by each corner's value."""
-        corners = self.level.triangulation.vertices
-        corners = corners[(corners < len(self.level.sites)).all(axis=1)]
-        points = self.level.sites[corners]
-        edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)
-        double = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+        corners, edges, double = _triangles(self.level.triangulation)
         # Along the border lie slivers, on which three values tell no gradient.
         longest = (edges**2).sum(axis=2).max(axis=1)
         good = np.abs(double) > _SLIVER * longest
         corners, edges, double = corners[good], edges[good], double[good]
-        normal = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
-        return corners, normal / double[:, None, None]
+        return corners, _normals(edges) / double[:, None, None]
 
 
 def site_gradients(triangulation: RegularTriangulation, values: FloatArray) -> FloatArray:
     """Return the gradient of values at the sites, (n, 2): the mean of the triangles around each."""
     n = len(values)
-    corners = triangulation.vertices
-    corners = corners[(corners < n).all(axis=1)]
-    points = triangulation.sites[corners]
-    edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)
-    double = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+    corners, edges, double = _triangles(triangulation)
     # The gradient times the double area, so that each triangle counts by its area.
-    normal = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
-    slope = np.einsum("ti,tic->tc", values[corners], normal) * np.sign(double)[:, None]
+    slope = np.einsum("ti,tic->tc", values[corners], _normals(edges)) * np.sign(double)[:, None]
     weight = np.repeat(np.abs(double), 3)
     total = np.maximum(np.bincount(corners.ravel(), weight, n), 1e-300)
     found = [np.bincount(corners.ravel(), np.repeat(part, 3), n) / total for part in slope.T]
     return np.stack(found, axis=1)
+
+
+def _triangles(triangulation: RegularTriangulation) -> tuple[Indices, FloatArray, FloatArray]:
+    """Corners of the triangles between sites, the edges opposite to them, and double areas."""
+    corners = triangulation.vertices
+    corners = corners[(corners < len(triangulation.sites)).all(axis=1)]
+    points = triangulation.sites[corners]
+    edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)
+    return corners, edges, edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+
+
+def _normals(edges: FloatArray) -> FloatArray:
+    return np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
 
 
 def _within(places: FloatArray, plan: SitePlan) -> BoolArray:
