@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import convolve1d
+from shapely import LinearRing, Polygon, box
 
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
@@ -92,6 +94,33 @@ def test_rough_fields_lose_no_flux() -> None:
     image = synthetic_image(field, source)
     assert image.min() >= 0
     assert image.sum() == pytest.approx(source.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.6, 3.0])
+def test_each_pixel_gets_what_the_landed_tiles_overlap_it(roughness: float) -> None:
+    """Overlaps of polygons by shapely, with tiles that fold, cross pixels and leave the image."""
+    shape = (7, 9)
+    source = random_source(shape)
+    field = np.random.default_rng(3).normal(scale=roughness, size=(2, *shape))
+    y, x = (np.arange(2 * n + 1) / 2 - 0.5 for n in shape)
+    along_y = CubicSpline(np.arange(shape[0]), field, axis=1)(y)
+    moved = CubicSpline(np.arange(shape[1]), along_y, axis=2)(x)
+    corners = np.stack(np.meshgrid(y, x, indexing="ij")) + moved
+    expected = np.zeros(shape)
+    for a, b in np.ndindex(2 * shape[0], 2 * shape[1]):
+        first, second = corners[:, a, b : b + 2].T
+        fourth, third = corners[:, a + 1, b : b + 2].T
+        triangles = [Polygon([first, second, third]), Polygon([first, third, fourth])]
+        signs = [LinearRing(one.exterior.coords).is_ccw for one in triangles]
+        areas = [triangles[0].area, triangles[1].area]
+        # Of one density, unless a fold has turned one half of the tile over.
+        shares = np.array(areas) / sum(areas) if signs[0] == signs[1] else [0.5, 0.5]
+        for one, area, share in zip(triangles, areas, shares, strict=True):
+            for i, j in np.ndindex(shape):
+                overlap = one.intersection(box(i - 0.5, j - 0.5, i + 0.5, j + 0.5)).area
+                expected[i, j] += source[a // 2, b // 2] / 4 * share * overlap / area
+    image = synthetic_image(field, source, rays_per_pixel=4)
+    np.testing.assert_allclose(image, expected, atol=1e-9)
 
 
 def test_flux_that_leaves_is_lost() -> None:
