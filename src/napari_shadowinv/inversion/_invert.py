@@ -73,6 +73,17 @@ def plan_sites(
         If `should_stop` returned true.
     """
     options = options or InversionOptions()
+    plan = _planned(source, options, mask, measured)
+    if options.is_adaptive:
+        return plan
+    heard = plan.levels.heard_by(Reporter(on_progress, should_stop))
+    return replace(plan, levels=heard.made(options.threads))
+
+
+def _planned(
+    source: ArrayLike, options: InversionOptions, mask: ArrayLike | None, measured: bool
+) -> SitePlan:
+    """Plan sites, of which no level has been made."""
     ground = _ground(source, options, mask)
     plan = plan_levels(
         ground.beam if ground.margin is None else ground.margin.beam,
@@ -82,12 +93,8 @@ def plan_sites(
         seed=options.seed,
         threads=options.threads,
     )
-    levels = plan.levels
-    if not options.is_adaptive:
-        levels = levels.heard_by(Reporter(on_progress, should_stop)).made(options.threads)
     return replace(
         plan,
-        levels=levels,
         source=ground.beam * ground.unit,
         mask=ground.mask,
         margin=ground.margin,
@@ -218,14 +225,7 @@ def invert(
         report("prepare", 1, 1)
     with _timed("sites", seconds):
         if plan is None:
-            plan = plan_sites(
-                prepared.source,
-                options,
-                mask=mask,
-                measured=source is not None,
-                on_progress=on_progress,
-                should_stop=should_stop,
-            )
+            plan = _planned(prepared.source, options, mask, source is not None)
         levels = plan.levels.heard_by(report)
     with _timed("transport", seconds):
         if plan.margin is not None and options.flux == "fit":
@@ -234,10 +234,11 @@ def invert(
             prepared = prepare(image, source, options, mask, flux_scale=scale)
         noise = ImageNoise(prepared.in_units(), options)
         budget = Budget(plan, prepared, noise, options)
-        if start is not None:
-            levels = _up_to(start, levels, plan.margin_width)
-        elif not options.is_adaptive and not levels.is_complete:
+        if not options.is_adaptive and not levels.is_complete:
             levels = levels.up_to(_ground(plan.source, options, plan.mask).n_sites)
+        if start is not None:
+            others = options.is_adaptive and not levels.is_complete
+            levels = _up_to(start, levels, plan.margin_width, others=others)
     adaptive = options.is_adaptive and not levels.is_complete and start is None
     solutions: list[LevelSolution] = []
     coarse = 0
@@ -382,10 +383,13 @@ def _read_fields(
     )
 
 
-def _up_to(start: Inversion, levels: Levels, margin_width: int) -> Levels:
-    """Return the levels up to that of an inversion to start from, if its sites are the same."""
+def _up_to(start: Inversion, levels: Levels, margin_width: int, *, others: bool) -> Levels:
+    """Return the levels up to that of an inversion to start from, if its sites are the same.
+
+    `others` tells whether there may be other levels than those that are counted.
+    """
     found = start.sites + margin_width
-    if len(found) in levels.counts or not (levels.is_complete or len(found) > levels.counts[-1]):
+    if len(found) in levels.counts or (others and len(found) <= levels.counts[-1]):
         up_to = levels.up_to(len(found))
         level = up_to[-1]
         if np.abs(found - level.sites).max() <= 1e-3 * level.spacing:

@@ -292,7 +292,7 @@ class Budget:
         for sample in drawn:
             waves = rng.normal(size=(2, _WAVES)) / length
             phases = rng.uniform(0, 2 * np.pi, _WAVES)
-            sample[:] = np.cos(np.einsum("nc,cw->nw", sites, waves) + phases).sum(axis=1)
+            sample[:] = np.cos((sites @ waves + phases).astype(np.float32)).sum(axis=1)
             sample -= (mass * sample).sum() / mass.sum()
             sample *= self._options.beam_variation / np.sqrt((mass * sample**2).sum() / mass.sum())
         return mass * drawn
@@ -301,7 +301,7 @@ class Budget:
         """What the solver has put into wrong cells."""
         gap = solution.flux - solution.level.mass
         # Which of the few sites each of the many is near is looked up by squares.
-        size = response.spacing / 2
+        size = response.spacing
         height, width = (int(side / size) + 1 for side in solution.level.shape)
         middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * size - 0.5
         nearest = KDTree(response.level.sites).query(middles)[1]

@@ -1,6 +1,7 @@
 """Newton's linear systems: aggregation multigrid for the graph Laplacians of power diagrams.
 
 - solve one system: `solve_laplacian`; several with the same matrix: `LaplacianSolver`
+- one after the other with matrices that change little: `SimilarSystems`
 
 Flexible conjugate gradients, preconditioned by one cycle over the levels of
 `napari_shadowinv.transport._coarsening`. One Gauss–Seidel sweep before and its mirror image
@@ -32,9 +33,11 @@ from napari_shadowinv.transport._coarsening import (
     require_connected,
 )
 
-__all__ = ["LaplacianSolver", "solve_laplacian"]
+__all__ = ["LaplacianSolver", "SimilarSystems", "solve_laplacian"]
 
 _DIRECT_BELOW = 200
+_MORE_ITERATIONS = 3  # that cost less than a new setup
+_KEPT_BELOW = 500_000  # nodes; a larger setup takes the memory that trial steps need
 _WORTH_A_THREAD = 100_000
 
 
@@ -211,15 +214,23 @@ class LaplacianSolver:
         self._hierarchy = build_hierarchy(laplacian, ground)
         nodes = int(self._hierarchy.bounds[-1])
         self._vectors = _Vectors(*(np.zeros(nodes) for _ in _Vectors._fields))
+        self._matrix: csr_array | None = None
 
     def solve(
-        self, right: FloatArray, tolerance: float = 1e-2, max_iterations: int = 200
+        self,
+        right: FloatArray,
+        tolerance: float = 1e-2,
+        max_iterations: int = 200,
+        *,
+        matrix: csr_array | None = None,
     ) -> tuple[FloatArray, int, float]:
         """Solve L x = b; return x, the iterations done, and the residual that was reached.
 
         Tolerance and residual are norms relative to that of b. Without a ground the mean of b
-        is ignored, and that of x is zero.
+        is ignored, and that of x is zero. A `matrix`, with the ground on its diagonal, takes the
+        place of the one that was set up for, and should be near to it.
         """
+        self._matrix = matrix
         right = self._centred(right)
         scale = self._norm(right)
         solution: FloatArray = np.zeros(self._n)
@@ -262,11 +273,52 @@ class LaplacianSolver:
         return energy
 
     def _multiply(self, x: FloatArray, product: FloatArray) -> None:
+        if self._matrix is not None:
+            product[: self._n] = self._matrix @ x[: self._n]
+            return
         operands = self._hierarchy.network, x, product
         in_ranges(_multiply, self._n, self._threads, *operands, smallest=_WORTH_A_THREAD)
 
     def _norm(self, x: FloatArray) -> float:
         return float(np.sqrt(_dot(0, self._n, x, x)))
+
+
+class SimilarSystems:
+    """Solves systems one after the other; what was set up for one serves the next ones, too.
+
+    That is as good as a setup for each where their matrices change little, as Newton's do.
+    """
+
+    def __init__(self, threads: int = 1) -> None:
+        self._threads = threads
+        self._solver: LaplacianSolver | None = None
+        self._most = 0
+
+    def solve(
+        self,
+        laplacian: csr_array,
+        right: FloatArray,
+        tolerance: float,
+        *,
+        ground: FloatArray | None = None,
+    ) -> FloatArray:
+        """Solve L x = b as `LaplacianSolver` does, or by factors if small or too hard for it."""
+        if len(right) < _DIRECT_BELOW:
+            require_connected(laplacian)
+            return _solved_by_factors(laplacian, right, ground)
+        if self._solver is not None:
+            matrix = laplacian if ground is None else laplacian + diags_array(ground)
+            solution, _, residual = self._solver.solve(right, tolerance, self._most, matrix=matrix)
+            if residual <= tolerance:
+                return solution
+        self._solver = None  # one at a time: they are large
+        solver = LaplacianSolver(laplacian, ground, threads=self._threads)
+        solution, iterations, residual = solver.solve(right, tolerance)
+        if residual > tolerance:
+            return _solved_by_factors(laplacian, right, ground)
+        if len(right) < _KEPT_BELOW:
+            self._solver, self._most = solver, iterations + _MORE_ITERATIONS
+        return solution
 
 
 def solve_laplacian(
@@ -277,14 +329,13 @@ def solve_laplacian(
     *,
     ground: FloatArray | None = None,
 ) -> FloatArray:
-    """Solve L x = b as `LaplacianSolver` does, or by factorisation if small or too hard for it."""
-    if len(right) < _DIRECT_BELOW:
-        require_connected(laplacian)
-    else:
-        solver = LaplacianSolver(laplacian, ground, threads=threads)
-        solution, _, residual = solver.solve(right, tolerance)
-        if residual <= tolerance:
-            return solution
+    """Solve one system as `SimilarSystems` does."""
+    return SimilarSystems(threads).solve(laplacian, right, tolerance, ground=ground)
+
+
+def _solved_by_factors(
+    laplacian: csr_array, right: FloatArray, ground: FloatArray | None
+) -> FloatArray:
     if ground is not None:
         return _factorised(laplacian + diags_array(ground), right)
     # Without a ground one unknown is free: all but the first are factorised.

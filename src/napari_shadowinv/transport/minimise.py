@@ -22,11 +22,12 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.sparse import csr_array
 
-from napari_shadowinv._system.machine import physical_memory
+from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.transport.linear import SimilarSystems
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 
 __all__ = ["SHORTEST_STEP", "descend", "newton", "with_full_cells"]
@@ -73,6 +74,7 @@ def newton(
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     errors = [_length(mass - diagram.masses)]
+    systems = SimilarSystems(available_threads(objective.threads))
     first = 1.0
     reason = f"the solver used all {max_iterations} iterations allowed"
     while residual > tolerance and len(errors) <= max_iterations:
@@ -83,7 +85,7 @@ def newton(
         laplacian = diagram.laplacian()
         del diagram  # the trial steps need its memory
         try:
-            step = objective.newton_step(laplacian, weights, gap, _LINEAR_TOLERANCE)
+            step = objective.newton_step(systems, laplacian, weights, gap, _LINEAR_TOLERANCE)
         except RuntimeError as error:
             reason = f"Newton's system cannot be solved: {error}"
             break

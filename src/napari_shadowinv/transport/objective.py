@@ -25,7 +25,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
-from napari_shadowinv.transport.linear import solve_laplacian
+from napari_shadowinv.transport.linear import SimilarSystems
 from napari_shadowinv.transport.margin import Margin
 from napari_shadowinv.transport.sites import Level
 
@@ -82,15 +82,19 @@ class TransportObjective:
         return self.image
 
     def newton_step(
-        self, laplacian: csr_array, weights: FloatArray, gap: FloatArray, tolerance: float
+        self,
+        systems: SimilarSystems,
+        laplacian: csr_array,
+        weights: FloatArray,
+        gap: FloatArray,
+        tolerance: float,
     ) -> FloatArray:
         """Return the change of the weights that fills what each cell lacks to first order.
 
         The Laplacian is that of the diagram for these weights. Raises a RuntimeError where the
         cells fall into groups with no flux between them.
         """
-        threads = available_threads(self.threads)
-        return solve_laplacian(laplacian, gap, tolerance, threads, ground=self.ground(weights))
+        return systems.solve(laplacian, gap, tolerance, ground=self.ground(weights))
 
     def ground(self, weights: FloatArray) -> FloatArray | None:
         """Return what a change of each weight adds to the image there, if anything."""

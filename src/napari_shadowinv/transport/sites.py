@@ -13,10 +13,11 @@ Quasi-Monte Carlo Methods* (SIAM, 1992), chapter 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from threading import Event, Lock
 from typing import Any, overload
 
@@ -150,30 +151,48 @@ class Levels(Sequence[Level]):
 
     def made(self, threads: int | None = None) -> Levels:
         """Make all levels; what is returned has no others, and needs no source any more."""
-        complete = Levels(self.counts, _no_other, self._made)
-        if available_threads(threads) == 1 or len(self) == 1:
-            list(self)
-            return complete
+        with self.in_background(threads) as begin:
+            # Beside the finest level, which takes three times as long as all others.
+            begin(self.counts[:-1])
+            for count in reversed(self.counts):
+                self.at(count)
+        return Levels(self.counts, _no_other, self._made)
+
+    @contextmanager
+    def in_background(
+        self, threads: int | None = None
+    ) -> Iterator[Callable[[Sequence[int]], None]]:
+        """Give what begins to make levels of so many sites, one by one, in another thread.
+
+        At the end of the block those are abandoned that nobody has waited for.
+        """
+        if available_threads(threads) == 1:
+            yield lambda counts: None
+            return
         abandoned = Event()
-        # Beside the finest level, which takes three times as long; this thread alone reports.
-        with ThreadPoolExecutor(1) as pool:
-            others = pool.submit(list, self[:-1].heard_by(Reporter(None, abandoned.is_set)))
-            try:
-                _ = self[-1]
-                while not wait([others], timeout=_POLL).done:
-                    self._report("sites", 0, None, "coarser levels")
-            except BaseException:
-                abandoned.set()
-                raise
-            others.result()
-        return complete
+        quiet = self.heard_by(Reporter(None, abandoned.is_set))
+        pool = ThreadPoolExecutor(1)
+
+        def begin(counts: Sequence[int]) -> None:
+            for count in counts:
+                pool.submit(quiet.at, count)
+
+        try:
+            yield begin
+        finally:
+            abandoned.set()
+            pool.shutdown(cancel_futures=True)
 
     def _level(self, count: int, report: Reporter) -> Level:
         slot = self._made.setdefault(count, _Slot())
-        with slot.lock:
+        while not slot.lock.acquire(timeout=_POLL):
+            report("sites", 0, None, f"{count:,} sites")
+        try:
             if slot.level is None:
                 slot.level = self._make(count, report)
             return slot.level
+        finally:
+            slot.lock.release()
 
 
 def _no_other(count: int, report: Reporter) -> Level:
@@ -286,26 +305,33 @@ def plan_levels(
     threads: int | None = None,
 ) -> SitePlan:
     """Plan levels over a source; the finest has `n_sites`, others a quarter of the next."""
-    density = Density.from_image(source)
     counts = [n_sites]
     while counts[-1] > COARSEST:
         counts.append(max(4, counts[-1] // RATIO))
 
+    @lru_cache(maxsize=1)
+    def density() -> Density:
+        return Density.from_image(source)
+
     def level(count: int, report: Reporter) -> Level:
+        beam = density()
+
         def tell(step: int) -> None:
             report("sites", step, lloyd_iterations, f"{count:,} sites, Lloyd relaxation")
 
         sites = sample_sites(source, count, seed)
-        triangulation = RegularTriangulation(sites, region=density.region, alive=partial(tell, 0))
+        triangulation = RegularTriangulation(sites, region=beam.region, alive=partial(tell, 0))
         diagram, steps = lloyd(
             triangulation,
-            density,
+            beam,
             iterations=lloyd_iterations,
             tolerance=lloyd_tolerance,
             threads=threads,
             report=tell,
         )
+        if count == n_sites:
+            density.cache_clear()  # it is large, and others are seldom made after the finest
         sites, masses, centroids = triangulation.sites, diagram.masses, diagram.centroids
-        return Level(sites, masses, centroids, triangulation, density.shape, steps)
+        return Level(sites, masses, centroids, triangulation, beam.shape, steps)
 
     return SitePlan(source, Levels(tuple(reversed(counts)), level))

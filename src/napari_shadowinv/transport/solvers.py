@@ -28,7 +28,7 @@ from napari_shadowinv.transport.continuation import blurred, sharpen
 from napari_shadowinv.transport.margin import Margin
 from napari_shadowinv.transport.minimise import descend, newton
 from napari_shadowinv.transport.objective import OpenObjective, Solution, TransportObjective
-from napari_shadowinv.transport.sites import Level, Levels
+from napari_shadowinv.transport.sites import RATIO, Level, Levels
 
 __all__ = ["LevelSolution", "Target", "fitted_flux", "solve"]
 
@@ -125,11 +125,27 @@ def solve(
         nearby = _solve_from(start, levels[-1], target, report)
         if nearby is not None:
             return [nearby]
+    with levels.in_background(options.threads) as begin:
+        return _climb(levels, target, report, needed, solved, begin)
+
+
+def _climb(
+    levels: Levels,
+    target: Target,
+    report: Reporter | None,
+    needed: Needed | None,
+    solved: Sequence[LevelSolution],
+    begin: Callable[[Sequence[int]], None],
+) -> list[LevelSolution]:
+    """Solve level after level; `begin` makes those in the background that will be needed."""
+    options = target.options
     by_newton = options.solver == "newton"
     solutions = list(solved)
     coarse = max(options.tolerance, _COARSE_TOLERANCE)
     fewest = len(solutions[-1].weights) if solutions else 0
     finer = [count for count in levels.counts if count > fewest]
+    if needed is None:
+        begin(finer[::-1])
     while finer:
         level = levels.at(finer.pop(0))
         finest = not finer
@@ -150,6 +166,8 @@ def solve(
             continue
         times = needed(solutions)
         count = len(level.sites)
+        if times > RATIO:
+            begin(finer[1:2])
         if 1 < times <= _HALFWAY and count >= _WORTH_HALF and count in levels.counts:
             finer.insert(0, _HALFWAY * count)
         elif times <= 1:
