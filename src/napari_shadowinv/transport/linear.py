@@ -18,8 +18,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import FloatArray
@@ -31,6 +30,7 @@ from napari_shadowinv.transport._coarsening import (
     build_hierarchy,
     require_connected,
 )
+from napari_shadowinv.transport.factorised import factorise
 
 __all__ = ["LaplacianSolver", "solve_laplacian"]
 
@@ -286,16 +286,10 @@ def solve_laplacian(
         if residual <= tolerance:
             return solution
     if ground is not None:
-        return _factorised(laplacian + diags_array(ground), right)
-    # Without a ground one unknown is free: all but the first are factorised.
+        return np.asarray(factorise(laplacian, ground).solve(right))
+    # Without a ground one unknown is free: all but the first are solved for.
     solution = np.zeros(len(right))
     if len(right) > 1:
-        solution[1:] = _factorised(laplacian[1:, 1:], right[1:] - right.mean())
+        solution[1:] = factorise(laplacian, ground).solve(right[1:] - right.mean())
     solution -= solution.mean()
-    return solution
-
-
-def _factorised(matrix: csr_array, right: FloatArray) -> FloatArray:
-    symmetric = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}}
-    solution: FloatArray = splu(matrix.tocsc(), diag_pivot_thresh=0.0, **symmetric).solve(right)
     return solution
