@@ -1,17 +1,15 @@
-"""A C¹ surface as a linear map of the values at its sites, for many sets of values.
+"""A C¹ surface for many sets of values at the same sites, `WIDTH` at a time.
 
-The same surface as `napari_shadowinv.geometry.interpolation` makes, whose geometry is worked out
-once: its gradients and its values anywhere are then sums over the values of a few sites.
+The same surface as `napari_shadowinv.geometry.interpolation` makes. It is linear in the values:
+what a triangle or an edge is like is found once for all sets, which lie side by side.
 
-- gradients at the sites, by values there: `gradient_map`
+- gradients at the sites, by values there: `with_gradients`
 - the surface anywhere, by values and gradients at the corners of triangles: `corner_weights`
-- triangles between sites and what makes gradients of values on them: `triangles_of`, `normals`
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import block_array, csr_array, diags_array, vstack
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
@@ -28,77 +26,97 @@ from napari_shadowinv.geometry.interpolation import (
 )
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
-__all__ = ["corner_weights", "gradient_map", "normals", "triangles_of"]
+__all__ = ["WIDTH", "corner_weights", "with_gradients"]
+
+WIDTH = 8  # so many numbers fill a line of the cache; a constant, so that loops are unrolled
 
 
-def triangles_of(triangulation: RegularTriangulation) -> tuple[Indices, FloatArray, FloatArray]:
-    """Corners of the triangles between sites, the edges opposite to them, and double areas."""
-    corners = triangulation.vertices
-    corners = corners[(corners < len(triangulation.sites)).all(axis=1)]
-    points = triangulation.sites[corners]
-    edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)
-    return corners, edges, edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+@njit(nogil=True, cache=True)
+def _mean_slopes(
+    vertices: Indices, points: FloatArray, values: FloatArray, gradients: FloatArray
+) -> None:
+    """Find the mean gradient of the triangles around each site, by their areas."""
+    n = values.shape[0]
+    areas = np.zeros(n)
+    slope = np.empty((2, WIDTH))
+    for a, b, c in vertices:
+        if a >= n or b >= n or c >= n:
+            continue
+        by, bx = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+        cy, cx = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1]
+        area = by * cx - bx * cy
+        sign = 1.0 if area > 0 else -1.0
+        for s in range(WIDTH):
+            to_b, to_c = values[b, s] - values[a, s], values[c, s] - values[a, s]
+            slope[0, s] = sign * (to_b * cx - to_c * bx)
+            slope[1, s] = sign * (to_c * by - to_b * cy)
+        for i in (a, b, c):
+            areas[i] += abs(area)
+            for s in range(WIDTH):
+                gradients[i, 0, s] += slope[0, s]
+                gradients[i, 1, s] += slope[1, s]
+    for i in range(n):
+        share = 1.0 / max(areas[i], 1e-300)
+        for s in range(WIDTH):
+            gradients[i, 0, s] *= share
+            gradients[i, 1, s] *= share
 
 
-def normals(edges: FloatArray) -> FloatArray:
-    """Edges turned by a right angle: each corner's value times that sums to the gradient."""
-    return np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
+@njit(nogil=True, cache=True)
+def _bend_least(
+    vertices: Indices,
+    neighbors: Indices,
+    points: FloatArray,
+    values: FloatArray,
+    gradients: FloatArray,
+    surface: FloatArray,
+) -> None:
+    """Make the sweep of `fit_gradients` from gradients, which end as those of the surface."""
+    n = values.shape[0]
+    system = np.zeros((n, 3))
+    for t in range(vertices.shape[0]):
+        for k in range(3):
+            a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
+            if neighbors[t, k] < t or a >= n or b >= n:
+                continue
+            ey, ex = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+            length2 = ey * ey + ex * ex
+            stiffness = 1.0 / (length2 * np.sqrt(length2))
+            for i, j in ((a, b), (b, a)):
+                system[i, 0] += stiffness * ey * ey
+                system[i, 1] += stiffness * ey * ex
+                system[i, 2] += stiffness * ex * ex
+                for s in range(WIDTH):
+                    rise = 3 * (values[b, s] - values[a, s])
+                    slope_there = gradients[j, 0, s] * ey + gradients[j, 1, s] * ex
+                    pull = stiffness * (rise - slope_there) / 2
+                    surface[i, 1, s] += pull * ey
+                    surface[i, 2, s] += pull * ex
+    for i in range(n):
+        yy, yx, xx = system[i]
+        determinant = yy * xx - yx * yx
+        fitted = determinant > 1e-12 * (yy + xx) ** 2
+        for s in range(WIDTH):
+            surface[i, 0, s] = values[i, s]
+            ry, rx = surface[i, 1, s], surface[i, 2, s]
+            if fitted:
+                surface[i, 1, s] = (ry * xx - rx * yx) / determinant
+                surface[i, 2, s] = (rx * yy - ry * yx) / determinant
+            else:
+                surface[i, 1, s], surface[i, 2, s] = gradients[i, 0, s], gradients[i, 1, s]
 
 
-def gradient_map(triangulation: RegularTriangulation) -> csr_array:
-    """Return what makes gradients, (2 n,), of values at the n sites: all along y, then along x.
+def with_gradients(triangulation: RegularTriangulation, values: FloatArray) -> FloatArray:
+    """Return `WIDTH` sets of values at n sites, (n, WIDTH), and their gradients: (n, 3, WIDTH).
 
     They are those of `fit_gradients`, begun with the mean of the triangles around each site.
     """
-    begin = _mean_gradients(triangulation)
-    n = len(triangulation.sites)
-    corners, edges, _ = triangles_of(triangulation)
-    # Each edge between two sites, in both directions and once.
-    first, second = np.roll(corners, -1, axis=1).ravel(), np.roll(corners, -2, axis=1).ravel()
-    pairs = np.concatenate([first * np.int64(n) + second, second * np.int64(n) + first])
-    here, there = np.divmod(np.unique(pairs), n)
-    edges = triangulation.sites[there] - triangulation.sites[here]
-    stiff = edges * ((edges**2).sum(axis=1) ** -1.5)[:, None]
-    yy, yx, xx = (
-        np.bincount(here, stiff[:, i] * edges[:, j], n) for i, j in ((0, 0), (0, 1), (1, 1))
-    )
-    determinant = yy * xx - yx * yx
-    fitted = determinant > 1e-12 * (yy + xx) ** 2
-    scale = np.where(fitted, 0.5 / np.where(fitted, determinant, 1.0), 0.0)
-    pull_y = scale[here] * (xx[here] * stiff[:, 0] - yx[here] * stiff[:, 1])
-    pull_x = scale[here] * (yy[here] * stiff[:, 1] - yx[here] * stiff[:, 0])
-
-    def between(pulls: FloatArray) -> csr_array:
-        return csr_array((pulls, (here, there)), shape=(n, n))
-
-    by_values = vstack(
-        [3 * between(p) - diags_array(3 * np.bincount(here, p, n)) for p in (pull_y, pull_x)]
-    )
-    kept = diags_array(np.where(fitted, 0.0, 1.0))
-    by_gradients = block_array(
-        [
-            [kept - between(pull_y * edges[:, 0]), -between(pull_y * edges[:, 1])],
-            [-between(pull_x * edges[:, 0]), kept - between(pull_x * edges[:, 1])],
-        ],
-        format="csr",
-    )
-    return csr_array(by_values + by_gradients @ begin)
-
-
-def _mean_gradients(triangulation: RegularTriangulation) -> csr_array:
-    """Return what makes the mean gradient of the triangles around each site, by their areas."""
-    n = len(triangulation.sites)
-    corners, edges, double = triangles_of(triangulation)
-    total = np.bincount(corners.ravel(), np.repeat(np.abs(double), 3), n)
-    # The gradient times the double area, at each corner of a triangle by the value at each.
-    slopes = normals(edges) * np.sign(double)[:, None, None]
-    rows, columns = np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, 3).ravel()
-    shares = 1 / np.maximum(total, 1e-300)[rows]
-    parts = [np.tile(slopes[..., axis], 3).ravel() * shares for axis in (0, 1)]
-    return csr_array(
-        (np.concatenate(parts), (np.concatenate([rows, rows + n]), np.tile(columns, 2))),
-        shape=(2 * n, n),
-    )
+    vertices, neighbors, points = arrays_of(triangulation)
+    gradients = np.zeros((len(values), 2, WIDTH))
+    _mean_slopes(vertices, points, values, gradients)
+    surface = np.zeros((len(values), 3, WIDTH))
+    _bend_least(vertices, neighbors, points, values, gradients, surface)
+    return surface
 
 
 @njit(nogil=True, cache=True)

@@ -111,8 +111,8 @@ def pixel_shares(
     starts = np.zeros(n + 1, np.int64)
     operands = shape, around, borders, starts
     threads = available_threads(threads)
-    in_ranges(_list_shares, n, threads, *operands, np.empty(0, np.int64), np.empty(0))
+    in_ranges(_list_shares, n, threads, *operands, np.empty(0, np.int32), np.empty(0))
     starts[:] = np.cumsum(starts)
-    pixels, shares = np.empty(starts[-1], np.int64), np.empty(starts[-1])
+    pixels, shares = np.empty(starts[-1], np.int32), np.empty(starts[-1])
     in_ranges(_list_shares, n, threads, *operands, pixels, shares)
     return csr_array((shares, pixels, starts), shape=(n, shape[0] * shape[1]))

@@ -6,13 +6,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_array, eye_array, vstack
+from scipy.sparse import csr_array
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
-from napari_shadowinv.geometry.linear_surface import corner_weights, gradient_map
-from napari_shadowinv.transport.factorised import WIDTH
+from napari_shadowinv.geometry.linear_surface import WIDTH, corner_weights, with_gradients
 from napari_shadowinv.transport.sites import Level, SitePlan
 
 __all__ = ["LinearReadout"]
@@ -74,9 +73,7 @@ class LinearReadout:
 
     def __init__(self, plan: SitePlan, level: Level, threads: int | None = None) -> None:
         n = len(level.sites)
-        # Of each site its value, then its gradient, side by side.
-        order = np.arange(3 * n).reshape(3, n).T.ravel()
-        self._at_sites = csr_array(vstack([eye_array(n), gradient_map(level.triangulation)]))[order]
+        self._triangulation = level.triangulation
         # One pixel more at each side; beyond the level's border the potential is its mirror image.
         beyond = [
             np.clip(np.arange(-1, size + 1) + plan.margin_width, 0, whole - 1)
@@ -99,10 +96,9 @@ class LinearReadout:
     def at_sites(self, weights: FloatArray) -> FloatArray:
         """Return the potential's values and gradients, (n, 3, WIDTH), for weights (n, WIDTH)."""
         # Half the weights are the potential.
-        found = self._at_sites @ (0.5 * weights)
-        mean = self._border_mean @ found
-        found[::3] -= mean
-        return np.asarray(found.reshape(-1, 3, WIDTH))
+        found = with_gradients(self._triangulation, 0.5 * weights)
+        found[:, 0] -= self._border_mean @ found.reshape(-1, WIDTH)
+        return found
 
     def add(
         self, values: FloatArray, sums: FloatArray, squares: FloatArray, start: int, rows: int

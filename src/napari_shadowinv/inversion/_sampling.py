@@ -18,6 +18,7 @@ from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.linear_surface import WIDTH
 from napari_shadowinv.geometry.overlaps import pixel_shares
 from napari_shadowinv.inversion._drawing import Draw
 from napari_shadowinv.inversion._linear_readout import LinearReadout
@@ -25,7 +26,7 @@ from napari_shadowinv.inversion.normalise import floored_by
 from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
-from napari_shadowinv.transport.factorised import WIDTH, FactorisedLaplacian
+from napari_shadowinv.transport.factorised import FactorisedLaplacian
 from napari_shadowinv.transport.linear import LaplacianSolver
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan
@@ -59,7 +60,7 @@ class Resolving:
     options: InversionOptions
 
     def sample(self, seeds: list[Seed], report: Reporter) -> Sample:
-        """Invert the noisy image of a single seed, without what the image alone needs (re-projection, caustics)."""
+        """Invert the noisy image of one seed, without what the image alone needs (caustics, …)."""
         (seed,) = seeds
         image = self.image(seed)
         plan = self.plan

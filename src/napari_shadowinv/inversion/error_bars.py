@@ -33,6 +33,7 @@ from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry.linear_surface import WIDTH
 from napari_shadowinv.inversion._drawing import noise_of
 from napari_shadowinv.inversion._invert import invert, plan_sites
 from napari_shadowinv.inversion._sampling import Resolving, Responding, Scatter, Seed
@@ -40,7 +41,6 @@ from napari_shadowinv.inversion.labels import dataset_from_field, label
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.transport.factorised import WIDTH
 from napari_shadowinv.transport.sites import SitePlan
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ import numpy as np
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.linear_surface import normals, triangles_of
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.factorised import factorise
 from napari_shadowinv.transport.sites import SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
@@ -94,12 +94,25 @@ class LinearResponse:
     @cached_property
     def _slopes(self) -> tuple[Indices, FloatArray]:
         """Corners of the triangles between sites, and the gradient by each corner's value."""
-        corners, edges, double = triangles_of(self.level.triangulation)
+        corners, edges, double = _triangles(self.level.triangulation)
         # Along the border lie slivers, on which three values tell no gradient.
         longest = (edges**2).sum(axis=2).max(axis=1)
         good = np.abs(double) > _SLIVER * longest
         corners, edges, double = corners[good], edges[good], double[good]
-        return corners, normals(edges) / double[:, None, None]
+        return corners, _normals(edges) / double[:, None, None]
+
+
+def _triangles(triangulation: RegularTriangulation) -> tuple[Indices, FloatArray, FloatArray]:
+    """Corners of the triangles between sites, the edges opposite to them, and double areas."""
+    corners = triangulation.vertices
+    corners = corners[(corners < len(triangulation.sites)).all(axis=1)]
+    points = triangulation.sites[corners]
+    edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)
+    return corners, edges, edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+
+
+def _normals(edges: FloatArray) -> FloatArray:
+    return np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
 
 
 def _within(places: FloatArray, plan: SitePlan) -> BoolArray:

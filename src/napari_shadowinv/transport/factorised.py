@@ -13,11 +13,10 @@ from scipy.sparse.linalg import SuperLU, splu
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.linear_surface import WIDTH
 from napari_shadowinv.transport._coarsening import require_connected
 
-__all__ = ["WIDTH", "FactorisedLaplacian", "factorise"]
-
-WIDTH = 8  # a row of so many numbers fills a line of the cache
+__all__ = ["FactorisedLaplacian", "factorise"]
 
 
 def factorise(laplacian: csr_array, ground: FloatArray | None) -> SuperLU:
@@ -66,7 +65,8 @@ class FactorisedLaplacian:
         require_connected(laplacian)
         factors = factorise(laplacian, ground)
         self._n, self._pinned = int(laplacian.shape[0]), int(ground is None)
-        self._pivots, self._places = factors.U.diagonal(), factors.perm_c
+        self._pivots = factors.U.diagonal()
+        self._places = factors.perm_c.copy()  # itself, it would keep all factors
         # Rows are exchanged as the columns are, so U = D Lᵀ, as long as each pivot is positive.
         if not (np.array_equal(factors.perm_r, self._places) and (self._pivots > 0).all()):
             raise RuntimeError("the Laplacian is not positive")
