@@ -94,13 +94,8 @@ def pixel_shares(
 ) -> csr_array:
     """Return the area of each pixel in each of the n cells, (n, H W), over images of a shape.
 
-    As `PowerDiagram.cell`, to be asked before the triangulation is updated.
-
-    >>> sites = np.array([[0.25, 0.0], [0.25, 3.0]])
-    >>> diagram = PowerDiagram(RegularTriangulation(sites), Density.from_image(np.ones((1, 4))))
-    >>> pixel_shares(diagram, (1, 4)).toarray()
-    array([[1., 1., 0., 0.],
-           [0., 0., 1., 1.]])
+    The columns are the pixels row by row. To be asked before the triangulation is updated, as
+    `PowerDiagram.cell`. Results do not depend on the number of threads.
     """
     n = diagram.n_sites
     cells, senses = diagram.edges.T.ravel(), np.repeat([1.0, -1.0], len(diagram.edges))
@@ -115,4 +110,4 @@ def pixel_shares(
     starts[:] = np.cumsum(starts)
     pixels, shares = np.empty(starts[-1], np.int32), np.empty(starts[-1])
     in_ranges(_list_shares, n, threads, *operands, pixels, shares)
-    return csr_array((shares, pixels, starts), shape=(n, shape[0] * shape[1]))
+    return csr_array((shares, pixels, starts.astype(np.int32)), shape=(n, shape[0] * shape[1]))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -129,19 +130,17 @@ class Scatter:
 class Responding:
     """The linear response of an inversion to what samples change in the image."""
 
-    def __init__(self, samples: Resolving, image: FloatArray) -> None:
+    def __init__(self, samples: Resolving, image: FloatArray, threads: int | None) -> None:
         self._samples, self._image = samples, image
-        plan, threads = samples.plan, samples.options.threads
-        level = plan.levels[-1]
+        plan, level = samples.plan, samples.plan.levels[-1]
         objective = Target.of(image, plan.margin, samples.options).objective(level)
         diagram = objective.diagram(samples.start)
-        numbers = np.arange(level.shape[0] * level.shape[1]).reshape(level.shape)
-        shares = pixel_shares(diagram, level.shape, threads=threads)
-        self._shares = shares[:, plan.within(numbers).ravel()]
+        self._shares = pixel_shares(diagram, level.shape, threads=threads)
         self._network = diagram.laplacian(), objective.ground(samples.start)
-        self._factors = (
-            FactorisedLaplacian(*self._network) if len(level.sites) <= _MOST_FACTORISED else None
-        )
+        self._factors = None
+        if len(level.sites) <= _MOST_FACTORISED:
+            with suppress(RuntimeError):  # too hard for factors; the multigrid says if it is, too
+                self._factors = FactorisedLaplacian(*self._network)
         self._readout = LinearReadout(plan, level, threads)
         self._solvers = threading.local()  # each has vectors of its own
 
@@ -154,17 +153,20 @@ class Responding:
             self._readout.add(values, sums, squares, start, _ROWS)
         return Scatter(len(seeds), sums, squares)
 
-    def changes(self, seeds: list[Seed], report: Reporter) -> list[FloatArray]:
-        """Return what each of up to `WIDTH` noisy images changes in (potential, displacement)."""
-        values = self._at_sites(seeds, report)
-        return [self._readout.field(values[..., sample]) for sample in range(len(seeds))]
+    def changes(self, seeds: list[Seed]) -> FloatArray:
+        """Return what up to `WIDTH` images change in potential and displacement, (k, 3, H, W)."""
+        values = self._at_sites(seeds, Reporter())
+        return np.array([self._readout.field(values[..., one]) for one in range(len(seeds))])
 
     def _at_sites(self, seeds: list[Seed], report: Reporter) -> FloatArray:
-        gained = np.zeros((self._shares.shape[0], WIDTH))
+        plan = self._samples.plan
+        change = np.zeros(plan.levels[-1].shape)
+        lacking = np.zeros((self._shares.shape[0], WIDTH))
         for sample, seed in enumerate(seeds):
             report("samples", 0)
-            gained[:, sample] = self._shares @ (self._samples.image(seed) - self._image).ravel()
-        return self._readout.at_sites(self._solve(-gained, report))
+            plan.within(change)[:] = self._image - self._samples.image(seed)
+            lacking[:, sample] = self._shares @ change.ravel()
+        return self._readout.at_sites(self._solve(lacking, report))
 
     def _solve(self, right: FloatArray, report: Reporter) -> FloatArray:
         if self._factors is not None:

@@ -261,13 +261,13 @@ def uncertainty(
         quietly = Reporter(None, should_stop)
         checked = np.array(list(solved(seeds[:_CHECKED], quietly)))
         clean = prepare(image, plan.source, clipping, plan.mask).floored_image
-        responding = Responding(resolving, clean)
-        linear = np.array(responding.changes(seeds[:_CHECKED], quietly))
+        responding = _beside(lambda: Responding(resolving, clean, options.threads), quietly)
+        linear = _beside(lambda: responding.changes(seeds[:_CHECKED]), quietly)
         off = _share(linear[:, 1:] - checked[:, 1:], checked[:, 1:])
         del checked, linear
         blocks = [seeds[start : start + WIDTH] for start in range(0, len(seeds), WIDTH)]
         scatter = reduce(add, _in_order(responding.scatter, blocks, workers, report))
-    mean = here + scatter.mean
+    mean, std = here + scatter.mean, scatter.std
     warnings = inversion.report.warnings
     if off > _LINEAR_ENOUGH:
         warnings = (
@@ -285,9 +285,9 @@ def uncertainty(
     return Uncertainty(
         inversion=inversion,
         potential_mean=mean[0],
-        potential_std=scatter.std[0],
+        potential_std=std[0],
         displacement_mean=mean[1:],
-        displacement_std=scatter.std[1:],
+        displacement_std=std[1:],
         n=int(n),
         noise=described,
         method=method,
@@ -314,6 +314,18 @@ def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
         return threads
     needed = n_sites * _BYTES_PER_SITE + n_pixels * _BYTES_PER_PIXEL
     return max(1, min(threads, memory // 2 // needed))
+
+
+def _beside(work: Callable[[], Result], report: Reporter) -> Result:
+    """Work in another thread, which is left alone with what it is at if this one is to stop."""
+    pool = ThreadPoolExecutor(1)
+    try:
+        found = pool.submit(work)
+        while not wait([found], timeout=_POLL_SECONDS).done:
+            report("samples", 0)
+        return found.result()
+    finally:
+        pool.shutdown(wait=False)
 
 
 def _in_order(

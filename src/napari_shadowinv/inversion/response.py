@@ -18,7 +18,7 @@ from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
-from napari_shadowinv.transport.factorised import factorise
+from napari_shadowinv.transport.linear import factorise
 from napari_shadowinv.transport.sites import SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 

@@ -1,33 +1,21 @@
 """One Laplacian, many right-hand sides: factors, with which a solution costs two substitutions.
 
-- factors of a Laplacian: `factorise`
 - solutions of `WIDTH` systems at a time: `FactorisedLaplacian`
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse import csr_array
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.linear_surface import WIDTH
 from napari_shadowinv.transport._coarsening import require_connected
+from napari_shadowinv.transport.linear import factorise
 
-__all__ = ["FactorisedLaplacian", "factorise"]
-
-
-def factorise(laplacian: csr_array, ground: FloatArray | None) -> SuperLU:
-    """Factorise a Laplacian with its ground; without one, all of it but its first node."""
-    matrix = laplacian[1:, 1:] if ground is None else laplacian + diags_array(ground)
-    return splu(
-        matrix.tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+__all__ = ["FactorisedLaplacian"]
 
 
 @njit(nogil=True, cache=True)
@@ -58,7 +46,7 @@ def _substitute(
 class FactorisedLaplacian:
     """Factors of a Laplacian as `LaplacianSolver` takes it, which threads may share.
 
-    A graph that is not connected raises a RuntimeError.
+    A graph that is not connected, or that rounding makes look so, raises a RuntimeError.
     """
 
     def __init__(self, laplacian: csr_array, ground: FloatArray | None = None) -> None:

@@ -1,6 +1,7 @@
 """Newton's linear systems: aggregation multigrid for the graph Laplacians of power diagrams.
 
 - solve one system: `solve_laplacian`; several with the same matrix: `LaplacianSolver`
+- factors of the matrix, where those are better: `factorise`
 
 Flexible conjugate gradients, preconditioned by one cycle over the levels of
 `napari_shadowinv.transport._coarsening`. One Gauss–Seidel sweep before and its mirror image
@@ -18,7 +19,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import SuperLU, splu
 
 from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import FloatArray
@@ -30,9 +32,8 @@ from napari_shadowinv.transport._coarsening import (
     build_hierarchy,
     require_connected,
 )
-from napari_shadowinv.transport.factorised import factorise
 
-__all__ = ["LaplacianSolver", "solve_laplacian"]
+__all__ = ["LaplacianSolver", "factorise", "solve_laplacian"]
 
 _DIRECT_BELOW = 200
 _WORTH_A_THREAD = 100_000
@@ -293,3 +294,14 @@ def solve_laplacian(
         solution[1:] = factorise(laplacian, ground).solve(right[1:] - right.mean())
     solution -= solution.mean()
     return solution
+
+
+def factorise(laplacian: csr_array, ground: FloatArray | None) -> SuperLU:
+    """Factorise a Laplacian with its ground; without one, all of it but its first node."""
+    matrix = laplacian[1:, 1:] if ground is None else laplacian + diags_array(ground)
+    return splu(
+        matrix.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
