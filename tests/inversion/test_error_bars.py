@@ -22,7 +22,7 @@ from napari_shadowinv import (
     write,
 )
 from napari_shadowinv.geometry.linear_surface import WIDTH
-from napari_shadowinv.inversion import _sampling
+from napari_shadowinv.inversion import _sampling, error_bars
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.poisson import border_mean
 
@@ -236,6 +236,20 @@ def test_cancelling_among_the_samples_ends_them(counts, plan):
             should_stop=lambda: max(steps, default=0) > 1,
         )
     assert max(steps) == WIDTH  # samples of a block are done together
+
+
+def test_cancelling_while_samples_are_prepared_waits_for_nothing(monkeypatch, counts, plan):
+    begun, go_on = threading.Event(), threading.Event()
+
+    def prepared(*_):
+        begun.set()
+        assert go_on.wait(60)
+
+    monkeypatch.setattr(error_bars, "Responding", prepared)
+    with pytest.raises(InversionCancelled, match="samples"):
+        uncertainty(counts, 3, plan=plan, should_stop=begun.is_set)
+    assert not go_on.is_set()
+    go_on.set()
 
 
 @pytest.mark.parametrize(
