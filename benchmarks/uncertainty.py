@@ -1,9 +1,10 @@
-"""What error bars cost, and whether they are right: two tables, printed as Markdown.
+"""What error bars cost, and whether they are right: three tables, printed as Markdown.
 
-    python benchmarks/uncertainty.py [--n-sites 40000] [--n 20] [--shots 30]
+    python benchmarks/uncertainty.py [--n 200] [--n-solved 20] [--shots 30]
 
-Cost: noisy samples against whole inversions of the same image, in the same run. Processor
-time does not depend on what else the machine does, wall time shows what two threads gain.
+Cost: what one more sample takes, by the linear response and by solving, on one thread. Both
+methods take turns, so that a busy machine slows both.
+Linear against solved: error bars of the same samples by both methods.
 Calibration: error bars from one noisy image against the scatter of the inversions
 of many independent ones, and how often they hold the truth.
 """
@@ -13,13 +14,13 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv import (
     InversionOptions,
-    Uncertainty,
     invert,
     plan_sites,
     synthetic_image,
@@ -40,35 +41,53 @@ def seconds(work: Callable[[], object]) -> NDArray[np.float64]:
     return np.array([time.perf_counter() - wall, time.process_time() - processor])
 
 
-def cost_row(name: str, peak: int, n: int, options: InversionOptions, repeat: int = 3) -> str:
-    """Inversions and samples take turns, so that a busy machine slows both."""
+def cost_rows(n_sites: int, n: int, n_solved: int, repeat: int = 5) -> list[str]:
+    """Time two numbers of samples of each method: their difference tells what samples take."""
+    options = InversionOptions(n_sites=n_sites, negative="clip", threads=1)
+    image = toroid_case(97, noise=True).image
+    plan = plan_sites(SOURCE, options)
+
+    def call(method: Literal["linear", "resolve"], samples: int) -> NDArray[np.float64]:
+        asked = {"plan": plan, "noise": SIGMA, "options": options, "method": method}
+        return seconds(lambda: uncertainty(image, samples, **asked))
+
+    few, most = 3, {"linear": n, "resolve": n_solved}  # linear samples are checked by so many
+    turns = [
+        [[call(method, samples) for samples in (few, many)] for method, many in most.items()]
+        + [[seconds(lambda: invert(image, plan=plan, options=options))] * 2]
+        for _ in range(repeat)
+    ]
+    *methods, (inversion, _) = np.median(turns, axis=0)
+    return [
+        f"| {n_sites:,} | {method} | {inversion[1]:.2f} | {many} | {whole[1]:.2f} "
+        f"| {1e3 * (whole[0] - start[0]) / (many - few):.2f} "
+        f"| {1e3 * (whole[1] - start[1]) / (many - few):.2f} |"
+        for (method, many), (start, whole) in zip(most.items(), methods, strict=True)
+    ]
+
+
+def agreement_row(peak: int, n_sites: int, n: int) -> str:
+    """Error bars of the same noisy images by both methods."""
+    options = InversionOptions(n_sites=n_sites, negative="clip")
     image = toroid_case(peak, noise=True).image
+    asked = {"plan": plan_sites(SOURCE, options), "noise": SIGMA, "options": options}
+    linear = uncertainty(image, n, **asked)
+    solved = uncertainty(image, n, **asked, method="resolve")
 
-    def whole() -> object:
-        return invert(image, source=SOURCE, options=options)
+    def compared(name: str) -> str:
+        one, other = getattr(linear, name), getattr(solved, name)
+        whole = np.linalg.norm(one) / np.linalg.norm(other)
+        low, high = np.percentile(one / other, (5, 95))
+        return f"{whole:.3f} ({low:.2f} to {high:.2f})"
 
-    found: list[Uncertainty] = []
-
-    def samples() -> None:
-        found.append(uncertainty(image, n, source=SOURCE, noise=SIGMA, options=options))
-
-    turns = []
-    for _ in range(repeat):
-        inversions = np.mean([seconds(whole) for _ in range(3)], axis=0)
-        error_bars = seconds(samples)
-        inversions = (inversions + np.mean([seconds(whole) for _ in range(3)], axis=0)) / 2
-        turns.append((inversions, error_bars, error_bars / inversions))
-    inversion, error_bars, ratio = np.median(turns, axis=0)
-    steps = np.mean(found[-1].iterations)
-    levels = found[-1].inversion.report.levels
     return (
-        f"| {name} | {options.threads} | {inversion[0]:.2f} | {error_bars[0]:.2f} "
-        f"| {ratio[0]:.1f} | {ratio[1]:.1f} | {(ratio[1] - 1) / n:.2f} "
-        f"| {sum(steps for _, steps, _ in levels)} ({levels[-1][1]}) | {steps:.1f} |"
+        f"| toroid {peak} | {n_sites:,} | {linear.nonlinearity:.0%} "
+        f"| {compared('displacement_std')} | {compared('potential_std')} |"
     )
 
 
-def calibration_row(peak: int, kind: str, n: int, shots: int, options: InversionOptions) -> str:
+def calibration_row(peak: int, kind: str, n: int, shots: int) -> str:
+    options = InversionOptions(n_sites=40_000, negative="clip")
     truth = toroid(SOURCE.shape, paper_setup(), float(peak), 30e-6).displacement
     clean = synthetic_image(truth)
     rng = np.random.default_rng(peak)
@@ -96,23 +115,30 @@ def calibration_row(peak: int, kind: str, n: int, shots: int, options: Inversion
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--n-sites", type=int, default=40_000)
-    parser.add_argument("--n", type=int, default=20)
+    parser.add_argument("--n", type=int, default=200)
+    parser.add_argument("--n-solved", type=int, default=20)
     parser.add_argument("--shots", type=int, default=30)
     arguments = parser.parse_args()
-    options = InversionOptions(n_sites=arguments.n_sites, negative="clip")
     uncertainty(np.ones((20, 20)) + np.eye(20), 2, noise=0.1)  # compile
 
-    print(f"{arguments.n_sites:,} sites, {arguments.n} samples, noise of {SIGMA:.0%}\n")
+    print(f"One thread, toroid 97, noise of {SIGMA:.0%}; processor time but for the last but one\n")
     print(
-        "| image | threads | invert, s | error bars, s | in inversions, by wall time "
-        "| by processor time | one sample | steps of the inversion (finest level) | of a sample |"
+        "| sites | method | inversion, s | samples | whole call, s | ms a sample, wall time "
+        "| processor time |"
     )
-    print("|---|---|---|---|---|---|---|---|---|")
-    for peak in (97, 194):
-        for threads in (1, 2):
-            chosen = options.model_copy(update={"threads": threads})
-            print(cost_row(f"toroid {peak}", peak, arguments.n, chosen), flush=True)
+    print("|---|---|---|---|---|---|---|")
+    for n_sites in (2_500, 10_000, 40_000):
+        print(*cost_rows(n_sites, arguments.n, arguments.n_solved), sep="\n", flush=True)
+
+    print(f"\n{arguments.n_solved} samples of noise of {SIGMA:.0%} by both methods\n")
+    print(
+        "| image | sites | nonlinearity | linear / solved, displacement: r.m.s. (90 % of pixels) "
+        "| potential |"
+    )
+    print("|---|---|---|---|---|")
+    for n_sites in (10_000, 40_000):
+        for peak in (24, 97, 194):
+            print(agreement_row(peak, n_sites, arguments.n_solved), flush=True)
 
     print(f"\n{arguments.shots} independent shots of each object\n")
     print(
@@ -123,7 +149,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     for peak in (24, 97, 194):
         for kind in ("Gaussian", "Poisson"):
-            row = calibration_row(peak, kind, arguments.n, arguments.shots, options)
+            row = calibration_row(peak, kind, arguments.n, arguments.shots)
             print(row, flush=True)
 
 

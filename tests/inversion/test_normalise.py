@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.normalise import number_of_sites, prepare
+from napari_shadowinv.inversion.normalise import floored_by, number_of_sites, prepare
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 
 
@@ -18,6 +18,22 @@ def test_image_source_and_floored_image_have_one_flux():
     assert prepared.floored_pixels == (image < 1e-3 * image.mean()).sum() == 90
     floor = prepared.floored_image.min() / prepared.floored_image.mean()
     assert floor == pytest.approx(1e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize("flux", ["conserve", "known"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_many_images_of_one_source_are_floored_as_each_alone(flux, masked):
+    rng = np.random.default_rng(4)
+    options = InversionOptions(flux=flux, boundary="free", negative="clip")
+    mask = rng.random((20, 30)) > 0.2 if masked else None
+    source = rng.random((20, 30))
+    floored = floored_by(source, options, mask)
+    for _ in range(3):
+        image = 10 * rng.normal(size=(20, 30))
+        expected = prepare(image, source, options, mask).floored_image
+        np.testing.assert_array_equal(floored(image), expected)
+    with pytest.raises(InputError, match="no positive pixel"):
+        floored(-image.clip(0))
 
 
 def test_without_a_source_it_is_uniform_and_keeps_the_images_units():

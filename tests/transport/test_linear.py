@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,7 +17,7 @@ from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 from napari_shadowinv.transport import linear
-from napari_shadowinv.transport.linear import LaplacianSolver, solve_laplacian
+from napari_shadowinv.transport.linear import LaplacianSolver, SimilarSystems
 
 Array = NDArray[np.float64]
 Edges = NDArray[np.int64]
@@ -122,7 +124,7 @@ def test_small_systems_have_the_pseudoinverse_solution(n: int, seed: int, decade
     right = noise(n, seed)
     expected = np.linalg.pinv(laplacian.toarray(), rcond=1e-12, hermitian=True) @ right
     for solution in (
-        solve_laplacian(laplacian, right, 1e-12),
+        SimilarSystems().solve(laplacian, right, 1e-12),
         LaplacianSolver(laplacian).solve(right, 1e-12)[0],
     ):
         assert np.abs(solution - expected).max() < 1e-7 * np.abs(expected).max()
@@ -133,7 +135,7 @@ def test_larger_systems_have_the_factorised_solution() -> None:
     right = noise(5000)
     expected = np.append(0.0, splu(laplacian[1:, 1:].tocsc()).solve(right[1:]))
     expected -= expected.mean()
-    solution = solve_laplacian(laplacian, right, 1e-10)
+    solution = SimilarSystems().solve(laplacian, right, 1e-10)
     assert np.abs(solution - expected).max() < 1e-6 * np.abs(expected).max()
 
 
@@ -193,7 +195,7 @@ def test_columns_may_come_in_any_order(order: str) -> None:
         shape=laplacian.shape,
     )
     right = noise(3000)
-    solution = solve_laplacian(shuffled, right, 1e-10)
+    solution = SimilarSystems().solve(shuffled, right, 1e-10)
     assert residual(laplacian, solution, right) <= 1e-10
 
 
@@ -202,8 +204,8 @@ def test_numbering_does_not_change_the_answer() -> None:
     right = noise(5000)
     order = np.random.default_rng(6).permutation(5000)
     permuted = csr_array(laplacian[order][:, order])
-    solution = solve_laplacian(laplacian, right, 1e-10)
-    again = solve_laplacian(permuted, right[order], 1e-10)
+    solution = SimilarSystems().solve(laplacian, right, 1e-10)
+    again = SimilarSystems().solve(permuted, right[order], 1e-10)
     assert np.abs(again - solution[order]).max() < 1e-6 * np.abs(solution).max()
 
 
@@ -211,8 +213,8 @@ def test_numbering_does_not_change_the_answer() -> None:
 def test_a_constant_in_the_right_side_is_ignored(n: int) -> None:
     laplacian = unit_delaunay(n)
     right = noise(n)
-    solution = solve_laplacian(laplacian, right, 1e-10)
-    shifted = solve_laplacian(laplacian, right + 7.0, 1e-10)
+    solution = SimilarSystems().solve(laplacian, right, 1e-10)
+    shifted = SimilarSystems().solve(laplacian, right + 7.0, 1e-10)
     assert np.allclose(shifted, solution, atol=1e-6 * np.abs(solution).max())
     assert abs(shifted.mean()) < 1e-12 * np.abs(shifted).max()
 
@@ -226,7 +228,7 @@ def test_one_set_up_serves_many_right_sides() -> None:
 
 
 def test_a_zero_right_side_gives_zeros() -> None:
-    assert not solve_laplacian(unit_delaunay(1000), np.full(1000, 3.0), 1e-2).any()
+    assert not SimilarSystems().solve(unit_delaunay(1000), np.full(1000, 3.0), 1e-2).any()
 
 
 @pytest.mark.parametrize("sizes", [(10, 10), (60, 1), (2000, 1), (2000, 2000), (4000, 5)])
@@ -237,13 +239,13 @@ def test_a_graph_in_two_pieces_is_refused(sizes: tuple[int, int]) -> None:
     whole[: sizes[0], : sizes[0]] = pieces[0]
     whole[sizes[0] :, sizes[0] :] = pieces[1]
     with pytest.raises(RuntimeError, match="several groups with no flux between them"):
-        solve_laplacian(csr_array(whole), noise(n), 1e-2)
+        SimilarSystems().solve(csr_array(whole), noise(n), 1e-2)
 
 
 def test_many_pieces_are_refused() -> None:
     pairs = np.arange(2000).reshape(-1, 2)
     with pytest.raises(RuntimeError, match="several groups with no flux between them"):
-        solve_laplacian(laplacian_of(pairs, np.ones(1000), 2000), noise(2000), 1e-2)
+        SimilarSystems().solve(laplacian_of(pairs, np.ones(1000), 2000), noise(2000), 1e-2)
 
 
 def test_infinite_conductances_are_refused() -> None:
@@ -257,15 +259,47 @@ def test_factorisation_takes_over_where_iterations_do_not_suffice(
 ) -> None:
     class Lazy(LaplacianSolver):
         def solve(
-            self, right: Array, tolerance: float = 1e-2, max_iterations: int = 200
+            self,
+            right: Array,
+            tolerance: float = 1e-2,
+            max_iterations: int = 200,
+            *,
+            matrix: csr_array | None = None,
         ) -> tuple[Array, int, float]:
-            return super().solve(right, tolerance, 1)
+            return super().solve(right, tolerance, 1, matrix=matrix)
 
     laplacian = smooth_contrast(5000)
     right = noise(5000)
     monkeypatch.setattr(linear, "LaplacianSolver", Lazy)
     assert Lazy(laplacian).solve(right, 1e-6)[2] > 1e-6
-    assert residual(laplacian, solve_laplacian(laplacian, right, 1e-6), right) <= 1e-6
+    assert residual(laplacian, SimilarSystems().solve(laplacian, right, 1e-6), right) <= 1e-6
+
+
+@pytest.mark.parametrize("grounded", [False, True])
+def test_one_setup_solves_similar_systems(grounded: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    setups = []
+
+    class Counted(LaplacianSolver):
+        def __init__(self, *given: Any, **named: Any) -> None:
+            setups.append(given)
+            super().__init__(*given, **named)
+
+    monkeypatch.setattr(linear, "LaplacianSolver", Counted)
+    systems, laplacian = SimilarSystems(), unit_delaunay(3000)
+    rng = np.random.default_rng(5)
+    for _ in range(3):
+        scale = diags_array(1 + 0.05 * rng.random(3000))
+        varied = scale @ laplacian @ scale
+        varied = csr_array(varied - diags_array(varied.sum(axis=1)))
+        ground = 0.1 * rng.random(3000) if grounded else None
+        whole = varied if ground is None else varied + diags_array(ground)
+        right = noise(3000)
+        assert residual(whole, systems.solve(varied, right, 1e-9, ground=ground), right) <= 1e-9
+    assert len(setups) == 1
+    right = noise(3000)
+    other = smooth_contrast(3000)
+    assert residual(other, systems.solve(other, right, 1e-9), right) <= 1e-9
+    assert len(setups) == 2
 
 
 @pytest.mark.parametrize("n", [50, 5000])
@@ -275,7 +309,7 @@ def test_a_ground_makes_the_system_regular(n: int, strength: float) -> None:
     ground = np.where(np.arange(n) % 7 == 0, strength, 0.0)
     right = np.random.default_rng(2).random(n)  # its sum flows off through the ground
     exact = splu((laplacian + diags_array(ground)).tocsc()).solve(right)
-    found = solve_laplacian(laplacian, right, 1e-10, ground=ground)
+    found = SimilarSystems().solve(laplacian, right, 1e-10, ground=ground)
     np.testing.assert_allclose(found, exact, rtol=1e-5, atol=1e-7 * np.abs(exact).max())
     assert ground @ found == pytest.approx(right.sum(), rel=1e-6)
 

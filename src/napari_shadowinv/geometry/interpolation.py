@@ -26,10 +26,22 @@ from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
-__all__ = ["BLOCK", "CloughTocher", "arrays_of", "fit_gradients", "locate", "with_mirror_images"]
+__all__ = [
+    "BLOCK",
+    "PATCH",
+    "CloughTocher",
+    "arrays_of",
+    "fill_patch",
+    "fit_gradients",
+    "locate",
+    "nearest_corner",
+    "value_on_patch",
+    "with_mirror_images",
+]
 
 BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
-_KEPT, _PATCH = 512, 31  # triangles that are remembered, by their numbers; numbers of each
+PATCH = 31  # numbers that describe the surface over a triangle
+_KEPT = 512  # triangles whose patches are remembered
 
 
 def with_mirror_images(
@@ -146,8 +158,8 @@ def _edge_ordinates(
 
 
 @njit(nogil=True, cache=True)
-def _fill_patch(p: FloatArray, f: FloatArray, g: FloatArray, patch: FloatArray) -> None:
-    """Work out what `_value` needs of the surface over the triangle p.
+def fill_patch(p: FloatArray, f: FloatArray, g: FloatArray, patch: FloatArray) -> None:
+    """Work out what `value_on_patch` needs of the surface over the triangle p.
 
     Three barycentric coordinates as a y + b x + c; then ordinates: at each vertex, along the edge
     opposite to it near its two ends, inside that edge's patch, on the way from the vertex to
@@ -174,7 +186,7 @@ def _fill_patch(p: FloatArray, f: FloatArray, g: FloatArray, patch: FloatArray) 
 
 
 @njit(nogil=True, cache=True)
-def _value(patch: FloatArray, y: float, x: float) -> tuple[float, float]:
+def value_on_patch(patch: FloatArray, y: float, x: float) -> tuple[float, float]:
     """Return the value at (y, x) of the surface over a triangle, and the point's least coordinate.
 
     That is negative where the triangle does not hold the point.
@@ -219,7 +231,7 @@ def _evaluate_blocks(
     """Evaluate blocks `start` to `stop` of the queries."""
     n = values.shape[0]
     p, f, g = np.empty((3, 2)), np.empty(3), np.empty((3, 2))
-    patches = np.empty((_KEPT, _PATCH))
+    patches = np.empty((_KEPT, PATCH))
     kept = np.empty(_KEPT, np.int64)
     for block in range(start, stop):
         # Nothing is left from the block before, so that it does not matter who has worked on it.
@@ -228,14 +240,14 @@ def _evaluate_blocks(
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
             y, x = queries[q]
             if kept[t % _KEPT] == t:
-                out[q], least = _value(patch, y, x)
+                out[q], least = value_on_patch(patch, y, x)
                 if least >= 0:
                     continue
             t = locate(vertices, neighbors, points, t, y, x)
             slot = t % _KEPT
             patch = patches[slot]
             if kept[slot] == t:
-                out[q], _ = _value(patch, y, x)
+                out[q], _ = value_on_patch(patch, y, x)
                 continue
             outside = False
             for k in range(3):
@@ -245,11 +257,11 @@ def _evaluate_blocks(
                     break
                 p[k], f[k], g[k] = points[a], values[a], gradients[a]
             if not outside:
-                _fill_patch(p, f, g, patch)
+                fill_patch(p, f, g, patch)
                 kept[slot] = t
-                out[q], _ = _value(patch, y, x)
+                out[q], _ = value_on_patch(patch, y, x)
                 continue
-            nearest = _nearest_corner(vertices[t], points, n, y, x)
+            nearest = nearest_corner(vertices[t], points, n, y, x)
             if nearest >= 0:
                 out[q] = (
                     values[nearest]
@@ -259,7 +271,7 @@ def _evaluate_blocks(
 
 
 @njit(nogil=True, cache=True)
-def _nearest_corner(corners: Indices, points: FloatArray, n: int, y: float, x: float) -> int:
+def nearest_corner(corners: Indices, points: FloatArray, n: int, y: float, x: float) -> int:
     """Return the corner nearest to (y, x) that is a site, or -1 between ghosts alone."""
     nearest, least = -1, np.inf
     for a in corners:

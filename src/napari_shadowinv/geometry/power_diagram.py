@@ -224,6 +224,15 @@ class PowerDiagram:
         )
         return csr_array((values, columns, starts), shape=(self.n_sites, self.n_sites))
 
+    @property
+    def borders(self) -> FloatArray:
+        """Ends (y, x) of the border between each pair of `edges`, shape (e, 2, 2).
+
+        The first of the pair lies to its left. To be asked before the triangulation is updated.
+        """
+        _, sides = _edges_of(self._triangulation)
+        return np.asarray(self.vertices[sides])
+
     def cell(self, site: int) -> FloatArray:
         """Return the corners of a site's cell, counter-clockwise in (y, x), shape (k, 2).
 

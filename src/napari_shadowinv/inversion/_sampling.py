@@ -7,7 +7,10 @@ with a matrix that all samples share; to solve the transport again costs a few, 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,31 +19,35 @@ from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.linear_surface import WIDTH
+from napari_shadowinv.geometry.overlaps import pixel_shares
 from napari_shadowinv.inversion._drawing import Draw
-from napari_shadowinv.inversion.normalise import prepare
-from napari_shadowinv.inversion.readout import read_dual, read_out
-from napari_shadowinv.inversion.response import site_gradients
-from napari_shadowinv.inversion.result import Inversion
+from napari_shadowinv.inversion._linear_readout import LinearReadout
+from napari_shadowinv.inversion.normalise import floored_by
+from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.transport.factorised import FactorisedLaplacian
 from napari_shadowinv.transport.linear import LaplacianSolver
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
 
-__all__ = ["Resolving", "Responding", "Sample"]
+__all__ = ["Resolving", "Responding", "Sample", "Scatter", "Seed"]
+
+Seed = np.random.SeedSequence
 
 _SAMPLE_SHARE = 0.2  # of the noise's flux errors that a sample may leave unsolved
 _LOOSEST_TOLERANCE = 0.1
+_MOST_FACTORISED = 300_000  # sites; their factors take 0.2 GB and two seconds
 _LINEAR_TOLERANCE = 0.02
+_ROWS = 64  # read out between two looks at whether to stop
 
 
 class Sample(NamedTuple):
     """One noisy image, inverted."""
 
-    potential: FloatArray
-    displacement: FloatArray
+    field: FloatArray  # potential and displacement, (3, H, W)
     solution: LevelSolution
 
 
@@ -53,8 +60,9 @@ class Resolving:
     draw: Draw
     options: InversionOptions
 
-    def sample(self, seed: np.random.SeedSequence, report: Reporter) -> Sample:
-        """Invert one noisy image, without what the image alone needs (re-projection, caustics)."""
+    def sample(self, seeds: list[Seed], report: Reporter) -> Sample:
+        """Invert the noisy image of one seed, without what the image alone needs (caustics, …)."""
+        (seed,) = seeds
         image = self.image(seed)
         plan = self.plan
         solution = solve(
@@ -63,9 +71,9 @@ class Resolving:
         potential, displacement = (
             plan.within(values) for values in read_out(solution, self.options)
         )
-        return Sample(potential - border_mean(potential), displacement, solution)
+        return Sample(np.stack([potential - border_mean(potential), *displacement]), solution)
 
-    def to_tolerance_of_noise(self, seed: np.random.SeedSequence) -> Resolving:
+    def to_tolerance_of_noise(self, seed: Seed) -> Resolving:
         """Ask of the solver no more than what matters beside the flux errors that noise makes."""
         # What it leaves unsolved is white, and moves the field far less than the flux that it
         # did move: where a fifth is left in the worst cell, a sample's field is within 3 % of
@@ -82,54 +90,94 @@ class Resolving:
         tolerance = max(loosest, self.options.tolerance)
         return replace(self, options=self.options.model_copy(update={"tolerance": tolerance}))
 
-    def image(self, seed: np.random.SeedSequence) -> FloatArray:
+    def image(self, seed: Seed) -> FloatArray:
         """Draw a noisy image, as the transport sees it."""
-        noisy = self.draw(np.random.default_rng(seed))
-        return prepare(noisy, self.plan.source, self.options, self.plan.mask).floored_image
+        return self._floored(self.draw(np.random.default_rng(seed)))
+
+    @cached_property
+    def _floored(self) -> Callable[[FloatArray], FloatArray]:
+        return floored_by(self.plan.source, self.options, self.plan.mask)
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Sums over samples of (potential, displacement), (3, H, W), as far as they differ from one."""
+
+    # About a field that is as near as noise leaves it, nothing is lost by sums of squares.
+    count: int
+    sums: FloatArray
+    squares: FloatArray
+
+    @classmethod
+    def of(cls, change: FloatArray) -> Scatter:
+        return cls(1, change, change**2)
+
+    def __add__(self, other: Scatter) -> Scatter:
+        return Scatter(
+            self.count + other.count, self.sums + other.sums, self.squares + other.squares
+        )
+
+    @property
+    def mean(self) -> FloatArray:
+        return self.sums / self.count
+
+    @property
+    def std(self) -> FloatArray:
+        variance = (self.squares - self.sums * self.mean) / (self.count - 1)
+        return np.sqrt(np.maximum(variance, 0))
 
 
 class Responding:
-    """Adds to an inversion its linear response to what each sample changes in the image."""
+    """The linear response of an inversion to what samples change in the image."""
 
-    def __init__(self, samples: Resolving, inversion: Inversion, image: FloatArray) -> None:
-        self._samples, self._inversion, self._image = samples, inversion, image
-        plan, options = samples.plan, samples.options
-        level = plan.levels[-1]
-        self._objective = Target.of(image, plan.margin, options).objective(level)
-        self._laplacian = self._objective.diagram(samples.start).laplacian()
-        self._ground = self._objective.ground(samples.start)
+    def __init__(self, samples: Resolving, image: FloatArray, threads: int | None) -> None:
+        self._samples, self._image = samples, image
+        plan, level = samples.plan, samples.plan.levels[-1]
+        objective = Target.of(image, plan.margin, samples.options).objective(level)
+        diagram = objective.diagram(samples.start)
+        self._shares = pixel_shares(diagram, level.shape, threads=threads)
+        self._network = diagram.laplacian(), objective.ground(samples.start)
+        self._factors = None
+        if len(level.sites) <= _MOST_FACTORISED:
+            with suppress(RuntimeError):  # too hard for factors; the multigrid says if it is, too
+                self._factors = FactorisedLaplacian(*self._network)
+        self._readout = LinearReadout(plan, level, threads)
         self._solvers = threading.local()  # each has vectors of its own
 
-    def sample(self, seed: np.random.SeedSequence, report: Reporter) -> Sample:
-        """Invert one noisy image to first order."""
-        report("samples", 0)
-        samples, plan = self._samples, self._samples.plan
-        level, threads = plan.levels[-1], samples.options.threads
-        change = np.zeros(level.shape)
-        plan.within(change)[:] = samples.image(seed) - self._image
-        triangulation = self._objective.triangulation
-        gained = PowerDiagram(triangulation, Density.from_image(change), threads=threads).masses
-        weights, steps, residual = self._solver.solve(-gained, _LINEAR_TOLERANCE)
-        solution = LevelSolution(
-            weights,
-            residual,
-            steps,
-            residual <= _LINEAR_TOLERANCE,
-            level=level,
-            threads=threads,
-            flux=gained,
-            displacement=-site_gradients(level.triangulation, 0.5 * weights),
-        )
-        potential, displacement = (
-            plan.within(values) for values in read_dual(solution.surface, level.shape)
-        )
-        potential = self._inversion.potential + potential - border_mean(potential)
-        return Sample(potential, self._inversion.displacement + displacement, solution)
+    def scatter(self, seeds: list[Seed], report: Reporter) -> Scatter:
+        """Sum the changes that up to `WIDTH` noisy images make, in order."""
+        values = self._at_sites(seeds, report)
+        sums, squares = np.zeros((2, 3, *self._image.shape))
+        for start in range(0, len(self._image), _ROWS):
+            report("samples", 0)
+            self._readout.add(values, sums, squares, start, _ROWS)
+        return Scatter(len(seeds), sums, squares)
 
-    @property
-    def _solver(self) -> LaplacianSolver:
+    def changes(self, seeds: list[Seed]) -> FloatArray:
+        """Return what up to `WIDTH` images change in potential and displacement, (k, 3, H, W)."""
+        values = self._at_sites(seeds, Reporter())
+        return np.array([self._readout.field(values[..., one]) for one in range(len(seeds))])
+
+    def _at_sites(self, seeds: list[Seed], report: Reporter) -> FloatArray:
+        plan = self._samples.plan
+        change = np.zeros(plan.levels[-1].shape)
+        lacking = np.zeros((self._shares.shape[0], WIDTH))
+        for sample, seed in enumerate(seeds):
+            report("samples", 0)
+            plan.within(change)[:] = self._image - self._samples.image(seed)
+            lacking[:, sample] = self._shares @ change.ravel()
+        return self._readout.at_sites(self._solve(lacking, report))
+
+    def _solve(self, right: FloatArray, report: Reporter) -> FloatArray:
+        if self._factors is not None:
+            return self._factors.solve(right)
         if not hasattr(self._solvers, "one"):
             threads = available_threads(self._samples.options.threads)
-            self._solvers.one = LaplacianSolver(self._laplacian, self._ground, threads=threads)
-        solver: LaplacianSolver = self._solvers.one
-        return solver
+            self._solvers.one = LaplacianSolver(*self._network, threads=threads)
+        weights = np.zeros_like(right)
+        for sample in np.flatnonzero(right.any(axis=0)):
+            report("samples", 0)
+            weights[:, sample], _, _ = self._solvers.one.solve(
+                right[:, sample].copy(), _LINEAR_TOLERANCE
+            )
+        return weights

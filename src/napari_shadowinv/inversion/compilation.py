@@ -77,6 +77,7 @@ def compile_rest() -> None:
     from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.transport.factorised import FactorisedLaplacian
     from napari_shadowinv.transport.linear import LaplacianSolver
 
     synthetic_image(np.zeros((2, 8, 8)), np.ones((8, 8)))
@@ -99,7 +100,9 @@ def compile_rest() -> None:
     density = Density.from_image(np.ones((20, 20)))
     for with_moments in (True, False):
         diagram = PowerDiagram(triangulation, density, with_moments=with_moments)
-    LaplacianSolver(diagram.laplacian()).solve(diagram.masses)
+    laplacian = diagram.laplacian()
+    LaplacianSolver(laplacian).solve(diagram.masses)
+    FactorisedLaplacian(laplacian).solve(diagram.masses[:, None])
 
 
 def how_often() -> str:

@@ -11,18 +11,20 @@ have (the parametric bootstrap).
 References
 ----------
 B. Efron and R. J. Tibshirani, *An Introduction to the Bootstrap* (Chapman & Hall, 1993),
-chapter 6; B. P. Welford, Technometrics 4, 419 (1962), for the running sums.
+chapter 6.
 """
 
 from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 from threading import Event
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,9 +33,10 @@ from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry.linear_surface import WIDTH
 from napari_shadowinv.inversion._drawing import noise_of
 from napari_shadowinv.inversion._invert import invert, plan_sites
-from napari_shadowinv.inversion._sampling import Resolving, Responding, Sample
+from napari_shadowinv.inversion._sampling import Resolving, Responding, Scatter, Seed
 from napari_shadowinv.inversion.labels import dataset_from_field, label
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.result import Inversion
@@ -46,6 +49,8 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["Uncertainty", "uncertainty"]
+
+Result = TypeVar("Result")
 
 _CHECKED = 3  # linear samples that are solved, too
 _LINEAR_ENOUGH = 0.3  # of their change
@@ -240,42 +245,34 @@ def uncertainty(
     resolving = Resolving(replace(plan, levels=levels), inversion.weights, draw, clipping)
     resolving = resolving.to_tolerance_of_noise(seeds[0])
     report = Reporter(on_progress, should_stop)
-    potential, displacement = _RunningMoments(), _RunningMoments()
+    here = np.stack([inversion.potential, *inversion.displacement])
     went: list[tuple[int, float, bool]] = []
-    checked: list[FloatArray] = []
-    off = _Share()
 
-    def add(sample: Sample) -> None:
-        potential.add(sample.potential)
-        displacement.add(sample.displacement)
+    def solved(seeds: list[Seed], report: Reporter) -> Iterator[FloatArray]:
+        for sample in _in_order(resolving.sample, [[seed] for seed in seeds], workers, report):
+            found = sample.solution  # which is large, and not kept
+            went.append((found.iterations, found.residual, found.converged))
+            yield sample.field - here
 
-    def keep_solution(sample: Sample) -> None:
-        found = sample.solution  # which is large, and not kept
-        went.append((found.iterations, found.residual, found.converged))
-        if method == "resolve":
-            add(sample)
-        else:
-            checked.append(sample.displacement)
-
-    def keep_linear(sample: Sample) -> None:
-        add(sample)
-        if potential.count <= len(checked):
-            exact = checked[potential.count - 1]
-            off.add(sample.displacement - exact, exact - inversion.displacement)
-
+    off = 0.0
     if method == "resolve":
-        _in_order(resolving.sample, seeds, workers, keep_solution, report)
+        scatter = reduce(add, map(Scatter.of, solved(seeds, report)))
     else:
         quietly = Reporter(None, should_stop)
-        _in_order(resolving.sample, seeds[:_CHECKED], workers, keep_solution, quietly)
+        checked = np.array(list(solved(seeds[:_CHECKED], quietly)))
         clean = prepare(image, plan.source, clipping, plan.mask).floored_image
-        responding = Responding(resolving, inversion, clean)
-        _in_order(responding.sample, seeds, workers, keep_linear, report)
+        responding = _beside(lambda: Responding(resolving, clean, options.threads), quietly)
+        linear = _beside(lambda: responding.changes(seeds[:_CHECKED]), quietly)
+        off = _share(linear[:, 1:] - checked[:, 1:], checked[:, 1:])
+        del checked, linear
+        blocks = [seeds[start : start + WIDTH] for start in range(0, len(seeds), WIDTH)]
+        scatter = reduce(add, _in_order(responding.scatter, blocks, workers, report))
+    mean, std = here + scatter.mean, scatter.std
     warnings = inversion.report.warnings
-    if off.value > _LINEAR_ENOUGH:
+    if off > _LINEAR_ENOUGH:
         warnings = (
             f"the response to noise is not linear: samples that were solved differ by "
-            f"{off.value:.0%} of what the noise changes; use method='resolve'",
+            f"{off:.0%} of what the noise changes; use method='resolve'",
             *warnings,
         )
     iterations, residuals, converged = zip(*went, strict=True)
@@ -287,14 +284,14 @@ def uncertainty(
         )
     return Uncertainty(
         inversion=inversion,
-        potential_mean=potential.mean,
-        potential_std=potential.std,
-        displacement_mean=displacement.mean,
-        displacement_std=displacement.std,
+        potential_mean=mean[0],
+        potential_std=std[0],
+        displacement_mean=mean[1:],
+        displacement_std=std[1:],
         n=int(n),
         noise=described,
         method=method,
-        nonlinearity=off.value,
+        nonlinearity=off,
         tolerance=resolving.options.tolerance,
         iterations=iterations,
         residuals=residuals,
@@ -303,37 +300,10 @@ def uncertainty(
     )
 
 
-class _RunningMoments:
-    """Mean and standard deviation of arrays that are not kept."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.mean = self._squares = np.zeros(())
-
-    def add(self, values: FloatArray) -> None:
-        self.count += 1
-        before = values - self.mean
-        self.mean = self.mean + before / self.count
-        self._squares = self._squares + before * (values - self.mean)
-
-    @property
-    def std(self) -> FloatArray:
-        return np.asarray(np.sqrt(self._squares / (self.count - 1)))
-
-
-class _Share:
-    """Length of one vector relative to another, both of which come in parts."""
-
-    def __init__(self) -> None:
-        self._part = self._whole = 0.0
-
-    def add(self, part: FloatArray, whole: FloatArray) -> None:
-        self._part += float((part**2).sum())
-        self._whole += float((whole**2).sum())
-
-    @property
-    def value(self) -> float:
-        return (self._part / self._whole) ** 0.5 if self._whole > 0 else 0.0
+def _share(part: FloatArray, whole: FloatArray) -> float:
+    """Length of one vector relative to another."""
+    length = float(np.linalg.norm(whole))
+    return float(np.linalg.norm(part)) / length if length > 0 else 0.0
 
 
 def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
@@ -346,34 +316,40 @@ def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
     return max(1, min(threads, memory // 2 // needed))
 
 
+def _beside(work: Callable[[], Result], report: Reporter) -> Result:
+    """Work in another thread, which is left alone with what it is at if this one is to stop."""
+    pool = ThreadPoolExecutor(1)
+    try:
+        found = pool.submit(work)
+        while not wait([found], timeout=_POLL_SECONDS).done:
+            report("samples", 0)
+        return found.result()
+    finally:
+        pool.shutdown(wait=False)
+
+
 def _in_order(
-    work: Callable[[np.random.SeedSequence, Reporter], Sample],
-    seeds: list[np.random.SeedSequence],
+    work: Callable[[list[Seed], Reporter], Result],
+    blocks: list[list[Seed]],
     workers: int,
-    keep: Callable[[Sample], None],
     report: Reporter,
-) -> None:
-    """Work on a few seeds at once and hand over the samples in the order of the seeds."""
+) -> Iterator[Result]:
+    """Work on a few blocks of seeds at once and give their results in the order of the seeds."""
     # Only this thread reports and asks whether to stop: what listens need not expect others.
     abandoned = Event()
-    waiting: deque[Future[Sample]] = deque()
-    done = 0
-
-    def keep_first() -> None:
-        nonlocal done
-        while not wait([waiting[0]], timeout=_POLL_SECONDS).done:
-            report("samples", done, len(seeds))
-        keep(waiting.popleft().result())
-        done += 1
-        report("samples", done, len(seeds))
-
+    waiting: deque[Future[Result]] = deque()
+    sizes = deque(map(len, blocks))
+    done, total = 0, sum(sizes)
     with ThreadPoolExecutor(workers) as pool:
         try:
-            for seed in seeds:
-                waiting.append(pool.submit(work, seed, Reporter(None, abandoned.is_set)))
-                if len(waiting) > workers:  # one more is ready to be begun
-                    keep_first()
-            while waiting:
-                keep_first()
+            for number, block in enumerate(blocks):
+                waiting.append(pool.submit(work, block, Reporter(None, abandoned.is_set)))
+                # One more than are worked on is ready to be begun.
+                while len(waiting) > (workers if number + 1 < len(blocks) else 0):
+                    while not wait([waiting[0]], timeout=_POLL_SECONDS).done:
+                        report("samples", done, total)
+                    yield waiting.popleft().result()
+                    done += sizes.popleft()
+                    report("samples", done, total)
         finally:
             abandoned.set()

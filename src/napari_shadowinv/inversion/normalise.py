@@ -1,11 +1,13 @@
 """An image and a source made ready for the transport.
 
 - check and normalise: `prepare`; a source or a mask alone: `checked_source`, `checked_mask`
+- only normalise, many images of one source: `floored_by`
 - the margin of a free boundary, and how many sites: `margin_around`, `number_of_sites`
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -65,11 +67,7 @@ def prepare(
             "if they result from background subtraction, clip them (negative='clip', or "
             "--clip-negative on the command line)"
         )
-    values = np.maximum(values, 0)
-    if not values.any():
-        raise InputError(
-            "image has no positive pixel, expected a beam: check the file and its background"
-        )
+    values = _positive(values)
     _check_range(values, "image")
     if source is None:
         beam = np.where(usable, values.sum() / usable.sum(), 0.0)
@@ -93,11 +91,8 @@ def prepare(
         flux_scale = ratio if conserved else 1.0
     values = values / flux_scale
     least = options.floor * values.sum() / usable.sum()
-    floored = np.maximum(values, least)
-    floored_source = masked_source(beam, usable, options)
-    if conserved:
-        # The floor has added to both, not alike.
-        floored *= floored_source.sum() / floored.sum()
+    floored_flux = masked_source(beam, usable, options).sum() if conserved else None
+    floored = _raised(values, least, floored_flux)
     below = int((values[usable] < least).sum())
     unit = power_of_two(beam)
     return Prepared(
@@ -111,6 +106,47 @@ def prepare(
         flux_scale=flux_scale,
         warnings=_warnings(ratio if conserved else 1.0, negative, below, usable, options),
     )
+
+
+def floored_by(
+    source: FloatArray, options: InversionOptions, mask: BoolArray | None
+) -> Callable[[FloatArray], FloatArray]:
+    """Return what makes the `floored_image` of `prepare` of images of one source, in its mask.
+
+    They are not checked again, and clipped; what does not depend on them is worked out once.
+    """
+    usable = np.ones(source.shape, bool) if mask is None else mask
+    beam = checked_source(source, usable)
+    flux, count, unit = beam.sum(), usable.sum(), power_of_two(beam)
+    conserved = options.flux != "known"
+    floored_flux = masked_source(beam, usable, options).sum() if conserved else None
+
+    def floored(image: FloatArray) -> FloatArray:
+        values = _positive(np.where(usable, image, 0.0))
+        if conserved:
+            values /= values.sum() / flux
+        return _raised(values, options.floor * values.sum() / count, floored_flux) / unit
+
+    return floored
+
+
+def _positive(values: FloatArray) -> FloatArray:
+    """Clip an image that has something left then."""
+    values = np.maximum(values, 0)
+    if not values.any():
+        raise InputError(
+            "image has no positive pixel, expected a beam: check the file and its background"
+        )
+    return values
+
+
+def _raised(values: FloatArray, least: float, flux: float | None) -> FloatArray:
+    """Raise dark pixels to the floor, and then all to a flux."""
+    floored = np.maximum(values, least)
+    if flux is not None:
+        # The floor has added to image and source, not alike.
+        floored *= flux / floored.sum()
+    return floored
 
 
 def power_of_two(source: FloatArray) -> float:

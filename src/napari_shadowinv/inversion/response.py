@@ -1,7 +1,5 @@
 """What small changes of flux do to the field: `LinearResponse`.
 
-The gradient of a potential that is known at the sites: `site_gradients`.
-
 Around a solved transport the weights answer a change of flux linearly, by the Hessian that
 Newton's step has: H δw = δS - δT, and the displacement by -½ ∇δw. A level of a few thousand sites
 is enough for noise, whose displacement is mostly of long waves (its spectrum falls as 1/k²); what
@@ -14,18 +12,17 @@ import math
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import diags_array
-from scipy.sparse.linalg import splu
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.transport.factorised import FactorisedLaplacian
 from napari_shadowinv.transport.sites import SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
-__all__ = ["LinearResponse", "site_gradients"]
+__all__ = ["LinearResponse"]
 
 _FELT = 2.5  # a level feels what is so many times finer than its spacing, within 5 %
 _SLIVER = 0.3  # double area by the longest side's square; of an equilateral triangle 0.87
@@ -52,26 +49,12 @@ class LinearResponse:
         self.flux = diagram.masses
         ones = Density.from_image(np.ones(solution.level.shape))
         self.area = PowerDiagram(objective.triangulation, ones, threads=solution.threads).masses
-        laplacian = diagram.laplacian()
         ground = objective.ground(solution.weights)
-        self._grounded = ground is not None
-        # Without a ground one potential is free.
-        matrix = laplacian[1:, 1:] if ground is None else laplacian + diags_array(ground)
-        self._factors = splu(
-            matrix.tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        self._factors = FactorisedLaplacian(diagram.laplacian(), ground)
 
     def to(self, changes: FloatArray) -> FloatArray:
         """Return each triangle's displacement (t, k, 2), px, by fluxes that cells gain (k, n)."""
-        potential = np.zeros(changes.shape[::-1])
-        if self._grounded:
-            potential[:] = -0.5 * self._factors.solve(changes.T)
-        else:
-            changes = changes - changes.mean(axis=1, keepdims=True)
-            potential[1:] = -0.5 * self._factors.solve(changes.T[1:])
+        potential = -0.5 * self._factors.solve(changes.T)
         corners, slopes = self._slopes
         return np.asarray(-np.einsum("tik,tic->tkc", potential[corners], slopes))
 
@@ -110,18 +93,6 @@ class LinearResponse:
         good = np.abs(double) > _SLIVER * longest
         corners, edges, double = corners[good], edges[good], double[good]
         return corners, _normals(edges) / double[:, None, None]
-
-
-def site_gradients(triangulation: RegularTriangulation, values: FloatArray) -> FloatArray:
-    """Return the gradient of values at the sites, (n, 2): the mean of the triangles around each."""
-    n = len(values)
-    corners, edges, double = _triangles(triangulation)
-    # The gradient times the double area, so that each triangle counts by its area.
-    slope = np.einsum("ti,tic->tc", values[corners], _normals(edges)) * np.sign(double)[:, None]
-    weight = np.repeat(np.abs(double), 3)
-    total = np.maximum(np.bincount(corners.ravel(), weight, n), 1e-300)
-    found = [np.bincount(corners.ravel(), np.repeat(part, 3), n) / total for part in slope.T]
-    return np.stack(found, axis=1)
 
 
 def _triangles(triangulation: RegularTriangulation) -> tuple[Indices, FloatArray, FloatArray]:

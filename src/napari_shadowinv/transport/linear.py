@@ -1,7 +1,8 @@
 """Newton's linear systems: aggregation multigrid for the graph Laplacians of power diagrams.
 
-- solve one system: `solve_laplacian`; several with the same matrix: `LaplacianSolver`
-- one after the other with matrices that change little: `SimilarSystems`
+- solve systems one after the other whose matrices change little: `SimilarSystems`
+- several with the same matrix: `LaplacianSolver`
+- factors of the matrix, where those are better: `factorise`
 
 Flexible conjugate gradients, preconditioned by one cycle over the levels of
 `napari_shadowinv.transport._coarsening`. One Gauss–Seidel sweep before and its mirror image
@@ -20,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import FloatArray
@@ -33,7 +34,7 @@ from napari_shadowinv.transport._coarsening import (
     require_connected,
 )
 
-__all__ = ["LaplacianSolver", "SimilarSystems", "solve_laplacian"]
+__all__ = ["LaplacianSolver", "SimilarSystems", "factorise"]
 
 _DIRECT_BELOW = 200
 _MORE_ITERATIONS = 3  # that cost less than a new setup
@@ -321,32 +322,25 @@ class SimilarSystems:
         return solution
 
 
-def solve_laplacian(
-    laplacian: csr_array,
-    right: FloatArray,
-    tolerance: float,
-    threads: int = 1,
-    *,
-    ground: FloatArray | None = None,
-) -> FloatArray:
-    """Solve one system as `SimilarSystems` does."""
-    return SimilarSystems(threads).solve(laplacian, right, tolerance, ground=ground)
-
-
 def _solved_by_factors(
     laplacian: csr_array, right: FloatArray, ground: FloatArray | None
 ) -> FloatArray:
     if ground is not None:
-        return _factorised(laplacian + diags_array(ground), right)
-    # Without a ground one unknown is free: all but the first are factorised.
+        return np.asarray(factorise(laplacian, ground).solve(right))
+    # Without a ground one unknown is free: all but the first are solved for.
     solution = np.zeros(len(right))
     if len(right) > 1:
-        solution[1:] = _factorised(laplacian[1:, 1:], right[1:] - right.mean())
+        solution[1:] = factorise(laplacian, ground).solve(right[1:] - right.mean())
     solution -= solution.mean()
     return solution
 
 
-def _factorised(matrix: csr_array, right: FloatArray) -> FloatArray:
-    symmetric = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}}
-    solution: FloatArray = splu(matrix.tocsc(), diag_pivot_thresh=0.0, **symmetric).solve(right)
-    return solution
+def factorise(laplacian: csr_array, ground: FloatArray | None) -> SuperLU:
+    """Factorise a Laplacian with its ground; without one, all of it but its first node."""
+    matrix = laplacian[1:, 1:] if ground is None else laplacian + diags_array(ground)
+    return splu(
+        matrix.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )

@@ -1,0 +1,112 @@
+"""The linear response of many samples at once against that of each alone, step by step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import InversionOptions, invert, plan_sites, synthetic_image, uncertainty
+from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.interpolation import CloughTocher
+from napari_shadowinv.geometry.linear_surface import WIDTH, with_gradients
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.inversion import _sampling
+from napari_shadowinv.inversion._drawing import noise_of
+from napari_shadowinv.inversion._sampling import Resolving, Responding, Scatter
+from napari_shadowinv.inversion.normalise import prepare
+from napari_shadowinv.inversion.readout import read_dual
+from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.transport.linear import SimilarSystems
+from napari_shadowinv.transport.solvers import Target
+
+SHAPE = (60, 60)
+NOISE = 0.1
+KINDS = {"closed": {}, "masked": {}, "free": {"boundary": "free"}}
+
+
+@pytest.fixture(scope="module")
+def image():
+    clean = synthetic_image(toroid(SHAPE, paper_setup(), 97.0, 100e-6).displacement)
+    return clean + NOISE * np.random.default_rng(3).normal(size=SHAPE)
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def case(request, image):
+    """Options, a plan, and what `uncertainty` makes of them."""
+    mask = None
+    if request.param == "masked":
+        mask = np.ones(SHAPE, bool)
+        mask[20:30, 5:25] = mask[50:, 50:] = False
+    options = InversionOptions(n_sites=1000, negative="clip", **KINDS[request.param])
+    plan = plan_sites(np.ones(SHAPE), options, mask=mask)
+    draw, _ = noise_of(image, NOISE, None, mask)
+    samples = Resolving(plan, invert(image, plan=plan, options=options).weights, draw, options)
+    clean = prepare(image, plan.source, options, mask).floored_image
+    return samples, clean
+
+
+def alone(samples, clean, seed):
+    """Potential and displacement that one sample changes, by the ways of a single inversion."""
+    plan, level = samples.plan, samples.plan.levels[-1]
+    objective = Target.of(clean, plan.margin, samples.options).objective(level)
+    laplacian = objective.diagram(samples.start).laplacian()
+    ground = objective.ground(samples.start)
+    change = np.zeros(level.shape)
+    plan.within(change)[:] = samples.image(seed) - clean
+    gained = PowerDiagram(objective.triangulation, Density.from_image(change)).masses
+    half = 0.5 * SimilarSystems().solve(laplacian, -gained, 1e-11, ground=ground)
+    at_sites = with_gradients(level.triangulation, np.repeat(half[:, None], WIDTH, axis=1))
+    mirrored = level.mirrored()
+    gradients = mirrored.sense * at_sites[mirrored.origin, 1:, 0]
+    surface = CloughTocher(mirrored.triangulation, half[mirrored.origin], gradients)
+    potential, displacement = (plan.within(part) for part in read_dual(surface, level.shape))
+    return np.stack([potential - border_mean(potential), *displacement])
+
+
+def test_moments_are_those_of_samples_read_out_one_by_one(case):
+    """To rounding and the tolerance of the linear system; sampling errs by a tenth and more."""
+    samples, clean = case
+    seeds = np.random.SeedSequence(0).spawn(WIDTH + 3)
+    responding = Responding(samples, clean, 2)
+    blocks = seeds[:WIDTH], seeds[WIDTH:]
+    scatter = responding.scatter(blocks[0], Reporter()) + responding.scatter(blocks[1], Reporter())
+    each = np.array([alone(samples, clean, seed) for seed in seeds])
+    assert scatter.count == len(each)
+    size = each.std(axis=(0, 2, 3))[:, None, None]
+    np.testing.assert_allclose(scatter.mean / size, each.mean(axis=0) / size, atol=1e-7)
+    np.testing.assert_allclose(scatter.std / size, each.std(axis=0, ddof=1) / size, atol=1e-7)
+    np.testing.assert_allclose(responding.changes(seeds[:3]) / size, each[:3] / size, atol=1e-7)
+
+
+def test_a_sample_is_the_same_in_any_block(case):
+    samples, clean = case
+    seeds = np.random.SeedSequence(0).spawn(WIDTH)
+    one, other = Responding(samples, clean, 1), Responding(samples, clean, 3)
+    together = one.changes(seeds)
+    np.testing.assert_array_equal(other.changes(seeds[5:]), together[5:])
+    np.testing.assert_array_equal(
+        other.scatter(seeds[:1], Reporter()).sums, one.scatter(seeds[:1], Reporter()).sums
+    )
+
+
+def test_too_many_sites_for_factors_are_left_to_the_multigrid(monkeypatch, image):
+    options = InversionOptions(n_sites=1000, negative="clip")
+    factorised = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
+    monkeypatch.setattr(_sampling, "_MOST_FACTORISED", 0)
+    found = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
+    assert not np.array_equal(found.potential_std, factorised.potential_std)
+    for name in ("potential_std", "displacement_std"):
+        one, other = getattr(found, name), getattr(factorised, name)
+        # a residual of 2 % was allowed
+        assert np.linalg.norm(one - other) < 0.02 * np.linalg.norm(other)
+
+
+def test_the_scatter_of_samples_is_that_of_all_at_once():
+    values = np.random.default_rng(0).normal(size=(50, 3, 4, 5)) + 3
+    scatter = Scatter.of(values[0])
+    for value in values[1:]:
+        scatter = scatter + Scatter.of(value)
+    np.testing.assert_allclose(scatter.mean, values.mean(axis=0), rtol=1e-13)
+    np.testing.assert_allclose(scatter.std, values.std(axis=0, ddof=1), rtol=1e-12)
