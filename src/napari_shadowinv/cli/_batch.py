@@ -189,6 +189,7 @@ def _summary(store: StackStore, ledger: _Ledger) -> Table:
     rows = [
         ("shots", _counts_text(store)),
         ("this run", this_run if ledger.ended else "nothing to do"),
+        *_site_rows(store),
         *_trouble_rows(store),
         ("written", str(store.path)),
     ]
@@ -220,6 +221,25 @@ def _fit_rows(attributes: Mapping[str, Any]) -> Rows:
     """What was fitted to each shot."""
     choices = {**json.loads(attributes["fit"]), "fields": json.loads(attributes["fields"])}
     return [("fit", options_text(choices))]
+
+
+def _site_rows(store: StackStore) -> Rows:
+    """How many sites the shots have, and why; and what errors are typical."""
+    reports = [report for report in store.reports() if "n_sites" in report]
+    if not reports:
+        return []
+    counts = sorted({report["n_sites"] for report in reports})
+    least, most = f"{counts[0]:,}", f"{counts[-1]:,}"
+    reasons = dict.fromkeys(report.get("sites_reason") or "as given" for report in reports)
+    reason = next(iter(reasons)) if len(reasons) == 1 else "each for its own reason"
+    rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
+    errors = [report["errors"] for report in reports if report.get("errors")]
+    told = [
+        f"{name} {np.median(values):.2g} px"
+        for name in ("noise", "discretisation")
+        if (values := [one[name][0] for one in errors if np.isfinite(one[name][0])])
+    ]
+    return [*rows, ("errors", f"{', '.join(told)} (r.m.s., median of the shots)")][: 1 + bool(told)]
 
 
 def _trouble_rows(store: StackStore) -> Rows:
@@ -318,6 +338,7 @@ def store_rows(path: Path, *, trouble: bool = True) -> Rows:
         ("stored", str(attributes["stored"])),
         *([] if store.field is None else _fit_rows(attributes)),
         ("options", options_text(json.loads(attributes["options"]))),
+        *_site_rows(store),
     ]
     if seconds:
         mean = sum(seconds) / len(seconds)

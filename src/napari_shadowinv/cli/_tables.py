@@ -100,7 +100,7 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
             if shares
         ],
         *peak_rows(inversion.displacement, setup, inversion.errors),
-        *([] if inversion.errors is None else inversion.errors.rows(inversion.options)),
+        *inversion.error_rows,
     ]
 
 

@@ -266,7 +266,8 @@ def invert(
     told = _report(prepared.in_units(), noise, solutions, fields, seconds, options)
     finest = adaptive and len(answer.weights) == levels.counts[-1]
     if finest and errors is not None and told.warnings == prepared.warnings:
-        told = replace(told, warnings=(*told.warnings, *filter(None, [budget.missed(errors)])))
+        missed = errors.missed(options.accuracy, "with the most sites placed unless more are given")
+        told = replace(told, warnings=(*told.warnings, *filter(None, [missed])))
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,

@@ -96,6 +96,17 @@ class Errors:
         found = {"noise": self.noise, "discretisation": self.discretisation, "solver": self.solver}
         return {name: one for name, one in found.items() if not math.isnan(one.rms)}
 
+    def missed(self, accuracy: float, why: str) -> str:
+        """Say so, and why, if discretisation misses an accuracy and shows beside the noise."""
+        error = self.discretisation.rms
+        if not error > max(accuracy * self.rms, _SHARE_OF_NOISE * self.noise.rms):
+            return ""
+        return (
+            f"the accuracy of {100 * accuracy:.2g} % is not reached: {why}, the discretisation "
+            f"error is about {_percent(error, self.rms)} of the displacement; give a larger number "
+            "of sites"
+        )
+
     def scaled(self, factor: float) -> Errors:
         """Return the same in another unit, of which a displacement of 1 px is `factor`."""
         one = {
@@ -109,7 +120,10 @@ class Errors:
         told = ", ".join(
             f"{name} {_percent(one.rms, self.rms)}" for name, one in self._known.items()
         )
-        rows = [("errors", f"{told} of the displacement (r.m.s.)")]
+        told = f"{told} of the displacement (r.m.s.)"
+        if math.isnan(self.discretisation.rms):
+            told += "; discretisation not estimated, as only one level was solved"
+        rows = [("errors", told)]
         if self.beam is not None:
             rows.append(
                 (
@@ -182,17 +196,6 @@ class Budget:
             return 0.0
         excess = error / max(allowed, _SHARE_OF_NOISE * noise)
         return float(_SAFETY * excess ** (1 / power))
-
-    def missed(self, errors: Errors) -> str:
-        """Say so if the accuracy that was asked for is not reached."""
-        error, accuracy = errors.discretisation.rms, self._options.accuracy
-        if not error > max(accuracy * errors.rms, _SHARE_OF_NOISE * errors.noise.rms):
-            return ""
-        return (
-            f"the accuracy of {100 * accuracy:.2g} % is not reached: with the most sites that are "
-            f"placed unless more are asked for, the discretisation error is about "
-            f"{_percent(error, errors.rms)} of the displacement; give a larger number of sites"
-        )
 
     def errors(self, solutions: Sequence[LevelSolution], displacement: FloatArray) -> Errors:
         """Return the errors of the last solution, whose displacement was read out, (2, H, W)."""

@@ -157,6 +157,24 @@ class Inversion:
         return self.report.errors
 
     @property
+    def error_rows(self) -> list[tuple[str, str]]:
+        """What is told of the errors: names and texts."""
+        if self.errors is None:
+            return []
+        rows = self.errors.rows(self.options)
+        steps = () if self.provenance is None else self.provenance.recipe.steps
+        smoothing = [step.title for step in steps if step.smooths]
+        if smoothing and self.options.noise_level is None:
+            rows.append(
+                (
+                    "noise",
+                    f"measured after smoothing ({', '.join(smoothing)}), which hides most of it: "
+                    "its error is larger than told; give the noise_level of the recorded image",
+                )
+            )
+        return rows
+
+    @property
     def setup(self) -> Setup | None:
         """The geometry of its pixels, as far as the provenance tells."""
         return None if self.provenance is None else self.provenance.setup

@@ -121,6 +121,10 @@ class LowPassFilter(Filter):
     step: Literal["low-pass"] = "low-pass"
     width: float = width_field(1.0, "Standard deviation of the Gaussian blur in px.", 0.1, 20.0)
 
+    @property
+    def smooths(self) -> bool:
+        return True
+
 
 def high_pass(image: ArrayLike, width: float, *, keep_mean: bool = True) -> FloatArray:
     """Remove the structures that a Gaussian blur would keep.
@@ -254,6 +258,10 @@ class ButterworthFilter(Filter):
     @property
     def flattens(self) -> bool:
         return self.kind == "high"
+
+    @property
+    def smooths(self) -> bool:
+        return self.kind == "low"
 
 
 def remove_background(

@@ -101,6 +101,11 @@ class Step(Choice):
         """Whether it removes the beam from the image, so that a measured source no longer fits."""
         return False
 
+    @property
+    def smooths(self) -> bool:
+        """Whether it takes noise from pixels that it leaves in their mean over many."""
+        return False
+
     def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         """Return the shot with this done to image, source, masks and setup.
 
@@ -146,6 +151,10 @@ class Rotate(Step):
     def _turns(self) -> int | None:
         turns, rest = divmod(self.angle, 90)
         return None if rest else int(turns) % 4
+
+    @property
+    def smooths(self) -> bool:
+        return self._turns is None
 
     def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         turns = self._turns

@@ -177,6 +177,10 @@ class Work:
         told = {**dataclasses.asdict(inversion.report), "stages": inversion.report.seconds}
         if self.sites_chosen:
             told["sites_reason"] = "as many as the first shots needed for the accuracy"
+            if inversion.errors is not None:
+                accuracy = inversion.options.accuracy
+                missed = inversion.errors.missed(accuracy, "with the sites of the first shots")
+                told["warnings"] = [*told["warnings"], *filter(None, [missed])]
         return told | numbers_of(inversion)
 
 

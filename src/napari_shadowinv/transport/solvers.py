@@ -36,6 +36,7 @@ __all__ = ["LevelSolution", "Target", "fitted_flux", "solve"]
 _COARSE_TOLERANCE = 3e-2
 _HALFWAY = 2  # times the sites of a level, where the next one has four times as many
 _WORTH_HALF = 40_000  # sites from which that is worth a level of its own
+_LARGE = 50_000  # sites from which a surface is made again rather than kept
 _STALLED = 0.1  # a residual above this is no solution of anything
 _WARM_STEPS = 10
 _SITES_OF_FIT = 1500
@@ -157,7 +158,8 @@ def _climb(
             weights = None
             if solutions:
                 weights = 2 * solutions[-1].surface(level.sites)
-                solutions[-1].forget_surface()
+                if len(solutions[-1].weights) > _LARGE:
+                    solutions[-1].forget_surface()
             solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > _STALLED and len(levels) > 1:

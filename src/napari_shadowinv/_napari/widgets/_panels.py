@@ -197,7 +197,7 @@ def _error_rows(inversion: Inversion) -> list[tuple[str, str]]:
     if errors is None:
         return []
     (field,) = shown_fields([inversion.displacement], inversion.setup)
-    told = [(name.capitalize(), text) for name, text in errors.rows(inversion.options)]
+    told = [(name.capitalize(), text) for name, text in inversion.error_rows]
     return [("Field", field.peak_text(errors.of_peak)), *told]
 
 
