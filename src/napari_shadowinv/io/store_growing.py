@@ -111,7 +111,9 @@ class GrowingStore:
     def _gather(self, index: int, report: Mapping[str, Any]) -> None:
         try:
             for name, kind in self._summary.items():
-                value = np.array([number_of(report, name, kind)], object if kind is str else kind)
+                value: Any = np.array(
+                    [number_of(report, name, kind)], object if kind is str else kind
+                )
                 self._writer.opened[name][index : index + 1] = value
         except OSError as error:
             raise store_error(self.path, error) from error

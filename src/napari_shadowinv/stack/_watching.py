@@ -128,7 +128,7 @@ class StackMaker:
         return self._made([self.shot(name) for name in names], names)
 
     def _made(self, items: Sequence[Shot], names: Sequence[str]) -> Stack:
-        stack = self.describe(Shots(items, tuple(map(text_of, names)), ()))
+        stack = self.describe(Shots(items, tuple(map(text_of, names)), (0, 0)))
         if stack.sources is not None:
             raise InputError(
                 f"got {len(stack.sources)} sources: expected one for all shots, as it is not known "
@@ -180,9 +180,9 @@ class Watch:
         self._books.tell()
         try:
             while not self._is_over(idle, most):
-                name = self._arrivals.take(_POLL)
-                if name is not None:
-                    self._take(name)
+                arrived = self._arrivals.take(_POLL)
+                if arrived is not None:
+                    self._take(arrived)
         except InversionCancelled:
             pass
         finally:
