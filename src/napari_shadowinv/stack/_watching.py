@@ -17,7 +17,7 @@ import numpy as np
 
 from napari_shadowinv._system.machine import interrupts_put_off
 from napari_shadowinv._system.progress import ShouldStop
-from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.io.store_growing import GrowingStore
@@ -70,7 +70,7 @@ class Books:
         self._arrivals = arrivals
         self._on_progress = on_progress
         self.store: GrowingStore | None = None
-        # What failed before there was a store, which the first good shot makes.
+        # What failed before the first good shot, which makes the store or shows that it fits.
         self.early: dict[str, dict[str, Any]] = {}
         self.in_work = 0  # shots that are being inverted
 
@@ -85,9 +85,9 @@ class Books:
         if self._on_progress is None:
             return
         early, store = len(self.early), self.store
-        total = early if store is None else len(store)
+        total = early + (0 if store is None else len(store))
         done = 0 if store is None else store.count(DONE)
-        failed = early if store is None else store.count(FAILED)
+        failed = early + (0 if store is None else store.count(FAILED))
         waiting = self._arrivals.waiting + self.in_work
         told: dict[str, Any] = {"engine": "watching", "waiting": waiting, **news}
         self._on_progress(WatchProgress(total, done, failed, **told))
@@ -129,11 +129,6 @@ class StackMaker:
 
     def _made(self, items: Sequence[Shot], names: Sequence[str]) -> Stack:
         stack = self.describe(Shots(items, tuple(map(text_of, names)), (0, 0)))
-        if stack.sources is not None:
-            raise InputError(
-                f"got {len(stack.sources)} sources: expected one for all shots, as it is not known "
-                "yet which shots will arrive"
-            )
         # Shots start from each other only on the same sites.
         chained = self.chained and stack.beam is not None and not isinstance(stack, FitStack)
         return replace(stack, as_arrived=True, chained=chained)
@@ -165,13 +160,14 @@ class Watch:
         """Refuse what cannot work before anything arrives, as far as that is known by then."""
         self._overwrite = overwrite
         self._stack = self._stacks.before_any()
-        if not self._goes_on:
+        if overwrite or not self._path.exists():
             return
         store = StackStore(self._path)
         again = (PENDING, FAILED) if redo_failed else (PENDING,)
         self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
+        self._books.store = GrowingStore(store, NUMBERED_AS_ARRIVED)
         if self._stack is not None:
-            self._resume(store, self._stack)
+            self._use(made_alike(store, self._stack, self._dtype))
 
     def run(self, idle: float | None = None, most: int | None = None) -> None:
         """Invert what is there and what arrives, until it is over."""
@@ -187,10 +183,6 @@ class Watch:
             pass
         finally:
             self._books.tell()
-
-    @property
-    def _goes_on(self) -> bool:
-        return self._path.exists() and not self._overwrite
 
     def _is_over(self, idle: float | None, most: int | None) -> bool:
         if most is not None and self._ended >= most:
@@ -234,12 +226,11 @@ class Watch:
     def _known(self, name: str) -> dict[str, Any] | None:
         """What was told of a shot that has ended before; None of one that has not."""
         store = self._books.store
-        if store is None:
+        index = None if store is None else store.number(name)
+        if store is None or index is None or name in self._books.early:
             return self._books.early.get(name)
-        index = store.number(name)
-        if index is None or name in self._redo or store.status(index) == PENDING:
-            return None
-        return store.report(index)
+        pending = name in self._redo or store.status(index) == PENDING
+        return None if pending else store.report(index)
 
     def _tried(self, name: str, shot: FileShot) -> Tried:
         if self._work is None:
@@ -263,8 +254,8 @@ class Watch:
             except Exception as error:
                 return Tried(began, time.perf_counter() - began, {}, failure=reason_of(error))
             stack = self._stacks.of(names)
-            if self._goes_on:
-                self._resume(StackStore(self._path), stack)
+            if self._books.store is not None:
+                self._use(made_alike(StackStore(self._path), stack, self._dtype))
                 return None
         if stack.chooses_sites:
             self._books.prepare("how many sites the first shots need")
@@ -282,13 +273,9 @@ class Watch:
         own = tuple(name for name in stack.variables if not stack.is_shared(name))
         self._work = stack.work(own)
 
-    def _resume(self, store: StackStore, stack: Stack) -> None:
-        self._use(made_alike(store, stack, self._dtype))
-        self._books.store = GrowingStore(store, NUMBERED_AS_ARRIVED)
-
     def _write(self, name: str, tried: Tried) -> ShotOutcome:
         early = self._books.early
-        if self._books.store is None and tried.result is None:
+        if tried.result is None and (self._work is None or self._books.store is None):
             early[name] = {**tried.origin, "reason": tried.failure, "seconds": tried.seconds}
             return ShotOutcome(len(early) - 1, FAILED, tried.seconds, tried.failure)
         store = self._books.store or self._made([*early, name])
