@@ -102,6 +102,11 @@ class CheckedStore(LocalStore):
             check_promise(path, "chunk's", int(head[1]), size)
 
 
+def describes_arrays(path: Path) -> bool:
+    """Tell whether a store's folder has its own copy of what its arrays are like."""
+    return bool(_json(path / _METADATA).get("consolidated_metadata"))
+
+
 def _json(path: Path) -> dict[str, Any]:
     return dict(json.loads(small_text(path, "metadata of the store")))
 

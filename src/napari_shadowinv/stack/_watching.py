@@ -198,6 +198,8 @@ class Watch:
             seen = stamp(shot.path)
             known = self._known(text_of(name))
             if known is not None and shot.unchanged(known):
+                if not self._arrivals.waiting:
+                    self._books.tell()
                 return
         except OSError:
             self._arrivals.check()
