@@ -18,7 +18,7 @@ import numpy as np
 from napari_shadowinv._system.machine import interrupts_put_off
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InversionCancelled
-from napari_shadowinv.io.files import text_of
+from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.io.store_growing import GrowingStore
 from napari_shadowinv.io.store_layout import create_store
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
 
+_TICK = 2.0  # seconds in which times of files may be the same, on any file system
 _POLL = 0.25  # seconds between two looks at `should_stop` while nothing arrives
 
 
@@ -91,6 +92,14 @@ class Books:
         waiting = self._arrivals.waiting + self.in_work
         told: dict[str, Any] = {"engine": "watching", "waiting": waiting, **news}
         self._on_progress(WatchProgress(total, done, failed, **told))
+
+
+def _unchanged(shot: FileShot, known: dict[str, Any], seen: dict[str, int]) -> bool:
+    """Whether a file is still the one of which this is known."""
+    # Within a tick of the file system's clock it may have changed without looking so.
+    if time.time() - seen["mtime_ns"] / 1e9 < _TICK and "sha256" in known:
+        return bool(sha256(shot.path) == known["sha256"])
+    return shot.unchanged(known)
 
 
 class _ShapeUnknown(Exception):  # noqa: N818 - nothing is wrong yet
@@ -197,7 +206,7 @@ class Watch:
         try:
             seen = stamp(shot.path)
             known = self._known(text_of(name))
-            if known is not None and shot.unchanged(known):
+            if known is not None and _unchanged(shot, known, seen):
                 if not self._arrivals.waiting:
                     self._books.tell()
                 return
