@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from store_content import content
 
-from command_line import flat, interrupted, shadowinv
+from command_line import flat, shadowinv
 from conftest import OPTIONS, make_shots
 from napari_shadowinv import FileFormatError, InputError, InversionOptions, read, watch_stack
 from napari_shadowinv._system.locking import locked
+from napari_shadowinv.cli import _watch
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.stack import WatchProgress, _arrivals, _watching
 
@@ -435,27 +436,27 @@ def test_the_command_tells_a_line_for_each_shot(folder, out, tmp_path, monkeypat
     assert shadowinv(*command, "--quiet").stdout == ""
 
 
-def test_ctrl_c_is_the_normal_end(folder, out, tmp_path):
+@pytest.mark.parametrize(("files", "code"), [(1, 0), (3, 130)])
+def test_ctrl_c_is_the_normal_end_unless_files_wait(
+    folder, out, tmp_path, monkeypatch, files, code
+):
     np.save(tmp_path / "reference.npy", SOURCE)
-    put(folder, 0)
-    preparation = f"""
-        import sys
-        sys.path.insert(0, {str(Path(__file__).parent)!r})
-        from napari_shadowinv.cli import _watch
-        show = _watch._Lines.show
-        def told(self, news):
-            show(self, news)
-            if news.outcome:
-                print("now", flush=True)
-        _watch._Lines.show = told
-    """
-    arguments = [
-        "watch", str(folder), "--pattern", "*.npy", "--source", "reference.npy",
-        "--n-sites", "100", "--out", str(out),
-    ]  # fmt: skip
-    code, errors = interrupted(tmp_path, preparation, arguments)
-    assert code == 0
-    assert errors.startswith("warning: ")  # of the shot, and nothing of the end
-    assert len(errors.splitlines()) == 1
+    put(folder, *range(files))
+    show = _watch._Lines.show
+
+    def told(lines: Any, news: WatchProgress) -> None:
+        show(lines, news)
+        if news.outcome is not None:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(_watch._Lines, "show", told)
+    result = shadowinv(
+        "watch", folder, "--pattern", "*.npy", "--source", tmp_path / "reference.npy",
+        "--n-sites", 100, "--out", out,
+    )  # fmt: skip
+    assert result.exit_code == code
+    left = ", 2 not yet inverted" if files > 1 else ""
+    (end,) = [line for line in result.output.splitlines() if line.startswith("Ended")]
+    assert end == (f"Ended: 1 done, 0 failed{left}; repeat the command to go on with {out}.")
     assert list(read(out).status.values) == [DONE]
-    assert sys.platform == "win32" or not list(tmp_path.glob(".*.lock"))
+    assert not list(tmp_path.glob(".*.lock"))
