@@ -286,11 +286,14 @@ def test_it_goes_on_with_its_store_and_does_nothing_twice(folder, out):
         name: before[name] for name in before if "/c/0" not in name
     }
     assert list(watch.result.status.values) == [DONE, DONE, FAILED, DONE]
+    np.save(folder / "shot_9.npy", IMAGES[0][:10])  # smaller than those before
+    assert list(watched_once(folder, out, source=None).status.values) == [1, 1, 2, 1, 2]
+    (folder / "shot_9.npy").write_bytes(whole(2))
     put(folder, 2)
     again = watched_once(folder, out, source=None, redo_failed=True)
-    assert list(again.status.values) == [DONE] * 4
+    assert list(again.status.values) == [DONE] * 5
     put(folder, 5)
-    assert len(watched_once(folder, out, source=None, skip_existing=True).shot) == 4
+    assert len(watched_once(folder, out, source=None, skip_existing=True).shot) == 5
     with pytest.raises(InputError, match="different options"):
         watched_once(folder, out, source=None, options=InversionOptions(n_sites=50))
     with pytest.raises(InputError, match=r"different warm start \(each shot from the one before"):

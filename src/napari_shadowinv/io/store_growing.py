@@ -6,7 +6,7 @@ It is opened once. What a shot costs does not depend on how many there are alrea
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,6 +66,12 @@ class GrowingStore:
     def number(self, name: str) -> int | None:
         """Return the number of a shot, None if it is not there yet."""
         return self._numbers.get(name)
+
+    def done(self) -> Iterator[str]:
+        """Yield the names of the shots that are done."""
+        for name, index in self._numbers.items():
+            if self._statuses[index] == DONE:
+                yield name
 
     def status(self, index: int) -> int:
         return self._statuses[index]

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -264,8 +265,13 @@ class Watch:
                 shot.shape()
             except Exception as error:
                 return Tried(began, time.perf_counter() - began, {}, failure=reason_of(error))
+            store = self._books.store
+            if store is not None:
+                # Earlier shots know better how large an image is.
+                there = (one for one in store.done() if self._stacks.shot(one).path.exists())
+                names = [*islice(there, TRIED), *names]
             stack = self._stacks.of(names)
-            if self._books.store is not None:
+            if store is not None:
                 self._use(made_alike(StackStore(self._path), stack, self._dtype))
                 return None
         if stack.chooses_sites:
