@@ -16,6 +16,9 @@ _SETTLE = (
     "Seconds without a change after which a file is complete where the system does not tell "
     "that it was closed (network file systems, macOS, Windows)."
 )
+_FIT = (
+    "Fit the forward model to each shot in place of inverting it, as the recipe's section fit says."
+)
 EPILOG = """
 [bold]Examples[/bold]
 shadowinv watch shots --source reference.tif --out night.shadowinv.zarr
@@ -48,7 +51,7 @@ def watch(
     save_recipe: _flags.SaveRecipe = None,
     setup: _flags.SetupFile = None,
     options: _flags.OptionsFile = None,
-    fit: Annotated[bool, typer.Option("--fit", help=HELP["fit"])] = False,
+    fit: Annotated[bool, typer.Option("--fit", help=_FIT)] = False,
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
     clip_negative: _flags.ClipNegative = False,
