@@ -380,6 +380,20 @@ def test_without_room_for_another_watch_it_looks_itself(folder, out, monkeypatch
     assert note.startswith("the system does not watch another folder (No space left on device)")
 
 
+def test_a_folder_that_is_gone_before_it_is_observed_leaves_no_thread(folder):
+    before = set(threading.enumerate())
+    arrivals = _arrivals.Arrivals(folder.resolve(), "*")
+    shutil.rmtree(folder)
+    with (
+        pytest.raises(FileFormatError, match="can no longer be read"),
+        _arrivals.observing(arrivals, polling=False, on_note=print),
+    ):
+        pass
+    with pytest.raises(OSError, match="No such file"):
+        _arrivals._started(arrivals)
+    assert set(threading.enumerate()) == before
+
+
 @pytest.mark.parametrize("how", ["removed", "moved"])
 def test_a_folder_that_disappears_ends_it_with_a_sentence(folder, out, how):
     put(folder, 0)

@@ -104,7 +104,8 @@ class CheckedStore(LocalStore):
 
 def describes_arrays(path: Path) -> bool:
     """Tell whether a store's folder has its own copy of what its arrays are like."""
-    return bool(_json(path / _METADATA).get("consolidated_metadata"))
+    file = path / _METADATA
+    return file.exists() and bool(_json(file).get("consolidated_metadata"))
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -247,6 +247,7 @@ def observing(
     arrivals: Arrivals, *, polling: bool, on_note: Callable[[str], None]
 ) -> Iterator[None]:
     """Let a folder's changes be told to `arrivals` in a block, and take in what is there."""
+    arrivals.check()
     share = _share_of(arrivals.folder)
     if share and not polling:
         on_note(
