@@ -12,7 +12,7 @@ from .physics.projection import project, project_potential
 from .physics.setup import OpticalSetup, ProtonSetup
 from .pipeline import run
 from .preprocessing import Recipe
-from .stack import invert_stack, run_stack, stack_statistics
+from .stack import invert_stack, run_stack, stack_statistics, watch_stack
 
 __version__: str
 
@@ -46,5 +46,6 @@ __all__ = [
     "stack_statistics",
     "synthetic_image",
     "uncertainty",
+    "watch_stack",
     "write",
 ]

@@ -37,6 +37,7 @@ def test_the_python_blocks_make_what_they_promise(folder, night):
     alone = invert(tifffile.imread("shots/shot_3.tif"), source=tifffile.imread("reference.tif"))
     assert float(names["one"].max()) == pytest.approx(alone.potential.max())  # type: ignore[attr-defined]
     assert list(names["later"].status) == [1] * 6  # type: ignore[attr-defined]
+    assert list(names["store"].status) == [1] * 6  # type: ignore[attr-defined]
 
 
 def test_the_columns_of_a_table_are_those_of_its_model():
@@ -64,7 +65,11 @@ def test_the_commands_work_as_shown(folder, night):
     (guessing,) = [command for command in COMMANDS if "--source-from" in command]
     command = [*guessing.replace("'", "").split()[1:], *fast]
     assert runner.invoke(app, command).exit_code == 0
-    others = [command for command in COMMANDS if "batch" not in command]
+    (watching,) = [command for command in COMMANDS if command.startswith("shadowinv watch")]
+    result = runner.invoke(app, [*watching.split()[1:], "--idle", "0.2", "--n-sites", "100"])
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines()[0] == "Watching shots for *.tif; Ctrl-C ends it."
+    others = [command for command in COMMANDS if not re.search("batch|watch", command)]
     assert len(others) == 5
     for command in others:
         result = runner.invoke(app, command.split()[1:])

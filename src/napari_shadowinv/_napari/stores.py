@@ -23,11 +23,14 @@ if TYPE_CHECKING:
 
 
 @refusing_damage
-def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
-    """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot."""
+def store_layers(path: Path, name: str = "", first: int | None = None) -> list[FullLayerData]:
+    """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot.
+
+    That is the first one that is done, which also decides on units, unless it is given.
+    """
     dataset = _opened(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
-    first = _first_done(dataset, path)
+    first = _first_done(dataset, path) if first is None else first
     setup = setup_from_dataset(dataset.isel(shot=first))
     frame = frame_for(dataset["displacement"].shape, setup)
     facts = {"store": str(path), "shots": _shot_names(dataset)}
@@ -35,17 +38,28 @@ def store_layers(path: Path, name: str = "") -> list[FullLayerData]:
 
 
 @refusing_damage
+def first_shot(path: Path) -> int:
+    """Return the number of the first shot of a store that is done."""
+    return _first_done(_opened(path), path)
+
+
+@refusing_damage
 def _opened(path: Path) -> xarray.Dataset:
     """Open a store lazily, the axis of shots first, or say why it is none."""
     import xarray as xr
 
-    from napari_shadowinv.io.store_files import CheckedStore
+    from napari_shadowinv.io.store_files import CheckedStore, describes_arrays
 
     if not path.is_dir():
         raise FileFormatError(f"{path} does not exist: expected a folder made by an inversion")
-    # Nothing in it is a time, whatever its units look like.
+    # Nothing in it is a time, whatever its units look like. While a store grows, only the folder's
+    # own copy gives all arrays one length.
     dataset: xr.Dataset = xr.open_zarr(
-        CheckedStore(path), chunks={}, decode_times=False, mask_and_scale=False, consolidated=False
+        CheckedStore(path),
+        chunks={},
+        decode_times=False,
+        mask_and_scale=False,
+        consolidated=describes_arrays(path),
     )
     if "displacement" not in dataset or "shot" not in dataset["displacement"].dims:
         raise FileFormatError(

@@ -13,7 +13,13 @@ from typing import Annotated
 import typer
 
 from napari_shadowinv import __version__
-from napari_shadowinv.cli import _film_command, _fit_command, _shot_commands, _stack_commands
+from napari_shadowinv.cli import (
+    _film_command,
+    _fit_command,
+    _shot_commands,
+    _stack_commands,
+    _watch_command,
+)
 
 __all__ = ["app"]
 
@@ -57,6 +63,7 @@ app.command(epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
 app.command()(_shot_commands.info)
 app.command()(_shot_commands.demo)
 app.command(epilog=_stack_commands.BATCH_EPILOG)(_stack_commands.batch)
+app.command(epilog=_watch_command.EPILOG)(_watch_command.watch)
 app.command()(_stack_commands.status)
 app.command()(_stack_commands.export)
 app.command()(_stack_commands.movie)

@@ -95,7 +95,7 @@ def run_batch(
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
-                variables=None if variables is None else _names(variables),
+                variables=None if variables is None else names_of(variables),
                 reader=functools.partial(read_shot, **part),
                 on_progress=show,
                 should_stop=interrupted,
@@ -108,10 +108,20 @@ def run_batch(
     store = StackStore(out)
     if not quiet:
         say(_summary(store, ledger))
+    exit_unless_good(store)
+
+
+def exit_unless_good(store: StackStore) -> None:
+    """End with an exit code of its own if not all shots are done, or to be trusted."""
     if (store.statuses() != DONE).any():
         raise typer.Exit(EXIT_FAILED_SHOTS)
     if not all(_is_good(report) for report in store.reports()):
         raise typer.Exit(EXIT_NOT_CONVERGED)
+
+
+def names_of(text: str) -> tuple[str, ...]:
+    """Names that are separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def _is_good(report: Mapping[str, Any]) -> bool:
@@ -129,10 +139,6 @@ def _check(out: Path, resume: bool, overwrite: bool) -> None:
             f"{out} exists ({_counts_text(StackStore(out))}): use --resume to continue, "
             "--overwrite to start again, or another name"
         )
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 @contextmanager

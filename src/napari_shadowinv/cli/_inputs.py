@@ -104,6 +104,27 @@ def fit_recipe(
     return recipe.model_copy(update={"fit": recipe.fit or FitChoices()})
 
 
+def recipe_for_shots(
+    flags: Mapping[str, Any],
+    recipe: Path | None,
+    options: Path | None,
+    setup: Path | None,
+    *,
+    fit: bool,
+    clip_negative: bool,
+    **files: Path | None,
+) -> Recipe:
+    """Recipe for many shots, which are fitted if it is asked for; `files` as for `recipe_from`."""
+    from napari_shadowinv.pipeline.files import setup_from
+
+    chosen = recipe_from(flags, recipe, options, clip_negative=clip_negative, **files)  # type: ignore[arg-type]
+    if fit or chosen.fit is not None:
+        chosen = fit_recipe(chosen, flags, options, clip_negative=clip_negative)
+    if setup is not None:
+        chosen = chosen.model_copy(update={"setup": setup_from(setup)})
+    return chosen
+
+
 def source_from(recipe: Recipe, image: Path, channel: str | None) -> Radiograph | None:
     """Read the measured source that a recipe names; one without a file is in the image's."""
     from napari_shadowinv.pipeline.files import read_part

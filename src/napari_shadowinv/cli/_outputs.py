@@ -56,6 +56,16 @@ def protect_files_of(recipe: Recipe, outputs: list[Path]) -> None:
     protect(outputs, [recipe.mask, recipe.source_mask, source])
 
 
+def save_recipe(path: Path, recipe: Recipe, inputs: list[Path | None], overwrite: bool) -> None:
+    """Write a recipe, but over nothing that is read."""
+    from napari_shadowinv.pipeline import write_recipe
+
+    check_outputs({path: (".toml",)}, overwrite)
+    protect([path], inputs)
+    protect_files_of(recipe, [path])
+    write_recipe(path, recipe, overwrite=overwrite)
+
+
 def protect_store(store: Path, output: Path) -> None:
     """Refuse to write among the files of a store that is read."""
     if output.resolve().is_relative_to(store.resolve()):

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from napari_shadowinv.cli import _flags, _outputs
-from napari_shadowinv.cli._inputs import fit_recipe, recipe_from
+from napari_shadowinv.cli._inputs import recipe_for_shots
 from napari_shadowinv.cli._terminal import notify_errors, say
 
 # Of options whose help is longer than a line.
@@ -92,27 +92,20 @@ def batch(
 ) -> None:
     """Invert, or fit, many shots into one store, which can be resumed after a crash."""
     from napari_shadowinv.cli._batch import run_batch
-    from napari_shadowinv.pipeline import write_recipe
-    from napari_shadowinv.pipeline.files import setup_from
 
-    chosen = recipe_from(
+    chosen = recipe_for_shots(
         flags,
         recipe,
         options,
+        setup,
+        fit=fit,
         clip_negative=clip_negative,
         source=None if source is None else Path(source),
         mask=mask,
         source_mask=source_mask,
     )
-    if fit or chosen.fit is not None:
-        chosen = fit_recipe(chosen, flags, options, clip_negative=clip_negative)
-    if setup is not None:
-        chosen = chosen.model_copy(update={"setup": setup_from(setup)})
     if save_recipe is not None:
-        _outputs.check_outputs({save_recipe: (".toml",)}, overwrite)
-        _outputs.protect([save_recipe], [recipe, setup, options])
-        _outputs.protect_files_of(chosen, [save_recipe])
-        write_recipe(save_recipe, chosen, overwrite=overwrite)
+        _outputs.save_recipe(save_recipe, chosen, [recipe, setup, options], overwrite)
     run_batch(
         shots,
         out,

@@ -122,6 +122,11 @@ def nothing_yet(kind: type) -> Any:
     return "" if kind is str else np.nan if kind is float else 0
 
 
+def number_of(report: Mapping[str, Any], name: str, kind: type) -> Any:
+    """Return what a shot's report says of one of the numbers that are gathered."""
+    return report.get("residual" if name == "flux_residual" else name, nothing_yet(kind))
+
+
 def _attributes(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(small_text(path / "zarr.json", "metadata of a store"))
@@ -238,8 +243,7 @@ class StackStore:
             for name, (kind, _) in summary_of(self.attributes).items():
                 if name not in group:  # a store of an older version
                     continue
-                key = "residual" if name == "flux_residual" else name
-                values = [report.get(key, nothing_yet(kind)) for report in reports]
+                values = [number_of(report, name, kind) for report in reports]
                 group[name][...] = np.array(values, dtype=object if kind is str else kind)
         except OSError as error:
             raise store_error(self.path, error) from error
@@ -308,6 +312,8 @@ def read_stack(path: Path) -> xarray.Dataset:
     dataset: xr.Dataset = xr.open_zarr(
         CheckedStore(path), decode_times=False, mask_and_scale=False, chunks={}
     )
+    if dataset.sizes["shot"] > len(store.names):  # grown since
+        dataset = dataset.isel(shot=slice(len(store.names)))
     setup = setup_from_dataset(dataset)
     complete = _with_fields(with_own_setups(dataset), setup)
     # The folder's own order is arbitrary.

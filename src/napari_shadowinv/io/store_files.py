@@ -102,6 +102,12 @@ class CheckedStore(LocalStore):
             check_promise(path, "chunk's", int(head[1]), size)
 
 
+def describes_arrays(path: Path) -> bool:
+    """Tell whether a store's folder has its own copy of what its arrays are like."""
+    file = path / _METADATA
+    return file.exists() and bool(_json(file).get("consolidated_metadata"))
+
+
 def _json(path: Path) -> dict[str, Any]:
     return dict(json.loads(small_text(path, "metadata of the store")))
 

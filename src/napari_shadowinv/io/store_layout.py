@@ -97,14 +97,30 @@ def grow_store(
 
     try:
         arrays = dict(zarr.open_group(path, mode="r+").arrays())
-        longer = [name for name, array in arrays.items() if is_along_shots(array)]
+    except OSError as error:
+        raise store_error(path, error) from error
+    before = arrays["status"].shape[0]
+    new = {name: one[before:] for name, one in values.items()}
+    lengthen(path, arrays, length, new, attributes)
+    return StackStore(path)
+
+
+def lengthen(
+    path: Path,
+    arrays: Mapping[str, Any],
+    length: int,
+    values: Mapping[str, AnyArray],
+    attributes: Mapping[str, Any],
+) -> None:
+    """Grow a store whose arrays are open; the coordinates, `values`, are those of new shots."""
+    longer = [name for name, array in arrays.items() if is_along_shots(array)]
+    try:
         for name in longer:
-            array: Any = arrays[name]
-            before = array.shape[0]
+            array = arrays[name]
             # Beyond the end stated in the folder's own copy: nobody sees it yet.
             array.resize((length, *array.shape[1:]))
             if name in values:
-                array[before:] = values[name][before:]
+                array[length - len(values[name]) :] = values[name]
         file = path / "zarr.json"
         metadata = json.loads(file.read_text(encoding="utf-8"))
         metadata["attributes"].update(attributes)
@@ -115,7 +131,6 @@ def grow_store(
             draft.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
     except OSError as error:
         raise store_error(path, error) from error
-    return StackStore(path)
 
 
 def _write_template(path: Path, contents: Contents) -> None:

@@ -4,6 +4,7 @@
 - write them shot by shot to ``name.shadowinv.zarr``, inverted or fitted, and go on after a crash:
   `run_stack`
 - read a shot's file with a colour channel chosen, or binned: `read_shot`
+- watch a folder and invert each shot as soon as it is there: `watch_stack`
 - mean, spread and peaks across shots: `stack_statistics`
 """
 
@@ -12,14 +13,18 @@ from napari_shadowinv.stack._references import read_shot
 from napari_shadowinv.stack._run import RunProgress, run_stack
 from napari_shadowinv.stack._spec import STORED
 from napari_shadowinv.stack._statistics import stack_statistics
+from napari_shadowinv.stack._watch import watch_stack
+from napari_shadowinv.stack._watching import WatchProgress
 from napari_shadowinv.stack._worker import ShotOutcome
 
 __all__ = [
     "STORED",
     "RunProgress",
     "ShotOutcome",
+    "WatchProgress",
     "invert_stack",
     "read_shot",
     "run_stack",
     "stack_statistics",
+    "watch_stack",
 ]

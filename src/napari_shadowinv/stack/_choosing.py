@@ -8,7 +8,7 @@ from napari_shadowinv.inversion import Inversion, count_sites
 from napari_shadowinv.inversion.normalise import number_of_sites
 from napari_shadowinv.stack._stacks import Stack
 
-_TRIED, _INVERTED = 10, 3  # shots at the beginning of a stack
+TRIED, _INVERTED = 10, 3  # shots at the beginning of a stack
 
 
 def choose_sites(stack: Stack, should_stop: ShouldStop | None = None) -> Stack:
@@ -17,12 +17,18 @@ def choose_sites(stack: Stack, should_stop: ShouldStop | None = None) -> Stack:
     All shots that share a beam then share the sites. Shots that cannot be inverted decide nothing;
     without any other there are as many sites as without an accuracy.
     """
-    if not stack.chooses_sites or stack.beam is None:
+    if not stack.chooses_sites:
         return stack
+    return with_chosen(stack, shares_needed(stack, should_stop))
+
+
+def shares_needed(stack: Stack, should_stop: ShouldStop | None = None) -> list[float]:
+    """Which share of the sites without an accuracy each of the first shots needs."""
+    assert stack.beam is not None
     options = stack.recipe.options
     most = count_sites(stack.beam.image, options, mask=stack.beam.mask)
     work, needed = stack.work(()), []
-    for shot in stack.shots.items[:_TRIED]:
+    for shot in stack.shots.items[:TRIED]:
         try:
             content, _ = shot.load()
             inversion = work.invert(content, stack.beam, workers=1, should_stop=should_stop)
@@ -31,9 +37,14 @@ def choose_sites(stack: Stack, should_stop: ShouldStop | None = None) -> Stack:
         except Exception:  # whatever is wrong is told when its turn comes
             continue
         assert isinstance(inversion, Inversion)
-        needed.append(inversion.report.n_sites)
+        needed.append(inversion.report.n_sites / most)
         if len(needed) == _INVERTED:
             break
+    return needed
+
+
+def with_chosen(stack: Stack, shares: list[float]) -> Stack:
+    """Return the stack with sites enough for each of these shares."""
     # A margin has its own sites, which are not counted here.
-    share = max(needed, default=most) / most
-    return stack.with_sites(max(4, round(share * number_of_sites(stack.shape, options))))
+    most = number_of_sites(stack.shape, stack.recipe.options)
+    return stack.with_sites(max(4, round(max(shares, default=1.0) * most)))

@@ -66,6 +66,8 @@ def find_shots(
     shots: Any, *, reader: Reader = read_shot, shape: tuple[int, int] | None = None
 ) -> Shots:
     """Turn whatever holds shots into references to them."""
+    if isinstance(shots, Shots):
+        return replace(shots, shape=shape or usual_shape(shots.items))
     if isinstance(shots, (str, Path)):
         return _from_path(str(shots), reader, shape)
     if hasattr(shots, "dims") and hasattr(shots, "coords"):

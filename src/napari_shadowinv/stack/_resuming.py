@@ -17,16 +17,19 @@ from napari_shadowinv.io.store_layout import Contents, Variable, grow_store
 from napari_shadowinv.stack import _spec
 from napari_shadowinv.stack._references import checksum
 from napari_shadowinv.stack._spec import dtype_of
-from napari_shadowinv.stack._stacks import Stack
+from napari_shadowinv.stack._stacks import CHAINED, Stack
 
 _CHOSEN = "chosen_sites"  # attribute: how many sites the first shots needed for the accuracy
 _APPENDED = "appended_at"  # attribute: where later runs began to append shots
+NUMBERED_AS_ARRIVED = {"order": "as they arrived"}  # attribute: names do not tell the order
 _INSTEAD = "use the same, overwrite the store, or choose another name"
 
 
 def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
     identity = {name: value for name, value in _identity(stack, dtype).items() if value}
     attributes: dict[str, Any] = {**_spec.attributes_of(stack), **identity}
+    if stack.as_arrived:
+        attributes |= NUMBERED_AS_ARRIVED
     if stack.sites_chosen:
         attributes[_CHOSEN] = stack.recipe.options.n_sites
     return Contents(stack.sizes, _variables(stack, dtype), _coordinates(stack), attributes)
@@ -85,7 +88,7 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
         "image_size": f"{width} × {height} px",
         "stored": f"{', '.join(stack.variables)} as {dtype}",
         "reader": stack.reader,
-        "warm_start": str(stack.warm_start),
+        "warm_start": stack.warm_start_text,
     }
 
 
@@ -95,7 +98,25 @@ def _sum_of(mask: BoolArray | None) -> str:
 
 def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
     """Return the stack in the order of its store, new shots last; refuse what does not belong."""
+    if store.attributes.get("warm_start") == CHAINED and not stack.as_arrived:
+        raise InputError(
+            f"{store.path} was written by watching a folder, where each shot starts from the one "
+            "before: continue with shadowinv watch, overwrite the store, or choose another name"
+        )
     stack = stack.chosen(_order(store, stack.shots.names))
+    stack = made_alike(store, stack, dtype)
+    for index in np.flatnonzero(store.statuses() == DONE):
+        changed = stack.changed(int(index), store.report(int(index)))
+        if changed:
+            raise InputError(
+                f"{changed} has changed since it was inverted into {store.path}: overwrite the "
+                "store or choose another name"
+            )
+    return stack
+
+
+def made_alike(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
+    """Return the stack with as many sites as its store has; refuse what was made otherwise."""
     if stack.chooses_sites and _CHOSEN in store.attributes:
         stack = stack.with_sites(int(store.attributes[_CHOSEN]))
     found = _identity(stack, dtype, len(store.names))
@@ -106,13 +127,6 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
             raise InputError(
                 f"{store.path} was started with {article}different {name.replace('_', ' ')} "
                 f"({_difference(before, value)}): {_INSTEAD}"
-            )
-    for index in np.flatnonzero(store.statuses() == DONE):
-        changed = stack.changed(int(index), store.report(int(index)))
-        if changed:
-            raise InputError(
-                f"{changed} has changed since it was inverted into {store.path}: overwrite the "
-                "store or choose another name"
             )
     return stack
 
@@ -131,6 +145,8 @@ def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
         )
         raise InputError(f"{store.path} was started with different shots ({missing}): {_INSTEAD}")
     known = [places[name] for name in store.names]
+    if NUMBERED_AS_ARRIVED.items() <= store.attributes.items():
+        return [*known, *sorted(set(range(len(names))) - set(known))]
     # What came in one run keeps its order; later runs may have brought what sorts before it.
     ends = [0, *store.attributes.get(_APPENDED, []), count]
     for first, last in pairwise(ends):

@@ -137,14 +137,10 @@ def run_stack(
         If `should_stop` returned true; the store can be resumed.
     """
     path = check_store_path(out)
-    if dtype not in ("float32", "float64"):
-        raise InputError(f"dtype is {dtype!r}: expected 'float32' or 'float64'")
-    kept = np.dtype(dtype)
-    if variables is None and (recipe is None or recipe.fit is None):
-        variables = STORED
+    kept = stored_type(dtype)
     stack = describe_stack(
         shots,
-        variables=variables,
+        variables=stored_variables(variables, recipe),
         source=source,
         mask=mask,
         recipe=recipe,
@@ -184,6 +180,21 @@ def run_stack(
                 store = append_shots(store, stack, kept)
             _Run(stack, store, again, on_progress, should_stop).on(engine)
     return read_stack(path)
+
+
+def stored_type(dtype: str) -> np.dtype[Any]:
+    """Return the type of stored images that was asked for."""
+    if dtype not in ("float32", "float64"):
+        raise InputError(f"dtype is {dtype!r}: expected 'float32' or 'float64'")
+    return np.dtype(dtype)
+
+
+def stored_variables(
+    variables: Collection[str] | None, recipe: Recipe | None
+) -> Collection[str] | None:
+    """Return what is stored of each shot; None for what is usual of a fit."""
+    is_fit = recipe is not None and recipe.fit is not None
+    return STORED if variables is None and not is_fit else variables
 
 
 class _Run:

@@ -78,6 +78,10 @@ def describe_stack(
         source = None
     found, inputs, sources = _described(shots, wanted, source, mask, source_mask, reader)
     own = sources if isinstance(sources, Shots) else None
+    if own is not None and isinstance(shots, Shots):
+        raise InputError(
+            f"got {len(own)} sources, and the shots are still to arrive: expected one for all"
+        )
     if own is not None and len(own) != len(found):
         raise InputError(
             f"got {len(own)} sources for {len(found)} shots: expected one, or one for each shot"

@@ -24,6 +24,8 @@ from napari_shadowinv.stack._worker import Beam, Work
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
+CHAINED = "each shot from the one before, as they arrived"
+
 
 @dataclass(frozen=True, eq=False)
 class Stack:
@@ -37,6 +39,13 @@ class Stack:
     warm_start: int = 1  # shots in a group, each initialised from the one before
     reader: str = ""  # name of what reads the files
     sites_chosen: bool = False  # whether the number of sites follows from the accuracy
+    as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
+    chained: bool = False  # whether each shot starts from the one before, without groups
+
+    @property
+    def warm_start_text(self) -> str:
+        """Which shots start from others."""
+        return CHAINED if self.chained else str(self.warm_start)
 
     @property
     def recipe(self) -> Recipe:

@@ -1,5 +1,7 @@
 """What a worker does: `Work` inverts one shot, `run_shots` some and writes each.
 
+The parts of it are `try_shot` and `write_shot`.
+
 `FitWork` takes the place of `Work` in a stack that is fitted, and has the same methods.
 """
 
@@ -27,6 +29,7 @@ from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
 from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
+from napari_shadowinv.io.store_growing import GrowingStore
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.pipeline import Cache, Inputs, run_prepared
 from napari_shadowinv.preprocessing import UniformEstimate
@@ -290,42 +293,75 @@ def run_shots(
 ) -> list[ShotOutcome]:
     """Task: invert, or fit, some shots one after the other and write each."""
     should_stop = None if stop is None else stop.is_set
-    work: Any = settings.work
     previous: Inversion | Fit | None = None
     outcomes = []
     for shot, (index, wanted, source) in zip(shots, labels, strict=True):
-        start = time.perf_counter()
-        failure = ""
-        try:
-            image, origin = _loaded(shot)
-            own = None
-            if source is not None:
-                own, origin["source"] = source.load()
-            previous = work.invert(
-                image, beam, own, start=previous, workers=settings.workers, should_stop=should_stop
-            )
-        except InversionCancelled:
-            raise
-        except Exception as error:
-            # Whatever a reader or a solver stumbles over, the other shots shall go on.
-            previous, failure = None, _reason(error)
-        if not wanted:
-            continue
-        seconds = time.perf_counter() - start
-        if previous is None:
-            settings.writer.fail(index, {"reason": failure, "seconds": seconds})
-            outcomes.append(ShotOutcome(index, FAILED, seconds, failure))
-        else:
-            told = work.report(previous)
-            warnings = [*told["warnings"], *origin.get("warnings", ())]
-            report = {**told, "seconds": seconds, **origin, "warnings": warnings}
-            settings.writer.write(index, work.arrays(previous), report)
-            spent = time.perf_counter() - start
-            outcomes.append(ShotOutcome(index, DONE, spent, converged=previous.report.converged))
+        tried = try_shot(settings.work, shot, beam, source, previous, settings.workers, should_stop)
+        previous = tried.result
+        if wanted:
+            outcomes.append(write_shot(settings.writer, settings.work, index, tried))
     return outcomes
 
 
-def _reason(error: Exception) -> str:
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """What came of the attempt to invert, or fit, a shot; it has a result or a failure."""
+
+    began: float  # value of `time.perf_counter`
+    seconds: float
+    origin: dict[str, Any]  # what is known of its file
+    result: Inversion | Fit | None = None
+    failure: str = ""
+
+
+def try_shot(
+    work: Any,
+    shot: Any,
+    beam: Beam | None,
+    source: Shot | None = None,
+    start: Any = None,
+    workers: int | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Tried:
+    """Read and invert, or fit, one shot; all but a cancellation is its own failure."""
+    began = time.perf_counter()
+    origin: dict[str, Any] = {}
+    result, failure = None, ""
+    try:
+        image, origin = _loaded(shot)
+        own = None
+        if source is not None:
+            own, origin["source"] = source.load()
+        result = work.invert(
+            image, beam, own, start=start, workers=workers, should_stop=should_stop
+        )
+    except InversionCancelled:
+        raise
+    except Exception as error:
+        # Whatever a reader or a solver stumbles over, the other shots shall go on.
+        failure = reason_of(error)
+    return Tried(began, time.perf_counter() - began, origin, result, failure)
+
+
+def write_shot(
+    writer: ShotWriter | GrowingStore, work: Any, index: int, tried: Tried
+) -> ShotOutcome:
+    """Write what came of a shot."""
+    made = tried.result
+    if made is None:
+        failed = {"reason": tried.failure, "seconds": tried.seconds}
+        writer.fail(index, {**tried.origin, **failed})
+        return ShotOutcome(index, FAILED, tried.seconds, tried.failure)
+    told = work.report(made)
+    warnings = [*told["warnings"], *tried.origin.get("warnings", ())]
+    report = {**told, "seconds": tried.seconds, **tried.origin, "warnings": warnings}
+    writer.write(index, work.arrays(made), report)
+    spent = time.perf_counter() - tried.began
+    return ShotOutcome(index, DONE, spent, converged=made.report.converged)
+
+
+def reason_of(error: Exception) -> str:
+    """Say why a shot failed."""
     if isinstance(error, MemoryError):
         return "there is not enough memory for this shot on its worker"
     kind = type(error).__name__

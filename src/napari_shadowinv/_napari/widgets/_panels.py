@@ -34,6 +34,7 @@ _STAGES = {
     "field": "Computing the field",
     "image": "Tracing the rays",
     "shots": "Inverting",
+    "wait": "Waiting for shots",
     "fit": "Fitting",
     "read": "Reading the scans",
     "dose": "Computing the doses",

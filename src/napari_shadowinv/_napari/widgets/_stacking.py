@@ -160,16 +160,20 @@ class StackRequest:
             self._describe()
         if index is None:
             return
-        for data, keywords, kind in self.described:
+        self._widen(self.described, index)
+
+    def _widen(self, described: Sequence[FullLayerData], index: int) -> None:
+        """Let the limits hold one more shot."""
+        for data, keywords, kind in described:
             if kind == "image":
                 role = str(role_of(keywords))
                 self._limits[role] = _widened(self._limits[role], np.asarray(data[index]))
 
-    def _describe(self) -> None:
+    def _describe(self, first: int | None = None) -> None:
         from napari_shadowinv._napari.stores import store_layers
 
         try:
-            layers = store_layers(self.job.out)
+            layers = store_layers(self.job.out, first=first)
         except (InputError, OSError):
             return  # the next shot may do, and the run goes on without
         # What napari remembers of a pending shot would hide that it is done.

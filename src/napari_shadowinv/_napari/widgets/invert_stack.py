@@ -23,17 +23,27 @@ from napari_shadowinv._napari.widgets._results import ResultLayers, place_togeth
 from napari_shadowinv._napari.widgets._runner import Outcome
 from napari_shadowinv._napari.widgets._shot_table import ShotTable
 from napari_shadowinv._napari.widgets._stacking import StackJob, StackRequest, place_on
+from napari_shadowinv._napari.widgets._watching import (
+    FolderEdit,
+    WatchJob,
+    WatchRequest,
+    last_in_view,
+    newest_of,
+    show_shot,
+)
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.store import STORE_SUFFIX
 
 if TYPE_CHECKING:
     import napari
+    from napari_shadowinv._typing import BoolArray
+    from napari_shadowinv.preprocessing import Recipe
 
 _REFRESH_AFTER = 200  # ms; many small shots may end in a second
 _MOST_FAILURES = 100
 _NAME_WIDTH = 110
-_LAYER, _FILES, _TABLE = "layer", "files", "table"
+_LAYER, _FILES, _TABLE, _FOLDER = "layer", "files", "table", "folder"
 _HERE, _SCHEDULER = "threads", "scheduler"
 _BETWEEN = "; "
 
@@ -90,23 +100,27 @@ class ShotsPicker(RowPicker):
             "<qt>A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF.</qt>"
         )
         self.table = ShotTable()
+        self.folder = FolderEdit()
         super().__init__(
             "Shots",
             {
                 _LAYER: ("a stack layer", None),
                 _FILES: ("files", None),
                 _TABLE: ("a table (.csv)", None),
+                _FOLDER: ("a folder, watched", None),
             },
             "Location of the shots.",
             {
                 _LAYER: labelled("", self.layers),
                 _FILES: labelled("", self.files),
                 _TABLE: self.table,
+                _FOLDER: self.folder,
             },
         )
         self.layers.picked.connect(self.changed)
         self.files.changed.connect(self.changed)
         self.table.changed.connect(self.changed)
+        self.folder.changed.connect(self.changed)
 
     @property
     def layer(self) -> Any | None:
@@ -114,8 +128,15 @@ class ShotsPicker(RowPicker):
         return self.layers.layer if self.picker.kind == _LAYER else None
 
     @property
+    def is_watched(self) -> bool:
+        """Whether the shots are still to arrive."""
+        return bool(self.picker.kind == _FOLDER)
+
+    @property
     def name(self) -> str:
         """What to call the shots."""
+        if self.is_watched:
+            return self.folder.folder.path
         if self.picker.kind == _FILES:
             return self.files.path
         if self.picker.kind == _TABLE:
@@ -255,9 +276,11 @@ class InvertStack(InversionInputs, ToolPanel):
     def request(self) -> StackRequest:
         layer = self.shots.layer
         recipe = self.recipe()
-        scheduler, workers = self.engine.engine()
         mask = self.masks.usable(layer)
         self.source.check(mask)
+        if self.shots.is_watched:
+            return self._watch(recipe, mask)
+        scheduler, workers = self.engine.engine()
         job = StackJob(
             shots=self.shots.shots(),
             out=self.store.store,
@@ -277,6 +300,21 @@ class InvertStack(InversionInputs, ToolPanel):
             {} if layer is None else place_on(layer, recipe),
             self.origins(layer, self.shots.name),
         )
+
+    def _watch(self, recipe: Recipe, mask: BoolArray | None) -> WatchRequest:
+        job = WatchJob(
+            shots=self.shots.folder.path,
+            out=self.store.store,
+            pattern=self.shots.folder.pattern.text().strip(),
+            recipe=recipe,
+            source=self._source(None),
+            mask=mask,
+            source_mask=self.hidden_from_source(None),
+            overwrite=self.overwrite.isChecked(),
+            redo_failed=self.redo_failed.isChecked(),
+        )
+        origins = self.origins(None, self.shots.name)
+        return WatchRequest(job, None, self.companions(None), {}, origins)
 
     def _source(self, layer: Any) -> ArrayLike | None:
         # A run may have a source for each shot.
@@ -324,6 +362,8 @@ class InvertStack(InversionInputs, ToolPanel):
         if self._look_at:
             self._look_at = False
             self.viewer.reset_view()
+            if isinstance(self._shown, WatchRequest):
+                show_shot(self.viewer, newest_of(self.results.layers))
         arrows = next((one for one in self.results.layers if role_of(one) == "arrows"), None)
         if arrows is not self._arrows:
             self._arrows = arrows
@@ -331,12 +371,24 @@ class InvertStack(InversionInputs, ToolPanel):
         self._soon.start()
 
     def _refresh(self) -> None:
+        if isinstance(self._shown, WatchRequest):
+            self._grow(self._shown)
         if self._shown is not None:
             self._shown.follow(self.results.layers)
         for layer in self.results.layers:
             layer.refresh()
         if self._read_arrows is not None:
             self._read_arrows()
+
+    def _grow(self, shown: WatchRequest) -> None:
+        """Show what has arrived; who has stepped back to an earlier shot is left there."""
+        if self.results.busy:
+            self._soon.start()
+            return
+        at_end = last_in_view(self.viewer, self.results.layers)
+        newest = shown.renew(self.results.layers)
+        if at_end and newest is not None:
+            show_shot(self.viewer, newest)
 
     def forget(self) -> None:
         self._heard = 0
@@ -353,6 +405,8 @@ class InvertStack(InversionInputs, ToolPanel):
         request: StackRequest = outcome.tag
         books = request.job.books
         if not books.total:
+            if self.shots.is_watched:
+                self.panel.say("Ended: no shot has arrived.")
             return
         self._show(request)
         self.report.show_rows(request.origins.rows())
@@ -366,6 +420,8 @@ class InvertStack(InversionInputs, ToolPanel):
 
     def _on_layer(self) -> None:
         layer = self.shots.layer
+        # In the order of their arrival there is nothing to distribute.
+        self.engine.setVisible(not self.shots.is_watched)
         self.source.follow(layer)
         self.setup.follow(layer, "" if layer is not None else self.shots.name)
         if not self.panel.runner.running:

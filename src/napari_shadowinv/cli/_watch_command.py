@@ -1,0 +1,121 @@
+"""The command `watch`: shots inverted as they arrive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from napari_shadowinv.cli import _flags, _outputs
+from napari_shadowinv.cli._inputs import recipe_for_shots
+from napari_shadowinv.cli._stack_commands import HELP
+from napari_shadowinv.cli._terminal import notify_errors
+
+_SETTLE = (
+    "Seconds without a change after which a file is complete where the system does not tell "
+    "that it was closed (network file systems, macOS, Windows)."
+)
+_FIT = (
+    "Fit the forward model to each shot in place of inverting it, as the recipe's section fit says."
+)
+EPILOG = """
+[bold]Examples[/bold]
+shadowinv watch shots --source reference.tif --out night.shadowinv.zarr
+shadowinv watch shots --pattern '*.bmp' --channel mean --bin 2 --out night.shadowinv.zarr
+shadowinv watch shots --source reference.tif --out night.shadowinv.zarr --idle 600
+
+Ctrl-C ends it. The same command again goes on with the same store.
+
+[bold]Exit codes[/bold]
+0 all shots that arrived are done; 1 some failed, the others are written; 2 invalid input, or the
+folder disappeared; 3 all done, but some did not converge or are not determined; 130 ended by
+Ctrl-C while files were waiting.
+"""
+
+
+@notify_errors
+@_flags.takes_recipe
+def watch(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder in which the shots appear.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
+    pattern: Annotated[
+        str, typer.Option(help="What names of shots look like, in quotes.")
+    ] = "*.tif",
+    source: _flags.SourceFile = None,
+    mask: _flags.MaskFile = None,
+    source_mask: _flags.SourceMask = None,
+    recipe: _flags.RecipeFile = None,
+    save_recipe: _flags.SaveRecipe = None,
+    setup: _flags.SetupFile = None,
+    options: _flags.OptionsFile = None,
+    fit: Annotated[bool, typer.Option("--fit", help=_FIT)] = False,
+    channel: _flags.Channel = None,
+    variable: _flags.Variable = None,
+    clip_negative: _flags.ClipNegative = False,
+    variables: Annotated[str | None, typer.Option(help=HELP["variables"])] = None,
+    warm_start: Annotated[
+        bool,
+        typer.Option(
+            "--warm-start/--no-warm-start", help="Initialise each shot from the previous one."
+        ),
+    ] = True,
+    settle: Annotated[float, typer.Option(metavar="S", help=_SETTLE)] = 1.0,
+    polling: Annotated[
+        bool,
+        typer.Option("--polling", help="Look at the folder every second, whatever it lies on."),
+    ] = False,
+    idle: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="End when nothing has arrived for so many seconds."),
+    ] = None,
+    most: Annotated[
+        int | None, typer.Option("--shots", metavar="N", help="End when N shots have ended.")
+    ] = None,
+    skip_existing: Annotated[
+        bool, typer.Option("--skip-existing", help="Leave out files that are there already.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Discard an earlier run.")] = False,
+    redo_failed: Annotated[
+        bool, typer.Option("--redo-failed", help="Retry shots of the store that failed.")
+    ] = False,
+    quiet: _flags.Quiet = False,
+    *,
+    flags: dict[str, Any],
+) -> None:
+    """Invert each shot as soon as it appears in a folder, into a store that grows."""
+    from napari_shadowinv.cli._watch import run_watch
+
+    chosen = recipe_for_shots(
+        flags,
+        recipe,
+        options,
+        setup,
+        fit=fit,
+        clip_negative=clip_negative,
+        source=source,
+        mask=mask,
+        source_mask=source_mask,
+    )
+    if save_recipe is not None:
+        _outputs.save_recipe(save_recipe, chosen, [recipe, setup, options], overwrite)
+    run_watch(
+        folder,
+        out,
+        channel=channel,
+        variable=variable,
+        variables=variables,
+        pattern=pattern,
+        quiet=quiet,
+        recipe=chosen,
+        warm_start=warm_start,
+        settle=settle,
+        polling=polling,
+        idle=idle,
+        shots=most,
+        skip_existing=skip_existing,
+        overwrite=overwrite,
+        redo_failed=redo_failed,
+    )

@@ -1,0 +1,130 @@
+"""A store that grows by one shot at a time while its run goes on: `GrowingStore`.
+
+It is opened once. What a shot costs does not depend on how many there are already.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from napari_shadowinv.io.store import (
+    DONE,
+    FAILED,
+    PENDING,
+    STATUS_NAMES,
+    ShotWriter,
+    StackStore,
+    is_along_shots,
+    number_of,
+    store_error,
+    summary_of,
+)
+from napari_shadowinv.io.store_layout import lengthen
+
+
+@dataclass(frozen=True)
+class _OpenWriter(ShotWriter):
+    """A writer that need not open the store for each shot."""
+
+    opened: dict[str, Any]
+
+    def arrays(self) -> dict[str, Any]:
+        return self.opened
+
+
+class GrowingStore:
+    """A store as the one process sees it that writes it; of each shot it keeps the name."""
+
+    def __init__(self, store: StackStore, attributes: Mapping[str, Any]) -> None:
+        import zarr
+
+        self.path = store.path
+        self._told = attributes  # of a store that has grown so
+        # Its own, as they grow: others in this process may hold those of a certain length.
+        arrays: dict[str, Any] = dict(zarr.open_group(store.path, mode="r+").arrays())
+        count = len(store.names)
+        self._writer = _OpenWriter(store.path, store.attributes["store_id"], count, arrays)
+        self._summary = {
+            name: kind for name, (kind, _) in summary_of(store.attributes).items() if name in arrays
+        }
+        self._numbers = {name: index for index, name in enumerate(store.names)}
+        self._statuses = bytearray(store.statuses().astype(np.uint8).tobytes())
+        self._counts = [self._statuses.count(one) for one in range(len(STATUS_NAMES))]
+
+    def __len__(self) -> int:
+        return len(self._statuses)
+
+    def count(self, status: int) -> int:
+        """Return how many shots are pending, done or failed."""
+        return self._counts[status]
+
+    def number(self, name: str) -> int | None:
+        """Return the number of a shot, None if it is not there yet."""
+        return self._numbers.get(name)
+
+    def done(self) -> Iterator[str]:
+        """Yield the names of the shots that are done."""
+        for name, index in self._numbers.items():
+            if self._statuses[index] == DONE:
+                yield name
+
+    def status(self, index: int) -> int:
+        return self._statuses[index]
+
+    def report(self, index: int) -> dict[str, Any]:
+        """Return how a shot went that has ended before."""
+        text = str(self._writer.opened["report"][index])
+        return dict(json.loads(text or "{}"))
+
+    def append(self, name: str) -> int:
+        """Make room for one more shot, pending, and return its number."""
+        index = len(self)
+        values = {"shot": np.array([index]), "name": np.array([name], dtype=object)}
+        lengthen(self.path, self._writer.opened, index + 1, values, self._told)
+        self._numbers[name] = index
+        self._statuses.append(PENDING)
+        self._counts[PENDING] += 1
+        return index
+
+    def reopen(self, index: int) -> None:
+        """Mark a shot as pending that is to be done again, and forget its fields."""
+        try:
+            for array in self._writer.opened.values():
+                if is_along_shots(array) and array.ndim > 1:
+                    array[index : index + 1] = array.fill_value
+            self._writer.opened["status"][index : index + 1] = np.int8(PENDING)
+        except OSError as error:
+            raise store_error(self.path, error) from error
+        self._note(index, PENDING)
+
+    def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
+        """As `ShotWriter.write`; the shot's numbers are there as soon as it is done."""
+        self._gather(index, report)
+        self._writer.write(index, arrays, report)
+        self._note(index, DONE)
+
+    def fail(self, index: int, report: Mapping[str, Any]) -> None:
+        """As `ShotWriter.fail`."""
+        self._gather(index, report)
+        self._writer.fail(index, report)
+        self._note(index, FAILED)
+
+    def _gather(self, index: int, report: Mapping[str, Any]) -> None:
+        try:
+            for name, kind in self._summary.items():
+                value: Any = np.array(
+                    [number_of(report, name, kind)], object if kind is str else kind
+                )
+                self._writer.opened[name][index : index + 1] = value
+        except OSError as error:
+            raise store_error(self.path, error) from error
+
+    def _note(self, index: int, status: int) -> None:
+        self._counts[self._statuses[index]] -= 1
+        self._counts[status] += 1
+        self._statuses[index] = status

@@ -1,0 +1,116 @@
+"""*Invert stack* with a folder that is watched: its layers grow as shots arrive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from napari_shadowinv._napari.layer_metadata import mark_of, role_of
+from napari_shadowinv.io.store import DONE, StackStore
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+
+PATIENCE = 60_000  # ms
+SHAPE = (24, 28)
+
+
+def put(folder: Path, index: int) -> None:
+    blob = gaussian_blob(SHAPE, 2.0 + index, 4.0, (10, 12 + index))
+    np.save(folder / f"shot_{index}.npy", 100 * synthetic_image(blob.displacement))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "live").mkdir()
+    return tmp_path / "live"
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "live.shadowinv.zarr"
+
+
+@pytest.fixture
+def tool(open_widget: Any, folder: Path, out: Path) -> Any:
+    tool = open_widget("Invert stack")
+    tool.options.set_values({"n_sites": 100})
+    tool.shots.picker.set_kind("folder")
+    tool.shots.folder.folder.edit.setText(str(folder))
+    tool.shots.folder.pattern.setText("*.npy")
+    tool.store.edit.setText(str(out))
+    return tool
+
+
+def layer_of(viewer: Any, role: str) -> Any:
+    (found,) = [one for one in viewer.layers if role_of(one) == role]
+    return found
+
+
+def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
+    window: Any, tool: Any, folder: Path, out: Path, qtbot: Any, told: list[str]
+) -> None:
+    def shown(count: int) -> Any:
+        """The field, once it has so many shots."""
+
+        def is_there() -> bool:
+            roles = [role_of(one) for one in window.layers]
+            return "field" in roles and len(layer_of(window, "field").data) == count
+
+        qtbot.waitUntil(is_there, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: not (tool.results.busy or tool._soon.isActive()), timeout=PATIENCE)
+        return layer_of(window, "field")
+
+    assert not tool.engine.isVisible()
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: "Waiting for shots" in tool.panel.status.text(), timeout=PATIENCE)
+    put(folder, 0)
+    field = shown(1)
+    put(folder, 1)
+    assert shown(2) is field
+    assert window.dims.current_step[0] == 1
+    limits = field.contrast_limits[1]
+    assert limits == pytest.approx(float(np.asarray(field.data[1]).max()))
+    arrows = layer_of(window, "arrows")
+    assert (arrows.data[:, 0, 0] == 1).all()
+    window.dims.set_current_step(0, 0)
+    (folder / "shot_2.npy").write_bytes(b"")
+    put(folder, 3)
+    shown(4)
+    assert window.dims.current_step[0] == 0
+    assert field.contrast_limits[1] > limits
+    assert np.isfinite(np.asarray(layer_of(window, "potential").data[3])).all()
+    assert list(tool.failures.texts()) == ["shot_2.npy"]
+    assert mark_of(field)["shots"] == [f"shot_{index}.npy" for index in range(4)]
+    status = tool.panel.status
+    qtbot.waitUntil(lambda: "3 done, 1 failed" in status.text(), timeout=PATIENCE)
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    assert tool.panel.status.text() == "3 done, 1 failed, in live.shadowinv.zarr"
+    assert told == []
+    # Run again: it goes on in the same layers.
+    tool.panel.button.click()
+    window.dims.set_current_step(0, 3)
+    put(folder, 4)
+    assert shown(5) is field
+    assert window.dims.current_step[0] == 4
+    assert (StackStore(out).statuses() == DONE).sum() == 4
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+
+
+def test_it_fits_and_a_folder_that_is_not_there_is_a_mistake(
+    tool: Any, qtbot: Any, told: list[str], assert_it_fits: Any, tmp_path: Path
+) -> None:
+    assert_it_fits(tool)
+    tool.shots.folder.folder.edit.setText(str(tmp_path / "nowhere"))
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: bool(told), timeout=PATIENCE)
+    assert "does not exist: expected a folder to watch" in told[0]
+    told.clear()
+    tool.shots.folder.folder.edit.setText("")
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: bool(told), timeout=PATIENCE)
+    assert "o folder is selected" in told[0]

@@ -1,0 +1,479 @@
+"""A folder that is watched: what arrives is inverted once, completely, and in order."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from store_content import content
+
+from command_line import flat, shadowinv
+from conftest import OPTIONS, make_shots
+from napari_shadowinv import FileFormatError, InputError, InversionOptions, read, watch_stack
+from napari_shadowinv._system.locking import locked
+from napari_shadowinv.cli import _watch
+from napari_shadowinv.io.store import DONE, FAILED, StackStore
+from napari_shadowinv.stack import WatchProgress, _arrivals, _watching
+
+IMAGES, SOURCE = make_shots(6)
+SETTLE = 0.1
+
+
+class Watched:
+    """A folder under watch in a thread, and what was told of it."""
+
+    def __init__(self, folder: Path, out: Path, **choices: Any) -> None:
+        self.folder, self.out = folder, out
+        self.told: list[WatchProgress] = []
+        self.error: Exception | None = None
+        self._stop = threading.Event()
+        given = {"source": SOURCE, "options": OPTIONS, "pattern": "*.npy", "settle": SETTLE}
+        self._choices = given | choices
+        self._thread = threading.Thread(target=self._watch)
+
+    def _watch(self) -> None:
+        try:
+            self.result = watch_stack(
+                self.folder,
+                self.out,
+                on_progress=self.told.append,
+                should_stop=self._stop.is_set,
+                **self._choices,
+            )
+        except Exception as error:
+            self.error = error
+
+    def __enter__(self) -> Watched:
+        self._thread.start()
+        self.until(lambda: any(not one.preparing for one in self.told) or self.error)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(30)
+        assert not self._thread.is_alive()
+
+    def until(self, condition: Callable[[], Any]) -> None:
+        end = time.monotonic() + 30
+        while not condition():
+            assert time.monotonic() < end, self.told
+            time.sleep(0.005)
+
+    def ended(self, count: int) -> list[WatchProgress]:
+        """Wait until so many shots have ended."""
+        self.until(lambda: self.error or len(self.shots) >= count)
+        if self.error is not None:
+            raise self.error
+        return self.shots
+
+    @property
+    def shots(self) -> list[WatchProgress]:
+        return [one for one in self.told if one.outcome is not None]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, compiled: None) -> Path:
+    (tmp_path / "live").mkdir()
+    return tmp_path / "live"
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """End at once when asked to."""
+    monkeypatch.setattr(_watching, "_POLL", 0.02)
+    monkeypatch.setattr(_arrivals, "_CHECK_EVERY", 0.1)
+
+
+def put(folder: Path, *indices: int) -> None:
+    for index in indices:
+        np.save(folder / f"shot_{index}.npy", IMAGES[index])
+
+
+def whole(index: int) -> bytes:
+    """The content of a shot's file."""
+    from io import BytesIO
+
+    file = BytesIO()
+    np.save(file, IMAGES[index])
+    return file.getvalue()
+
+
+def watched_once(folder: Path, out: Path, **choices: Any) -> Any:
+    """Invert what is there and return the store."""
+    with Watched(folder, out, idle=0.2, **choices) as watch:
+        watch.until(lambda: not watch._thread.is_alive())
+    if watch.error is not None:
+        raise watch.error
+    return watch.result
+
+
+def test_what_is_there_comes_first_and_then_what_arrives_in_its_order(folder, out):
+    put(folder, 2, 1)
+    with Watched(folder, out) as watch:
+        watch.ended(2)
+        put(folder, 5)
+        watch.ended(3)
+        put(folder, 0)
+        watch.ended(4)
+        # It can be opened at any time, with its numbers filled in.
+        store = read(out)
+        assert list(store.status.values) == [DONE] * 4
+        assert store.converged.values.all()
+        assert (store.noise_error.values > 0).all()
+        with pytest.raises(FileFormatError, match="is being written by"), locked(out):
+            pass
+    names = [f"shot_{index}.npy" for index in (1, 2, 5, 0)]
+    assert [one.name for one in watch.shots] == names
+    assert list(watch.result.name.values) == names
+    assert watch.shots[0].total == 1
+    assert watch.result.attrs["warm_start"] == "each shot from the one before, as they arrived"
+
+
+def test_fields_are_those_of_a_run_and_of_later_shots_need_fewer_steps(folder, out, tmp_path):
+    put(folder, *range(6))
+    warm = watched_once(folder, out)
+    cold = watched_once(folder, tmp_path / "cold.shadowinv.zarr", warm_start=False)
+    from napari_shadowinv import run_stack
+
+    files = [folder / f"shot_{index}.npy" for index in range(6)]
+    run = run_stack(files, tmp_path / "run.shadowinv.zarr", source=SOURCE, options=OPTIONS)
+    np.testing.assert_array_equal(cold.displacement, run.displacement)
+    scale = float(np.abs(run.displacement).max())
+    np.testing.assert_allclose(warm.displacement, run.displacement, atol=5e-3 * scale)
+    assert not np.array_equal(warm.displacement[1:], run.displacement[1:])
+    np.testing.assert_array_equal(warm.displacement[0], run.displacement[0])
+    for name in ("iterations", "image_residual", "seconds"):
+        assert (warm[name] > 0).all()
+
+
+def test_the_accuracy_decides_once_how_many_sites_all_shots_get(folder, out):
+    put(folder, 0, 1, 2)
+    options = InversionOptions(accuracy=0.3)
+    watched_once(folder, out, options=options)
+    chosen = StackStore(out).attributes["chosen_sites"]
+    put(folder, 3)
+    watched_once(folder, out, options=options)
+    store = StackStore(out)
+    assert store.attributes["chosen_sites"] == chosen
+    assert {report["n_sites"] for report in store.reports()} == {chosen}
+    from napari_shadowinv import run_stack
+
+    files = [folder / f"shot_{index}.npy" for index in range(3)]
+    other = out.with_name("run.shadowinv.zarr")
+    run_stack(files, other, source=SOURCE, options=options)
+    assert StackStore(other).attributes["chosen_sites"] == chosen
+
+
+def test_a_file_that_is_written_slowly_is_inverted_from_its_whole_content(folder, out):
+    data = whole(0)
+    with Watched(folder, out) as watch:
+        path = folder / "shot_0.npy"
+        with path.open("wb") as file:
+            for part in (data[:100], data[100:2000], data[2000:]):
+                file.write(part)
+                file.flush()
+                time.sleep(2 * SETTLE)
+                assert not watch.shots
+        assert watch.ended(1)[0].outcome.status == DONE
+        # Opened and closed twice: the first half fails, and the whole takes its place.
+        path = folder / "shot_1.npy"
+        path.write_bytes(data[:2000])
+        assert watch.ended(2)[1].outcome.status == FAILED
+        with path.open("ab") as file:
+            file.write(data[2000:])
+        assert watch.ended(3)[2].again
+    assert list(watch.result.status.values) == [DONE, DONE]
+    np.testing.assert_allclose(
+        watch.result.displacement[0], watch.result.displacement[1], atol=5e-3
+    )
+
+
+def test_a_shot_that_changes_is_told_of_and_inverted_again(folder, out):
+    put(folder, 0, 1)
+    with Watched(folder, out) as watch:
+        watch.ended(2)
+        before = content(out)
+        os.utime(folder / "shot_1.npy")
+        (folder / "shot_1.npy").write_bytes(whole(1))  # the same again
+        (folder / "shot_0.npy").write_bytes(whole(4))
+        changed = watch.ended(3)[2]
+    assert (changed.name, changed.again, changed.outcome.index) == ("shot_0.npy", True, 0)
+    assert len(watch.shots) == 3
+    after = content(out)
+    assert {name for name in before if before[name] != after[name]} & {
+        "displacement/c/1/0/0/0",
+        "report/c/1",
+    } == set()
+    (folder / "shot_1.npy").write_bytes(whole(5))
+    with Watched(folder, out) as watch:
+        assert watch.ended(1)[0].again
+
+
+def test_what_is_moved_or_linked_here_counts_and_what_is_not_a_shot_does_not(folder, out, tmp_path):
+    put(tmp_path, 0, 1, 2)
+    with Watched(folder, out, pattern="*") as watch:
+        shutil.move(tmp_path / "shot_0.npy", folder)
+        watch.ended(1)
+        (folder / ".shot_7.npy").write_bytes(whole(1))
+        (folder / "inner").mkdir()
+        put(folder / "inner", 3)
+        os.link(tmp_path / "shot_1.npy", folder / "shot_1.npy")
+        watch.ended(2)
+    with Watched(folder, out) as watch:
+        (folder / "shot_4.npy.part").write_bytes(whole(4))
+        (folder / "shot_4.npy.part").rename(folder / "shot_4.npy")
+        watch.ended(1)
+    assert list(watch.result.name.values) == [f"shot_{i}.npy" for i in (0, 1, 4)]
+
+
+def test_a_store_inside_the_folder_does_not_set_it_off(folder):
+    out = folder / "night.shadowinv.zarr"
+    with Watched(folder, out, pattern="*") as watch:
+        put(folder, 0, 1)
+        watch.ended(2)
+        time.sleep(3 * SETTLE)
+        assert len(watch.shots) == 2
+    assert list(watch.result.status.values) == [DONE, DONE]
+
+
+def test_bad_files_fail_alone_and_the_next_shot_starts_afresh(folder, out, tmp_path):
+    (folder / "shot_0.npy").write_bytes(b"")
+    np.save(folder / "shot_1.npy", IMAGES[0][:10])
+    (folder / "shot_2.npy").write_text("no image")
+    put(folder, 3)
+    with Watched(folder, out) as watch:
+        watch.ended(4)
+        (folder / "shot_4.npy").write_bytes(b"")
+        watch.ended(5)
+        put(folder, 5)
+        watch.ended(6)
+    result = watch.result
+    assert list(result.status.values) == [FAILED] * 3 + [DONE, FAILED, DONE]
+    reasons = [one.outcome.reason for one in watch.shots]
+    assert "is empty" in reasons[0]
+    assert "image has shape (10, 28), expected (24, 28)" in reasons[1]
+    assert reasons[4] == StackStore(out).report(4)["reason"]
+    assert np.isnan(result.displacement[4]).all()
+    cold = watched_once(folder, tmp_path / "cold.shadowinv.zarr", warm_start=False)
+    np.testing.assert_array_equal(cold.displacement[5], result.displacement[5])
+
+
+def test_without_a_good_shot_there_is_no_store(folder, out):
+    (folder / "shot_0.npy").write_bytes(b"")
+    assert watched_once(folder, out, source=None) is None
+    assert not out.exists()
+
+
+def test_it_goes_on_with_its_store_and_does_nothing_twice(folder, out):
+    put(folder, 0, 1)
+    (folder / "shot_2.npy").write_bytes(b"")
+    watched_once(folder, out, source=None)
+    before = content(out)
+    (folder / "shot_0.npy").unlink()  # put away after it was inverted
+    with Watched(folder, out, source=None) as watch:
+        put(folder, 4)
+        assert watch.ended(1)[0].name == "shot_4.npy"
+    after = content(out)
+    assert {name: after[name] for name in before if "/c/0" not in name} == {
+        name: before[name] for name in before if "/c/0" not in name
+    }
+    assert list(watch.result.status.values) == [DONE, DONE, FAILED, DONE]
+    np.save(folder / "shot_9.npy", IMAGES[0][:10])  # smaller than those before
+    assert list(watched_once(folder, out, source=None).status.values) == [1, 1, 2, 1, 2]
+    (folder / "shot_9.npy").write_bytes(whole(2))
+    put(folder, 2)
+    again = watched_once(folder, out, source=None, redo_failed=True)
+    assert list(again.status.values) == [DONE] * 5
+    put(folder, 5)
+    assert len(watched_once(folder, out, source=None, skip_existing=True).shot) == 5
+    with pytest.raises(InputError, match="different options"):
+        watched_once(folder, out, source=None, options=InversionOptions(n_sites=50))
+    with pytest.raises(InputError, match=r"different warm start \(each shot from the one before"):
+        watched_once(folder, out, source=None, warm_start=False)
+
+
+def test_a_batch_goes_on_with_a_store_only_if_shots_start_afresh(folder, out, tmp_path):
+    np.save(tmp_path / "reference.npy", SOURCE)
+    put(folder, 3, 4)
+    given = ["--source", tmp_path / "reference.npy", "--n-sites", 100, "--out", out]
+    watch = ["watch", folder, "--pattern", "*.npy", *given, "--settle", SETTLE, "--idle", 0.2]
+    assert shadowinv(*watch, "--no-warm-start").exit_code == 0
+    put(folder, 1)
+    assert shadowinv(*watch, "--no-warm-start").exit_code == 0
+    put(folder, 0)
+    batch = ["batch", f"{folder}/*.npy", *given, "--scheduler", "threads"]
+    result = shadowinv(*batch, "--resume")
+    assert result.exit_code == 0, result.output
+    assert list(read(out).name.values) == [f"shot_{i}.npy" for i in (3, 4, 1, 0)]
+    shutil.rmtree(out)
+    assert shadowinv(*watch).exit_code == 0
+    result = shadowinv(*batch, "--resume")
+    assert result.exit_code == 2
+    assert "was written by watching a folder" in flat(result.output)
+
+
+def test_a_hundred_small_frames_keep_up_and_leave_no_thread(folder, out):
+    count = 100
+    with Watched(folder, out, shots=count) as watch:
+        began = time.monotonic()
+        for number in range(count):
+            np.save(folder / f"shot_{number:03d}.npy", IMAGES[number % 6])
+        watch.ended(count)
+        seconds = time.monotonic() - began
+        watch.until(lambda: not watch._thread.is_alive())
+    assert list(watch.result.status.values) == [DONE] * count
+    assert list(watch.result.name.values) == [f"shot_{i:03d}.npy" for i in range(count)]
+    assert max(one.waiting for one in watch.shots) > 1
+    assert watch.shots[-1].waiting == 0
+    # Late shots cost no more than early ones.
+    spent = [one.outcome.seconds for one in watch.shots]
+    assert np.median(spent[-30:]) < 2 * np.median(spent[10:40])
+    assert seconds < 15
+    left = [type(one).__module__ for one in threading.enumerate()]
+    assert not [module for module in left if module.startswith("watchdog")]
+    assert "lock" not in {one.name for one in threading.enumerate()}
+
+
+def test_it_ends_after_so_many_shots_or_when_nothing_arrives(folder, out):
+    put(folder, *range(4))
+    with Watched(folder, out, shots=2) as watch:
+        watch.until(lambda: not watch._thread.is_alive())
+    assert len(watch.result.shot) == 2
+    assert watch.told[-1].waiting == 2
+    began = time.monotonic()
+    assert len(watched_once(folder, out).shot) == 4
+    assert time.monotonic() - began < 3
+
+
+def test_by_looking_itself_it_waits_until_a_file_has_settled(folder, out, monkeypatch):
+    monkeypatch.setattr(_arrivals, "_LOOK_EVERY", 0.05)
+    put(folder, 0)
+    data = whole(1)
+    with Watched(folder, out, polling=True, settle=0.4) as watch:
+        watch.ended(1)
+        with (folder / "shot_1.npy").open("wb") as file:
+            for part in np.array_split(np.frombuffer(data, np.uint8), 4):
+                file.write(part.tobytes())
+                file.flush()
+                time.sleep(0.1)
+        assert len(watch.shots) == 1
+        assert watch.ended(2)[1].outcome.status == DONE
+
+
+def test_without_room_for_another_watch_it_looks_itself(folder, out, monkeypatch):
+    def full(_arrivals: Any) -> Any:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(_arrivals, "_started", full)
+    put(folder, 0)
+    with Watched(folder, out) as watch:
+        watch.ended(1)
+    (note,) = [one.note for one in watch.told if one.note]
+    assert note.startswith("the system does not watch another folder (No space left on device)")
+
+
+def test_a_folder_that_is_gone_before_it_is_observed_leaves_no_thread(folder):
+    before = set(threading.enumerate())
+    arrivals = _arrivals.Arrivals(folder.resolve(), "*")
+    shutil.rmtree(folder)
+    with (
+        pytest.raises(FileFormatError, match="can no longer be read"),
+        _arrivals.observing(arrivals, polling=False, on_note=print),
+    ):
+        pass
+    with pytest.raises(OSError, match="No such file"):
+        _arrivals._started(arrivals)
+    assert set(threading.enumerate()) == before
+
+
+@pytest.mark.parametrize("how", ["removed", "moved"])
+def test_a_folder_that_disappears_ends_it_with_a_sentence(folder, out, how):
+    put(folder, 0)
+    with Watched(folder, out) as watch:
+        watch.ended(1)
+        if how == "removed":
+            shutil.rmtree(folder)
+        else:
+            folder.rename(folder.with_name("elsewhere"))
+        watch.until(lambda: watch.error)
+    assert isinstance(watch.error, FileFormatError)
+    assert "can no longer be read" in str(watch.error)
+    assert list(read(out).status.values) == [DONE]
+
+
+def test_what_cannot_be_watched_is_refused_at_once(folder, out, tmp_path):
+    def refused(*more: object, names: str, place: Path = folder) -> None:
+        result = shadowinv("watch", place, "--out", out, *more)
+        assert result.exit_code == 2, result.output
+        assert names in flat(result.output)
+        assert "Traceback" not in result.output
+
+    refused(names="does not exist: expected a folder", place=tmp_path / "nowhere")
+    (tmp_path / "file").touch()
+    refused(names="is a file: expected a folder", place=tmp_path / "file")
+    refused("--pattern", "inner/*.tif", names="the pattern is 'inner/*.tif'")
+    refused("--idle", "0", names="idle is 0: expected a number above 0")
+    refused("--source", tmp_path / "none.tif", names="none.tif")
+    sources = np.stack([SOURCE, SOURCE])
+    with pytest.raises(InputError, match="got 2 sources, and the shots are still to arrive"):
+        watch_stack(folder, out, source=sources)
+
+
+def test_the_command_tells_a_line_for_each_shot(folder, out, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    np.save(tmp_path / "reference.npy", SOURCE)
+    put(folder, 0, 1)
+    (folder / "shot_2.npy").write_bytes(b"")
+    command = [
+        "watch", folder, "--pattern", "*.npy", "--source", tmp_path / "reference.npy",
+        "--n-sites", 100, "--out", out, "--idle", 0.2, "--settle", SETTLE,
+    ]  # fmt: skip
+    result = shadowinv(*command)
+    assert result.exit_code == 1
+    lines = result.stdout.splitlines()
+    told = [line for line in lines if line.startswith("shot_")]
+    assert [line.split()[0] for line in told] == ["shot_0.npy", "shot_1.npy"]
+    assert all(" peak |d| " in line and " px  residual " in line for line in told)
+    assert all(len(line) <= 100 for line in told)
+    assert "2 waiting" in told[0]
+    # What casts doubt on a shot is said once, whatever its numbers.
+    warning, failure = result.stderr.splitlines()
+    assert warning.startswith("warning: shot_0.npy: the field reaches the image's edge")
+    assert all(line.endswith("1 warning") for line in told)
+    assert failure.startswith("failed: shot_2.npy: ")
+    assert lines[-1].startswith("Ended: 2 done, 1 failed; repeat the command to go on with")
+    assert shadowinv(*command, "--quiet").stdout == ""
+
+
+@pytest.mark.parametrize(("files", "code"), [(1, 0), (3, 130)])
+def test_ctrl_c_is_the_normal_end_unless_files_wait(
+    folder, out, tmp_path, monkeypatch, files, code
+):
+    np.save(tmp_path / "reference.npy", SOURCE)
+    put(folder, *range(files))
+    show = _watch._Lines.show
+
+    def told(lines: Any, news: WatchProgress) -> None:
+        show(lines, news)
+        if news.outcome is not None:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(_watch._Lines, "show", told)
+    result = shadowinv(
+        "watch", folder, "--pattern", "*.npy", "--source", tmp_path / "reference.npy",
+        "--n-sites", 100, "--out", out,
+    )  # fmt: skip
+    assert result.exit_code == code
+    left = ", 2 not yet inverted" if files > 1 else ""
+    (end,) = [line for line in result.output.splitlines() if line.startswith("Ended")]
+    assert end == (f"Ended: 1 done, 0 failed{left}; repeat the command to go on with {out}.")
+    assert list(read(out).status.values) == [DONE]
+    assert not list(tmp_path.glob(".*.lock"))
