@@ -200,7 +200,7 @@ class RegularTriangulation:
         threads look for irregular edges; the flips themselves take one.
         """
         self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
-        self._forget()
+        self.forget()
         suspects = np.empty(self._mesh.counters[SIZE], np.bool_)
         in_ranges(_flips.look_for_irregular, suspects.size, threads, self._mesh, suspects)
         policy = _flips.STOP if stop_when_hidden else _flips.REMOVE
@@ -228,7 +228,7 @@ class RegularTriangulation:
         targets = given if self._order is None else given[self._order]
         points, self._ghost_distance = _with_ghosts(targets, self._region)
         same_ghosts = np.array_equal(points[n:], self._mesh.points[n:])
-        self._forget()
+        self.forget()
         if same_ghosts:
             self._mesh = self._mesh._replace(points=self._mesh.points.copy())
             if _flips.relocate(self._mesh, targets) == _flips.DONE:
@@ -253,7 +253,7 @@ class RegularTriangulation:
             ghosts = self._mesh.weights[-1]
             if _flips.raise_hidden(self._mesh) == _flips.EXHAUSTED:
                 raise RuntimeError(self._exhausted())
-            self._forget()
+            self.forget()
             # The ghosts follow if the lightest sites were raised; then a site may hide again.
             self._weigh_ghosts()
             if ghosts != self._mesh.weights[-1]:
@@ -341,6 +341,7 @@ class RegularTriangulation:
         given[self._order] = values[: self._order.size]
         return given
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
+        """Let go of arrays that are made when they are asked for."""
         for name in ("points", "weights", "hidden", "vertices", "neighbors"):
             self.__dict__.pop(name, None)

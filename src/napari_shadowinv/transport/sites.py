@@ -332,6 +332,7 @@ def plan_levels(
         if count == n_sites:
             density.cache_clear()  # it is large, and others are seldom made after the finest
         sites, masses, centroids = triangulation.sites, diagram.masses, diagram.centroids
+        triangulation.forget()
         return Level(sites, masses, centroids, triangulation, beam.shape, steps)
 
     return SitePlan(source, Levels(tuple(reversed(counts)), level))
