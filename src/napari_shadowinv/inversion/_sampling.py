@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density
@@ -172,8 +171,7 @@ class Responding:
         if self._factors is not None:
             return self._factors.solve(right)
         if not hasattr(self._solvers, "one"):
-            threads = available_threads(self._samples.options.threads)
-            self._solvers.one = LaplacianSolver(*self._network, threads=threads)
+            self._solvers.one = LaplacianSolver(*self._network)
         weights = np.zeros_like(right)
         for sample in np.flatnonzero(right.any(axis=0)):
             report("samples", 0)

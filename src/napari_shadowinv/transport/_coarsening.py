@@ -18,6 +18,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -40,7 +41,7 @@ class Network(NamedTuple):
     starts: Indices
     middles: Indices
     neighbors: Indices
-    conductances: FloatArray
+    conductances: NDArray[np.float32]  # whose sums the degrees are, so nothing leaks
     degrees: FloatArray
     inverse_degrees: FloatArray
 
@@ -60,7 +61,7 @@ def _empty_network(nodes: int, entries: int) -> Network:
         np.zeros(nodes + 1, np.int32),
         np.empty(nodes, np.int32),
         np.empty(entries, np.int32),
-        np.empty(entries),
+        np.empty(entries, np.float32),
         np.empty(nodes),
         np.empty(nodes),
     )
@@ -68,7 +69,7 @@ def _empty_network(nodes: int, entries: int) -> Network:
 
 @njit(nogil=True, cache=True)
 def _put_lower_first(
-    neighbors: Indices, conductances: FloatArray, begin: int, end: int, node: int
+    neighbors: Indices, conductances: NDArray[np.float32], begin: int, end: int, node: int
 ) -> tuple[int, float]:
     """Sort a row to lower and upper neighbours; return where the upper begin, and the sum."""
     middle = begin
@@ -280,7 +281,7 @@ def _with_room(network: Network, entries: int) -> Network:
         return network
     return network._replace(
         neighbors=np.concatenate([network.neighbors, np.empty(missing, np.int32)]),
-        conductances=np.concatenate([network.conductances, np.empty(missing)]),
+        conductances=np.concatenate([network.conductances, np.empty(missing, np.float32)]),
     )
 
 

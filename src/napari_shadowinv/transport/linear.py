@@ -23,7 +23,6 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
@@ -39,7 +38,6 @@ __all__ = ["LaplacianSolver", "SimilarSystems", "factorise"]
 _DIRECT_BELOW = 200
 _MORE_ITERATIONS = 3  # that cost less than a new setup
 _KEPT_BELOW = 500_000  # nodes; a larger setup takes the memory that trial steps need
-_WORTH_A_THREAD = 100_000
 
 
 class _Vectors(NamedTuple):
@@ -206,16 +204,13 @@ class LaplacianSolver:
     connected raises a RuntimeError.
     """
 
-    def __init__(
-        self, laplacian: csr_array, ground: FloatArray | None = None, *, threads: int = 1
-    ) -> None:
+    def __init__(self, laplacian: csr_array, ground: FloatArray | None = None) -> None:
         self._n = int(laplacian.shape[0])
         self._grounded = ground is not None
-        self._threads = threads
+        self._matrix = _with_ground(laplacian, ground)
         self._hierarchy = build_hierarchy(laplacian, ground)
         nodes = int(self._hierarchy.bounds[-1])
         self._vectors = _Vectors(*(np.zeros(nodes) for _ in _Vectors._fields))
-        self._matrix: csr_array | None = None
 
     def solve(
         self,
@@ -223,15 +218,17 @@ class LaplacianSolver:
         tolerance: float = 1e-2,
         max_iterations: int = 200,
         *,
-        matrix: csr_array | None = None,
+        laplacian: csr_array | None = None,
+        ground: FloatArray | None = None,
     ) -> tuple[FloatArray, int, float]:
         """Solve L x = b; return x, the iterations done, and the residual that was reached.
 
         Tolerance and residual are norms relative to that of b. Without a ground the mean of b
-        is ignored, and that of x is zero. A `matrix`, with the ground on its diagonal, takes the
-        place of the one that was set up for, and should be near to it.
+        is ignored, and that of x is zero. A `laplacian` with its ground, if given, takes the place
+        of the one that was set up for, and should be near to it.
         """
-        self._matrix = matrix
+        if laplacian is not None:
+            self._matrix = _with_ground(laplacian, ground)
         right = self._centred(right)
         scale = self._norm(right)
         solution: FloatArray = np.zeros(self._n)
@@ -274,14 +271,15 @@ class LaplacianSolver:
         return energy
 
     def _multiply(self, x: FloatArray, product: FloatArray) -> None:
-        if self._matrix is not None:
-            product[: self._n] = self._matrix @ x[: self._n]
-            return
-        operands = self._hierarchy.network, x, product
-        in_ranges(_multiply, self._n, self._threads, *operands, smallest=_WORTH_A_THREAD)
+        # Not with the hierarchy's rounded conductances.
+        product[: self._n] = self._matrix @ x[: self._n]
 
     def _norm(self, x: FloatArray) -> float:
         return float(np.sqrt(_dot(0, self._n, x, x)))
+
+
+def _with_ground(laplacian: csr_array, ground: FloatArray | None) -> csr_array:
+    return laplacian if ground is None else csr_array(laplacian + diags_array(ground))
 
 
 class SimilarSystems:
@@ -290,8 +288,7 @@ class SimilarSystems:
     That is as good as a setup for each where their matrices change little, as Newton's do.
     """
 
-    def __init__(self, threads: int = 1) -> None:
-        self._threads = threads
+    def __init__(self) -> None:
         self._solver: LaplacianSolver | None = None
         self._most = 0
 
@@ -308,12 +305,13 @@ class SimilarSystems:
             require_connected(laplacian)
             return _solved_by_factors(laplacian, right, ground)
         if self._solver is not None:
-            matrix = laplacian if ground is None else laplacian + diags_array(ground)
-            solution, _, residual = self._solver.solve(right, tolerance, self._most, matrix=matrix)
+            solution, _, residual = self._solver.solve(
+                right, tolerance, self._most, laplacian=laplacian, ground=ground
+            )
             if residual <= tolerance:
                 return solution
         self._solver = None  # one at a time: they are large
-        solver = LaplacianSolver(laplacian, ground, threads=self._threads)
+        solver = LaplacianSolver(laplacian, ground)
         solution, iterations, residual = solver.solve(right, tolerance)
         if residual > tolerance:
             return _solved_by_factors(laplacian, right, ground)
@@ -337,7 +335,7 @@ def _solved_by_factors(
 
 def factorise(laplacian: csr_array, ground: FloatArray | None) -> SuperLU:
     """Factorise a Laplacian with its ground; without one, all of it but its first node."""
-    matrix = laplacian[1:, 1:] if ground is None else laplacian + diags_array(ground)
+    matrix = laplacian[1:, 1:] if ground is None else _with_ground(laplacian, ground)
     return splu(
         matrix.tocsc(),
         permc_spec="MMD_AT_PLUS_A",

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.sparse import csr_array
 
-from napari_shadowinv._system.machine import available_threads, physical_memory
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
@@ -74,7 +74,7 @@ def newton(
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     errors = [_length(mass - diagram.masses)]
-    systems = SimilarSystems(available_threads(objective.threads))
+    systems = SimilarSystems()
     first = 1.0
     reason = f"the solver used all {max_iterations} iterations allowed"
     while residual > tolerance and len(errors) <= max_iterations:
