@@ -23,12 +23,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 
 __all__ = ["Density", "split_pixels", "walk_edge"]
 
 Triple = tuple[float, float, float]
+
+_WORTH_A_THREAD = 100_000  # pixels
 
 
 @dataclass(frozen=True)
@@ -44,10 +47,16 @@ class Density:
     sums: FloatArray
 
     @classmethod
-    def from_image(cls, image: ArrayLike) -> Density:
+    def from_image(cls, image: ArrayLike, *, threads: int | None = 1) -> Density:
         """Make a density of an image of shape (H, W)."""
         values = np.ascontiguousarray(image, dtype=np.float64)
-        return cls(values, _row_sums(values))
+        if not values.flags.writeable:  # the kernel is compiled for one type
+            values = values.copy()
+        height, width = values.shape
+        sums = np.zeros((3, height, width + 1))
+        rows = max(1, _WORTH_A_THREAD // max(1, width))
+        in_ranges(_sum_rows, height, available_threads(threads), values, sums, smallest=rows)
+        return cls(values, sums)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -66,18 +75,15 @@ class Density:
 
 
 @njit(nogil=True, cache=True)
-def _row_sums(image: FloatArray) -> FloatArray:
-    height, width = image.shape
-    sums = np.zeros((3, height, width + 1))
-    for row in range(height):
-        for left in range(width):
+def _sum_rows(start: int, stop: int, image: FloatArray, sums: FloatArray) -> None:
+    for row in range(start, stop):
+        for left in range(image.shape[1]):
             value = image[row, left]
             right = left + 1
             # ∫ s ds and ∫ s² ds over the pixel
             sums[0, row, right] = sums[0, row, left] + value
             sums[1, row, right] = sums[1, row, left] + value * (left + 0.5)
             sums[2, row, right] = sums[2, row, left] + value * (left * right + 1 / 3)
-    return sums
 
 
 def split_pixels(image: FloatArray, factor: int) -> FloatArray:

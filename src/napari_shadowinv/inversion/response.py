@@ -47,7 +47,7 @@ class LinearResponse:
         objective = target.objective(solution.level)
         diagram = objective.diagram(solution.weights)
         self.flux = diagram.masses
-        ones = Density.from_image(np.ones(solution.level.shape))
+        ones = Density.from_image(np.ones(solution.level.shape), threads=solution.threads)
         self.area = PowerDiagram(objective.triangulation, ones, threads=solution.threads).masses
         ground = objective.ground(solution.weights)
         self._factors = FactorisedLaplacian(diagram.laplacian(), ground)

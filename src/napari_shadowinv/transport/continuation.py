@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.fft import dctn, idctn
 
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.transport.minimise import newton, with_full_cells
@@ -44,18 +45,19 @@ _SHARES_OF_PREDICTION = (1.0, 0.5, 0.25)
 _LEAST_OF_PREDICTION = 1e-2  # of the smallest flux to reach
 
 
-def blurred(image: FloatArray, width: float) -> FloatArray:
+def blurred(image: FloatArray, width: float, threads: int | None = 1) -> FloatArray:
     """Let a positive image's flux diffuse to a standard deviation in px, mirrored at the border.
 
     The kernel is the discrete Gaussian (T. Lindeberg, IEEE Trans. Pattern Anal. Mach. Intell. 12,
     234, 1990), which has no negative lobes at any width; the sum stays.
     """
-    spectrum = dctn(image)
+    workers = available_threads(threads)
+    spectrum = dctn(image, workers=workers)
     for axis in (0, 1):
         waves = np.pi * np.arange(image.shape[axis]) / image.shape[axis]
         damping = np.exp(-(width**2) * (1 - np.cos(waves)))
         spectrum *= np.expand_dims(damping, 1 - axis)
-    diffused: FloatArray = np.maximum(idctn(spectrum), image.min())
+    diffused: FloatArray = np.maximum(idctn(spectrum, workers=workers), image.min())
     diffused *= image.sum() / diffused.sum()
     return diffused
 

@@ -311,7 +311,7 @@ def plan_levels(
 
     @lru_cache(maxsize=1)
     def density() -> Density:
-        return Density.from_image(source)
+        return Density.from_image(source, threads=threads)
 
     def level(count: int, report: Reporter) -> Level:
         beam = density()

@@ -258,7 +258,7 @@ class Target:
 
     @classmethod
     def of(cls, image: FloatArray, margin: Margin | None, options: InversionOptions) -> Target:
-        return cls(Density.from_image(image), margin, options)
+        return cls(Density.from_image(image, threads=options.threads), margin, options)
 
     def objective(self, level: Level) -> TransportObjective:
         """Pose the problem for the sites of a level."""
@@ -276,7 +276,7 @@ class Target:
         margin = self.margin and self.margin.split(factor)
         decay_length = self.options.decay_length and factor * self.options.decay_length
         options = self.options.model_copy(update={"decay_length": decay_length})
-        return Target.of(blurred(pixels, blur), margin, options).objective(level)
+        return Target.of(blurred(pixels, blur, options.threads), margin, options).objective(level)
 
     def sharpened(self, level: Level, tolerance: float, report: Reporter | None) -> Solution:
         """Solve a level from zero weights, by way of blurred images."""
