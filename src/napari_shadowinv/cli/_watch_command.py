@@ -11,6 +11,7 @@ from napari_shadowinv.cli import _flags, _outputs
 from napari_shadowinv.cli._inputs import recipe_for_shots
 from napari_shadowinv.cli._stack_commands import HELP
 from napari_shadowinv.cli._terminal import notify_errors
+from napari_shadowinv.io.formats import NEW_SHOTS
 
 _SETTLE = (
     "Seconds without a change after which a file is complete where the system does not tell "
@@ -43,7 +44,7 @@ def watch(
     out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
     pattern: Annotated[
         str, typer.Option(help="What names of shots look like, in quotes.")
-    ] = "*.tif",
+    ] = NEW_SHOTS,
     source: _flags.SourceFile = None,
     mask: _flags.MaskFile = None,
     source_mask: _flags.SourceMask = None,

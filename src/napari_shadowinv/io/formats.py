@@ -169,6 +169,7 @@ RESULT_WRITERS = _writers("result_writer")
 FIT_WRITERS = _writers("fit_writer")
 PACK_WRITERS = _writers("pack_writer")
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
+NEW_SHOTS = f"*{TIFF.suffix}"  # names in a folder that is watched
 
 _OTHERS = {
     b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",

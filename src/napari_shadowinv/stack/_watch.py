@@ -14,6 +14,7 @@ from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
+from napari_shadowinv.io.formats import NEW_SHOTS
 from napari_shadowinv.io.store import check_store_path
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._arrivals import Arrivals, checked_folder, observing
@@ -33,7 +34,7 @@ def watch_stack(
     folder: str | Path,
     out: str | Path,
     *,
-    pattern: str = "*.tif",
+    pattern: str = NEW_SHOTS,
     source: Any = None,
     mask: ArrayLike | None = None,
     recipe: Recipe | None = None,

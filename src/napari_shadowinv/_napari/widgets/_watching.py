@@ -19,6 +19,7 @@ from napari_shadowinv._napari.widgets._qt import column
 from napari_shadowinv._napari.widgets._stacking import RunBooks, StackJob, StackRequest
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.formats import NEW_SHOTS
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
@@ -44,7 +45,7 @@ class FolderEdit(QtWidgets.QWidget):
             "<qt>Each file that appears here is inverted as soon as it is complete, until you "
             "press Cancel.</qt>"
         )
-        self.pattern = QtWidgets.QLineEdit("*.tif")
+        self.pattern = QtWidgets.QLineEdit(NEW_SHOTS)
         self.pattern.setToolTip("Names of the shots.")
         self.pattern.setMinimumWidth(60)
         column(self, labelled("", self.folder), labelled("Names", self.pattern))
@@ -85,7 +86,7 @@ class WatchBooks(RunBooks):
 class WatchJob(StackJob):
     """A folder to watch, as `shots`: arguments of `stack.watch_stack`, and the books."""
 
-    pattern: str = "*.tif"
+    pattern: str = NEW_SHOTS
     books: RunBooks = field(default_factory=WatchBooks)
 
     def run(
