@@ -21,7 +21,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.budget import ErrorEstimate
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.pipeline import run
-from napari_shadowinv.preprocessing import PolynomialEstimate, Recipe
+from napari_shadowinv.preprocessing import LowPassFilter, PolynomialEstimate, Recipe
 from napari_shadowinv.stack import invert_stack, run_stack
 
 SIDE = 96
@@ -220,6 +220,28 @@ def test_a_start_has_the_sites_of_the_shot_before(image):
     assert again.report.errors.noise.rms == pytest.approx(first.report.errors.noise.rms, rel=0.1)
 
 
+def test_errors_that_are_not_known_are_said_to_be(image):
+    rows = dict(invert(image[:20, :20], options=InversionOptions(n_sites=100)).error_rows)
+    assert "discretisation not estimated, as only one level was solved" in rows["errors"]
+    rows = dict(invert(image, options=InversionOptions(n_sites=900)).error_rows)
+    assert "not estimated" not in rows["errors"]
+
+
+def test_noise_that_was_smoothed_is_not_passed_off_as_measured():
+    """A filter takes the finest differences, by which noise is measured, but not the noise."""
+    image = counting(synthetic_image(pair().displacement), np.random.default_rng(8))
+    options = InversionOptions(n_sites=900)
+    smooth = LowPassFilter(width=1.5)
+    plain = run(Recipe(options=options), image)
+    filtered = run(Recipe(options=options, steps=(smooth,)), image)
+    known = options.model_copy(update={"quantum": 1.0})
+    given = run(Recipe(options=known, steps=(smooth,)), image)
+    assert given.errors.noise.rms == pytest.approx(plain.errors.noise.rms, rel=0.2)
+    assert filtered.errors.noise.rms < 0.5 * plain.errors.noise.rms
+    assert "measured after low-pass (smooth)" in dict(filtered.error_rows)["noise"]
+    assert "noise" not in dict(plain.error_rows) | dict(given.error_rows)
+
+
 def test_a_dataset_keeps_the_errors_and_has_them_in_si(image, proton_setup: ProtonSetup):
     found = invert(image, options=InversionOptions(n_sites=900))
     dataset = found.to_dataset(proton_setup)
@@ -263,6 +285,9 @@ def test_the_first_shots_decide_for_a_stack(tmp_path):
     assert (store.discretisation_error.values[:4] < store.discretisation_error.values[4]).all()
     reasons = {json.loads(str(text))["sites_reason"] for text in store.report.values}
     assert reasons == {"as many as the first shots needed for the accuracy"}
+    missed = "the accuracy of 3 % is not reached: with the sites of the first shots"
+    warned = ["".join(json.loads(str(text))["warnings"]) for text in store.report.values]
+    assert [missed in text for text in warned] == 4 * [False] + [True]
     lazy = invert_stack(np.stack([easy, hard]), options=options)
     assert lazy.sizes["site"] == alone[1]
 

@@ -91,6 +91,12 @@ def test_a_batch_is_written_and_told_of(night, folder):
     assert provenance.source is not None
     assert provenance.source.file == "reference.npy"
     assert "line_integrated_density" in dataset
+    reports = StackStore(Path("n.shadowinv.zarr")).reports()
+    noise = np.median([report["errors"]["noise"][0] for report in reports])
+    status = flat(shadowinv("status", "n.shadowinv.zarr").output)
+    for text in flat(result.output), status:
+        assert "100; as given" in text
+        assert f"noise {noise:.2g} px" in text
 
 
 def test_shots_that_fail_are_named_and_the_exit_code_is_one(night, folder):

@@ -245,7 +245,9 @@ def _site_rows(store: StackStore) -> Rows:
         for name in ("noise", "discretisation")
         if (values := [one[name][0] for one in errors if np.isfinite(one[name][0])])
     ]
-    return [*rows, ("errors", f"{', '.join(told)} (r.m.s., median of the shots)")][: 1 + bool(told)]
+    if told:
+        rows.append(("errors", f"{', '.join(told)} (r.m.s., median of the shots)"))
+    return rows
 
 
 def _trouble_rows(store: StackStore) -> Rows:

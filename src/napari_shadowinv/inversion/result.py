@@ -164,14 +164,12 @@ class Inversion:
         rows = self.errors.rows(self.options)
         steps = () if self.provenance is None else self.provenance.recipe.steps
         smoothing = [step.title for step in steps if step.smooths]
-        if smoothing and self.options.noise_level is None:
-            rows.append(
-                (
-                    "noise",
-                    f"measured after smoothing ({', '.join(smoothing)}), which hides most of it: "
-                    "its error is larger than told; give the noise_level of the recorded image",
-                )
+        if smoothing and self.options.noise_level is None and self.options.quantum is None:
+            told = (
+                f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
+                "error is larger than told; give the noise_level or quantum of the recorded image"
             )
+            rows.append(("noise", told))
         return rows
 
     @property

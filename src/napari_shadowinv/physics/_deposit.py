@@ -223,7 +223,7 @@ def _add_in_row(row: FloatArray, flow: float, left: float, right: float) -> None
     if left < 0:
         row[0] -= rate * left
         left = 0.0
-    for j in range(int(left), min(int(right) + 1, width)):
+    for j in range(int(left), min(int(min(right, float(width))) + 1, width)):
         part = flow if rate == 0 else rate * (min(right, j + 1.0) - max(left, float(j)))
         later = part * (0.5 * (max(left, float(j)) + min(right, j + 1.0)) - j)
         row[j] += part - later
