@@ -65,7 +65,7 @@ class Arrivals:
         self._settling: dict[str, tuple[Stamp, float]] = {}  # as last seen, and since when
         self._tells_closing = False
         self._same = _identity(folder)
-        self._gone = False
+        self._gone = self._woken = False
         self._checked = self.heard = time.monotonic()  # `heard`: the last sign of a file
 
     @property
@@ -100,11 +100,14 @@ class Arrivals:
                     self._settling[name] = (seen, time.monotonic())
 
     def take(self, timeout: float) -> str | None:
-        """Return the name of the next complete file; None if there is none for so long."""
+        """Return the name of the next complete file; None without one for so long, or if woken."""
         end = time.monotonic() + timeout
         with self._changed:
             while True:
                 self._check()
+                if self._woken:
+                    self._woken = False
+                    return None
                 due = self._settle_some()
                 if self._ready:
                     name = next(iter(self._ready))
@@ -114,6 +117,12 @@ class Arrivals:
                 if time.monotonic() >= end:
                     return None
                 self._changed.wait(max(left, 0.0))
+
+    def wake(self) -> None:
+        """End the wait for a file, or the next one."""
+        with self._changed:
+            self._woken = True
+            self._changed.notify_all()
 
     def peek(self, count: int) -> list[str]:
         """Return the names of the first files that wait, without handing them out."""

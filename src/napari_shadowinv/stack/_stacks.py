@@ -24,7 +24,7 @@ from napari_shadowinv.stack._worker import Beam, Work
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
-CHAINED = "each shot from the one before, as they arrived"
+CHAINED = "each shot from an earlier one, as they arrived"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Stack:
     reader: str = ""  # name of what reads the files
     sites_chosen: bool = False  # whether the number of sites follows from the accuracy
     as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
-    chained: bool = False  # whether each shot starts from the one before, without groups
+    chained: bool = False  # whether each shot starts from an earlier one, without groups
 
     @property
     def warm_start_text(self) -> str:

@@ -77,8 +77,9 @@ def watch_stack(
         decide how many all of them get: up to three that are there at the start, or the first
         that arrives.
     warm_start : bool, optional
-        Initialise each shot from the one before, unless that failed or did not converge. Shots
-        with a source estimated from each, and fits, always start afresh.
+        Initialise each shot from the last but one, as two are inverted at once, unless that failed
+        or did not converge. Shots with a source estimated from each, and fits, always start
+        afresh.
     variables, dtype, overwrite, redo_failed
         As for `run_stack`.
     skip_existing : bool, optional
@@ -95,8 +96,8 @@ def watch_stack(
     on_progress : callable, optional
         Receives a `WatchProgress` at the start, when a shot has ended, and at the end.
     should_stop : callable, optional
-        Asked now and then; when it returns true, the watch ends. What was not finished is done
-        when it is resumed.
+        Asked now and then, also in other threads; when it returns true, the watch ends. What was
+        not finished is done when it is resumed.
 
     Returns
     -------

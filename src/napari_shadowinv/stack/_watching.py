@@ -7,11 +7,14 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,6 +39,9 @@ if TYPE_CHECKING:
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
 
+# Shots at once. It is fixed, because each starts from the one so many before, and what is found
+# shall not depend on the machine.
+_ABREAST = 2
 _TICK = 2.0  # seconds in which times of files may be the same, on any file system
 _POLL = 0.25  # seconds between two looks at `should_stop` while nothing arrives
 
@@ -121,7 +127,7 @@ class StackMaker:
     describe: Callable[[Shots], Stack]
     folder: Path
     reader: Reader
-    chained: bool  # whether each shot shall start from the one before
+    chained: bool  # whether each shot shall start from an earlier one
 
     def shot(self, name: str) -> FileShot:
         return FileShot(self.folder / name, self.reader)
@@ -144,8 +150,22 @@ class StackMaker:
         return replace(stack, as_arrived=True, chained=chained)
 
 
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """A shot that is being inverted."""
+
+    name: str
+    shot: FileShot
+    seen: dict[str, int]  # of its file, before it was read
+    lane: int
+    tried: Future[Tried]
+
+
 class Watch:
-    """Takes file after file, and keeps of the last one what the next one starts from."""
+    """Takes file after file, inverts two at once, and writes them in the order of arrival.
+
+    Shots begin in the two lanes by turns; each starts from what came of the last one in its lane.
+    """
 
     def __init__(
         self,
@@ -161,9 +181,12 @@ class Watch:
         self._overwrite = False
         self._stack: Stack | None = None
         self._work: Any = None  # known once the number of sites is
-        self._previous: Inversion | Fit | None = None
+        self._pool = ThreadPoolExecutor(_ABREAST)
+        self._abandoned = Event()
+        self._attempts: deque[_Attempt] = deque()
+        self._lanes: list[Inversion | Fit | None] = [None] * _ABREAST
         self._redo: set[str] = set()
-        self._ended = 0
+        self._begun = self._ended = 0
         self._last = time.monotonic()
 
     def open(self, *, overwrite: bool, redo_failed: bool) -> None:
@@ -186,12 +209,12 @@ class Watch:
         self._books.tell()
         try:
             while not self._is_over(idle, most):
-                arrived = self._arrivals.take(_POLL)
-                if arrived is not None:
-                    self._take(arrived)
+                self._go_on(most)
         except InversionCancelled:
             pass
         finally:
+            self._abandoned.set()
+            self._pool.shutdown(cancel_futures=True)
             self._books.tell()
 
     def _is_over(self, idle: float | None, most: int | None) -> bool:
@@ -200,9 +223,27 @@ class Watch:
         if self._should_stop is not None and self._should_stop():
             return True
         quiet = time.monotonic() - max(self._arrivals.heard, self._last)
-        return idle is not None and quiet > idle and self._arrivals.is_quiet
+        is_quiet = self._arrivals.is_quiet and not self._attempts
+        return idle is not None and quiet > idle and is_quiet
 
-    def _take(self, name: str) -> None:
+    def _is_stopped(self) -> bool:
+        asked = self._should_stop is not None and self._should_stop()
+        return asked or self._abandoned.is_set()
+
+    def _go_on(self, most: int | None) -> None:
+        """Write the oldest shot once it is done, or begin the next one."""
+        begun = len(self._attempts)
+        is_full = begun == _ABREAST or (most is not None and self._ended + begun == most)
+        if begun and (is_full or self._attempts[0].tried.done()):
+            self._finish()
+            return
+        arrived = self._arrivals.take(_POLL)
+        if arrived is not None:
+            self._begin(arrived)
+
+    def _begin(self, name: str) -> None:
+        while any(name == one.name for one in self._attempts):
+            self._finish()  # it may have changed since it was read
         shot = self._stacks.shot(name)
         try:
             seen = stamp(shot.path)
@@ -214,26 +255,37 @@ class Watch:
         except OSError:
             self._arrivals.check()
             return  # removed before its turn
-        self._books.in_work = 1
-        tried = self._tried(name, shot)
+        lane = self._begun % _ABREAST
+        self._begun += 1
+        self._books.in_work = len(self._attempts) + 1
+        tried = self._trying(name, shot, lane)
+        tried.add_done_callback(lambda _: self._arrivals.wake())
+        self._attempts.append(_Attempt(name, shot, seen, lane, tried))
+
+    def _finish(self) -> None:
+        """Wait for the oldest attempt, and write what came of it."""
+        attempt = self._attempts[0]
+        tried, seen = attempt.tried.result(), attempt.seen
+        self._attempts.popleft()
         changed = {**seen, **tried.origin}
         with suppress(OSError):
-            changed = stamp(shot.path) if tried.failure else changed
+            changed = stamp(attempt.shot.path) if tried.failure else changed
         if not seen.items() <= changed.items():
-            self._arrivals.put_back(name)  # it was written to while it was read
-            self._books.in_work = 0
+            self._arrivals.put_back(attempt.name)  # it was written to while it was read
+            self._books.in_work = len(self._attempts)
             return
         if tried.failure:
             self._arrivals.check()
+        name = text_of(attempt.name)
+        again = self._known(name) is not None
         with interrupts_put_off():
-            outcome = self._write(text_of(name), replace(tried, origin={**seen, **tried.origin}))
-        self._redo.discard(text_of(name))
-        self._previous = self._start_for_next(tried)
+            outcome = self._write(name, replace(tried, origin={**seen, **tried.origin}))
+        self._redo.discard(name)
+        self._lanes[attempt.lane] = self._start_for_next(tried)
         self._ended += 1
         self._last = time.monotonic()
-        self._books.in_work = 0
-        told = {"name": text_of(name), "outcome": outcome, "result": tried.result}
-        self._books.tell(**told, again=known is not None)
+        self._books.in_work = len(self._attempts)
+        self._books.tell(name=name, outcome=outcome, result=tried.result, again=again)
 
     def _known(self, name: str) -> dict[str, Any] | None:
         """What was told of a shot that has ended before; None of one that has not."""
@@ -244,16 +296,20 @@ class Watch:
         pending = name in self._redo or store.status(index) == PENDING
         return None if pending else store.report(index)
 
-    def _tried(self, name: str, shot: FileShot) -> Tried:
-        if self._work is None:
-            failed = self._prepare(name, shot)
-            if failed is not None:
-                return failed
-        stack, start = self._stack, self._previous
+    def _trying(self, name: str, shot: FileShot, lane: int) -> Future[Tried]:
+        failed = self._prepare(name, shot) if self._work is None else None
+        if failed is not None:
+            known: Future[Tried] = Future()
+            known.set_result(failed)
+            return known
+        stack = self._stack
         assert stack is not None
-        source = stack.source_of(0)
-        # One at a time, it has all the cores.
-        return try_shot(self._work, shot, stack.beam, source, start, 1, self._should_stop)
+        source, start = stack.source_of(0), self._lanes[lane]
+        # Alone, it has all the cores.
+        workers = _ABREAST if self._attempts or self._arrivals.waiting else 1
+        return self._pool.submit(
+            try_shot, self._work, shot, stack.beam, source, start, workers, self._is_stopped
+        )
 
     def _prepare(self, name: str, shot: FileShot) -> Tried | None:
         """Find out what all shots share by the first one; or why that one tells nothing."""
