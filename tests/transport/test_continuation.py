@@ -110,6 +110,15 @@ def test_blurring_twice_adds_variances():
     )
 
 
+def test_a_wide_blur_is_that_of_narrower_ones_although_it_is_of_means():
+    image = 0.1 + np.random.default_rng(3).random((210, 331)) ** 8
+    image[40:90, 200:260] *= 5
+    narrow = blurred(blurred(blurred(image, 24.0), 24.0), 30.0)
+    wide = blurred(image, np.sqrt(24.0**2 + 24.0**2 + 30.0**2))
+    np.testing.assert_allclose(wide, narrow, rtol=0.01)
+    assert np.ptp(narrow) > 0.1 * narrow.mean()
+
+
 @pytest.mark.parametrize("name", HARD)
 def test_images_with_jumps_are_solved(name):
     image, source = HARD[name]

@@ -23,6 +23,7 @@ from scipy.fft import dctn, idctn
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.geometry.density import split_pixels
 from napari_shadowinv.transport.minimise import newton, with_full_cells
 from napari_shadowinv.transport.objective import Solution, TransportObjective
 from napari_shadowinv.transport.sites import Level
@@ -38,6 +39,7 @@ _NARROWEST = 1e-3  # px
 _CLOSEST = 1.02  # ratio of two widths
 _PATH_TOLERANCE = 0.3  # a blurred image's solution only has to start the next
 _SHORTEST_STEP = 1e-2
+_FINE = 16.0  # pixels to a blur that are as good as more
 _SMOOTH = 1.5  # smallest blur, in pixels, that hides them
 _MOST_PARTS = 8  # of a pixel's side
 _MOST_PIXELS = 2**22  # after splitting
@@ -49,17 +51,32 @@ def blurred(image: FloatArray, width: float, threads: int | None = 1) -> FloatAr
     """Let a positive image's flux diffuse to a standard deviation in px, mirrored at the border.
 
     The kernel is the discrete Gaussian (T. Lindeberg, IEEE Trans. Pattern Anal. Mach. Intell. 12,
-    234, 1990), which has no negative lobes at any width; the sum stays.
+    234, 1990), which has no negative lobes at any width; the sum stays. A wide blur is that of the
+    means of squares that are small beside it.
     """
+    diffused: FloatArray
+    parts = int(width / _FINE)
+    if parts > 1:
+        few = blurred(_means(image, parts), width / parts, threads)
+        diffused = split_pixels(few, parts)[: image.shape[0], : image.shape[1]]
+        return np.ascontiguousarray(diffused * (image.sum() / diffused.sum()))
     workers = available_threads(threads)
     spectrum = dctn(image, workers=workers)
     for axis in (0, 1):
         waves = np.pi * np.arange(image.shape[axis]) / image.shape[axis]
         damping = np.exp(-(width**2) * (1 - np.cos(waves)))
         spectrum *= np.expand_dims(damping, 1 - axis)
-    diffused: FloatArray = np.maximum(idctn(spectrum, workers=workers), image.min())
+    diffused = np.maximum(idctn(spectrum, workers=workers), image.min())
     diffused *= image.sum() / diffused.sum()
     return diffused
+
+
+def _means(image: FloatArray, parts: int) -> FloatArray:
+    """Means of squares of pixels; at the end those at the border count for what is beyond it."""
+    height, width = image.shape
+    whole = np.pad(image, ((0, -height % parts), (0, -width % parts)), mode="edge")
+    rows = sum((whole[k::parts] for k in range(parts)), start=np.zeros(()))
+    return sum((rows[:, k::parts] for k in range(parts)), start=np.zeros(())) / parts**2
 
 
 def sharpen(

@@ -175,7 +175,9 @@ class Levels(Sequence[Level]):
 
         def begin(counts: Sequence[int]) -> None:
             for count in counts:
-                pool.submit(quiet.at, count)
+                if count not in self._made:
+                    self._report("sites", 0, None, f"{count:,} sites")
+                    pool.submit(quiet.at, count)
 
         try:
             yield begin

@@ -13,6 +13,7 @@ Paper, section III.A ("multi-stage approach"); Q. Mérigot, Computer Graphics Fo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,8 +35,7 @@ __all__ = ["LevelSolution", "Target", "fitted_flux", "solve"]
 
 
 _COARSE_TOLERANCE = 3e-2
-_HALFWAY = 2  # times the sites of a level, where the next one has four times as many
-_WORTH_HALF = 40_000  # sites from which that is worth a level of its own
+_LIKELY = 20_000  # sites of the levels that hardly any accuracy can do without
 _LARGE = 50_000  # sites from which a surface is made again rather than kept
 _STALLED = 0.1  # a residual above this is no solution of anything
 _WARM_STEPS = 10
@@ -115,9 +115,9 @@ def solve(
     The image, shape (H, W), is positive everywhere, and has the flux of the source unless there
     is a margin. With a `start` (weights of the finest level that solve a similar image) it solves
     on the finest level alone, if that converges. After each coarser level it is asked how many
-    times as many sites are `needed`, and ended there, or with twice as many, if that is enough;
-    what was `solved` before is not solved again. Returns one solution for each level that was
-    tried, and for the finest one tried afresh where a level led nowhere; the last is the answer.
+    times as many sites are `needed`, and ended there if it is once; what was `solved` before is
+    not solved again. Returns one solution for each level that was tried, and for the finest one
+    tried afresh where a level led nowhere; the last is the answer.
     """
     if options.stages == "single":
         levels = levels[-1:]
@@ -145,12 +145,13 @@ def _climb(
     coarse = max(options.tolerance, _COARSE_TOLERANCE)
     fewest = len(solutions[-1].weights) if solutions else 0
     finer = [count for count in levels.counts if count > fewest]
-    if needed is None:
-        begin(finer[::-1])
+    times = math.inf  # as many sites are needed as there are
+    begin(finer[::-1] if needed is None else [count for count in finer if count <= _LIKELY])
     while finer:
         level = levels.at(finer.pop(0))
         finest = not finer
-        tolerance = options.tolerance if finest else coarse
+        # The level that is expected to be enough is solved as well as it has to be in the end.
+        tolerance = options.tolerance if finest or times <= RATIO else coarse
         objective = target.objective(level)
         if not solutions and by_newton:
             solution = target.sharpened(level, tolerance, report)
@@ -167,12 +168,11 @@ def _climb(
         if needed is None or finest:
             continue
         times = needed(solutions)
-        count = len(level.sites)
         if times > RATIO:
             begin(finer[1:2])
-        if 1 < times <= _HALFWAY and count >= _WORTH_HALF and count in levels.counts:
-            finer.insert(0, _HALFWAY * count)
         elif times <= 1:
+            if solution.residual <= options.tolerance:
+                return solutions
             final = newton(
                 objective,
                 solution.weights,
