@@ -26,9 +26,9 @@ from napari_shadowinv.cli import _info
 from napari_shadowinv.cli._flags import recipe_of
 from napari_shadowinv.cli._inputs import setup_for
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import Inversion, compilation, invert
-from napari_shadowinv.inversion.compilation import code_folder
+from napari_shadowinv.inversion import Inversion, invert, machine_code
 from napari_shadowinv.inversion.labels import PACK_FORMAT, setup_from_dataset
+from napari_shadowinv.inversion.machine_code import code_folder
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import InversionOptions
@@ -995,7 +995,7 @@ def test_the_report_tells_what_is_not_installed(monkeypatch: pytest.MonkeyPatch)
 
 def test_the_report_hides_the_home_folder(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     monkeypatch.setattr(Path, "home", lambda: folder)
-    monkeypatch.setattr(compilation, "code_folder", lambda: folder / "kept")
+    monkeypatch.setattr(machine_code, "code_folder", lambda: folder / "kept")
     text = shadowinv("info", "--report").stdout
     assert str(Path("~") / "kept") in text
     assert str(folder) not in text
@@ -1005,7 +1005,7 @@ def test_the_report_survives_a_compiler_that_fails(monkeypatch: pytest.MonkeyPat
     def broken() -> None:
         raise ImportError("llvmlite does not\nload")
 
-    monkeypatch.setattr(compilation, "code_folder", broken)
+    monkeypatch.setattr(machine_code, "code_folder", broken)
     last = shadowinv("info", "--report").stdout.splitlines()[-1]
     assert last.endswith("not known: ImportError: llvmlite does not load")
 

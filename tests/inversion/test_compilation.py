@@ -5,18 +5,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from napari_shadowinv import InversionCancelled
-from napari_shadowinv.inversion import compilation
-from napari_shadowinv.inversion.compilation import ensure_compiled, is_compiled
+from napari_shadowinv import InversionCancelled, invert
+from napari_shadowinv.inversion import compilation, machine_code
+from napari_shadowinv.inversion.compilation import ensure_compiled
+from napari_shadowinv.inversion.machine_code import is_compiled
 
 # Root may write everywhere, unless it does without its privileges.
 WITHOUT_PRIVILEGES = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"]
 
 
 def test_an_empty_cache_means_to_compile(tmp_path):
-    script = "from napari_shadowinv.inversion.compilation import is_compiled; print(is_compiled())"
+    script = "from napari_shadowinv.inversion.machine_code import is_compiled; print(is_compiled())"
     printed = subprocess.run(
         [sys.executable, "-c", script],
         env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
@@ -38,6 +40,27 @@ def test_it_is_told_and_can_be_cancelled_and_is_done_once(monkeypatch):
     assert is_compiled()
     ensure_compiled(told.append)
     assert len(told) == 1
+
+
+def test_a_first_inversion_has_the_help_of_a_second_process_which_ends_with_it(monkeypatch):
+    helpers = []
+
+    class Helper(subprocess.Popen):
+        def __init__(self, command, **choices):
+            helpers.append(self)
+            super().__init__([sys.executable, "-c", "import time; time.sleep(60)"], **choices)
+            self.asked = command[-1]
+
+    monkeypatch.setattr(machine_code.subprocess, "Popen", Helper)
+    invert(np.ones((20, 20)))
+    assert helpers == []
+    monkeypatch.setattr(machine_code, "is_compiled", lambda: False)
+    invert(np.ones((20, 20)))
+    (helper,) = helpers
+    assert helper.returncode is not None
+    namespace = {}
+    exec(helper.asked.split(";")[0], namespace)
+    assert namespace["compile_rest"] is compilation.compile_rest
 
 
 def test_it_leaves_nothing_to_compile_for_an_inversion():

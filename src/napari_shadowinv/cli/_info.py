@@ -216,7 +216,7 @@ def _cores() -> str:
 def _compiled_code() -> str:
     """The folder with the machine code; the home folder is written ~ to hide the user's name."""
     try:
-        from napari_shadowinv.inversion.compilation import code_folder, is_compiled
+        from napari_shadowinv.inversion.machine_code import code_folder, is_compiled
 
         folder = code_folder()
         if folder is None:

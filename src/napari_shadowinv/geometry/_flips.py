@@ -346,7 +346,8 @@ def raise_hidden(mesh: Mesh) -> int:
     on_hull = mesh.weights.copy()
     mesh.counters[_mesh.POLICY] = RAISE
     if _sweep(mesh, np.empty(0, np.bool_)) == EXHAUSTED:
-        mesh.weights[:] = on_hull
+        for v in range(on_hull.size):
+            mesh.weights[v] = on_hull[v]
     _mesh.compact(mesh)
     return DONE
 
@@ -466,7 +467,9 @@ def relocate(mesh: Mesh, targets: FloatArray) -> int:
     n = targets.shape[0]
     origins = mesh.points[:n].copy()
     strays = np.zeros(n, dtype=np.bool_)
-    mesh.points[:n] = targets
+    # By single numbers: numba takes two seconds to compile assignments of arrays.
+    for v in range(n):
+        mesh.points[v, 0], mesh.points[v, 1] = targets[v, 0], targets[v, 1]
     while _stay_behind(mesh, origins, strays):
         pass
     if strays.sum() > MOST_STRAYS * n or repair(mesh, REMOVE, strays[:0]) != DONE:
@@ -474,7 +477,7 @@ def relocate(mesh: Mesh, targets: FloatArray) -> int:
     status = _take_out(mesh, strays)
     for v in range(n):
         if strays[v]:
-            mesh.points[v] = targets[v]
+            mesh.points[v, 0], mesh.points[v, 1] = targets[v, 0], targets[v, 1]
     for v in range(n):
         if mesh.hidden[v] and status == DONE:
             status = insert(mesh, v, 1.0 if strays[v] else -1.0)

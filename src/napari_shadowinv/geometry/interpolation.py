@@ -255,7 +255,9 @@ def _evaluate_blocks(
                 if a >= n:
                     outside = True
                     break
-                p[k], f[k], g[k] = points[a], values[a], gradients[a]
+                f[k] = values[a]
+                for axis in range(2):
+                    p[k, axis], g[k, axis] = points[a, axis], gradients[a, axis]
             if not outside:
                 fill_patch(p, f, g, patch)
                 kept[slot] = t

@@ -17,6 +17,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import normalise
 from napari_shadowinv.inversion.budget import Budget
+from napari_shadowinv.inversion.machine_code import compiling_together
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, prepare
 from napari_shadowinv.inversion.readout import read_out
@@ -144,6 +145,7 @@ def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
+@compiling_together()
 def invert(
     image: ArrayLike,
     *,

@@ -1,28 +1,19 @@
 """The compiler's work, done once after an installation.
 
 - do it before an inversion that somebody waits for: `ensure_compiled`
-- the half of it that needs no triangulation, for a second process: `compile_rest`
-- how often it is waited for: `how_often`
-- whether it was done: `is_compiled`; where its result is kept: `code_folder`
+- the second process's part of it: `compile_rest`
 """
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv.inversion.machine_code import how_often, is_compiled
 
-_REST = "from napari_shadowinv.inversion.compilation import compile_rest; compile_rest()"
 _NODES = 300  # enough for a multigrid
 
 
@@ -37,36 +28,7 @@ def ensure_compiled(
     Reporter(on_progress, should_stop)("compile", 0, None, how_often())
     y, x = np.indices((64, 64)) / 64  # enough sites for every kernel to be used
     uneven = np.exp(-4 * (y + x))
-    with _rest_beside():
-        invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)
-
-
-@contextmanager
-def _rest_beside() -> Iterator[None]:
-    """Have another process compile what this one needs last, which loads what is there by then."""
-    # Numba lets one thread of a process compile at a time.
-    executable = Path(sys.executable or "")
-    alone = available_threads(None) == 1 or not executable.stem.lower().startswith("python")
-    if alone or code_folder() is None:
-        yield
-        return
-    import numba
-
-    found: Any = numba.config
-    environment = os.environ | ({"NUMBA_CACHE_DIR": found.CACHE_DIR} if found.CACHE_DIR else {})
-    helper = subprocess.Popen(
-        [executable, "-c", _REST],
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-    )
-    try:
-        yield
-    finally:
-        helper.terminate()  # what it has not done by now is done
-        helper.wait()
+    invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)
 
 
 def compile_rest() -> None:
@@ -103,28 +65,3 @@ def compile_rest() -> None:
     laplacian = diagram.laplacian()
     LaplacianSolver(laplacian).solve(diagram.masses)
     FactorisedLaplacian(laplacian).solve(diagram.masses[:, None])
-
-
-def how_often() -> str:
-    """Return how often the compiler is waited for, in words."""
-    from napari_shadowinv.geometry._kernel import is_kept
-
-    if is_kept():
-        return "once, for a minute or so"
-    return "every time: set NUMBA_CACHE_DIR to a writable folder"
-
-
-def is_compiled() -> bool:
-    """Return whether an earlier run has left its machine code for this one."""
-    kept = code_folder()
-    return kept is not None and any(kept.glob("_flips.build-*.nbi"))
-
-
-def code_folder() -> Path | None:
-    """Return the folder of the triangulation's machine code; None where none can be kept."""
-    from napari_shadowinv.geometry._flips import build
-    from napari_shadowinv.geometry._kernel import is_kept
-
-    if not is_kept():
-        return None
-    return Path(build.stats.cache_path)  # type: ignore[attr-defined]

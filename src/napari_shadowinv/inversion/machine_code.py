@@ -1,0 +1,80 @@
+"""The machine code of the kernels, which is kept from one run to the next.
+
+- whether it is there: `is_compiled`; where: `code_folder`
+- how often the compiler is waited for: `how_often`
+- share its work between two processes: `compiling_together`
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from napari_shadowinv._system.machine import available_threads
+
+_REST = "from napari_shadowinv.inversion.compilation import compile_rest; compile_rest()"
+
+
+@contextmanager
+def compiling_together() -> Iterator[None]:
+    """Have another process compile what this one needs last, which loads what is there by then."""
+    if is_compiled():
+        yield
+        return
+    # Numba lets one thread of a process compile at a time.
+    executable = Path(sys.executable or "")
+    alone = available_threads(None) == 1 or not executable.stem.lower().startswith("python")
+    if alone or code_folder() is None:
+        yield
+        return
+    import numba
+
+    found: Any = numba.config
+    environment = os.environ | ({"NUMBA_CACHE_DIR": found.CACHE_DIR} if found.CACHE_DIR else {})
+    helper = subprocess.Popen(
+        [executable, "-c", _REST],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+    )
+    try:
+        yield
+    finally:
+        helper.terminate()  # what it has not done by now is done
+        helper.wait()
+
+
+def how_often() -> str:
+    """Return how often the compiler is waited for, in words."""
+    from napari_shadowinv.geometry._kernel import is_kept
+
+    if is_kept():
+        return "once, for a minute or so"
+    return "every time: set NUMBA_CACHE_DIR to a writable folder"
+
+
+def is_compiled() -> bool:
+    """Return whether this process has the machine code, or an earlier one has left it."""
+    from napari_shadowinv.geometry._flips import build
+
+    if build.signatures:  # type: ignore[attr-defined]
+        return True
+    kept = code_folder()
+    return kept is not None and any(kept.glob("_flips.build-*.nbi"))
+
+
+def code_folder() -> Path | None:
+    """Return the folder of the triangulation's machine code; None where none can be kept."""
+    from napari_shadowinv.geometry._flips import build
+    from napari_shadowinv.geometry._kernel import is_kept
+
+    if not is_kept():
+        return None
+    return Path(build.stats.cache_path)  # type: ignore[attr-defined]
