@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,14 @@ def settings_folder(tmp_path: Path) -> Path:
     folder = tmp_path / "settings"
     QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(folder))
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _lasting() -> None:
+    """Napari collects garbage twice a test: not among what lasts until the end."""
+    import_module("napari._qt.qt_main_window")
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
