@@ -222,9 +222,10 @@ def test_a_start_has_the_sites_of_the_shot_before(image):
 
 def test_errors_that_are_not_known_are_said_to_be(image):
     rows = dict(invert(image[:20, :20], options=InversionOptions(n_sites=100)).error_rows)
-    assert "discretisation not estimated, as only one level was solved" in rows["errors"]
+    assert "discretisation was not estimated, as only one level was solved" in rows["errors"]
     rows = dict(invert(image, options=InversionOptions(n_sites=900)).error_rows)
     assert "not estimated" not in rows["errors"]
+    assert rows["errors"].endswith("blur and crossing rays are not in it")
 
 
 def test_noise_that_was_smoothed_is_not_passed_off_as_measured():

@@ -120,9 +120,9 @@ class Errors:
         told = ", ".join(
             f"{name} {_percent(one.rms, self.rms)}" for name, one in self._known.items()
         )
-        told = f"{told} of the displacement (r.m.s.)"
+        told = f"{told} of the displacement (r.m.s.); blur and crossing rays are not in it"
         if math.isnan(self.discretisation.rms):
-            told += "; discretisation not estimated, as only one level was solved"
+            told += "; discretisation was not estimated, as only one level was solved"
         rows = [("errors", told)]
         if self.beam is not None:
             rows.append(

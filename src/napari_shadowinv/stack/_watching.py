@@ -261,6 +261,7 @@ class Watch:
         tried = self._trying(name, shot, lane)
         tried.add_done_callback(lambda _: self._arrivals.wake())
         self._attempts.append(_Attempt(name, shot, seen, lane, tried))
+        self._books.tell()
 
     def _finish(self) -> None:
         """Wait for the oldest attempt, and write what came of it."""

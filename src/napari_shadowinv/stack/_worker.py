@@ -157,7 +157,8 @@ class Work:
             options = options.model_copy(update={"threads": threads_here(workers)})
         inputs = replace(inputs, recipe=recipe.model_copy(update={"options": options}))
         sites = _SharedSites(beam=beam)
-        return run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
+        found = run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
+        return _as_chosen(found) if self.sites_chosen else found
 
     def gathered(self, content: Any, beam: Beam | None, source: AnyArray | None) -> Inputs:
         """Return what the recipe is applied to."""
@@ -178,13 +179,20 @@ class Work:
     def report(self, inversion: Inversion) -> dict[str, Any]:
         """Return what is told of a shot."""
         told = {**dataclasses.asdict(inversion.report), "stages": inversion.report.seconds}
-        if self.sites_chosen:
-            told["sites_reason"] = "as many as the first shots needed for the accuracy"
-            if inversion.errors is not None:
-                accuracy = inversion.options.accuracy
-                missed = inversion.errors.missed(accuracy, "with the sites of the first shots")
-                told["warnings"] = [*told["warnings"], *filter(None, [missed])]
         return told | numbers_of(inversion)
+
+
+def _as_chosen(inversion: Inversion) -> Inversion:
+    """Tell of a shot that the first ones have decided on its sites, and whether these suffice."""
+    missed, errors = "", inversion.errors
+    if errors is not None:
+        missed = errors.missed(inversion.options.accuracy, "with the sites of the first shots")
+    report = replace(
+        inversion.report,
+        sites_reason="as many as the first shots needed for the accuracy",
+        warnings=(*inversion.report.warnings, *filter(None, [missed])),
+    )
+    return replace(inversion, report=report)
 
 
 def numbers_of(inversion: Inversion) -> dict[str, Any]:

@@ -70,6 +70,9 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     field = shown(1)
     put(folder, 1)
     assert shown(2) is field
+    qtbot.waitUntil(
+        lambda: "Waiting for shots: 2 done" in tool.panel.status.text(), timeout=PATIENCE
+    )
     assert window.dims.current_step[0] == 1
     limits = field.contrast_limits[1]
     assert limits == pytest.approx(float(np.asarray(field.data[1]).max()))

@@ -106,11 +106,11 @@ class WatchJob(StackJob):
                 on_progress(Progress("prepare", 0, None, news.preparing))
                 return
             books.waiting = news.waiting
-            if news.done:
-                ended = news.outcome
+            ended = news.outcome
+            if news.done and (ended is not None or not books.total):
                 on_done(None if ended is None or ended.reason else ended.index)
             books.take(news)
-            stage = "shots" if books.ended else "wait"
+            stage = "shots" if books.ended and books.waiting else "wait"
             on_progress(Progress(stage, books.ended, None, books.text))
 
         watch_stack(

@@ -327,7 +327,7 @@ class InvertStack(InversionInputs, ToolPanel):
     # A run
 
     def _on_progress(self, news: Progress) -> None:
-        if news.stage == "shots":
+        if news.stage == "shots" or (news.stage == "wait" and news.step):
             self._show(self.panel.runner.tag)
 
     def _show(self, request: StackRequest) -> None:
