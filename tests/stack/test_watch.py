@@ -481,6 +481,15 @@ def test_the_command_tells_a_line_for_each_shot(folder, out, tmp_path, monkeypat
     assert shadowinv(*command, "--quiet").stdout == ""
 
 
+def test_it_is_said_once_that_the_folder_is_watched(folder, out):
+    put(folder, 0, 1)
+    result = shadowinv(
+        "watch", folder, "--pattern", "*.npy", "--out", out, "--shots", 2, "--settle", SETTLE
+    )
+    assert result.stdout.count("Watching") == 1
+    assert "How many sites the first shots need" in result.stderr
+
+
 @pytest.mark.parametrize(("files", "code"), [(1, 0), (3, 130)])
 def test_ctrl_c_is_the_normal_end_unless_files_wait(
     folder, out, tmp_path, monkeypatch, files, code

@@ -43,9 +43,10 @@ class _Lines:
     err: Console
     now: WatchProgress | None = None
     warned: set[str] = field(default_factory=set)
+    is_watching: bool = False
 
     def show(self, news: WatchProgress) -> None:
-        first, self.now = self.now is None or self.now.preparing != "", news
+        self.now = news
         if self.quiet:
             return
         if news.note or news.preparing:
@@ -53,7 +54,8 @@ class _Lines:
             self._print(self.err, text, "dim")
         elif news.outcome is not None:
             self._show_shot(news)
-        elif first:
+        elif not self.is_watching:
+            self.is_watching = True
             there = f"{news.done} done, {news.failed} failed; " if news.total else ""
             self._print(
                 self.out, f"Watching {self.folder} for {self.pattern}; {there}Ctrl-C ends it."

@@ -186,7 +186,6 @@ def uncertainty(
         Of Poisson noise only: the image's units that one detected quantum makes; a pixel of
         value v then scatters by √(gain · v). Default: 1 for an image of whole numbers, which are
         taken as counts; any other image needs it.
-
     method : {"linear", "resolve"}
         ``"linear"``: by the linear response of the transport, which a few samples that are solved
         as well check. ``"resolve"``: solve the transport of each sample, which takes many times as
