@@ -41,6 +41,11 @@ PARTS = {  # function, or file of functions, that belong to a part of the work
     "_coarsening.py": "multigrid: set-up",
     "linear.py": "multigrid: cycles",
     "interpolation.py": "coarse to fine, and read-out",
+    "budget.py": "error budget",
+    "response.py": "error budget",
+    "noise.py": "error budget",
+    "factorised.py": "error budget",
+    "<built-in method scipy.sparse.linalg._dsolve._superlu.gstrf>": "error budget",
     "forward.py": "re-projection",
     # with one thread only the re-projection waits for workers, which the profiler does not see
     "<method 'acquire' of '_thread.lock' objects>": "re-projection",

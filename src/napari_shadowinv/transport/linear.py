@@ -37,6 +37,7 @@ __all__ = ["LaplacianSolver", "SimilarSystems", "factorise"]
 
 _DIRECT_BELOW = 200
 _MORE_ITERATIONS = 3  # that cost less than a new setup
+_SHORTER = 0.4  # right-hand side relative to that of the setup, from where it serves
 _KEPT_BELOW = 500_000  # nodes; a larger setup takes the memory that trial steps need
 
 
@@ -285,12 +286,13 @@ def _with_ground(laplacian: csr_array, ground: FloatArray | None) -> csr_array:
 class SimilarSystems:
     """Solves systems one after the other; what was set up for one serves the next ones, too.
 
-    That is as good as a setup for each where their matrices change little, as Newton's do.
+    That is as good as a setup for each where their matrices change little, as Newton's do once
+    their right-hand sides have become short.
     """
 
     def __init__(self) -> None:
         self._solver: LaplacianSolver | None = None
-        self._most = 0
+        self._most, self._longest = 0, 0.0
 
     def solve(
         self,
@@ -304,7 +306,8 @@ class SimilarSystems:
         if len(right) < _DIRECT_BELOW:
             require_connected(laplacian)
             return _solved_by_factors(laplacian, right, ground)
-        if self._solver is not None:
+        length = float(np.sqrt(np.sum(right * right)))
+        if self._solver is not None and length < self._longest:
             solution, _, residual = self._solver.solve(
                 right, tolerance, self._most, laplacian=laplacian, ground=ground
             )
@@ -317,6 +320,7 @@ class SimilarSystems:
             return _solved_by_factors(laplacian, right, ground)
         if len(right) < _KEPT_BELOW:
             self._solver, self._most = solver, iterations + _MORE_ITERATIONS
+            self._longest = _SHORTER * length
         return solution
 
 
