@@ -6,8 +6,9 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 
@@ -41,11 +42,24 @@ def in_ranges(
     if ranges == 1:
         kernel(0, n, *args)
         return
-    with ThreadPoolExecutor(ranges - 1) as pool:
-        others = [pool.submit(kernel, bounds[k], bounds[k + 1], *args) for k in range(1, ranges)]
+    pool = _helpers()
+    others = [pool.submit(kernel, bounds[k], bounds[k + 1], *args) for k in range(1, ranges)]
+    try:
         kernel(bounds[0], bounds[1], *args)
-        for other in others:
-            other.result()
+    finally:
+        wait(others)
+    for other in others:
+        other.result()
+
+
+@cache
+def _helpers() -> ThreadPoolExecutor:
+    """Threads for the kernels, kept because to start one takes as long as a small kernel."""
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="shadowinv kernel")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_helpers.cache_clear)  # threads are not copied
 
 
 @contextmanager

@@ -1,0 +1,62 @@
+"""Threads that are kept for the kernels."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from napari_shadowinv._system.machine import in_ranges
+
+
+def fill(start, stop, values):
+    values[start:stop] = np.arange(start, stop)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_ranges_cover_everything_once(threads):
+    values = np.full(1001, -1)
+    in_ranges(fill, 1001, threads, values, smallest=10)
+    np.testing.assert_array_equal(values, np.arange(1001))
+
+
+def test_an_error_is_raised_after_all_ranges_have_ended():
+    ended = []
+
+    def work(start, stop):
+        if start == 0:
+            raise ValueError("first")
+        ended.append(stop)
+
+    with pytest.raises(ValueError, match="first"):
+        in_ranges(work, 30, 3, smallest=10)
+    assert sorted(ended) == [20, 30]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be copied")
+def test_a_copied_process_has_threads_of_its_own():
+    script = """
+import os
+from napari_shadowinv._system.machine import in_ranges
+
+def work(start, stop, ends):
+    ends.append(stop)
+
+def done():
+    ends = []
+    in_ranges(work, 20, 2, ends, smallest=10)
+    return len(ends)
+
+assert done() == 2
+child = os.fork()
+if child == 0:
+    os._exit(done())
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    printed = subprocess.run(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, check=True, timeout=60
+    )
+    assert printed.stdout.strip() == "2"
