@@ -55,7 +55,7 @@ def in_ranges(
 @cache
 def _helpers() -> ThreadPoolExecutor:
     """Threads for the kernels, kept because to start one takes as long as a small kernel."""
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="shadowinv kernel")
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="kernels of shadowinv")
 
 
 if hasattr(os, "register_at_fork"):
