@@ -257,7 +257,7 @@ class Watch:
             return  # removed before its turn
         lane = self._begun % _ABREAST
         self._begun += 1
-        self._books.in_work = len(self._attempts) + 1
+        self._books.in_work += 1
         tried = self._trying(name, shot, lane)
         tried.add_done_callback(lambda _: self._arrivals.wake())
         self._attempts.append(_Attempt(name, shot, seen, lane, tried))
@@ -268,12 +268,12 @@ class Watch:
         attempt = self._attempts[0]
         tried, seen = attempt.tried.result(), attempt.seen
         self._attempts.popleft()
+        self._books.in_work -= 1
         changed = {**seen, **tried.origin}
         with suppress(OSError):
             changed = stamp(attempt.shot.path) if tried.failure else changed
         if not seen.items() <= changed.items():
             self._arrivals.put_back(attempt.name)  # it was written to while it was read
-            self._books.in_work = len(self._attempts)
             return
         if tried.failure:
             self._arrivals.check()
@@ -285,7 +285,6 @@ class Watch:
         self._lanes[attempt.lane] = self._start_for_next(tried)
         self._ended += 1
         self._last = time.monotonic()
-        self._books.in_work = len(self._attempts)
         self._books.tell(name=name, outcome=outcome, result=tried.result, again=again)
 
     def _known(self, name: str) -> dict[str, Any] | None:

@@ -54,19 +54,17 @@ def blurred(image: FloatArray, width: float, threads: int | None = 1) -> FloatAr
     234, 1990), which has no negative lobes at any width; the sum stays. A wide blur is that of the
     means of squares that are small beside it.
     """
-    diffused: FloatArray
-    parts = int(width / _FINE)
-    if parts > 1:
-        few = blurred(_means(image, parts), width / parts, threads)
-        diffused = split_pixels(few, parts)[: image.shape[0], : image.shape[1]]
-        return np.ascontiguousarray(diffused * (image.sum() / diffused.sum()))
+    height, breadth = image.shape
+    parts = max(1, int(width / _FINE))
+    means = _means(image, parts)
     workers = available_threads(threads)
-    spectrum = dctn(image, workers=workers)
+    spectrum = dctn(means, workers=workers)
     for axis in (0, 1):
-        waves = np.pi * np.arange(image.shape[axis]) / image.shape[axis]
-        damping = np.exp(-(width**2) * (1 - np.cos(waves)))
+        waves = np.pi * np.arange(means.shape[axis]) / means.shape[axis]
+        damping = np.exp(-((width / parts) ** 2) * (1 - np.cos(waves)))
         spectrum *= np.expand_dims(damping, 1 - axis)
-    diffused = np.maximum(idctn(spectrum, workers=workers), image.min())
+    few = np.maximum(idctn(spectrum, workers=workers), means.min())
+    diffused: FloatArray = split_pixels(few, parts)[:height, :breadth]
     diffused *= image.sum() / diffused.sum()
     return diffused
 
