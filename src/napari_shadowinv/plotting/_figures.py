@@ -139,7 +139,6 @@ def _footer(inversion: Inversion, field: ShownField, columns: int) -> list[tuple
     """Lines below the panels, each with its colour, wrapped to a number of letters."""
     report = inversion.report
     facts = [
-        f"{report.n_sites:,} sites",
         f"flux residual {report.residual:.1e} (tolerance {report.tolerance:.0e})",
         f"{report.iterations} steps in {sum(report.seconds.values()):.1f} s",
         field.peak_text({} if inversion.errors is None else inversion.errors.of_peak),
@@ -150,7 +149,9 @@ def _footer(inversion: Inversion, field: ShownField, columns: int) -> list[tuple
     alarms = list(report.warnings)
     if not report.converged and not any("not converged" in alarm for alarm in alarms):
         alarms.insert(0, "not converged: do not trust the field")
-    lines = [(line, QUIET_COLOUR) for line in textwrap.wrap("  ·  ".join(facts), columns)]
+    sites = f"{report.n_sites:,} sites; {report.sites_reason}".removesuffix("; ")
+    quiet = textwrap.wrap("  ·  ".join(facts), columns) + textwrap.wrap(sites, columns)
+    lines = [(line, QUIET_COLOUR) for line in quiet]
     for alarm in alarms:
         lines += [(line, ALARM_COLOUR) for line in textwrap.wrap(f"⚠ {alarm}", columns)]
     return lines
