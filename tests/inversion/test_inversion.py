@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import time
 
 import numpy as np
@@ -505,3 +506,14 @@ def test_a_margin_wider_than_the_image_is_refused_before_it_is_made():
     options = InversionOptions(boundary="free", margin=100_000)
     with pytest.raises(InputError, match=r"margin is 100,000 px .* at most 60 px"):
         invert(_lens(), options=options)
+
+
+def test_the_headline_puts_warnings_before_the_peak(image):
+    inversion = invert(image)
+    assert inversion.headline.level == "sound"
+    assert f"{peak(inversion.displacement):.4f}" in inversion.headline.text
+    doubtful = inversion.with_warnings(["the beam is wrong"]).headline
+    assert doubtful.level == "doubtful"
+    assert doubtful.text == f"the beam is wrong; {inversion.headline.text}"
+    unconverged = dataclasses.replace(inversion.report, converged=False)
+    assert dataclasses.replace(inversion, report=unconverged).headline.level == "failed"

@@ -1,4 +1,4 @@
-"""The result of an inversion: `Inversion`, with a `Report`."""
+"""The result of an inversion: `Inversion`, with a `Report` and a `Headline`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.labels import FORMAT, VARIABLES, dataset_from_field, label
 from napari_shadowinv.inversion.trust import image_residual
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.preprocessing import Provenance
 
 if TYPE_CHECKING:
@@ -24,7 +26,31 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Inversion", "Report"]
+__all__ = ["Headline", "Inversion", "Level", "Report"]
+
+
+class Level(StrEnum):
+    """How far a result can be trusted."""
+
+    SOUND = "sound"
+    DOUBTFUL = "doubtful"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Headline:
+    """A result in one line.
+
+    Attributes
+    ----------
+    level : Level
+        Sound without warnings, doubtful with warnings, failed if the solver did not converge.
+    text : str
+        The warnings, then the peak of the main field with its error.
+    """
+
+    level: Level
+    text: str
 
 
 @dataclass(frozen=True)
@@ -176,6 +202,16 @@ class Inversion:
     def setup(self) -> Setup | None:
         """The geometry of its pixels, as far as the provenance tells."""
         return None if self.provenance is None else self.provenance.setup
+
+    @property
+    def headline(self) -> Headline:
+        """The warnings and the peak of the main field in one line, as every face shows it."""
+        shares = {} if self.errors is None else self.errors.of_peak
+        (field,) = shown_fields([self.displacement], self.setup)
+        level = Level.DOUBTFUL if self.report.warnings else Level.SOUND
+        if not self.report.converged:
+            level = Level.FAILED
+        return Headline(level, "; ".join([*self.report.warnings, field.peak_text(shares)]))
 
     def with_warnings(self, texts: Iterable[str]) -> Inversion:
         """Return the same inversion with more warnings in its report.
