@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -24,6 +25,27 @@ from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 # The same examples in each run: a change is to blame for what fails, not the day.
 settings.register_profile("same each time", derandomize=True)
 settings.load_profile("same each time")
+
+_HOOKS: list[object] = []  # an audit hook cannot be removed
+_opened_paths: list[str] | None = None
+
+
+def _note_opened(event: str, arguments: tuple[object, ...]) -> None:
+    if event == "open" and _opened_paths is not None:
+        _opened_paths.append(str(arguments[0]))
+
+
+@pytest.fixture
+def opened_paths() -> Iterator[list[str]]:
+    """Paths of the files that this process opens during a test."""
+    global _opened_paths
+    if _note_opened not in _HOOKS:
+        sys.addaudithook(_note_opened)
+        _HOOKS.append(_note_opened)
+    _opened_paths = []
+    yield _opened_paths
+    _opened_paths = None
+
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

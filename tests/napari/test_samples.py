@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,17 +17,13 @@ from napari_shadowinv._napari import samples
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, source_of
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv.fitting import FitOptions, Verdict
-from napari_shadowinv.physics.forward import synthetic_image
 
 SHOTS = ("toroid", "toroid_with_caustics", "four_toroids", "coaxial_line")
 
 
 @pytest.mark.parametrize("name", [*SHOTS, "two_energies", "wakefield_run"])
-def test_each_opens_within_two_seconds(viewer: ViewerModel, name: str) -> None:
-    synthetic_image(np.zeros((2, 8, 8)))  # compiles its kernels
-    start = time.thread_time()
+def test_each_opens_with_its_setup(viewer: ViewerModel, name: str) -> None:
     layers = viewer.open_sample("napari-shadowinv", name)
-    assert time.thread_time() - start < 2
     assert layers
     for layer in layers:
         assert isinstance(setup_of(layer), (ProtonSetup, OpticalSetup))

@@ -7,7 +7,6 @@ import json
 import os
 import pickle
 import sys
-import time
 import tracemalloc
 from pathlib import Path
 
@@ -40,10 +39,8 @@ def test_the_count_of_a_report_is_looked_at_first(store):
     chunk = store / "report" / "c" / "0"
     chunk.write_bytes(np.uint32(2**31 - 1).tobytes() + chunk.read_bytes()[4:])
     tracemalloc.start()
-    start = time.perf_counter()
     with pytest.raises(FileFormatError, match="implies 2147483647"):
         StackStore(store).reports()
-    assert time.perf_counter() - start < 2
     assert tracemalloc.get_traced_memory()[1] < 20_000_000
     tracemalloc.stop()
     assert status(store).exit_code == 2
@@ -59,14 +56,14 @@ def test_the_bytes_of_a_packed_chunk_are_looked_at_first(store):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs pipes and devices")
 @pytest.mark.parametrize("where", ["zarr.json", "name/c/0", "status/c/1", "report/c/0"])
-def test_a_pipe_or_a_device_in_a_store_is_refused_at_once(store, where):
+def test_a_pipe_or_a_device_in_a_store_is_refused(store, where, opened_paths):
     for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
         (store / where).unlink()
         make(store / where)
-        start = time.perf_counter()
+        opened_paths.clear()
         with pytest.raises(FileFormatError):
             StackStore(store).reports()
-        assert time.perf_counter() - start < 2
+        assert str(store / where) not in opened_paths
 
 
 def test_the_copy_of_an_arrays_metadata_is_enough(store):

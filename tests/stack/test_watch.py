@@ -376,9 +376,7 @@ def test_it_ends_after_so_many_shots_or_when_nothing_arrives(folder, out):
         watch.until(lambda: not watch._thread.is_alive())
     assert len(watch.result.shot) == 2
     assert watch.told[-1].waiting == 2
-    began = time.monotonic()
     assert len(watched_once(folder, out).shot) == 4
-    assert time.monotonic() - began < 3
 
 
 def test_by_looking_itself_it_waits_until_a_file_has_settled(folder, out, monkeypatch):

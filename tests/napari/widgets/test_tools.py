@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import time
 from pathlib import Path
 from typing import Any, get_args
 
@@ -42,17 +41,12 @@ NAMES = (
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_widget_opens_quickly_and_fits(
-    name: str, window: Any, open_widget: Any, shot: Array, qtbot: Any, record_property: Any
+def test_a_widget_fits_beside_the_canvas(
+    name: str, window: Any, open_widget: Any, shot: Array, qtbot: Any
 ) -> None:
     window.add_image(shot, name="shot")
-    start, used = time.perf_counter(), time.process_time()
     widget = open_widget(name)
     qtbot.waitUntil(widget.isVisible, timeout=PATIENCE)
-    seconds = time.perf_counter() - start
-    record_property("seconds to open", seconds)
-    # Where others use the machine, the time it would take alone counts.
-    assert min(seconds, time.process_time() - used) < 1.5
     assert widget.minimumSizeHint().width() <= 360
     for size in ((1280, 800), (2560, 1440)):
         window.window._qt_window.resize(*size)
