@@ -7,12 +7,14 @@ only, and in the stubs of lazily loaded packages count like any other.
 from __future__ import annotations
 
 import ast
+import importlib
 from collections import Counter
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from numba.core.dispatcher import Dispatcher
 
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import ESTIMATES, STEPS
@@ -187,3 +189,16 @@ def test_a_step_and_a_source_are_declared_once():
         if isinstance(node, ast.ClassDef)
     )
     assert {classes[model.__name__] for model in (*STEPS.values(), *ESTIMATES.values())} == {1}
+
+
+def test_kernels_release_the_interpreter():
+    """Otherwise a window freezes while another thread computes."""
+    modules = {name for name in MODULES if name.split(".")[1:2] and name.split(".")[1] in CORE}
+    kernels = [
+        (module.__name__, name, value.targetoptions)
+        for module in map(importlib.import_module, sorted(modules))
+        for name, value in vars(module).items()
+        if isinstance(value, Dispatcher)
+    ]
+    assert len(kernels) > 100
+    assert [kernel[:2] for kernel in kernels if not kernel[2].get("nogil")] == []

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -34,6 +34,7 @@ from napari_shadowinv._napari.widgets import _fitting
 from napari_shadowinv.cli import app
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitOptions, Verdict, compilation, fit
+from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.projection import project, transferred_displacement
@@ -433,10 +434,7 @@ def test_a_fit_is_cancelled_at_once(window: Any, tool: Any, qtbot: Any, told: li
     qtbot.waitUntil(lambda: "Fitting: " in tool.panel.status.text(), timeout=PATIENCE)
     assert "objective" in tool.panel.status.text()
     qtbot.waitUntil(tool.view.curve.isVisible, timeout=PATIENCE)
-    start = time.perf_counter()
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
-    assert time.perf_counter() - start < 1
+    cancel(tool, qtbot)
     assert tool.panel.status.text() == "Cancelled."
     assert tool.panel.button.text() == "Run"
     assert not [layer for layer in window.layers if role_of(layer) == "field"]
@@ -459,18 +457,30 @@ def threads() -> list[str]:
     return [one.name for one in threading.enumerate() if one.name == "shadowinv"]
 
 
-def cancelled(tool: Any, qtbot: Any) -> float:
-    """Press Cancel; return after how many seconds the widget is free again."""
-    start = time.perf_counter()
+def cancel(tool: Any, qtbot: Any) -> None:
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
-    return time.perf_counter() - start
+
+
+@pytest.fixture
+def traced_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """One item for each image whose rays have been traced."""
+    traced: list[int] = []
+    trace = RayModel.image
+
+    def image(*args: Any, **keywords: Any) -> Any:
+        traced.append(1)
+        return trace(*args, **keywords)
+
+    monkeypatch.setattr(RayModel, "image", image)
+    return traced
 
 
 @pytest.mark.parametrize("stage", ["transport", "from near", "smoothness", "full size", "samples"])
-def test_each_stage_is_cancelled_within_half_a_second(
-    window: Any, tool: Any, qtbot: Any, told: list[str], stage: str
+def test_each_stage_ends_soon_after_cancel(
+    window: Any, tool: Any, qtbot: Any, told: list[str], stage: str, traced_images: list[int]
 ) -> None:
+    tool.panel.runner._patience = math.inf  # the fit has to end by itself
     enlarged(window)
     tool.view._drawing.setInterval(DRAWN_EVERY)
     tool.options.set_values({"samples": 1000, "steps": 100} | BEFORE.get(stage, {}))
@@ -479,9 +489,11 @@ def test_each_stage_is_cancelled_within_half_a_second(
     course = tool.panel.runner.tag.course
     qtbot.waitUntil(lambda: any(one == stage for one, _ in course.history), timeout=PATIENCE)
     assert course.history[-1][0] == stage
-    assert cancelled(tool, qtbot) < 0.5
+    traced_images.clear()
+    cancel(tool, qtbot)
+    assert len(traced_images) <= 8 * len(before)  # a line search of the step under way
     assert tool.panel.status.text() == "Cancelled."
-    qtbot.waitUntil(lambda: not threads(), timeout=1000)
+    assert not threads()
     qtbot.wait(50)
     assert list(window.layers) == before
     assert told == []
@@ -497,9 +509,10 @@ def test_the_compiler_is_told_and_does_not_hold_up_cancelling(
     tool.panel.button.click()
     qtbot.waitUntil(lambda: "Compiling" in tool.panel.status.text(), timeout=PATIENCE)
     assert "once, for a minute or so" in tool.panel.status.text()
-    assert cancelled(tool, qtbot) < 0.5
+    cancel(tool, qtbot)
+    assert not at_work.is_set()
     at_work.set()
-    qtbot.waitUntil(lambda: not threads(), timeout=1000)
+    qtbot.waitUntil(lambda: not threads(), timeout=PATIENCE)
     assert not [layer for layer in window.layers if role_of(layer) == "field"]
 
 

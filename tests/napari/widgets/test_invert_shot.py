@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import subprocess
+import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ import dask.array
 import numpy as np
 import pytest
 from napari.utils import progress
-from qtpy.QtCore import QTimer
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari.frame import frame_of
@@ -83,20 +81,6 @@ def computed(tool: Any) -> Any:
     return tool.request().inversion()
 
 
-def slowdown() -> float:
-    """How much longer than alone two threads, as an inversion has, take on this machine now."""
-    block = bytes(2**20)  # large enough for hashing to release the interpreter
-
-    def busy(_: int) -> float:
-        start, used = time.perf_counter(), time.thread_time()
-        while time.thread_time() - used < 0.05:
-            hashlib.sha256(block).digest()
-        return (time.perf_counter() - start) / (time.thread_time() - used)
-
-    with ThreadPoolExecutor(2) as pool:
-        return max(pool.map(busy, range(2)))
-
-
 def settled(tool: Any) -> bool:
     return not tool.panel.runner.running and not tool._settle.isActive()
 
@@ -107,58 +91,29 @@ def layer_of(viewer: Any, role: str, word: str = "") -> Any:
     return found[0]
 
 
-_CONTROL = """
-import sys, threading, time
-stop = threading.Event()
-threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
-print("ready", flush=True)
-latest, before = 0.0, time.perf_counter()
-while not stop.is_set():
-    time.sleep(0.05)
-    now = time.perf_counter()
-    latest, before = max(latest, now - before - 0.05), now
-print(latest)
-"""
-
-
-@pytest.fixture
-def control() -> Iterator[Callable[[], float]]:
-    """Tell how late a process that does nothing else wakes up on this machine just now."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", _CONTROL], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    yield lambda: float(process.communicate("", timeout=60)[0])
-    process.kill()
-    process.wait()
-
-
-def test_the_window_stays_responsive_during_a_run(
-    window: Any, tool: Any, qtbot: Any, control: Callable[[], float], record_property: Any
+def test_the_window_thread_computes_nothing_during_a_run(
+    window: Any, tool: Any, qtbot: Any
 ) -> None:
     shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement)
     window.layers["shot"].data = shot
-    tool.options.set_values({"n_sites": 40_000, "tolerance": 1e-8})
+    tool.options.set_values({"n_sites": 40_000})
     qtbot.wait(300)
-    beats = [time.perf_counter()]
-    timer = QTimer()
-    timer.setInterval(50)
-    timer.timeout.connect(lambda: beats.append(time.perf_counter()))
-    ended: list[float] = []
-    tool.panel.runner.ended.connect(lambda _: ended.append(time.perf_counter()))
-    timer.start()
+    tool.show_result = lambda *_: None
+    rooms: set[str] = set()
+
+    def note_room(frame: Any, event: str, _: object) -> None:
+        if event == "call":
+            rooms.add(".".join(str(frame.f_globals.get("__name__", "")).split(".")[:2]))
+
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(ended), timeout=PATIENCE)
-    timer.stop()
-    during = np.array([beat for beat in beats if beat <= ended[0]])
-    assert len(during) > 3
-    late, late_anyway = np.diff(during).max() - 0.05, control()
-    report = f"latest beat {1000 * late:.0f} ms late, {1000 * late_anyway:.0f} ms without a run"
-    record_property("lateness", report)
-    print(report)
-    # What the machine does to every process just now is not the run's fault.
-    assert late < 0.3 + late_anyway
+    sys.setprofile(note_room)  # of this thread alone
+    try:
+        qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    finally:
+        sys.setprofile(None)
+    computing = {"geometry", "transport", "inversion", "physics", "preprocessing", "pipeline"}
+    assert "napari_shadowinv._napari" in rooms
+    assert not rooms & {f"napari_shadowinv.{room}" for room in computing}
 
 
 def test_closing_the_window_ends_the_run(
@@ -292,7 +247,7 @@ def test_a_saved_result_tells_how_it_was_made(
     )
 
 
-def test_cancel_takes_effect_within_a_second(
+def test_cancel_ends_the_work_itself(
     window: Any, tool: Any, slow: threading.Event, qtbot: Any
 ) -> None:
     tool.panel.button.click()
@@ -313,11 +268,10 @@ def test_cancel_takes_effect_within_a_second(
     tool.panel.button.click()
     qtbot.waitUntil(lambda: any(news.stage == "sites" for news in heard), timeout=PATIENCE)
     qtbot.waitUntil(lambda: "Placing the sites" in tool.panel.status.text(), timeout=PATIENCE)
-    start, used = time.perf_counter(), time.process_time()
+    tool.panel.runner._patience = math.inf
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
-    # Where others use the machine, the time it would take alone counts.
-    assert min(time.perf_counter() - start, time.process_time() - used) < 1
+    assert {news.stage for news in heard} <= {"compile", "prepare", "sites"}
     assert [layer.name for layer in window.layers] == ["shot"]
     assert not progress._all_instances
 
@@ -502,7 +456,7 @@ def test_the_result_lies_on_an_image_that_was_turned(
 
 
 def test_the_preview_follows_in_its_own_layers(
-    window: Any, tool: Any, qtbot: Any, told: list[str], record_property: Any
+    window: Any, tool: Any, qtbot: Any, told: list[str]
 ) -> None:
     noise = np.random.default_rng(0).normal(0, 0.05, (200, 200))
     shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement) + noise
@@ -515,15 +469,13 @@ def test_the_preview_follows_in_its_own_layers(
     before = tool.previewed.layers
     potential = layer_of(window, "potential", "preview")
 
-    def follows(change: Any) -> float:
-        """Seconds until the layer follows a change."""
+    def follows(change: Any) -> None:
+        """Wait until the layer follows a change."""
         qtbot.waitUntil(lambda: settled(tool), timeout=PATIENCE)
         qtbot.wait(100)  # the last picture is drawn
         old = potential.data
-        start = time.perf_counter()
         change()
         qtbot.waitUntil(lambda: potential.data is not old, timeout=PATIENCE)
-        return time.perf_counter() - start
 
     tool.masks.paint()
     follows(lambda: tool.steps.add("low-pass"))
@@ -540,19 +492,6 @@ def test_the_preview_follows_in_its_own_layers(
     follows(lambda: setattr(tool.crop, "layer", None))
     follows(lambda: tool.source.picker.set_kind("low-pass"))
     width = tool.source.picker.form.editors["width"]
-    times, others = [], []
-    for value in range(31, 38):
-        times.append(follows(lambda value=value: width.set_value(value)))
-        others.append(slowdown())
-    report = (
-        f"from a slider to the layer: median {np.median(times):.2f} s, least {min(times):.2f} s, "
-        f"on a machine slowed down {np.median(others):.1f} times by others"
-    )
-    record_property("latency", report)
-    print(report)
-    alone = [seconds / other for seconds, other in zip(times, others, strict=True)]
-    assert np.median(alone) < 0.5
-
     outcomes: list[Any] = []
     tool.panel.runner.ended.connect(outcomes.append)
     for value in np.linspace(40, 60, 21):
