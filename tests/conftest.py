@@ -17,6 +17,7 @@ from napari_shadowinv.fitting import Basin, Fit, FitOptions, FitReport, FittedFi
 from napari_shadowinv.inversion import Inversion, Report
 from napari_shadowinv.inversion.budget import ErrorEstimate, Errors
 from napari_shadowinv.inversion.trust import image_residual
+from napari_shadowinv.io.public_images import BURNER_FILES, fetch_burner
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -207,3 +208,15 @@ def small_disk(tmp_path: Path) -> Iterator[tuple[Path, Callable[[str], bool]]]:
         yield folder, lambda size: mount(f"remount,size={size}")
     finally:
         subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.fixture(scope="session")
+def burner() -> list[Path]:
+    """Reference beam and frames of a real plume: beside the project, or downloaded."""
+    folder = SHARED_DATA / "burner" / "data"
+    if folder.is_dir():
+        return [folder / name for name in BURNER_FILES]
+    try:
+        return fetch_burner(len(BURNER_FILES) - 1)
+    except OSError as error:
+        pytest.skip(str(error))

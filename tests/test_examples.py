@@ -101,8 +101,8 @@ def test_prediction_for_another_energy_and_the_command_line_agree(run: Run, tmp_
     np.testing.assert_allclose(np.load(out), names["predicted"], rtol=1e-9, atol=1e-12)
 
 
-def test_burner_strip_explains_every_frame(run: Run, shared_data: Path) -> None:
-    names = run("burner_strip", shared_data / DATA["burner_strip"])
+def test_burner_strip_explains_every_frame(run: Run, burner: list[Path]) -> None:
+    names = run("burner_strip", burner[0].parent)
     assert len(names["inversions"]) == len(names["files"]) == 11
     assert all(inversion.report.converged for inversion in names["inversions"])
     np.testing.assert_allclose(np.diff(names["seconds"]), 0.1, atol=0.02)

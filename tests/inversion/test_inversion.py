@@ -462,10 +462,8 @@ def test_the_donut_is_retrieved(shared_data):
     assert 100 * relative_error(inversion.displacement, true) <= 2.4
 
 
-def test_a_real_plume_with_its_real_reference_is_explained(shared_data):
-    folder = shared_data / "burner" / "data"
-    shot = read(folder / "Image_20241017221829851.bmp").binned(2)
-    reference = read(folder / "Image_00000.bmp").binned(2)
+def test_a_real_plume_with_its_real_reference_is_explained(burner):
+    reference, shot = (read(burner[number]).binned(2) for number in (0, 3))
     options = InversionOptions(n_sites=shot.image.size)
     inversion = invert(shot.image, source=reference.image, options=options)
     assert inversion.report.converged

@@ -316,11 +316,9 @@ def test_other_reference_images_get_no_doubts(shared_data: Path):
 
 
 @pytest.mark.parametrize("number", [0, 4, 5])
-def test_a_real_plume_gets_no_doubts(shared_data: Path, number: int):
-    folder = shared_data / "burner" / "data"
-    shot = sorted(folder.glob("Image_2*.bmp"))[number]
-    reference = read(folder / "Image_00000.bmp").binned(4).image
-    assert invert(read(shot).binned(4).image, source=reference).report.warnings == ()
+def test_a_real_plume_gets_no_doubts(burner: list[Path], number: int):
+    reference = read(burner[0]).binned(4).image
+    assert invert(read(burner[1 + number]).binned(4).image, source=reference).report.warnings == ()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from napari.components import ViewerModel
 from qtpy.QtCore import QSettings
 
-from napari_shadowinv import OpticalSetup, ProtonSetup
+from napari_shadowinv import OpticalSetup, ProtonSetup, read
 from napari_shadowinv._napari import samples
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, source_of
 from napari_shadowinv._napari.widgets.fit_images import FitImages
@@ -103,3 +103,13 @@ def test_the_run_is_lazy_and_changes_with_time() -> None:
     assert contrast[1] > 1.5 * contrast[0]
     low, high = keywords["contrast_limits"]
     assert low < planes.mean() < high
+
+
+def test_the_burner_comes_with_its_reference(
+    viewer: ViewerModel, burner: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(samples, "fetch_burner", lambda: burner[:2])
+    layers = {role_of(layer): layer for layer in viewer.open_sample("napari-shadowinv", "burner")}
+    reference, frame = (read(path).image for path in burner[:2])
+    np.testing.assert_array_equal(layers["shot"].data, frame)
+    np.testing.assert_array_equal(source_of(layers["shot"]), reference)

@@ -1,16 +1,20 @@
-"""Sample data: shots of known objects with setup and source, made when they are asked for."""
+"""Sample data: shots of known objects with setup and source, made or downloaded on request."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from napari_shadowinv import io
 from napari_shadowinv._napari.layer_metadata import CAME_WITH
 from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
+from napari_shadowinv._napari.notifications import notify_errors
 from napari_shadowinv._napari.shots import lazy_stack, radiograph_layers, shot_layer
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.io import Radiograph
+from napari_shadowinv.io.public_images import fetch_burner
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.setup import setup_from_dict
@@ -75,6 +79,13 @@ def wakefield_run() -> list[FullLayerData]:
     origin = f"{CAME_WITH} the sample 'wakefield run'"
     setup = phantoms.wakefield_setup()
     return [shot_layer(stack, "wakefield run", setup, limits, setup_origin=origin)]
+
+
+@notify_errors(list)
+def burner() -> list[FullLayerData]:
+    """Shadowgram of an alcohol burner's plume with its reference beam, downloaded once."""
+    reference, frame = (io.read_radiograph(path) for path in fetch_burner())
+    return radiograph_layers(replace(frame, source=reference.image), "burner")
 
 
 def _toroid_of(peak: float) -> phantoms.Phantom:
