@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -191,7 +191,7 @@ def _from_array(shots: Any, coordinate: Any = None) -> Shots:
 
 
 class _Blocks(Sequence[Shot]):
-    """The shots of a dask array; each is cut out when it is asked for."""
+    """Shots of a dask array, cut out on access; a slice is a shorter sequence."""
 
     def __init__(self, array: Any) -> None:
         self._array = array
@@ -199,7 +199,15 @@ class _Blocks(Sequence[Shot]):
     def __len__(self) -> int:
         return int(self._array.shape[0])
 
-    def __getitem__(self, index: Any) -> Any:
+    @overload
+    def __getitem__(self, index: int) -> Shot: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> _Blocks: ...
+
+    def __getitem__(self, index: int | slice) -> Shot | _Blocks:
+        if isinstance(index, slice):
+            return _Blocks(self._array[index])
         dask: Any = import_module("dask")
         # Without the tasks of other shots, which would travel with it.
         return _references.BlockShot(dask.optimize(self._array.blocks[index])[0])

@@ -1,0 +1,88 @@
+"""Every way to pass shots gives the same fields, with the options of a new user."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import dask.array as da
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+
+from napari_shadowinv import invert_stack, run_stack, synthetic_image
+from napari_shadowinv.io.store import DONE
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.stack._discovery import find_shots
+
+SHAPE, COUNT = (32, 36), 4
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    """Shots of a blob that moves, as a camera would store them."""
+    blobs = [gaussian_blob(SHAPE, 4.0, 5.0, (14, 14 + 2 * shot)) for shot in range(COUNT)]
+    return np.stack([synthetic_image(blob.displacement) for blob in blobs]).astype(np.float32)
+
+
+def write_files(images: np.ndarray, folder: Path) -> list[Path]:
+    paths = [folder / f"shot_{shot}.tif" for shot in range(len(images))]
+    for path, image in zip(paths, images, strict=True):
+        tifffile.imwrite(path, image)
+    return paths
+
+
+def write_pages(images: np.ndarray, folder: Path) -> Path:
+    path = folder / "shots.tif"
+    tifffile.imwrite(path, images, photometric="minisblack")
+    return path
+
+
+def write_table(images: np.ndarray, folder: Path) -> Path:
+    names = [path.name for path in write_files(images, folder)]
+    path = folder / "shots.csv"
+    path.write_text("\n".join(["file", *names]) + "\n", encoding="utf-8")
+    return path
+
+
+KINDS = {
+    "numpy": lambda images, _: images,
+    "dask of one shot": lambda images, _: da.from_array(images, chunks=(1, -1, -1)),
+    "dask of many shots": lambda images, _: da.from_array(images, chunks=(3, 20, -1)),
+    "list of arrays": lambda images, _: list(images),
+    "xarray": lambda images, _: xr.DataArray(images, dims=("shot", "y", "x")),
+    "xarray of dask": lambda images, _: xr.DataArray(images, dims=("shot", "y", "x")).chunk(),
+    "dataset": lambda images, _: xr.Dataset({"image": (("shot", "y", "x"), images)}),
+    "pages": write_pages,
+    "files": write_files,
+    "glob": lambda images, folder: str(write_files(images, folder)[0].parent / "shot_*.tif"),
+    "table": write_table,
+}
+
+
+@pytest.fixture(scope="module")
+def reference(images):
+    return invert_stack(images).compute()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_stack_of_any_kind_runs_with_default_options(kind, images, reference, tmp_path):
+    stack = invert_stack(KINDS[kind](images, tmp_path))
+    assert stack.sizes["site"] == reference.sizes["site"]
+    np.testing.assert_array_equal(stack.potential.compute(), reference.potential)
+
+
+@pytest.mark.parametrize("kind", ["dask of many shots", "table"])
+def test_store_of_any_kind_runs_with_default_options(kind, images, reference, tmp_path):
+    stored = run_stack(KINDS[kind](images, tmp_path), tmp_path / "out.shadowinv.zarr")
+    assert (stored.status == DONE).all()
+    np.testing.assert_allclose(stored.potential, reference.potential, rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "table"])
+def test_slice_of_shots_holds_its_shots(kind, images, tmp_path):
+    items = find_shots(KINDS[kind](images, tmp_path)).items
+    part = items[1:3]
+    assert len(part) == 2
+    for shot, image in zip(part, images[1:3], strict=True):
+        np.testing.assert_array_equal(shot.load()[0], image)
