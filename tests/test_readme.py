@@ -42,7 +42,7 @@ def test_the_python_example_makes_the_file_it_promises(shot_folder):
         exec(compile(block, "README.md", "exec"), names)
     result = names["result"]
     assert isinstance(result, xarray.Dataset)
-    assert result.potential.attrs["units"] == "px²"
+    assert result.potential.attrs["units"] == "pixel**2"
     peak = np.hypot(*names["inversion"].displacement).max()  # type: ignore[attr-defined]
     assert peak == pytest.approx(20 / 6 * np.exp(-0.5), rel=0.05)
 
@@ -84,7 +84,7 @@ def test_commands_and_python_work_one_after_the_other_in_one_folder(shot_folder)
             done.append(shlex.split(text)[0])
     assert done == ["invert", "info", "forward", "batch", "status"]
     assert (shot_folder / "shot.png").read_bytes().startswith(b"\x89PNG")
-    assert read("shot.shadowinv").potential.attrs["units"] == "px²"
+    assert read("shot.shadowinv").potential.attrs["units"] == "pixel**2"
     image = tifffile.imread("shot_image.tif")
     assert image.shape == (40, 50)
     assert xarray.open_zarr("night.shadowinv.zarr", consolidated=False).sizes["shot"] == 2

@@ -48,7 +48,7 @@ def test_the_script_finds_the_field_that_it_simulates(tmp_path, monkeypatch, cap
     assert names["peaks"] == pytest.approx([names["peaks"][0]] * 3, rel=0.03)
     saved = read("toroid.shadowinv")
     np.testing.assert_allclose(saved.potential, names["inversion"].potential)
-    assert "px²" in capsys.readouterr().out
+    assert "pixel**2" in capsys.readouterr().out
 
 
 def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch):

@@ -66,6 +66,13 @@ def on_films(truth: Truth, dataset, plane: Callable[[int], np.ndarray], layer: i
     return ndimage.map_coordinates(plane(layer), np.moveaxis(at, -1, 0), order=3, mode="nearest")
 
 
+def test_places_of_a_packs_pixels_are_in_metres(dataset) -> None:
+    pixel = dataset.attrs["scan_pixel_size"]
+    for name in ("y", "x"):
+        assert dataset[name].attrs["units"] == "m"
+        np.testing.assert_allclose(dataset[name], pixel * np.arange(dataset.sizes[name]))
+
+
 def test_doses_are_those_that_the_films_saw(truth: Truth, dataset) -> None:
     scales = truth.scene.magnifications / truth.scene.magnifications[0]
     for layer in range(COUNT):

@@ -220,7 +220,7 @@ def test_a_tiff_with_pages_a_mask_and_bins(night, folder):
     assert result.exit_code == 0, result.output
     dataset = read("f.shadowinv.zarr")
     assert dict(dataset.sizes) == {"shot": 6, "y": 12, "x": 14, "component": 2}
-    assert float(dataset.x_si[1]) == pytest.approx(4e-5)
+    assert float(dataset.x[1]) == pytest.approx(4e-5)
 
     def binned(image: np.ndarray) -> np.ndarray:
         return image.reshape(12, 2, 14, 2).sum(axis=(1, 3))

@@ -130,7 +130,7 @@ def test_error_bars_are_stored_if_they_are_made(images: Any, out: Path) -> None:
     options = HASTY.model_copy(update={"samples": 2})
     recipe = Recipe(fit=CHOICES.model_copy(update={"options": options}))
     store = run_stack(images[:1], out, recipe=recipe, scheduler="synchronous")
-    assert store["displacement_uncertainty"].attrs["units"] == "px"
+    assert store["displacement_uncertainty"].attrs["units"] == "pixel"
     assert float(store["displacement_uncertainty"].min()) > 0
     assert float(store["uncertainty"][0]) == run_fit(recipe, [images[0]]).report.uncertainty
 
@@ -183,7 +183,7 @@ def test_images_of_one_object_are_fitted_together(folder: Path, out: Path) -> No
         ]
         assert report["chi2_images"] == alone.chi2.tolist()
     assert "path_integrated_b" in store
-    np.testing.assert_allclose(store["x_si"], np.arange(48) * SETUPS[0].object_pixel_size)
+    np.testing.assert_allclose(store["x"], np.arange(48) * SETUPS[0].object_pixel_size)
 
 
 def test_a_table_that_changed_is_told_and_grows(folder: Path, out: Path) -> None:

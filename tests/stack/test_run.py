@@ -65,7 +65,7 @@ def test_read_opens_it_and_so_does_plain_xarray(night, out, recwarn):
     night.run(out, shots=night.images)
     dataset = read(out)
     assert isinstance(dataset, xr.Dataset)
-    assert dataset.potential.attrs["units"] == "px²"
+    assert dataset.potential.attrs["units"] == "pixel**2"
     assert json.loads(dataset.attrs["options"])["n_sites"] == 100
     plain = xr.open_zarr(out)
     assert list(plain.status.values) == [DONE] * 6

@@ -14,7 +14,7 @@ import numpy as np
 
 from napari_shadowinv.cli._outputs import make_folder, protect_store
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.labels import display_unit, setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
@@ -163,7 +163,7 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
     peaks = stack_statistics(read_stack(store))
     names = [str(name) for name in peaks.data_vars if str(name).endswith("_peak")]
     columns = {name: np.asarray(peaks[name].values) for name in names}
-    headings = [f"{name} ({peaks[name].attrs['units']})" for name in names]
+    headings = [f"{name} ({display_unit(peaks[name].attrs['units'])})" for name in names]
     count = len(content.names)
     chosen = range(count) if shots is None else _parsed_shots(shots, count)
     statuses, reports = content.statuses(), content.reports()

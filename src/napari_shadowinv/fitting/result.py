@@ -15,6 +15,8 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.inversion.labels import (
     FIT_FORMAT,
+    FLUX_DENSITY,
+    PIXEL,
     UNCERTAINTY,
     belongs,
     dataset_from_field,
@@ -32,10 +34,10 @@ __all__ = ["Basin", "Fit", "FitReport", "FittedField"]
 _IMAGES = ("image", "y", "x")
 # Variables beside those of the fields: dimensions, units, long name.
 _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "images": (_IMAGES, "flux/px²", "Image"),
-    "source": (_IMAGES, "flux/px²", "Undisturbed beam"),
-    "reprojection": (_IMAGES, "flux/px²", "Image as explained by the fields"),
-    "residual": (_IMAGES, "flux/px²", "Image minus re-projection"),
+    "images": (_IMAGES, FLUX_DENSITY, "Image"),
+    "source": (_IMAGES, FLUX_DENSITY, "Undisturbed beam"),
+    "reprojection": (_IMAGES, FLUX_DENSITY, "Image as explained by the fields"),
+    "residual": (_IMAGES, FLUX_DENSITY, "Image minus re-projection"),
     "mask": (_IMAGES, "1", "Pixels that were used"),
     "chi2": (("image",), "1", "Mean squared residual over the noise"),
     "gain": (("image",), "1", "Factor that the image is brighter by than given"),
@@ -51,7 +53,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "basin_distance": (("basin",), "1", "Distance from the best displacement, as a share of it"),
     "basin_displacement": (
         ("basin", "field", "component", "coarse_y", "coarse_x"),
-        "px",
+        PIXEL,
         "Displacement where a start has led, at every other pixel",
     ),
 }

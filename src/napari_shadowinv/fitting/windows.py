@@ -11,6 +11,7 @@ import numpy as np
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.inversion.labels import (
+    PIXEL,
     UNCERTAINTY,
     belongs,
     dataset_from_field,
@@ -128,7 +129,7 @@ class FitWindows:
                 label(*words),
             )
         for variable in one.data_vars.values():
-            if "px" in variable.attrs["units"]:
+            if PIXEL in variable.attrs["units"]:
                 variable.attrs["long_name"] += ", in the image displaced most"
         return one
 

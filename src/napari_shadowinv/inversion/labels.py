@@ -5,6 +5,10 @@
 - the setup that a dataset was made with: `setup_from_dataset`
 - whether it is a fit's or a film pack's: `is_fit`, `is_pack`; what a fit of one field has:
   `fit_labels`
+- the labels of files of earlier versions: `update_labels`
+
+Units are spelled as pint parses them, because napari hands those of an xarray's coordinates to it.
+For pint ``px`` is a length, 1/96 inch, and ``flux`` a femtolux.
 """
 
 from __future__ import annotations
@@ -28,28 +32,34 @@ FORMAT = "shadowinv result"
 FIT_FORMAT = "shadowinv fit"
 PACK_FORMAT = "shadowinv film pack"
 
+PIXEL = "pixel"
+PIXEL_AREA = "pixel**2"
+FLUX_DENSITY = "1/pixel**2"
+_FLUX = "1"
+_EARLIER_UNITS = {"px": PIXEL, "px²": PIXEL_AREA, "flux": _FLUX, "flux/px²": FLUX_DENSITY}
+
 _PLANE = ("y", "x")
 _VECTORS = ("component", "y", "x")
 _SITE_VECTORS = ("site", "component")
 
 # Attribute of Inversion: dimensions, units, long name.
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "potential": (_PLANE, "px²", "Normalised deflection potential"),
-    "displacement": (_VECTORS, "px", "Displacement of the ray through each pixel"),
-    "sites": (_SITE_VECTORS, "px", "Positions of the sites"),
-    "weights": (("site",), "px²", "Weights of the power diagram"),
-    "site_mass": (("site",), "flux", "Source flux in each site's cell"),
-    "site_flux": (("site",), "flux", "Image flux in each site's power cell"),
-    "site_displacement": (_SITE_VECTORS, "px", "Centroid of each site's cell minus the site"),
-    "image": (_PLANE, "flux/px²", "Image, scaled to the flux of the source"),
-    "source": (_PLANE, "flux/px²", "Undisturbed beam"),
-    "reprojection": (_PLANE, "flux/px²", "Source as displaced by the retrieved field"),
-    "residual": (_PLANE, "flux/px²", "Image minus re-projection"),
+    "potential": (_PLANE, PIXEL_AREA, "Normalised deflection potential"),
+    "displacement": (_VECTORS, PIXEL, "Displacement of the ray through each pixel"),
+    "sites": (_SITE_VECTORS, PIXEL, "Positions of the sites"),
+    "weights": (("site",), PIXEL_AREA, "Weights of the power diagram"),
+    "site_mass": (("site",), _FLUX, "Source flux in each site's cell"),
+    "site_flux": (("site",), _FLUX, "Image flux in each site's power cell"),
+    "site_displacement": (_SITE_VECTORS, PIXEL, "Centroid of each site's cell minus the site"),
+    "image": (_PLANE, FLUX_DENSITY, "Image, scaled to the flux of the source"),
+    "source": (_PLANE, FLUX_DENSITY, "Undisturbed beam"),
+    "reprojection": (_PLANE, FLUX_DENSITY, "Source as displaced by the retrieved field"),
+    "residual": (_PLANE, FLUX_DENSITY, "Image minus re-projection"),
     "caustic": (_PLANE, "1", "The map folds or its Jacobian is below the threshold"),
     "mask": (_PLANE, "1", "Pixels that were used"),
 }
 
-UNCERTAINTY = (_VECTORS, "px", "Standard deviation of the displacement")
+UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement")
 """What a fit has beside potential and displacement."""
 
 _ASSUMES = {"path_integrated_b": "B", "path_integrated_e": "E"}
@@ -145,9 +155,55 @@ def label(units: str, long_name: str) -> dict[str, str]:
     return {"units": units, "long_name": long_name}
 
 
-def place_label(name: str) -> dict[str, str]:
+def place_label(name: str, plane: str = "object plane") -> dict[str, str]:
     """Return the attributes of pixels' places along y or x in metres."""
-    return label("m", f"{name} in the object plane")
+    return label("m", f"{name} in the {plane}")
+
+
+def place_coordinates(
+    shape: tuple[int, int], pixel_size: float | None, plane: str = "object plane"
+) -> dict[str, Any]:
+    """Return y and x of the pixels in metres, or their indices if their size is unknown.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Height and width of the image.
+    pixel_size : float or None
+        Size of a pixel in that plane, in metres.
+    plane : str, optional
+        The plane for the long names.
+    """
+    coordinates: dict[str, Any] = {}
+    for name, count in zip(_PLANE, shape, strict=True):
+        index = np.arange(count, dtype=np.float64)
+        if pixel_size is None:
+            coordinates[name] = (name, index, label(PIXEL, f"{name} in the {plane}"))
+        else:
+            coordinates[name] = (name, index * pixel_size, place_label(name, plane))
+    return coordinates
+
+
+def display_unit(units: str) -> str:
+    """Return the attribute ``units`` as figures print it: px² for ``pixel**2``."""
+    return units.replace("**2", "²").replace("pixel", "px")
+
+
+def update_labels(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Return the dataset of a file with today's units and coordinates.
+
+    Earlier versions wrote pixel indices in ``px`` as y and x, with the places in metres beside
+    them, as y_si and x_si.
+    """
+    for variable in dataset.variables.values():
+        if variable.attrs.get("units") in _EARLIER_UNITS:
+            variable.attrs["units"] = _EARLIER_UNITS[variable.attrs["units"]]
+    for name in _PLANE:
+        places = dataset.coords.get(f"{name}_si")
+        if places is not None and places.dims == (name,):
+            metres = {name: (name, places.values, place_label(name))}
+            dataset = dataset.drop_vars(f"{name}_si").assign_coords(metres)
+    return dataset
 
 
 def _vectors_first(setup: Setup) -> list[SIField]:
@@ -155,14 +211,6 @@ def _vectors_first(setup: Setup) -> list[SIField]:
 
 
 def _coordinates(height: int, width: int, setup: Setup | None) -> dict[str, Any]:
-    """Pixel indices, and metres where the pixel's size is known."""
-    coords: dict[str, Any] = {
-        "component": ("component", ["y", "x"], label("1", "Component of a vector"))
-    }
-    for name, count in (("y", height), ("x", width)):
-        index = np.arange(count, dtype=np.float64)
-        coords[name] = (name, index, label("px", f"{name} in the object plane"))
-        if setup is not None:
-            metres = index * setup.object_pixel_size
-            coords[f"{name}_si"] = (name, metres, place_label(name))
-    return coords
+    components = ("component", ["y", "x"], label("1", "Component of a vector"))
+    size = None if setup is None else setup.object_pixel_size
+    return {"component": components, **place_coordinates((height, width), size)}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import FORMAT, is_fit, is_pack
+from napari_shadowinv.inversion.labels import FORMAT, is_fit, is_pack, update_labels
 from napari_shadowinv.io.hdf5 import check_arrays, hdf5_in_memory
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def read_result(path: Path) -> xarray.Dataset:
 
     check_arrays(path)
     # Nothing in it is a time, whatever its units look like.
-    return xr.load_dataset(path, engine="h5netcdf", decode_times=False)
+    return update_labels(xr.load_dataset(path, engine="h5netcdf", decode_times=False))
 
 
 def write_sites(path: Path, dataset: xarray.Dataset) -> None:

@@ -23,10 +23,12 @@ from napari_shadowinv._system.safety import refusing_damage, small_text
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.labels import (
+    PIXEL,
     SETUPS_LABEL,
     fit_labels,
     place_label,
     setup_from_dataset,
+    update_labels,
     variable_labels,
 )
 from napari_shadowinv.io.files import check_folder_of
@@ -47,11 +49,11 @@ SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
     ),
     "noise_error": (
         float,
-        {"units": "px", "long_name": "Standard error of the displacement by noise, r.m.s."},
+        {"units": PIXEL, "long_name": "Standard error of the displacement by noise, r.m.s."},
     ),
     "discretisation_error": (
         float,
-        {"units": "px", "long_name": "Error of the displacement by too few sites, r.m.s."},
+        {"units": PIXEL, "long_name": "Error of the displacement by too few sites, r.m.s."},
     ),
     "iterations": (int, {"units": "1", "long_name": "Solver iterations, summed over all levels"}),
     "seconds": (float, {"units": "s", "long_name": "Time its worker spent on the shot"}),
@@ -312,6 +314,7 @@ def read_stack(path: Path) -> xarray.Dataset:
     dataset: xr.Dataset = xr.open_zarr(
         CheckedStore(path), decode_times=False, mask_and_scale=False, chunks={}
     )
+    dataset = update_labels(dataset)
     if dataset.sizes["shot"] > len(store.names):  # grown since
         dataset = dataset.isel(shot=slice(len(store.names)))
     setup = setup_from_dataset(dataset)

@@ -31,7 +31,7 @@ from napari_shadowinv.film.registration import EDGES
 from napari_shadowinv.film.response import relative_strengths
 from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.fitting.measurements import estimated_noise
-from napari_shadowinv.inversion.labels import PACK_FORMAT
+from napari_shadowinv.inversion.labels import PACK_FORMAT, PIXEL, place_coordinates
 from napari_shadowinv.io.scans import Scan
 from napari_shadowinv.pipeline._film_inputs import Film, as_it_lay, in_parallel, read_films
 
@@ -316,7 +316,7 @@ def _dataset(
         kept = values if name == "usable" else values.astype(np.float32)
         variables[name] = (("layer", "y", "x"), kept, {"units": _UNITS[name]})
     for name, (dims, values) in by_film.items():
-        variables[name] = (dims, values, {"units": _UNITS.get(name, "px")})
+        variables[name] = (dims, values, {"units": _UNITS.get(name, PIXEL)})
     coordinates: dict[str, Any] = {
         "layer": np.arange(1, len(bands) + 1),
         "film": ("layer", [layer.film for layer in pack.layers]),
@@ -325,6 +325,7 @@ def _dataset(
         "energy_low": ("layer", [band.low for band in bands], {"units": "MeV"}),
         "energy_high": ("layer", [band.high for band in bands], {"units": "MeV"}),
         "strength": ("layer", relative_strengths(energies), {"units": "1"}),
+        **place_coordinates(planes["dose"].shape[1:], pixel, "film's plane"),
     }
     attributes: dict[str, Any] = {
         "format": PACK_FORMAT,

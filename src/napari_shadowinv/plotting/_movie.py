@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from napari_shadowinv._system.machine import interrupts_put_off
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.labels import display_unit, setup_from_dataset
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.physics.units import PREFIXED_UNITS, prefix_for
 from napari_shadowinv.plotting._panels import STYLE, choose_grid, image_scale, new_page
@@ -77,7 +77,7 @@ def stack_frames(
     factor, prefix = 1.0, ""
     if unit in PREFIXED_UNITS:
         factor, prefix = prefix_for(max(abs(low), abs(high)))
-    label = f"{field.attrs.get('long_name', variable)} ({prefix}{unit})"
+    label = f"{field.attrs.get('long_name', variable)} ({prefix}{display_unit(unit)})"
     shape = field.sizes["y"], field.sizes["x"]
     draw = _Frame(shape, _scale_of_all(stack), label, (factor * low, factor * high))
     return (

@@ -1,0 +1,99 @@
+"""Variables of a result given to napari as they are: napari takes scale and units from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pint
+import pytest
+import xarray as xr
+from napari.components import ViewerModel
+
+from napari import __version__ as napari_version
+from napari_shadowinv import invert_stack, read, write
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion.labels import update_labels
+from napari_shadowinv.physics.setup import OpticalSetup
+
+PIXEL_M = 2e-6
+SETUP = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=PIXEL_M)
+registry = pint.get_application_registry()
+
+reads_coordinates = pytest.mark.skipif(
+    tuple(map(int, napari_version.split(".")[:2])) < (0, 9),
+    reason="napari takes scale and units from coordinates since 0.9",
+)
+
+
+def as_written_before(dataset: xr.Dataset) -> xr.Dataset:
+    """A result as version 0.1.0 labelled it: indices in px, metres in y_si and x_si."""
+    earlier = {"pixel": "px", "pixel**2": "px²", "1/pixel**2": "flux/px²"}
+    for name in ("y", "x"):
+        index = np.arange(dataset.sizes[name], dtype=float)
+        places = (name, index * PIXEL_M, {"units": "m", "long_name": name})
+        dataset = dataset.assign_coords(
+            {name: (name, index, {"units": "px", "long_name": name}), f"{name}_si": places}
+        )
+    for variable in dataset.variables.values():
+        units = variable.attrs.get("units", "1")
+        variable.attrs["units"] = earlier.get(units, units)
+    return dataset
+
+
+@reads_coordinates
+@pytest.mark.parametrize("origin", ["memory", "file", "earlier file", "stack"])
+def test_field_in_metres_lies_over_a_layer_of_its_pixels(
+    origin: str, inversion: Inversion, tmp_path: Path
+) -> None:
+    dataset = inversion.to_dataset(SETUP)
+    path = tmp_path / "shot.shadowinv"
+    if origin == "earlier file":
+        dataset = as_written_before(dataset)
+    if "file" in origin:
+        write(path, dataset)
+        dataset = read(path)
+    if origin == "stack":
+        dataset = invert_stack(inversion.image[np.newaxis], setup=SETUP).isel(shot=0)
+    viewer = ViewerModel()
+    size_um = PIXEL_M * 1e6
+    image = viewer.add_image(inversion.image, scale=(size_um, size_um), units=("um", "um"))
+    field = viewer.add_image(dataset["potential"])
+    assert [str(unit) for unit in field.units] == ["meter", "meter"]
+    together = viewer.layers.extent
+    assert [str(unit) for unit in together.units] in (["micrometer"] * 2, ["meter"] * 2)
+    to_um = (1 * together.units[-1]).to("um").magnitude
+    np.testing.assert_allclose(to_um * together.world, image.extent.world, rtol=1e-9)
+    np.testing.assert_allclose(1e6 * field.extent.world, image.extent.world, rtol=1e-9)
+
+
+@reads_coordinates
+def test_field_without_a_setup_is_in_pixels_of_napari(inversion: Inversion) -> None:
+    viewer = ViewerModel()
+    image = viewer.add_image(inversion.image)
+    field = viewer.add_image(inversion.to_dataset()["potential"])
+    assert field.units == image.units
+    np.testing.assert_array_equal(field.scale, image.scale)
+
+
+def test_units_of_a_result_are_parsed_by_pint_as_meant(inversion: Inversion) -> None:
+    dataset = inversion.to_dataset(SETUP)
+    units = {name: registry.Unit(dataset[name].attrs["units"]) for name in dataset.variables}
+    pixel = registry.Unit("pixel")
+    assert units["potential"] == pixel**2
+    assert units["displacement"] == pixel
+    assert units["image"] == registry.Unit("1/pixel**2")
+    assert units["y"] == registry.Unit("m")
+    assert units["line_integrated_density"].dimensionality == {"[length]": -2}
+    allowed = {"[printing_unit]", "[length]"}
+    for name, unit in units.items():
+        assert set(unit.dimensionality) <= allowed, name
+
+
+def test_labels_of_an_earlier_file_become_those_of_today(inversion: Inversion) -> None:
+    today = inversion.to_dataset(SETUP)
+    updated = update_labels(as_written_before(inversion.to_dataset(SETUP)))
+    for name, variable in today.variables.items():
+        assert updated[name].attrs["units"] == variable.attrs["units"], name
+    assert set(updated.coords) == set(today.coords)
+    np.testing.assert_array_equal(updated.x, today.x)
