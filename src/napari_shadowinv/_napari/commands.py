@@ -59,7 +59,7 @@ def refine(
         raise InputError("no layer is selected: select a layer of an inversion's result")
     from napari_shadowinv._napari.fit_jobs import name_of_result, refinement
 
-    name = name_of_result([layer] if viewer is None else viewer.layers, layer)
+    name = name_of_result(layer)
     job = refinement(layer, layer, name, psf=0.0)
     if viewer is None or not notifications.in_event_loop():
         return list(job.run(lambda _: None, lambda: False).described)
@@ -160,9 +160,8 @@ def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLaye
     told = {"source_origin": "uniform"}
     if picked.setup_origin:
         told["setup_origin"] = picked.setup_origin
-    return results.result_layers(
-        about.Result(inversion, picked.setup, told), picked.frame, picked.name
-    )
+    result = about.Result(inversion, picked.setup, told)
+    return results.main_layers(results.result_layers(result, picked.frame, picked.name))
 
 
 def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:

@@ -6,16 +6,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.fit_course import PACE, Course, Forecast, forecast_of
 from napari_shadowinv._napari.fit_layers import fit_layers, setup_of_fit
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layer_metadata import Result, result_of
+from napari_shadowinv._napari.layer_metadata import Result, mark_of, result_of
 from napari_shadowinv._napari.shots import loaded
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
@@ -172,9 +171,6 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
     )
 
 
-def name_of_result(layers: Iterable[Any], layer: Any) -> str:
-    """Return what the names of all layers of the same result begin with."""
-    result = result_of(layer)
-    names = [str(one.name) for one in layers if result_of(one) is result is not None]
-    alike = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
-    return "".join(letters[0] for letters in alike).strip(" |∫") or str(layer.name)
+def name_of_result(layer: Any) -> str:
+    """Return the name of the result that a layer shows a part of, or else that of the layer."""
+    return str(mark_of(layer).get("name") or layer.name)

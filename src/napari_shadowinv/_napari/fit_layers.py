@@ -15,6 +15,7 @@ from napari_shadowinv._napari.layers import (
     FullLayerData,
     dataset_layers,
     intensity_limits,
+    layer_name,
     symmetric_limits,
 )
 from napari_shadowinv._typing import FloatArray
@@ -38,7 +39,7 @@ def fit_layers(
     A fit that comes `alone`, as from a file, has layers of its images and of all other answers.
     """
     fit = _fit_of(result)
-    facts = _facts(result, fit)
+    facts = _facts(result, fit, name)
     layers = _image_layers(fit, frame, name, facts, with_images=alone)
     if alone:
         for number in range(len(fit.basins) - 1, 0, -1):
@@ -50,9 +51,11 @@ def fit_layers(
             "potential": (("y", "x"), field.potential),
             "displacement": (("component", "y", "x"), field.displacement),
         }
+        if fit.mask.shape[1:] == field.potential.shape:
+            variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
         if field.uncertainty is not None:
             variables["displacement_uncertainty"] = ("component", "y", "x"), field.uncertainty
-        titled = _titled(f"{name}{doubt_in_words(fit)}", fit, field)
+        titled = f"{_titled(name, fit, field)}{doubt_in_words(fit)}"
         described = _field_layers(variables, field, setup_of_fit(fit), frame, titled, facts)
         if number:
             _part(described, field.name)
@@ -75,7 +78,7 @@ def answer_layers(result: Result, number: int, frame: Frame, name: str) -> list[
             setup_of_fit(fit),
             frame,
             _titled(f"{name} {start_in_words(basin)}", fit, field),
-            _facts(result, fit),
+            _facts(result, fit, name),
         )
         kept = [layer for layer in described if role_of(layer[1]) in _COMPARED]
         for _, keywords, _ in kept:
@@ -113,10 +116,11 @@ def _fit_of(result: Result) -> Fit:
     return result.content
 
 
-def _facts(result: Result, fit: Fit) -> dict[str, Any]:
-    """What all layers of a fit know about it."""
+def _facts(result: Result, fit: Fit, name: str) -> dict[str, Any]:
+    """Collect the metadata that all layers of a fit share."""
     return {
         "result": result,
+        "name": name,
         "made_from": dict(result.attributes),
         "verdict": fit.verdict.value,
         "explanation": fit.explanation,
@@ -156,7 +160,7 @@ def _image_layers(
     setup = setup_of_fit(fit)
     grey = intensity_limits(fit.images[0])
     means = [image[use].mean() for image, use in zip(fit.images, fit.mask, strict=True)]
-    percent = 100 * fit.residual / np.array(means)[:, None, None]
+    percent = np.where(fit.mask, 100 * fit.residual / np.array(means)[:, None, None], np.nan)
     shown = {"reprojection": (fit.reprojection, grey), "residual": (percent, None)}
     if np.ptp(fit.source[0]):
         shown = {"source": (_without_gains(fit.source), grey), **shown}
@@ -167,8 +171,8 @@ def _image_layers(
         kind = _KINDS[role]
         data = planes[0] if len(planes) == 1 else planes
         keywords = {
-            "name": f"{name} {kind.title}",
-            "metadata": mark(role, kind.unit, setup, **facts),
+            "name": layer_name(kind.title, name),
+            "metadata": mark(role, kind.unit, setup, **facts, main=role != "reprojection"),
             "visible": False,
             **frame.keywords(stacked=data.ndim == 3),
             "colormap": kind.colormap,

@@ -88,8 +88,8 @@ def keep_setup(layer: Any, setup: Setup | None, origin: str) -> None:
 
 
 def may_be_shot(layer: Any) -> bool:
-    """Whether a layer is a shot, or may be one: neither a source nor part of a result."""
-    return role_of(layer) in (None, SHOT)
+    """Whether a layer is a shot, or may be one; of a result's layers only its image."""
+    return role_of(layer) in (None, SHOT, "image")
 
 
 def may_be_source(layer: Any) -> bool:
@@ -106,6 +106,11 @@ def result_of(layer: Any) -> Result | None:
     """Return the result that a layer shows a part of, None for any other layer."""
     found = mark_of(layer).get("result")
     return found if isinstance(found, Result) else None
+
+
+def belongs_to_result(layer: Any) -> bool:
+    """Whether a layer shows a part of a result, or of a store of results."""
+    return not {"result", "store"}.isdisjoint(mark_of(layer))
 
 
 def displacement_of(layer: Any) -> FloatArray | None:

@@ -5,15 +5,24 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from napari_shadowinv._napari.fit_layers import fit_layers, verdict_in_words
-from napari_shadowinv._napari.frame import Frame, frame_for, matrix_of
-from napari_shadowinv._napari.layer_metadata import Result, role_of, slot_of
-from napari_shadowinv._napari.layers import FullLayerData, result_layers
+from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, matrix_of
+from napari_shadowinv._napari.layer_metadata import (
+    SHOT,
+    SOURCE,
+    Result,
+    mark_of,
+    role_of,
+    slot_of,
+)
+from napari_shadowinv._napari.layers import FullLayerData, main_layers, result_layers
 from napari_shadowinv._napari.packs import pack_frame, pack_layers, pack_result, warnings_of_pack
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
 
 if TYPE_CHECKING:
@@ -22,10 +31,10 @@ if TYPE_CHECKING:
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
 
-_LOOKS = "napari_layers"
+_LOOKS, _NAME = "napari_layers", "napari_name"
 
 # Attributes that the dataset of a result makes anew.
-_OWN_ATTRIBUTES = {_LOOKS, "format", "options", "report", "image_residual", "errors_si"}
+_OWN_ATTRIBUTES = {_LOOKS, _NAME, "format", "options", "report", "image_residual", "errors_si"}
 _OWN_ATTRIBUTES |= {"setup", "provenance", "package_version", "created"}
 _OWN_ATTRIBUTES |= {"verdict", "explanation", "folded", "fields", "setups"}
 
@@ -55,7 +64,8 @@ def layers_of_result(
 
 
 def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]:
-    """Describe the layers of a result as they were saved; those that were not are hidden."""
+    """Describe the layers of a result as they were saved, the main ones, and its image."""
+    name = dataset.attrs.get(_NAME, name)
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     if is_pack(dataset.attrs):
         layers = pack_layers(pack_result(dataset), pack_frame(dataset), name)
@@ -76,18 +86,63 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
             shear=float(place["shear"][-1]),
             affine=matrix_of(np.array(place["affine"])[-3:, -3:]),
         )
-    return _looking(layers_of_result(result, frame, name, cells="cells" in looks), looks)
+    layers = layers_of_result(result, frame, name, cells="cells" in looks)
+    return _looking(main_layers(layers, also={*looks, "image"}), looks)
 
 
 def _looking(layers: list[FullLayerData], looks: dict[str, dict[str, Any]]) -> list[FullLayerData]:
-    """Layers as they looked; those that were not there are hidden."""
-    if not looks:
-        return layers
-    hidden = {"visible": False}
+    """Give layers the looks that were saved."""
     return [
-        (data, keywords | looks.get(slot_of(keywords), hidden), kind)
-        for data, keywords, kind in layers
+        (data, keywords | looks.get(slot_of(keywords), {}), kind) for data, keywords, kind in layers
     ]
+
+
+def missing_layers(viewer: Any, layer: Any) -> list[FullLayerData]:
+    """Describe the layers of a result, or of a store, that a viewer does not show yet.
+
+    `layer` shows a part of it. An image that was inverted as it was is a layer already.
+    """
+    from napari_shadowinv._napari.stores import store_layers
+
+    facts = mark_of(layer)
+    result, store = facts.get("result"), facts.get("store")
+    if result is not None:
+        described = layers_of_result(result, frame_of(layer), str(facts.get("name", "")))
+    elif store is not None:
+        described = store_layers(Path(store), str(facts.get("name", "")))
+        place = {"cache": False, **frame_of(layer).keywords(stacked=True)}
+        described = [(data, keywords | place, kind) for data, keywords, kind in described]
+    else:
+        raise InputError(
+            f"'{layer.name}' shows no result: select a layer of one, or press Run first"
+        )
+    alike = [
+        shown
+        for shown in viewer.layers
+        if mark_of(shown).get("result") is result and mark_of(shown).get("store") == store
+    ]
+    slots = {slot_of(shown) for shown in alike} | _inputs_shown(viewer, result)
+    missing = [each for each in described if slot_of(each[1]) not in slots]
+    for _, keywords, _ in missing:
+        keywords["visible"] = False
+    return missing
+
+
+def _inputs_shown(viewer: Any, result: Result | None) -> set[str]:
+    """Roles of what a viewer shows already as a shot and its source, because no step changed it."""
+    content = None if result is None else result.content
+    recipe = getattr(getattr(content, "provenance", None), "recipe", None)
+    if recipe is None or recipe.steps:
+        return set()
+    shape = content.image.shape  # type: ignore[union-attr]
+    inputs = {SHOT: "image", SOURCE: "source", None: "image"}
+    return {
+        inputs[role_of(shown)]
+        for shown in viewer.layers
+        if type(shown).__name__ == "Image"
+        and role_of(shown) in inputs
+        and tuple(shown.data.shape) == shape
+    }
 
 
 def doubts_of(result: Result) -> tuple[str, ...]:
@@ -113,7 +168,8 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray
 
     content = result.content
     looks = {slot_of(keywords): _look(keywords, kind) for _, keywords, kind in layers}
-    kept = {_LOOKS: json.dumps(looks)}
+    name = next((mark_of(keywords).get("name") for _, keywords, _ in layers), None)
+    kept = {_LOOKS: json.dumps(looks), **({_NAME: name} if name else {})}
     if isinstance(content, xr.Dataset):
         return content.assign_attrs(kept)
     told = {**result.attributes, **kept}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,10 +10,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from napari_shadowinv._napari.frame import Frame, frame_for
-from napari_shadowinv._napari.layer_metadata import Result, mark, role_of
+from napari_shadowinv._napari.layer_metadata import (
+    KEY,
+    Result,
+    belongs_to_result,
+    mark,
+    mark_of,
+    role_of,
+    slot_of,
+)
 from napari_shadowinv._napari.sites import Cells, power_cells, site_features
-from napari_shadowinv._napari.viewer_sync import keep_in_step
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._napari.viewer_sync import keep_in_step, show_scale_bar
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.inversion.labels import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
 from napari_shadowinv.physics.units import ShownField, shown_fields, shown_potential
@@ -51,6 +59,7 @@ class Kind:
     colormap: str = ""
     type: str = "image"
     visible: bool = False
+    main: bool = False  # shown by default; all others by *More layers*
     shown_of: Literal["shot", "stack", "both"] = "both"
 
 
@@ -58,25 +67,55 @@ KINDS = (
     Kind("image", "image", "image", "flux/px²", "gray"),
     Kind("source", "source", "source", "flux/px²", "gray", shown_of="shot"),
     Kind("reprojection", "reprojection", "re-projection", "flux/px²", "gray"),
-    Kind("residual", "residual", "residual (% of mean)", "%", "RdBu_r", shown_of="shot"),
-    Kind("residual", "residual", "residual", "flux/px²", "RdBu_r", shown_of="stack"),
+    Kind("residual", "residual", "residual (% of mean)", "%", "RdBu_r", main=True, shown_of="shot"),
+    Kind("residual", "residual", "residual", "flux/px²", "RdBu_r", main=True, shown_of="stack"),
     Kind("potential", "potential", "potential ({unit})", colormap="viridis"),
     Kind("field y", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
     Kind("field x", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
-    Kind("field", "displacement", "{symbol} ({unit})", colormap="inferno", visible=True),
+    Kind("field", "displacement", "{symbol} ({unit})", colormap="inferno", visible=True, main=True),
     Kind(
         "uncertainty",
         "displacement_uncertainty",
         "σ of {symbol} ({unit})",
         colormap="magma",
+        main=True,
         shown_of="shot",
     ),
-    Kind("caustic", "caustic", "caustics", type="labels"),
+    Kind("caustic", "caustic", "caustics", type="labels", main=True),
     Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
-    Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),
+    Kind(
+        "arrows",
+        "displacement",
+        "displacement arrows",
+        "px",
+        type="vectors",
+        visible=True,
+        main=True,
+    ),
     Kind("sites", "sites", "sites{share}", colormap="inferno", type="points", shown_of="shot"),
-    Kind("cells", "sites", "power cells", type="shapes", shown_of="shot"),
+    Kind("cells", "sites", "power cells", type="shapes", main=True, shown_of="shot"),
 )
+_MAIN_ROLES = {kind.role for kind in KINDS if kind.main}
+_MASKED_ROLES = {"reprojection", "residual", "potential", "field y", "field x", "field"}
+_MASKED_ROLES |= {"uncertainty"}
+
+
+def main_layers(
+    described: Sequence[FullLayerData], also: Collection[str] = ()
+) -> list[FullLayerData]:
+    """Select the layers shown by default, and those whose role and part are in `also`."""
+    return [
+        layer
+        for layer in described
+        if role_of(layer[1]) in _MAIN_ROLES
+        or mark_of(layer[1]).get("main", not belongs_to_result(layer[1]))
+        or slot_of(layer[1]) in also
+    ]
+
+
+def layer_name(title: str, name: str) -> str:
+    """Name a layer by its quantity and then its result: long names are cut in the middle."""
+    return f"{title} – {name}" if name else title
 
 
 def inversion_layers(
@@ -100,11 +139,13 @@ def add_inversion(
     setup: Setup | None = None,
     *,
     name: str = "",
+    all_layers: bool = False,
     **keywords: Any,
 ) -> list[Any]:
     """Add the layers of a result to a viewer, with a scale bar.
 
-    The strength of the field and the arrows are visible, all others are there to be switched on.
+    The strength of the field and the arrows are visible; residual, caustics and the uncertainty
+    are hidden.
 
     Parameters
     ----------
@@ -114,7 +155,10 @@ def add_inversion(
     setup : Setup, optional
         Gives pixel size and SI units; default: that of the inversion's provenance, if any.
     name : str
-        Name of the shot; the layers' names begin with it.
+        Name of the shot; the layers' names end with it.
+    all_layers : bool
+        Add all of the result, hidden: also image, source, re-projection, potential, components,
+        field arrows and sites.
     **keywords
         ``scale``, ``translate``, ``units`` (in axis order y, x): place of the image in the world,
         where it is not the setup's, such as those of the layer that it was cropped from.
@@ -138,9 +182,10 @@ def add_inversion(
     >>> viewer = ViewerModel()
     >>> layers = add_inversion(viewer, invert(np.ones((20, 20))), name="blank")
     >>> [layer.name for layer in layers if layer.visible]
-    ['blank |d| (px)', 'blank displacement arrows']
+    ['|d| (px) – blank', 'displacement arrows – blank']
     """
-    return add_layers(viewer, inversion_layers(inversion, setup, name=name, **keywords))
+    described = inversion_layers(inversion, setup, name=name, **keywords)
+    return add_layers(viewer, described if all_layers else main_layers(described))
 
 
 def add_layers(
@@ -157,8 +202,7 @@ def add_layers(
         if role_of(layer) in ("field", "fluence"):
             # The status line then tells the value below the mouse.
             viewer.layers.selection.active = layer
-    overlays = getattr(getattr(viewer, "canvas", None), "overlays", viewer)  # napari before 0.9
-    overlays.scale_bar.visible = True
+    show_scale_bar(viewer)
     keep_in_step(viewer)
     return added
 
@@ -172,7 +216,7 @@ def result_layers(
     from napari_shadowinv.inversion import Inversion
 
     content = result.content
-    facts = {"result": result, "made_from": dict(result.attributes)}
+    facts = {"result": result, "made_from": dict(result.attributes), "name": name}
     if isinstance(content, xr.Dataset):
         field = content[[variable for variable in _OF_A_FIELD if variable in content]]
         return dataset_layers(field, result.setup, frame, name, facts)
@@ -181,7 +225,22 @@ def result_layers(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     )
     diagram = power_cells(content) if cells else None
-    return dataset_layers(dataset, result.setup, frame, name, facts, cells=diagram)
+    titled = f"{name} {doubt_of_inversion(content)}".strip()
+    described = dataset_layers(dataset, result.setup, frame, titled, facts, cells=diagram)
+    for _, keywords, _ in described:
+        if role_of(keywords) == "image":
+            # With its beam and mask it can be inverted again.
+            usable = None if content.mask.all() else content.mask
+            keywords["metadata"][KEY] |= {"source": content.source, "usable": usable}
+    return described
+
+
+def doubt_of_inversion(inversion: Inversion) -> str:
+    """Return the mark in the names of layers that must not be trusted blindly, or nothing."""
+    from napari_shadowinv.inversion import Level
+
+    level = inversion.headline.level
+    return "" if level is Level.SOUND else f"({level.value})"
 
 
 def dataset_layers(
@@ -201,9 +260,11 @@ def dataset_layers(
         if not shown.has(kind):
             continue
         data, words, look = _CONTENTS[kind.type](shown, kind)
+        if kind.role in _MASKED_ROLES and shown.masked is not None:
+            data = _where(shown.masked, np.nan, data)
         unit = words.get("unit", kind.unit)
         keywords = {
-            "name": f"{name} {kind.title.format(**words)}".strip(),
+            "name": layer_name(kind.title.format(**words), name),
             "metadata": mark(kind.role, unit, setup, **facts),
             "visible": kind.visible,
             **frame.keywords(stacked=shot is not None),
@@ -244,6 +305,22 @@ class _Shown:
         values = self.dataset[variable]
         one = values if self.shot is None else values.isel(shot=self.shot)
         return np.asarray(one, dtype=np.float64)
+
+    @cached_property
+    def masked(self) -> Any | None:
+        """Pixels without data: of the shot, or of all shots, lazily; None if there are none."""
+        mask = self.dataset.get("mask")
+        if mask is None or (self.shot is not None and "shot" not in mask.dims and mask.all()):
+            return None
+        return None if self.shot is None and bool(mask.all()) else ~mask.data.astype(bool)
+
+    @cached_property
+    def used(self) -> BoolArray:
+        """Pixels with data, in one shot."""
+        if self.masked is None:
+            return np.ones(self.dataset["displacement"].shape[-2:], dtype=np.bool_)
+        plane = self.masked[self.shot] if self.masked.ndim == 3 else self.masked
+        return ~np.asarray(plane)
 
     @cached_property
     def field(self) -> ShownField:
@@ -306,7 +383,7 @@ def _image(shown: _Shown, kind: Kind) -> Content:
         # Whatever the unit, a field is as long as its displacement, but for a factor.
         data = shown.per_pixel * np.hypot(*shown.plane(kind.variable))
         words = {"unit": shown.field.unit, "symbol": shown.field.symbol}
-        limits = 0.0, float(np.percentile(_sample(data), _BRIGHTEST))
+        limits = 0.0, float(np.percentile(data[shown.used], _BRIGHTEST))
     elif kind.variable == "displacement":
         data, limits, words = _field(shown, kind.role)
     elif kind.role == "potential":
@@ -317,7 +394,8 @@ def _image(shown: _Shown, kind: Kind) -> Content:
         else:
             own = shown.relative_to_shot(lambda one: float(one.potential(np.ones(1))[0]))
             data = data * (own * _ratio(values, plane))
-        limits, words = (float(values.min()), float(values.max())), {"unit": unit}
+        used = values[shown.used]
+        limits, words = (float(used.min()), float(used.max())), {"unit": unit}
     elif kind.role == "residual":
         if kind.unit == "%":
             used = shown.plane("image")[shown.dataset["mask"].values]
@@ -332,16 +410,29 @@ def _image(shown: _Shown, kind: Kind) -> Content:
 def _field(shown: _Shown, role: str) -> tuple[Any, Limits, dict[str, str]]:
     """Strength or a component of the field, its limits, its unit and symbol."""
     field = shown.field
-    strongest = float(shown.magnitude.max())
+    strongest = float(shown.magnitude[shown.used].max())
     if role == "field":
         # On lazy arrays, numpy's functions are dask's.
         data = shown.magnitude if shown.shot is None else np.hypot(*shown.vectors)
         return data, (0.0, strongest), {"unit": field.unit, "symbol": field.symbol}
     axis = "yx".index(role[-1])
     # In another shot of a stack the field may lie along the other axis.
-    limit = strongest if shown.shot is not None else float(np.abs(field.vectors).max())
+    limit = strongest if shown.shot is not None else _largest(field.vectors, shown.used)
     words = {"unit": field.unit, "symbol": field.components[axis]}
     return shown.vectors[axis], (-limit, limit), words
+
+
+def _largest(vectors: FloatArray, used: BoolArray) -> float:
+    return float(np.abs(vectors[:, used]).max())
+
+
+def _where(condition: Any, value: float, data: Any) -> Any:
+    """Do as `numpy.where`, lazily where either array is lazy."""
+    if isinstance(condition, np.ndarray) and isinstance(data, np.ndarray):
+        return np.where(condition, value, data)
+    from dask import array
+
+    return array.where(condition, value, data)
 
 
 def _caustics(shown: _Shown, kind: Kind) -> Content:
@@ -357,7 +448,8 @@ def _caustics(shown: _Shown, kind: Kind) -> Content:
 def _arrows(shown: _Shown, kind: Kind) -> Content:
     """Vectors of few enough rays that each arrow can be seen."""
     is_field = kind.role == "field arrows"
-    data, spacing = thinned_arrows(shown.field.vectors if is_field else shown.plane("displacement"))
+    vectors = shown.field.vectors if is_field else shown.plane("displacement")
+    data, spacing = thinned_arrows(np.where(shown.used, vectors, 0.0))
     lengths = np.hypot(*data[:, 1].T)
     # Most arrows keep to their own place; the strongest reach to the next but one at most.
     usual = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
@@ -454,7 +546,7 @@ def intensity_limits(image: AnyArray) -> Limits:
 
 def symmetric_limits(residual: AnyArray) -> Limits:
     """Return limits around 0 that a handful of pixels at a caustic cannot blow up."""
-    limit = float(np.percentile(np.abs(_sample(residual)), _BRIGHTEST))
+    limit = float(np.nanpercentile(np.abs(_sample(residual)), _BRIGHTEST))
     return _opened((-limit, limit))
 
 

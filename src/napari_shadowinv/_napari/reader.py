@@ -57,9 +57,10 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
     if not isinstance(path, str):
         return list(stack_layers([Path(item) for item in path]))
     if path.rstrip("/").endswith(STORE.suffix):
+        from napari_shadowinv._napari.layers import main_layers
         from napari_shadowinv._napari.stores import follow_once_added, store_layers
 
-        layers = store_layers(Path(path))
+        layers = main_layers(store_layers(Path(path)))
         follow_once_added(layers)
         return list(layers)
     if "*" in path:
@@ -85,7 +86,7 @@ def _read_file(path: Path) -> list[FullLayerData]:
     from napari_shadowinv._napari.layer_state import doubts_of, layers_of_dataset
     from napari_shadowinv._napari.shots import radiograph_layers
     from napari_shadowinv._napari.stores import viewer_in_window
-    from napari_shadowinv._napari.viewer_sync import keep_in_step
+    from napari_shadowinv._napari.viewer_sync import keep_in_step, select_once_added
     from napari_shadowinv.inversion.labels import is_pack
     from napari_shadowinv.io import Radiograph, read
 
@@ -95,9 +96,11 @@ def _read_file(path: Path) -> list[FullLayerData]:
             show_caution(f"{path.name}: {text}")
         return radiograph_layers(content)
     layers = layers_of_dataset(content, path.stem)
-    viewer = viewer_in_window() if is_pack(content.attrs) else None
+    viewer = viewer_in_window()
     if viewer is not None:
         keep_in_step(viewer)
+        if not is_pack(content.attrs):
+            select_once_added(viewer, layers)
     result = result_of(layers[0][1])
     for text in () if result is None else doubts_of(result):
         show_caution(f"{path.name}: {text}")

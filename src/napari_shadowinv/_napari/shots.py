@@ -106,6 +106,8 @@ def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> io.Radiog
     known = mark_of(layer)
     path = known.get("path") or layer.source.path
     shot = io.Radiograph(image, warnings=tuple(known.get("warnings", ())))
+    if known.get("result") is not None:
+        return shot  # after the steps of its recipe it is no file's image any more
     paths = known.get("paths", ())
     if plane is not None and len(paths) == len(layer.data):
         return replace(shot, path=Path(paths[plane]))

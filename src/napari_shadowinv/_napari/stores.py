@@ -13,7 +13,7 @@ from napari_shadowinv._napari.frame import frame_for
 from napari_shadowinv._napari.layer_metadata import mark_of, role_of
 from napari_shadowinv._napari.layers import FullLayerData, at_shot, dataset_layers, thinned_arrows
 from napari_shadowinv._system.safety import refusing_damage
-from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.formats import RESULT
 from napari_shadowinv.io.store import with_own_setups
@@ -33,7 +33,7 @@ def store_layers(path: Path, name: str = "", first: int | None = None) -> list[F
     first = _first_done(dataset, path) if first is None else first
     setup = setup_from_dataset(dataset.isel(shot=first))
     frame = frame_for(dataset["displacement"].shape, setup)
-    facts = {"store": str(path), "shots": _shot_names(dataset)}
+    facts = {"store": str(path), "name": name, "shots": _shot_names(dataset)}
     return dataset_layers(dataset, setup, frame, name, facts, first)
 
 
@@ -67,6 +67,31 @@ def _opened(path: Path) -> xarray.Dataset:
             "displacement): open it with napari's own reader"
         )
     return with_own_setups(dataset).transpose("shot", "component", "y", "x", ...)
+
+
+@refusing_damage
+def shot_of_store(path: Path, index: int) -> xarray.Dataset:
+    """Read one shot of a store as the dataset of its own result.
+
+    Raises
+    ------
+    InputError
+        If the shot is not done.
+    """
+    from napari_shadowinv.io.store import DONE, STATUS_NAMES, StackStore, read_stack
+
+    store = StackStore(path)
+    status = store.statuses()[index]
+    if status != DONE:
+        raise InputError(
+            f"shot {index} ('{store.names[index]}') is {STATUS_NAMES[status]}: move the slider to "
+            "a finished shot"
+        )
+    shot = read_stack(path).isel(shot=index)
+    labels = {name: str(shot[name].values) for name in ("name", "report") if name in shot}
+    planes = [str(name) for name in shot.data_vars if "y" in shot[name].dims]
+    saved: xarray.Dataset = shot[planes].drop_vars("shot", errors="ignore").compute()
+    return saved.assign_attrs(shot=labels.get("name", str(index)))
 
 
 def _first_done(dataset: xarray.Dataset, path: Path) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,31 @@ def keep_in_step(viewer: Any) -> None:
         _follow_top_image(viewer, events)
         _place_newcomers(viewer, events)
         _tell_films(viewer, events)
+
+
+def show_scale_bar(viewer: Any) -> None:
+    """Switch on the scale bar."""
+    overlays = getattr(getattr(viewer, "canvas", None), "overlays", viewer)  # napari before 0.9
+    overlays.scale_bar.visible = True
+
+
+def select_once_added(viewer: Any, described: Sequence[Any]) -> None:
+    """Select the field of a result, with a scale bar, once napari has added its last layer."""
+    results = [mark_of(keywords).get("result") for _, keywords, _ in described]
+
+    def select(event: Any) -> None:
+        layers = [layer for layer in viewer.layers if mark_of(layer).get("result") is results[0]]
+        if len(layers) < len(described):
+            return
+        viewer.layers.events.inserted.disconnect(select)
+        show_scale_bar(viewer)
+        fields = [layer for layer in layers if role_of(layer) == "field"]
+        shown = [layer for layer in fields if layer.visible] or fields
+        if shown:
+            viewer.layers.selection.active = shown[-1]
+
+    if results and results[0] is not None:
+        viewer.layers.events.inserted.connect(select)
 
 
 def _follow_top_image(viewer: Any, events: Any) -> None:

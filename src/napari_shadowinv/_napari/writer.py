@@ -14,6 +14,8 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.formats import PRADFORMAT, RESULT, SITES, Format
 
 if TYPE_CHECKING:
+    import xarray
+
     from napari_shadowinv._napari.layer_metadata import Result
     from napari_shadowinv._napari.layers import FullLayerData
 
@@ -34,21 +36,27 @@ def write_sites(path: str, layers: Sequence[FullLayerData]) -> list[str]:
 
 
 def _write(path: str, layers: Sequence[FullLayerData], form: Format) -> list[str]:
-    from napari_shadowinv._napari.layer_state import dataset_of_layers
     from napari_shadowinv.io import write
 
     try:
-        own, result = _one_result(layers)
-        _warn_of_changes(own, result)
         target = Path(path)
         is_named = target.suffix.lower() in form.suffixes
         if not is_named:
             target = target.with_name(target.name + form.suffix)
         # napari's dialog asked about the name that was typed in, not about a longer one.
-        return [str(write(target, dataset_of_layers(own, result), overwrite=is_named))]
+        return [str(write(target, dataset_to_save(layers), overwrite=is_named))]
     except InputError as error:
         # napari takes any ValueError of a writer for "no writer", and swallows what it says.
         raise FileFormatError(str(error)) from error
+
+
+def dataset_to_save(layers: Sequence[FullLayerData]) -> xarray.Dataset:
+    """Make the dataset of the one result that layers show; a warning names changed layers."""
+    from napari_shadowinv._napari.layer_state import dataset_of_layers
+
+    parts, result = _one_result(layers)
+    _warn_of_changes(parts, result)
+    return dataset_of_layers(parts, result)
 
 
 def _one_result(layers: Sequence[FullLayerData]) -> tuple[list[FullLayerData], Result]:
@@ -91,7 +99,9 @@ def _warn_of_changes(layers: Sequence[FullLayerData], result: Result) -> None:
 
 
 def _same(shown: Any, retrieved: Any) -> bool:
-    return shown is retrieved or (retrieved is not None and np.array_equal(shown, retrieved))
+    if shown is retrieved:
+        return True
+    return retrieved is not None and np.array_equal(shown, retrieved, equal_nan=True)
 
 
 def _name(layer: FullLayerData) -> str:

@@ -19,6 +19,7 @@ from napari_shadowinv._napari.fit_layers import (
     verdict_in_words,
 )
 from napari_shadowinv._napari.layer_metadata import Result, result_of
+from napari_shadowinv._napari.layers import main_layers
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
@@ -70,6 +71,7 @@ class FitView(QWidget):
         self._job: FitJob | None = None
         self._result: Result | None = None
         self._others = ResultLayers(viewer, self)
+        self.results: ResultLayers | None = None
         self.curve = ObjectiveCurve()
         self.verdict = wrapping_label()
         self.answers = SteadyComboBox()
@@ -111,7 +113,8 @@ class FitView(QWidget):
         self._job, self._result = job, answer.result
         self._fill_answers(found)
         results = last.next_of((job.layer, job.name))
-        results.show(answer.described)
+        results.show(main_layers(answer.described, also=results.slots))
+        self.results = results
         return results
 
     def follow(self) -> None:

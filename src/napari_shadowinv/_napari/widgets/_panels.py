@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -10,12 +11,14 @@ from napari.utils import progress as activity
 from qtpy import QtWidgets
 from qtpy.QtCore import QSize, Qt
 
+from napari_shadowinv._napari.layers import main_layers
 from napari_shadowinv._napari.notifications import MISTAKES
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, wrapping_label
+from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, section, wrapping_label
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv._system.progress import Progress
+from napari_shadowinv.inversion import Headline, Level
 from napari_shadowinv.physics.units import shown_fields
 
 if TYPE_CHECKING:
@@ -43,6 +46,11 @@ _STAGES = {
 }
 _LOOK_EVERY = 500  # ms
 _SHOW_SECONDS_FROM = 2.0
+_LEVEL_STYLES = {
+    Level.SOUND: "color: #4caf72;",
+    Level.DOUBTFUL: PROBLEM_STYLE,
+    Level.FAILED: "color: #e05252;",
+}
 _SETTLE = 10  # ms; a few changes at once are one
 
 
@@ -176,20 +184,30 @@ class RunPanel(QtWidgets.QWidget):
 
 
 def report_rows(inversion: Inversion) -> list[tuple[str, str]]:
-    """How an inversion went, in two columns of text; warnings come last."""
+    """Describe an inversion in two columns of text; its warnings stand in the headline."""
+    report = inversion.report
+    return [
+        ("Converged", "yes" if report.converged else "NO"),
+        ("Image residual", image_residual_text(inversion)),
+        *_error_rows(inversion),
+        ("Caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
+    ]
+
+
+def image_residual_text(inversion: Inversion) -> str:
+    return f"{100 * inversion.report.image_residual:.3g} % of the mean, r.m.s."
+
+
+def solver_rows(inversion: Inversion) -> list[tuple[str, str]]:
+    """Describe the solver's work and its time, in two columns of text."""
     report = inversion.report
     stages = [(f"  {stage}", f"{seconds:.2f} s") for stage, seconds in report.seconds.items()]
     return [
-        ("Converged", "yes" if report.converged else "NO"),
-        ("Flux residual", f"{report.residual:.2g} (tolerance {report.tolerance:.2g})"),
-        ("Image residual", f"{100 * report.image_residual:.3g} % of the mean, r.m.s."),
-        ("Iterations", f"{report.iterations} on {len(report.levels)} levels"),
         ("Sites", f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; ")),
-        *_error_rows(inversion),
-        ("Caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
+        ("Flux residual", f"{report.residual:.2g} (tolerance {report.tolerance:.2g})"),
+        ("Iterations", f"{report.iterations} on {len(report.levels)} levels"),
         ("Time", f"{sum(report.seconds.values()):.2f} s"),
         *stages,
-        *[("Warning", text) for text in report.warnings],
     ]
 
 
@@ -246,6 +264,59 @@ class ReportTable(QtWidgets.QTableWidget):
     def _fit(self) -> None:
         self.resizeRowsToContents()
         self.setFixedHeight(self.verticalHeader().length() + 2 * self.frameWidth())
+
+
+class FoldedReport(QtWidgets.QWidget):
+    """A report whose last rows, on the solver and its time, are folded away."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.table, self._details = ReportTable(), ReportTable()
+        self.details = section("Solver and timing", self._details)
+        self.details.toggled.connect(lambda _: self._details.setVisible(True))
+        qt.column(self, self.table, self.details)
+        self.empty()
+
+    def show_rows(
+        self, rows: list[tuple[str, str]], details: list[tuple[str, str]] | None = None
+    ) -> None:
+        self.table.show_rows(rows)
+        self._details.show_rows(details or [])
+        self.details.setVisible(bool(details))
+        self.setVisible(True)
+
+    def empty(self) -> None:
+        self.table.empty()
+        self._details.empty()
+        self.setVisible(False)
+
+    def texts(self) -> dict[str, str]:
+        return self.table.texts() | self._details.texts()
+
+
+class VerdictLine(QtWidgets.QLabel):
+    """A coloured line under Run with the level of trust, the warnings, and the peak."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setWordWrap(True)
+        self.setSizePolicy(
+            QtWidgets.QSizePolicy.Policy.Ignored, QtWidgets.QSizePolicy.Policy.Minimum
+        )
+        self.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.empty()
+
+    def show_headline(self, headline: Headline, before: str = "") -> None:
+        """Show a headline; `before` says whose it is, such as a preview's."""
+        level = headline.level.value.capitalize()
+        text = html.escape(headline.text)
+        self.setText(f"<b>{html.escape(before)}{level}</b><br>{text[:1].upper()}{text[1:]}")
+        self.setStyleSheet(_LEVEL_STYLES[headline.level])
+        self.setVisible(True)
+
+    def empty(self) -> None:
+        self.clear()
+        self.setVisible(False)
 
 
 class ToolPanel(qt.Docked):
@@ -375,7 +446,7 @@ class LivePanel(ToolPanel):
             return
         self.previewed.hide()
         self.results = self._last.next_of(shot)
-        self.results.show(described)
+        self.results.show(main_layers(described, also=self.results.slots))
 
     def on_change(self) -> None:
         """Something that the result depends on has changed."""

@@ -101,6 +101,18 @@ class ResultLayers(QObject):
         else:
             self.complete.emit()
 
+    def extend(self, described: Sequence[FullLayerData]) -> None:
+        """Add layers of the same result below the others, without a change of the selection."""
+        self._select, self._before = False, self._viewer.layers.selection.active
+        self._order = [slot_of(keywords) for _, keywords, _ in described] + self._order
+        self._waiting += described
+        self._timer.start()
+
+    @property
+    def slots(self) -> set[str]:
+        """Roles and parts of the layers that are still in the viewer."""
+        return {slot for slot, layer in self._layers.items() if layer in self._viewer.layers}
+
     def take_over(self, earlier: ResultLayers) -> None:
         """Show the next result in the layers of another one, which shows nothing any more."""
         earlier._timer.stop()

@@ -29,6 +29,13 @@ from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import beside, while_alive
 from napari_shadowinv._napari.widgets._recipes import FitRecipeButton
 from napari_shadowinv._napari.widgets._results import LastResults, result_frame
+from napari_shadowinv._napari.widgets._saving import (
+    MoreLayersButton,
+    SaveButton,
+    field_of,
+    result_to_save,
+    shown_result,
+)
 from napari_shadowinv._napari.widgets._steps import StepsSection
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
@@ -103,6 +110,13 @@ class FitImages(ToolPanel):
         self.recipes = FitRecipeButton(self)
         self.cost = forms.wrapping_label()
         self.view = FitView(self.viewer, self.panel)
+        self.save_result = SaveButton(
+            self,
+            lambda: result_to_save(self.viewer, shown_result(self.viewer, self._fields_shown())),
+            "Write the selected or last fit: all of it with its layers (.shadowinv), or its field "
+            "for other programs (.h5).",
+        )
+        self.more_layers = MoreLayersButton(self, lambda: self.view.results)
         self.add(
             self.images,
             forms.labelled("Fields", self.fields),
@@ -117,6 +131,7 @@ class FitImages(ToolPanel):
             self.cost,
             self.panel,
             self.view,
+            beside((self.save_result, 1), (self.more_layers, 1)),
         )
 
     def _connect(self) -> None:
@@ -280,6 +295,9 @@ class FitImages(ToolPanel):
         self.results = self.view.show_result(request, value, self._last)
         self.reveal(self.view.verdict)
         self._tell_cost()
+
+    def _fields_shown(self) -> list[Any]:
+        return [] if self.view.results is None else field_of(self.view.results.layers)
 
     def _tell_cost(self) -> None:
         """Say how long it will take."""

@@ -19,7 +19,8 @@ from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import beside, error_text
-from napari_shadowinv._napari.widgets._results import LastResults
+from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
+from napari_shadowinv._napari.widgets._saving import IMAGE_FORMATS, Savable, SaveButton
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import SETUPS, Deflector
@@ -132,6 +133,12 @@ class ForwardModel(ToolPanel):
         tip = "Image layer of the undisturbed beam."
         self.source = LayerPicker(viewer, ("image",), tip, "uniform", about.may_be_source)
         self.warning = forms.wrapping_label(style=forms.PROBLEM_STYLE)
+        self.save_result = SaveButton(
+            self,
+            self._image_to_save,
+            "Write the predicted image, with the size of its pixels (.tif, .npy or .png).",
+        )
+        self.results: ResultLayers | None = None
         self._potential_rows = (
             forms.labelled("Layer", self.potential),
             self.expected,
@@ -142,7 +149,7 @@ class ForwardModel(ToolPanel):
         self._size_row = forms.labelled("Size", size)
         self.add(self.object, *self._potential_rows, self._size_row, self.setup)
         self.add(forms.labelled("Source", self.source), self._last.keep_earlier)
-        self.add(self.panel, self.warning)
+        self.add(self.panel, self.warning, self.save_result)
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
         self.object.changed.connect(self._on_change)
         self.potential.picked.connect(self._follow_potential)
@@ -183,9 +190,10 @@ class ForwardModel(ToolPanel):
                 deflector=self.deflector.currentData(),
                 source=source,
             )
-            # The unit in the name of a field is not that of the image.
-            name = layer.name.removesuffix(f" ({about.unit_of(layer)})")
-            return _Request(job, f"{name} image", frame_of(layer), self.setup.origin, layer)
+            name = str(about.mark_of(layer).get("name") or layer.name)
+            return _Request(
+                job, f"forward image – {name}", frame_of(layer), self.setup.origin, layer
+            )
         recipe: Any = self.object.model()
         shape = (self.height_px.value(), self.width_px.value())
         if source is not None:
@@ -193,7 +201,14 @@ class ForwardModel(ToolPanel):
         job = ForwardJob(recipe, shape=shape, setup=setup, source=source)
         name = type(recipe).title
         frame = frame_for(shape, setup)
-        return _Request(job, f"{name} image", frame, self.setup.origin, name)
+        return _Request(job, f"forward image – {name}", frame, self.setup.origin, name)
+
+    def _image_to_save(self) -> Savable:
+        layers = [] if self.results is None else self.results.layers
+        if not layers:
+            raise InputError("there is no predicted image yet: press Simulate first")
+        (layer,) = layers
+        return Savable(layer.name, np.asarray(layer.data), IMAGE_FORMATS, about.setup_of(layer))
 
     def forget(self) -> None:
         self.warning.setVisible(False)
@@ -270,7 +285,8 @@ class ForwardModel(ToolPanel):
             "contrast_limits": intensity_limits(value.image),
             **frame.keywords(),
         }
-        self._last.next_of(request.of).show([(value.image, keywords, "image")])
+        self.results = self._last.next_of(request.of)
+        self.results.show([(value.image, keywords, "image")])
         self.viewer.reset_view()
         self.warning.setText(value.warning)
         self.warning.setVisible(bool(value.warning))

@@ -10,23 +10,40 @@ from napari.utils.notifications import show_warning
 from napari_shadowinv._napari.fit_course import duration_in_words
 from napari_shadowinv._napari.fit_jobs import FitAnswer, FitJob, name_of_result, refinement
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, role_of
+from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, result_of, role_of
 from napari_shadowinv._napari.shots import loaded, radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._fitting import FitView, Refining
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
-from napari_shadowinv._napari.widgets._panels import LivePanel, ReportTable, RunPanel, report_rows
-from napari_shadowinv._napari.widgets._qt import notify_errors
+from napari_shadowinv._napari.widgets._panels import (
+    FoldedReport,
+    LivePanel,
+    RunPanel,
+    VerdictLine,
+    image_residual_text,
+    report_rows,
+    solver_rows,
+)
+from napari_shadowinv._napari.widgets._qt import beside, notify_errors, while_alive
 from napari_shadowinv._napari.widgets._results import (
     Origins,
     ResultLayers,
     place_together,
     result_frame,
 )
+from napari_shadowinv._napari.widgets._saving import (
+    MoreLayersButton,
+    SaveButton,
+    field_of,
+    result_to_save,
+    shown_result,
+)
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting import Fit
+from napari_shadowinv.inversion import Inversion, Level
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.pipeline._run import PREVIEW_SITES, run
@@ -35,9 +52,8 @@ from napari_shadowinv.preprocessing import Radiograph, Recipe
 if TYPE_CHECKING:
     import napari
     from napari_shadowinv._napari.layers import FullLayerData
-    from napari_shadowinv.inversion import Inversion
 
-_PREVIEW_ROLES = ("potential", "field", "caustic")
+_PREVIEW_ROLES = ("field", "caustic")
 # Measured on two cores, images of 0.25 to 4 Mpx with 5,000 to 1,000,000 sites; a window's layers
 # of the result are counted with the pixels.
 _SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
@@ -149,6 +165,7 @@ class InvertShot(InversionInputs, LivePanel):
         self._connect()
         self.restore_last()
         self._on_image()
+        self._follow_result()
         self._ready = True
 
     def _build(self) -> None:
@@ -170,10 +187,20 @@ class InvertShot(InversionInputs, LivePanel):
         self.refining = Refining(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
         self._refined = ResultLayers(self.viewer, self)
-        self.report = ReportTable()
+        self.verdict, self.report = VerdictLine(), FoldedReport()
+        self._told: Result | None = None
+        save = SaveButton(
+            self,
+            lambda: result_to_save(self.viewer, shown_result(self.viewer, self._result_layers())),
+            "Write the selected or last result: all of it with its layers (.shadowinv), for "
+            "other programs (.h5), or its sites (.csv).",
+        )
+        self.save_result = save
+        self.more_layers = MoreLayersButton(self, self._last_results)
         crop = forms.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
         self.add(forms.labelled("Image", self.image), *self.beam, forms.labelled("Crop", crop))
-        self.add(*self.how, self.live, self.keep_earlier, self.cost, self.panel, self.report)
+        self.add(*self.how, self.live, self.keep_earlier, self.cost, self.panel)
+        self.add(self.verdict, beside((save, 1), (self.more_layers, 1)), self.report)
         self.add(self.refining, self.fit_view)
 
     def _connect(self) -> None:
@@ -184,7 +211,8 @@ class InvertShot(InversionInputs, LivePanel):
         layers.LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
         # Also for a run that is cancelled, or refused before it starts.
         for signal in (self.panel.button.clicked, self.panel.runner.started):
-            signal.connect(lambda: self.report.empty())
+            signal.connect(self._empty_report)
+        while_alive(self, self.viewer.layers.selection.events.active, self._follow_result)
         changes = [one.changed for one in self.inputs]
         for signal in (*changes, self.crop.picked, edits.edited):
             signal.connect(self.on_change)
@@ -231,7 +259,7 @@ class InvertShot(InversionInputs, LivePanel):
         """Refine the inversion that a layer shows a part of, such as one of a file."""
         self.refining.folded.expand()
         image = self._last.shot_of(layer)
-        name = name_of_result(self.viewer.layers, layer) if image is None else str(image.name)
+        name = name_of_result(layer) if image is None else str(image.name)
         job = refinement(layer, layer if image is None else image, name, self.refining.psf.value())
         if self.panel.runner.running and not self._running_preview:
             raise InputError(
@@ -253,7 +281,39 @@ class InvertShot(InversionInputs, LivePanel):
             assert isinstance(value, _Answer)
             self._show_inversion(value, request)
 
+    def _empty_report(self) -> None:
+        self._told = None
+        self.verdict.empty()
+        self.report.empty()
+
+    def _last_results(self) -> ResultLayers | None:
+        """The layers that show the last result, of a refinement or of an inversion."""
+        return self._refined if self._refined.layers else getattr(self, "results", None)
+
+    def _result_layers(self) -> list[Any]:
+        results = self._last_results()
+        return [] if results is None else field_of(results.layers)
+
+    def _follow_result(self, event: Any = None) -> None:
+        """Report on the inversion whose layer is selected, such as one from a file."""
+        layer = self.viewer.layers.selection.active
+        result = None if layer is None else result_of(layer)
+        if result is None or result is self._told or self.panel.runner.running:
+            return
+        if isinstance(result.content, Fit):
+            self._empty_report()
+            self.fit_view.follow()
+        elif isinstance(result.content, Inversion):
+            self.fit_view.empty()
+            self._report(result.content, [])
+            self._told = result
+
+    def _report(self, inversion: Inversion, given: list[tuple[str, str]]) -> None:
+        self.verdict.show_headline(inversion.headline)
+        self.report.show_rows([*given, *report_rows(inversion)], solver_rows(inversion))
+
     def _show_inversion(self, value: _Answer, request: _Request) -> None:
+        headline = value.inversion.headline
         image = request.image
         if image not in self.viewer.layers and not request.preview:
             show_warning(
@@ -263,10 +323,14 @@ class InvertShot(InversionInputs, LivePanel):
             place_together(self.viewer, image, request.recipe.setup, request.companions)
         if request.preview:
             self.show_layers(image, value.described, preview=True)
-            if not value.inversion.report.converged:
-                self.panel.say(f"Preview {value.inversion.report.warnings[0]}", problem=True)
+            self.verdict.show_headline(headline, "Preview: ")
+            self.panel.say(f"Image residual {image_residual_text(value.inversion)}")
             return
-        self.report.show_rows([*request.origins.rows(), *report_rows(value.inversion)])
+        self._report(value.inversion, request.origins.rows())
+        self._told = result_of(value.described[0][1])
+        if headline.level is not Level.SOUND:
+            show_warning(f"{headline.level.value.capitalize()}: {headline.text}")
+        self.reveal(self.verdict)
         self._learn_pace(value.inversion)
         # They refine an earlier result, and lie above the new one.
         self._refined.hide()
@@ -309,8 +373,8 @@ class InvertShot(InversionInputs, LivePanel):
         self.on_change()
 
     def _forget_report(self) -> None:
-        """What was said of one image does not hold for another."""
-        self.report.empty()
+        """Take away the report: that of one image does not hold for another."""
+        self._empty_report()
         self.fit_view.empty()
         if not self.panel.runner.running:
             self.panel.say("")

@@ -18,9 +18,16 @@ from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelle
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
-from napari_shadowinv._napari.widgets._qt import notify_errors, timer
+from napari_shadowinv._napari.widgets._qt import beside, notify_errors, timer
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._runner import Outcome
+from napari_shadowinv._napari.widgets._saving import (
+    MoreLayersButton,
+    SaveButton,
+    field_of,
+    shot_to_save,
+    shown_result,
+)
 from napari_shadowinv._napari.widgets._shot_table import ShotTable
 from napari_shadowinv._napari.widgets._stacking import StackJob, StackRequest, place_on
 from napari_shadowinv._napari.widgets._watching import (
@@ -257,12 +264,19 @@ class InvertStack(InversionInputs, ToolPanel):
         self.redo_failed.setToolTip("<qt>Retry shots that failed in an earlier run.</qt>")
         self.engine = EnginePicker()
         self.report = ReportTable()
+        self.save_result = SaveButton(
+            self,
+            lambda: shot_to_save(self.viewer, shown_result(self.viewer, self._fields_shown())),
+            "Write the shot in view to a file of its own. The store holds all shots already.",
+        )
+        self.more_layers = MoreLayersButton(self, lambda: self.results)
         self.failures_title = QLabel("Failed shots")
         self.failures_title.setVisible(False)
         self.failures = FailureTable()
         self.add(self.shots, *self.beam, *self.how, labelled("Store", self.store))
         self.add(labelled("", self.overwrite), labelled("", self.redo_failed), self.engine)
-        self.add(self.panel, self.report, self.failures_title, self.failures)
+        self.add(self.panel, beside((self.save_result, 1), (self.more_layers, 1)))
+        self.add(self.report, self.failures_title, self.failures)
 
     def _connect(self) -> None:
         self.shots.changed.connect(self._on_layer)
@@ -300,6 +314,9 @@ class InvertStack(InversionInputs, ToolPanel):
             {} if layer is None else place_on(layer, recipe),
             self.origins(layer, self.shots.name),
         )
+
+    def _fields_shown(self) -> list[Any]:
+        return field_of(self.results.layers)
 
     def _watch(self, recipe: Recipe, mask: BoolArray | None) -> WatchRequest:
         job = WatchJob(

@@ -1,0 +1,188 @@
+"""Buttons below Run: `SaveButton` writes a result, `MoreLayersButton` shows all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from napari.utils.notifications import show_info
+from qtpy.QtWidgets import QFileDialog, QMessageBox, QPushButton
+
+from napari_shadowinv._napari.layer_metadata import mark_of, result_of, role_of
+from napari_shadowinv._napari.layer_state import missing_layers
+from napari_shadowinv._napari.stores import shot_of_store
+from napari_shadowinv._napari.viewer_sync import plane_in_view
+from napari_shadowinv._napari.widgets._qt import notify_errors
+from napari_shadowinv._napari.widgets._results import ResultLayers
+from napari_shadowinv._napari.writer import dataset_to_save
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.io import write
+from napari_shadowinv.io.formats import NPY, PNG, PRADFORMAT, RESULT, SITES, TIFF, Format
+
+if TYPE_CHECKING:
+    from napari_shadowinv._napari.widgets._panels import ToolPanel
+    from napari_shadowinv.physics.setup import Setup
+
+_TITLES = {
+    RESULT: "All of the result",
+    PRADFORMAT: "Potential and deflection, pradformat",
+    SITES: "Table of the sites",
+    TIFF: "Image, float32 TIFF",
+    NPY: "Image, NumPy array",
+    PNG: "Image, 16-bit PNG",
+}
+RESULT_FORMATS, IMAGE_FORMATS = (RESULT, PRADFORMAT, SITES), (TIFF, NPY, PNG)
+
+
+@dataclass(frozen=True, eq=False)
+class Savable:
+    """Content to write, its name, and the formats to choose from, the usual one first."""
+
+    name: str
+    content: Any
+    formats: tuple[Format, ...]
+    setup: Setup | None = None  # of an image
+
+
+def shown_result(viewer: Any, preferred: Iterable[Any] = ()) -> Any:
+    """Return a layer of the result that is meant, or an `InputError` if there is none.
+
+    That is the selected one, else one of the preferred layers, else the uppermost visible one.
+    """
+    visible = [layer for layer in reversed(viewer.layers) if layer.visible]
+    for layer in (viewer.layers.selection.active, *preferred, *visible):
+        marks = {} if layer is None else mark_of(layer)
+        if marks.get("result") is not None or marks.get("store") is not None:
+            return layer
+    raise InputError("there is no result yet: press Run first, or select a layer of a result")
+
+
+def result_to_save(viewer: Any, layer: Any) -> Savable:
+    """Collect the result that a layer shows a part of, with the look of all of its layers."""
+    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.inversion import Inversion
+
+    result = result_of(layer)
+    if result is None:
+        raise InputError(f"'{layer.name}' shows no result: select a layer of one")
+    shown = [one.as_layer_data_tuple() for one in viewer.layers if result_of(one) is result]
+    formats: tuple[Format, ...] = (RESULT,)
+    if isinstance(result.content, Inversion):
+        formats = RESULT_FORMATS if _has_particles(result.setup) else (RESULT, SITES)
+    elif isinstance(result.content, Fit) and _has_particles(result.setup):
+        formats = (RESULT, PRADFORMAT)
+    name = str(mark_of(layer).get("name") or layer.name)
+    return Savable(name, dataset_to_save(shown), formats)
+
+
+def shot_to_save(viewer: Any, layer: Any) -> Savable:
+    """Collect the shot in view of a store that a layer shows."""
+    store = mark_of(layer).get("store")
+    if store is None:
+        return result_to_save(viewer, layer)
+    index = plane_in_view(viewer, layer)
+    shots = mark_of(layer).get("shots", ())
+    name = Path(shots[index]).stem if index < len(shots) else str(index)
+    dataset = shot_of_store(Path(store), index)
+    particles = _has_particles(setup_from_dataset(dataset))
+    formats = (RESULT, PRADFORMAT) if particles else (RESULT,)
+    return Savable(f"{mark_of(layer).get('name', '')} {name}", dataset, formats)
+
+
+def _has_particles(setup: Setup | None) -> bool:
+    return setup is not None and setup.kind == "proton"
+
+
+class SaveButton(QPushButton):
+    """Ask for a file, write what `savable` returns, and say what was written where."""
+
+    def __init__(self, tool: ToolPanel, savable: Callable[[], Savable], tip: str) -> None:
+        super().__init__("Save result…")
+        self._tool, self._savable = tool, savable
+        self.setToolTip(f"<qt>{tip}</qt>")
+        self.clicked.connect(lambda: self.ask_and_save())
+
+    @notify_errors
+    def ask_and_save(self) -> None:
+        """Let the user choose a file; nothing is written if he does not."""
+        content = self._savable()
+        path = self._ask(content)
+        if path is not None and self._may_replace(path):
+            self._write(content, path)
+
+    def _ask(self, content: Savable) -> Path | None:
+        filters = {f"{_TITLES[each]} (*{each.suffix})": each for each in content.formats}
+        # Whether a file may be replaced is asked about the name with its ending.
+        text, chosen = QFileDialog.getSaveFileName(
+            self,
+            "Save result",
+            _file_name(content.name) + content.formats[0].suffix,
+            ";;".join(filters),
+            options=QFileDialog.Option.DontConfirmOverwrite,
+        )
+        if not text:
+            return None
+        path = Path(text).expanduser()
+        suffixes = [suffix for each in content.formats for suffix in each.suffixes]
+        if path.suffix.lower() in suffixes:
+            return path
+        return path.with_name(path.name + filters.get(chosen, content.formats[0]).suffix)
+
+    def _may_replace(self, path: Path) -> bool:
+        if not path.exists():
+            return True
+        buttons = QMessageBox.StandardButton
+        answer = QMessageBox.question(
+            self, "Save result", f"{path.name} exists. Replace it?", buttons.Yes | buttons.No
+        )
+        return bool(answer == buttons.Yes)
+
+    def _write(self, content: Savable, path: Path) -> None:
+        write(path, content.content, setup=content.setup, overwrite=True)
+        kind = next(each for each in content.formats if path.suffix.lower() in each.suffixes)
+        title = _TITLES[kind]
+        text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"
+        self._tool.panel.say(text)
+        show_info(text)
+
+
+class MoreLayersButton(QPushButton):
+    """Add the layers of a result that are not shown by default; `preferred` are the tool's own."""
+
+    def __init__(self, tool: ToolPanel, results: Callable[[], ResultLayers | None]) -> None:
+        super().__init__("More layers")
+        self._tool, self._results = tool, results
+        self._others = ResultLayers(tool.viewer, self)
+        self.setToolTip(
+            "<qt>Add the hidden layers of the result: potential, components of the field, "
+            "re-projection, sites and more.</qt>"
+        )
+        self.clicked.connect(lambda: self.add())
+
+    @notify_errors
+    def add(self) -> None:
+        """Add them, hidden; the next result of the same shot then has them, too."""
+        results = self._results()
+        own = [] if results is None else results.layers
+        layer = shown_result(self._tool.viewer, own)
+        missing = missing_layers(self._tool.viewer, layer)
+        if not missing:
+            show_info("All layers of the result are there")
+        elif results is not None and layer in own:
+            results.extend(missing)
+        else:
+            self._others = ResultLayers(self._tool.viewer, self)
+            self._others.show(missing, select=False)
+
+
+def field_of(layers: Iterable[Any]) -> list[Any]:
+    """Select the layers that show a field's strength."""
+    return [layer for layer in layers if role_of(layer) == "field"]
+
+
+def _file_name(name: str) -> str:
+    stem = "".join(c if c.isalnum() or c in "-_. " else "_" for c in name).strip(" .")
+    return stem.replace(" ", "_") or "result"
