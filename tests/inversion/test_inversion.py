@@ -246,6 +246,18 @@ def test_a_bad_mask_is_one_clear_sentence(mask, says):
         invert(np.ones((20, 20)), mask=mask)
 
 
+def test_caustics_are_not_marked_for_noise():
+    # The map compresses the beam to a quarter of its area and folds nowhere.
+    blob = gaussian_blob((100, 100), 0.82 * 12**2 / (2 * np.exp(-1.5)), 12.0)
+    least = jacobian_determinant(blob.displacement).min()
+    assert 0.2 < least < 0.3
+    counts = 400 * synthetic_image(blob.displacement)
+    noisy = np.random.default_rng(0).poisson(counts)
+    inversion = invert(noisy, source=np.full(noisy.shape, 400.0))
+    assert (jacobian_determinant(inversion.displacement) < 0.2).sum() > 5
+    assert not inversion.caustic.any()
+
+
 def test_caustics_are_marked_where_the_map_folds():
     folding = ellipse_pair((80, 100), strength=4.0)
     inversion = invert(synthetic_image(folding.displacement))

@@ -11,6 +11,7 @@ import typer
 from napari_shadowinv.cli import _flags, _inputs, _outputs
 from napari_shadowinv.cli._terminal import alarm_unless_converged, inverted, notify_errors, say
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import InversionOptions
 
 # Of arguments whose help is longer than a line.
 HELP = {
@@ -282,7 +283,7 @@ def demo(
     dm: Annotated[float, typer.Option(help="Peak path-integrated field in MG·µm.")] = 97.0,
     noise: Annotated[float, typer.Option(help="Noise, as a fraction of the mean.")] = 0.1,
     n_sites: Annotated[
-        int | None, typer.Option(help="Number of sites. Default: one per pixel.")
+        int | None, typer.Option(help=InversionOptions.model_fields["n_sites"].description)
     ] = None,
 ) -> None:
     """Simulate a proton radiograph of a toroidal field, invert it and compare with the truth.

@@ -22,7 +22,7 @@ from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, prepare
 from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.inversion.result import Inversion, Report
-from napari_shadowinv.inversion.trust import doubts, image_residual, is_coarse
+from napari_shadowinv.inversion.trust import doubts, image_residual, is_coarse, mark_caustics
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
@@ -283,7 +283,9 @@ def invert(
         site_displacement=answer.displacement,
         reprojection=reprojection,
         residual=np.where(prepared.mask, prepared.image - reprojection, 0.0),
-        caustic=(fields.jacobian < options.caustic_jacobian) & prepared.mask,
+        caustic=mark_caustics(
+            fields.jacobian, prepared.mask, len(answer.weights), options.caustic_jacobian
+        ),
         mask=prepared.mask,
         report=replace(
             told,

@@ -149,7 +149,7 @@ class Inversion:
     residual : ndarray, shape (H, W)
         ``image - reprojection``.
     caustic : ndarray of bool, shape (H, W)
-        Where the map folds or its Jacobian is below the threshold.
+        Where the map folds or its Jacobian is below the threshold, without specks by noise.
     mask : ndarray of bool, shape (H, W)
         The pixels that were used; image, source, residual and caustic are 0 elsewhere.
     report : Report

@@ -45,6 +45,7 @@ measured on either side of them (200 × 200 px and the reference images):
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -191,6 +192,39 @@ def _nothing_found(noise: ImageNoise, rms: float) -> str:
         f"{usual:.2g} px expected from the image's noise of {noise.typical:.1%} per pixel; "
         "average shots, or bin or smooth the image, before interpreting the field"
     )
+
+
+def mark_caustics(
+    jacobian: FloatArray, mask: BoolArray, n_sites: int, threshold: float
+) -> BoolArray:
+    """Mark the pixels where rays cross or nearly cross.
+
+    Wherever the field compresses the beam, noise takes single pixels below the threshold. A region
+    below it is a caustic if its Jacobian averaged over the spacing of the sites, the resolution of
+    the map, falls below the threshold, too.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (H, W)
+        Jacobian determinant of the map.
+    mask : ndarray of bool, shape (H, W)
+        Pixels that were used; no other is marked.
+    n_sites : int
+        Number of sites.
+    threshold : float
+        Upper limit of the determinant in a caustic, `InversionOptions.caustic_jacobian`.
+
+    Returns
+    -------
+    ndarray of bool, shape (H, W)
+    """
+    spacing_px = max(1.0, math.sqrt(jacobian.size / n_sites))
+    averaged = ndimage.gaussian_filter(jacobian, spacing_px, mode="nearest")
+    below = (jacobian < threshold) & mask
+    regions, _ = ndimage.label(below, structure=np.ones((3, 3)))
+    caustics = np.unique(regions[below & (averaged < threshold)])
+    marked: BoolArray = np.isin(regions, caustics) & below
+    return marked
 
 
 def _deep_folds(jacobian: FloatArray, mask: BoolArray) -> str:

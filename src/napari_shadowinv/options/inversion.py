@@ -181,8 +181,9 @@ class InversionOptions(BaseModel):
         ge=0,
         title="Caustic threshold",
         description=(
-            "Pixels where the Jacobian determinant of the map is below this are marked as "
-            "caustics: rays cross or nearly cross there, and the field is less certain."
+            "Regions where the Jacobian determinant of the map is below this are marked as "
+            "caustics: rays cross or nearly cross there, and the field is less certain. Specks "
+            "that vanish in the average over the spacing of the sites are noise."
         ),
     )
     noise_level: float | None = Field(
