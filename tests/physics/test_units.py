@@ -8,6 +8,7 @@ import pytest
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.physics.units import (
     PREFIXED_UNITS,
+    intensity_limits,
     shown_fields,
     shown_potential,
     with_errors,
@@ -65,3 +66,28 @@ def test_what_deflects_is_shown_by_its_own_path_integral(proton_setup: ProtonSet
     np.testing.assert_allclose(field.vectors, 3)
     (usual,) = shown_fields([displacement], proton_setup, "magnetic field")
     assert usual.symbol == "|∫B×dz|"
+
+
+def test_intensity_limits_show_negative_pixels() -> None:
+    image = np.linspace(-2.0, 8.0, 10_000).reshape(100, 100)
+    low, high = intensity_limits(image)
+    assert low == pytest.approx(-2.0, abs=0.02)
+    assert high == pytest.approx(8.0, abs=0.04)
+
+
+def test_intensity_limits_begin_at_zero_for_dark_images() -> None:
+    assert intensity_limits(np.linspace(1.0, 8.0, 10_000).reshape(100, 100))[0] == 0.0
+    bright = np.linspace(7.0, 8.0, 10_000).reshape(100, 100)
+    assert intensity_limits(bright)[0] == pytest.approx(7.0, abs=0.01)
+
+
+def test_intensity_limits_ignore_a_caustic() -> None:
+    image = np.ones((100, 100))
+    image[40:43] = 50.0
+    assert intensity_limits(image)[1] == pytest.approx(3.5 * image.mean())
+
+
+def test_intensity_limits_differ_for_an_empty_image() -> None:
+    for image in (np.full((4, 4), np.nan), np.zeros((4, 4)), np.full((4, 4), -1.0)):
+        low, high = intensity_limits(image)
+        assert low < high

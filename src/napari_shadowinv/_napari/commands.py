@@ -16,6 +16,7 @@ from napari_shadowinv._napari.shots import loaded, radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.physics.units import intensity_limits
 
 if TYPE_CHECKING:
     import napari.layers
@@ -190,7 +191,7 @@ def _filtered(picked: _Picked, image: FloatArray, title: str) -> results.FullLay
         image,
         f"{picked.name} {title}",
         picked.setup,
-        results.intensity_limits(picked.image),  # the same limits show what a filter did
+        intensity_limits(picked.image),  # the same limits show what a filter did
         picked.role,
         frame=picked.frame,
         setup_origin=picked.setup_origin or None,

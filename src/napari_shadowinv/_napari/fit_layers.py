@@ -14,12 +14,12 @@ from napari_shadowinv._napari.layers import (
     KINDS,
     FullLayerData,
     dataset_layers,
-    intensity_limits,
     layer_name,
     symmetric_limits,
 )
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import FIELDS
+from napari_shadowinv.physics.units import intensity_limits
 
 if TYPE_CHECKING:
     from napari_shadowinv.fitting import Basin, Fit, FittedField

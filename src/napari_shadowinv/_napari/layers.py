@@ -24,7 +24,12 @@ from napari_shadowinv._napari.viewer_sync import keep_in_step, show_scale_bar
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.inversion.labels import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
-from napari_shadowinv.physics.units import ShownField, shown_fields, shown_potential
+from napari_shadowinv.physics.units import (
+    ShownField,
+    intensity_limits,
+    shown_fields,
+    shown_potential,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -45,7 +50,6 @@ _SHORTEST_ARROW = 0.05
 _MOST_SITES_SHOWN = 200_000
 _BRIGHTEST = 99.7  # percentile
 _ENOUGH_PIXELS = 100_000
-_LARGEST_INTENSITY = 3.5
 
 
 @dataclass(frozen=True)
@@ -530,18 +534,6 @@ def _ratio(shown: FloatArray, plane: FloatArray) -> float:
     """Factor between two planes that differ by a factor only."""
     largest = np.unravel_index(np.argmax(np.abs(plane)), plane.shape)
     return float(shown[largest] / plane[largest]) if plane[largest] else 1.0
-
-
-def intensity_limits(image: AnyArray) -> Limits:
-    """Return limits that neither a caustic's few bright pixels nor a faint contrast can spoil."""
-    sample = _sample(image)
-    finite = sample[np.isfinite(sample)]
-    if not finite.size:
-        return 0.0, 1.0
-    dark, bright = (float(value) for value in np.percentile(finite, (0.1, _BRIGHTEST)))
-    mean = float(finite.mean())
-    high = min(bright, _LARGEST_INTENSITY * mean) if mean > 0 else bright
-    return _opened((0.0 if 0 <= dark < 0.3 * high else dark, high))
 
 
 def symmetric_limits(residual: AnyArray) -> Limits:

@@ -9,7 +9,7 @@ import numpy as np
 
 from napari_shadowinv import io
 from napari_shadowinv._napari.layer_metadata import CAME_WITH
-from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
+from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.notifications import notify_errors
 from napari_shadowinv._napari.shots import lazy_stack, radiograph_layers, shot_layer
 from napari_shadowinv._typing import AnyArray, FloatArray
@@ -18,6 +18,7 @@ from napari_shadowinv.io.public_images import fetch_burner
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.setup import setup_from_dict
+from napari_shadowinv.physics.units import intensity_limits
 
 _SHAPE = (200, 200)
 _COUNTS = 400.0  # of a pixel: 5 % of noise

@@ -23,12 +23,13 @@ from napari_shadowinv._napari.layer_metadata import (
     mark_of,
     role_of,
 )
-from napari_shadowinv._napari.layers import FullLayerData, intensity_limits
+from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, sha256
 from napari_shadowinv.io.formats import RADIOGRAPH_SUFFIXES
+from napari_shadowinv.physics.units import intensity_limits
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup

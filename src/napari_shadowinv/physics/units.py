@@ -1,6 +1,7 @@
 """Fields and potentials in units whose numbers are handy to read.
 
 - the field that an experimenter asks for: `shown_fields`; the potential: `shown_potential`
+- the grey limits of an image: `intensity_limits`
 - a number with its errors: `with_errors`
 - the prefix for a number: `prefix_for`; the units that take one: `PREFIXED_UNITS`
 """
@@ -14,17 +15,23 @@ from types import MappingProxyType
 
 import numpy as np
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.physics.setup import SETUPS, Setup
 
 __all__ = [
     "PREFIXED_UNITS",
     "ShownField",
+    "intensity_limits",
     "prefix_for",
     "shown_fields",
     "shown_potential",
     "with_errors",
 ]
+
+_SHOWN_PERCENTILES = 0.1, 99.7
+_MAX_SHOWN_PER_MEAN = 3.5
+_MIN_SHADE = 0.3  # of the brightest intensity; the limits of darker images begin at 0
+_SAMPLED_PIXELS = 100_000
 
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 
@@ -129,3 +136,30 @@ def shown_potential(potential: FloatArray, setup: Setup | None) -> tuple[FloatAr
     metres = setup.potential(potential)
     factor, prefix = prefix_for(float(np.abs(metres).max()))
     return metres * factor, f"{prefix}m"
+
+
+def intensity_limits(image: AnyArray) -> tuple[float, float]:
+    """Return grey limits of an image that a caustic's few bright pixels cannot spoil.
+
+    The lower limit is 0, unless the image has negative pixels or all of it is bright.
+
+    Parameters
+    ----------
+    image : ndarray
+        Intensities in any unit. A large image is sampled.
+
+    Returns
+    -------
+    tuple of float
+        Darkest and brightest intensity to show, the second larger.
+    """
+    step = max(1, int(np.sqrt(image.size / _SAMPLED_PIXELS)))
+    sample = np.asarray(image[::step, ::step])
+    finite = sample[np.isfinite(sample)]
+    if not finite.size:
+        return 0.0, 1.0
+    dark, bright = (float(value) for value in np.percentile(finite, _SHOWN_PERCENTILES))
+    mean = float(finite.mean())
+    high = min(bright, _MAX_SHOWN_PER_MEAN * mean) if mean > 0 else bright
+    low = 0.0 if 0 <= dark < _MIN_SHADE * high else dark
+    return (low, high) if high > low else (low, low + 1.0)

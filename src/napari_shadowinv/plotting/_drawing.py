@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 _CUT_COLOURS = ("#1f9bff", "#18b368")
 _REFERENCE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.4, "alpha": 0.45}
 _CAUSTIC_DENSITY = 0.15  # where a caustic is outlined
-_LARGEST_INTENSITY = 3.5
 
 
 def draw_intensity(
@@ -29,15 +28,6 @@ def draw_intensity(
 ) -> None:
     """Show an image, or what an answer predicts of it, in units of the mean source."""
     panel.show(plane, title, label, "gray", limits)
-
-
-def intensity_limits(image: FloatArray) -> tuple[float, float]:
-    """Limits that neither a caustic's few bright pixels nor a faint contrast can spoil."""
-    dark, bright = (float(p) for p in np.percentile(image, (0.1, 99.7)))
-    if not bright > 0:
-        return 0.0, 1.0
-    high = min(bright, _LARGEST_INTENSITY)
-    return (dark if 0.3 * high < dark < high else 0.0), high
 
 
 def draw_potential(panel: Panel, potential: FloatArray, setup: Setup | None) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing
-from napari_shadowinv.physics.units import ShownField, shown_fields
+from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._drawing import (
     draw_cuts,
@@ -21,7 +21,6 @@ from napari_shadowinv.plotting._drawing import (
     draw_intensity,
     draw_potential,
     draw_side_by_side,
-    intensity_limits,
     outline_caustics,
 )
 from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Panel

@@ -11,7 +11,7 @@ import numpy as np
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting import FIELDS, Fit, FittedField, Verdict
 from napari_shadowinv.physics.forward import jacobian_determinant
-from napari_shadowinv.physics.units import ShownField, shown_fields
+from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._drawing import (
     draw_cuts,
@@ -19,7 +19,6 @@ from napari_shadowinv.plotting._drawing import (
     draw_field,
     draw_intensity,
     draw_potential,
-    intensity_limits,
     outline_caustics,
 )
 from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Grid, Panel

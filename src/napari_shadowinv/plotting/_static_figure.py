@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from napari_shadowinv.fitting import FIELDS, FitWindows, LeaveOneOut, Verdict
-from napari_shadowinv.physics.units import shown_fields
+from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._drawing import (
     draw_differences,
     draw_intensity,
     draw_side_by_side,
-    intensity_limits,
 )
 from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Grid, Panel
 

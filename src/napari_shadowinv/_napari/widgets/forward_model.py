@@ -11,7 +11,6 @@ from qtpy.QtWidgets import QLabel, QSpinBox
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of
-from napari_shadowinv._napari.layers import intensity_limits
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox, parsed
 from napari_shadowinv._napari.widgets._forecast import PHANTOMS, Forecast, ForwardJob
@@ -24,6 +23,7 @@ from napari_shadowinv._napari.widgets._saving import IMAGE_FORMATS, Savable, Sav
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import SETUPS, Deflector
+from napari_shadowinv.physics.units import intensity_limits
 
 if TYPE_CHECKING:
     import napari
