@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.formats import RESULT
-from napari_shadowinv.io.store import with_own_setups
+from napari_shadowinv.io.store_setups import with_own_setups
 
 if TYPE_CHECKING:
     import xarray
@@ -102,8 +103,9 @@ def _first_done(dataset: xarray.Dataset, path: Path) -> int:
     if "status" in dataset and "shot" in dataset["status"].dims:
         shots = np.flatnonzero(dataset["status"].values == DONE)
     for shot in shots:
-        if np.isfinite(displacement[shot].values).all():
-            return int(shot)
+        with suppress(FileFormatError):  # it is damaged
+            if np.isfinite(displacement[shot].values).all():
+                return int(shot)
     raise FileFormatError(f"{path} contains no finished shot yet: wait for the first one")
 
 

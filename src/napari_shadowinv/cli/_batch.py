@@ -29,7 +29,14 @@ from napari_shadowinv.cli._terminal import (
     say_on_stderr,
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.io.store import DONE, FAILED, STATUS_NAMES, StackStore, check_store_path
+from napari_shadowinv.io.store import (
+    DAMAGED,
+    DONE,
+    FAILED,
+    STATUS_NAMES,
+    StackStore,
+    check_store_path,
+)
 
 if TYPE_CHECKING:
     from napari_shadowinv.stack import RunProgress
@@ -186,7 +193,8 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
 def _counts_text(store: StackStore) -> str:
     statuses = store.statuses()
     counts = {name: np.sum(statuses == status) for status, name in enumerate(STATUS_NAMES)}
-    return ", ".join(f"{counts[name]} {name}" for name in ("done", "failed", "pending"))
+    shown = ["done", "failed", "pending", *(["damaged"] if counts["damaged"] else [])]
+    return ", ".join(f"{counts[name]} {name}" for name in shown)
 
 
 def _summary(store: StackStore, ledger: _Ledger) -> Table:
@@ -251,17 +259,22 @@ def _site_rows(store: StackStore) -> Rows:
 
 
 def _trouble_rows(store: StackStore) -> Rows:
-    """Shots that failed, and those that are not to be trusted."""
+    """Shots that failed or are damaged, and those that are not to be trusted."""
     statuses = store.statuses()
-    failed = [int(index) for index in np.flatnonzero(statuses == FAILED)]
-    rows = [
-        ("failed", f"{store.names[i]}: {store.report(i).get('reason', 'its report is missing')}")
-        for i in failed[:_NAMED]
-    ]
-    if len(failed) > _NAMED:
-        rows.append(
-            ("failed", f"and {len(failed) - _NAMED} more: shadowinv status {store.path} --all")
-        )
+    rows = []
+    for status in (FAILED, DAMAGED):
+        label = STATUS_NAMES[status]
+        indices = [int(index) for index in np.flatnonzero(statuses == status)]
+        rows += [
+            (label, f"{store.names[i]}: {store.report(i).get('reason', 'its report is missing')}")
+            for i in indices[:_NAMED]
+        ]
+        if len(indices) > _NAMED:
+            rest = len(indices) - _NAMED
+            rows.append((label, f"and {rest} more: shadowinv status {store.path} --all"))
+    rows += [(STATUS_NAMES[DAMAGED], problem) for problem in store.damage.files[:_NAMED]]
+    if store.damage.shots or store.damage.files:
+        rows.append(("warning", "repeat the run with --resume to repair what is damaged"))
     rough = [
         store.names[index]
         for index, report in enumerate(store.reports())
@@ -304,12 +317,19 @@ _FIT_COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
 
 
 @refusing_damage
-def status_tables(path: Path, every: bool) -> list[Table]:
-    """Tell what a store is, and what became of each shot."""
-    tables = [two_columns(str(path), store_rows(path, trouble=not every))]
+def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[Table], bool]:
+    """Describe a store and what became of each shot, and return whether anything is damaged.
+
+    With `verify`, all files are read and compared with their checksums.
+    """
+    store = StackStore(path, every_byte=verify)
+    rows = store_rows(store, trouble=not every)
+    if verify:
+        rows.append(("checksums", _checksums_text(store)))
+    tables = [two_columns(str(path), rows)]
+    is_damaged = bool(store.damage.shots or store.damage.files)
     if not every:
-        return tables
-    store = StackStore(path)
+        return tables, is_damaged
     own = _ROW_COLUMNS if store.own_setups else _SHOT_COLUMNS
     columns = own if store.field is None else _FIT_COLUMNS
     headings = "shot", "name", "status", "seconds", *columns, "how it went"
@@ -326,14 +346,20 @@ def status_tables(path: Path, every: bool) -> list[Table]:
             f"{report['seconds']:.1f}" if "seconds" in report else "",
             *(show(report[key]) if key in report else "" for key, show in columns.values()),
             plain(report.get("reason") or "; ".join(report.get("warnings", ()))),
-            style="red" if STATUS_NAMES[status] == "failed" else "",
+            style="red" if status in (FAILED, DAMAGED) else "",
         )
-    return [*tables, shots]
+    return [*tables, shots], is_damaged
 
 
-@refusing_damage
-def store_rows(path: Path, *, trouble: bool = True) -> Rows:
-    store = StackStore(path)
+def _checksums_text(store: StackStore) -> str:
+    if not store.has_checksums:
+        return "none: the store was written by an earlier version, and damage cannot be noticed"
+    count = len(store.damage.shots) + len(store.damage.files)
+    return f"{count} do not match" if count else "all files match"
+
+
+def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
+    """Describe a store in names and texts."""
     attributes = store.attributes
     seconds = [report["seconds"] for report in store.reports() if "stages" in report]
     rows = [

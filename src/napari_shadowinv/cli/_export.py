@@ -18,7 +18,7 @@ from napari_shadowinv.inversion.labels import display_unit, setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
-from napari_shadowinv.io.store import DONE, STATUS_NAMES, StackStore, read_stack
+from napari_shadowinv.io.store import DAMAGED, DONE, STATUS_NAMES, StackStore, read_stack
 from napari_shadowinv.preprocessing import Provenance
 
 if TYPE_CHECKING:
@@ -49,6 +49,14 @@ def _opened(path: Path, shots: str | None) -> xarray.Dataset:
     chosen = dataset.assign_coords(index=("shot", np.arange(count)))
     if shots is not None:
         chosen = chosen.isel(shot=_parsed_shots(shots, count))
+    for index in np.flatnonzero(chosen["status"].values == DAMAGED)[:1]:
+        number = int(chosen["index"].values[index])
+        store = StackStore(path)
+        raise FileFormatError(
+            f"{path} is damaged: shot {number} ({store.names[number]}): "
+            f"{store.report(number)['reason']}; "
+            "repeat the run with --resume to invert it again, or choose other shots with --shots"
+        )
     done = chosen.isel(shot=np.flatnonzero(chosen["status"].values == DONE))
     if not done.sizes["shot"]:
         raise InputError(f"{path} has no finished shots in this selection: see shadowinv status")

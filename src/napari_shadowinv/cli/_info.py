@@ -41,9 +41,10 @@ def _rows(path: Path, variable: str | None) -> _tables.Rows:
     from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.hdf5 import read_hdf5
     from napari_shadowinv.io.images import read_npy
+    from napari_shadowinv.io.store import StackStore
 
     if is_stack(path):
-        return store_rows(path)
+        return store_rows(StackStore(path))
     found = format_of(path)
     if found.name == "mat":
         return _matlab_rows(path, variable)

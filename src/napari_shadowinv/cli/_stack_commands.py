@@ -127,12 +127,22 @@ def batch(
 def status(
     store: _flags.StoreFolder,
     every: Annotated[bool, typer.Option("--all", help="Show one line per shot.")] = False,
+    verify: Annotated[
+        bool,
+        typer.Option(
+            "--verify",
+            help="Read all files and compare their checksums; exit code 1 if any is damaged.",
+        ),
+    ] = False,
 ) -> None:
-    """Show which shots of a store are done, pending or failed, and why."""
-    from napari_shadowinv.cli._batch import status_tables
+    """Show which shots of a store are done, pending, failed or damaged, and why."""
+    from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, status_tables
 
-    for table in status_tables(store, every):
+    tables, is_damaged = status_tables(store, every, verify)
+    for table in tables:
         say(table)
+    if verify and is_damaged:
+        raise typer.Exit(EXIT_FAILED_SHOTS)
 
 
 @notify_errors

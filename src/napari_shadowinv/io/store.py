@@ -11,28 +11,38 @@ written again. So workers can write side by side, and any of them may die.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from napari_shadowinv._system.safety import refusing_damage, small_text
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.labels import (
     PIXEL,
-    SETUPS_LABEL,
     fit_labels,
-    place_label,
     setup_from_dataset,
     update_labels,
     variable_labels,
 )
 from napari_shadowinv.io.files import check_folder_of
 from napari_shadowinv.io.formats import STORE
+from napari_shadowinv.io.store_checksums import (
+    FIXED,
+    LABELS,
+    SEAL,
+    Damage,
+    Layout,
+    Status,
+    check_seal,
+    find_damage,
+    note_shot,
+)
+from napari_shadowinv.io.store_setups import OWN_SETUPS, field_in_si, with_own_setups
 
 if TYPE_CHECKING:
     import xarray
@@ -74,11 +84,8 @@ TABLE_SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
     **SUMMARY,
     "energy": (float, {"units": "MeV", "long_name": "Energy of the particles"}),
 }
-# Attribute of a store whose shots are rows of a table, each with its own setup in its report.
-OWN_SETUPS = "table_of_shots"
-PENDING, DONE, FAILED = 0, 1, 2
-STATUS_NAMES = ("pending", "done", "failed")
-_NO_TEXT = np.array([], object)
+PENDING, DONE, FAILED, DAMAGED = map(int, Status)
+STATUS_NAMES = tuple(status.name.lower() for status in Status)
 _OWN_ORDER = ("status", *dict.fromkeys((*FIT_SUMMARY, *TABLE_SUMMARY)), "setup", "report")
 
 
@@ -129,17 +136,27 @@ def number_of(report: Mapping[str, Any], name: str, kind: type) -> Any:
     return report.get("residual" if name == "flux_residual" else name, nothing_yet(kind))
 
 
-def _attributes(path: Path) -> dict[str, Any]:
+def _document(path: Path) -> dict[str, Any]:
+    """Return the description of a store, empty for a folder of another kind."""
     try:
-        found = json.loads(small_text(path / "zarr.json", "metadata of a store"))
-        return dict(found["attributes"])
+        document = dict(json.loads(small_text(path / "zarr.json", "metadata of a store")))
+        return document if isinstance(document["attributes"], dict) else {}
     except Exception:
-        # A folder of another kind, or a damaged one, is no store; who opens it tells more.
+        # Who opens it says more of what is wrong.
         return {}
+
+
+def _attributes(path: Path) -> dict[str, Any]:
+    return dict(_document(path).get("attributes", {}))
 
 
 def store_error(path: Path, error: OSError) -> StoreError:
     """Say that a store cannot be written, why, and what to do."""
+    if not (path / "zarr.json").exists():
+        return StoreError(
+            f"{path} was removed or moved while it was being written: put it back and run again to "
+            "resume, or start again with another name"
+        )
     return StoreError(
         f"{path} cannot be written ({error.strerror or error}): free some disk space or check "
         "the folder's permissions, then run again to resume"
@@ -165,17 +182,33 @@ class ShotWriter:
     def _commit(
         self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int
     ) -> None:
-        if _attributes(self.path).get("store_id") != self.store_id:
+        attributes = _attributes(self.path)
+        if attributes.get("store_id") != self.store_id:
             raise StoreError(
                 f"{self.path} is missing or is not the store the run started with: all workers "
                 "must share one file system, and the store must not be replaced during the run"
             )
         group = self.arrays()
         try:
-            for name, values in arrays.items():
-                group[name][index : index + 1] = np.asarray(values)[np.newaxis]
-            group["report"][index : index + 1] = np.array([json.dumps(report)], dtype=object)
+            for name in fields_of(group):
+                if name in arrays:
+                    group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
+                else:
+                    erase(self.path, group[name], index)
+            noted = note_shot(self.path, group, index, summary_of(attributes))
+            text = json.dumps({**report, **noted})
+            group["report"][index : index + 1] = np.array([text], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
+        except OSError as error:
+            raise store_error(self.path, error) from error
+
+    def reopen(self, index: int) -> None:
+        """Mark a shot as pending that is to be done again, and forget its report and fields."""
+        group = self.arrays()
+        try:
+            group["status"][index : index + 1] = np.int8(PENDING)
+            for name in ("report", *fields_of(group)):
+                erase(self.path, group[name], index)
         except OSError as error:
             raise store_error(self.path, error) from error
 
@@ -183,11 +216,35 @@ class ShotWriter:
         return _opened(self.path, self.store_id, self.shots)
 
 
-@lru_cache(maxsize=4)
-def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
+def fields_of(arrays: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the arrays that hold a chunk of values for each shot."""
+    return tuple(
+        name
+        for name, array in arrays.items()
+        if is_along_shots(array) and array.chunks[0] == 1 and name not in ("status", "report")
+    )
+
+
+def erase(path: Path, array: Any, index: int) -> None:
+    """Remove the chunk of a shot, which is read as the fill value then."""
+    key = array.metadata.encode_chunk_key((index, *[0] * (array.ndim - 1)))
+    (path / array.basename / key).unlink(missing_ok=True)
+
+
+def open_to_write(path: Path) -> dict[str, Any]:
+    """Open the arrays of a store to write to them."""
     import zarr
 
-    arrays: dict[str, Any] = dict(zarr.open_group(path, mode="r+").arrays())
+    # Also chunks that are empty: one that is not there has been lost.
+    return {
+        name: array.with_config({"write_empty_chunks": True})
+        for name, array in zarr.open_group(path, mode="r+").arrays()
+    }
+
+
+@lru_cache(maxsize=4)
+def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
+    arrays = open_to_write(path)
     found = arrays["status"].shape[0]
     if found != shots:
         raise StoreError(
@@ -198,41 +255,114 @@ def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
 
 
 class StackStore:
-    """A store as a run sees it: what is done, failed, pending.
+    """A store as a run sees it: what is done, failed, pending, damaged.
 
-    The `field`, if it was fitted; `own_setups` tells whether its shots are rows of a table.
+    Parameters
+    ----------
+    path : Path
+    every_byte : bool, optional
+        Read all files to find damage. Otherwise damage within a field is noticed when the field is
+        read.
+
+    Attributes
+    ----------
+    field : str or None
+        What was fitted.
+    own_setups : bool
+        Whether its shots are rows of a table.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, every_byte: bool = False) -> None:
         self.path = path
+        self._every_byte = every_byte
         if not path.exists():
             raise FileFormatError(
                 f"{path} does not exist: expected a stack of shots, name{STORE_SUFFIX}; check the "
                 "path"
             )
-        self.attributes = _attributes(path)
+        document = _document(path)
+        check_seal(path / "zarr.json", document)
+        self.attributes = document.get("attributes", {})
         if self.attributes.get("format") != FORMAT:
             raise FileFormatError(f"{path} is not a stack of shots: expected name{STORE_SUFFIX}")
         self.field = fitted_field(self.attributes)
         self.own_setups = OWN_SETUPS in self.attributes
+        self._layout = Layout.of(path, document)
         self._arrays = _readable(path)
         self.names = tuple(map(str, self._values("name").tolist()))
-        self.statuses()
+        if self._layout is None:
+            self.statuses()
 
     @property
     def writer(self) -> ShotWriter:
         return ShotWriter(self.path, self.attributes["store_id"], len(self.names))
 
     def statuses(self) -> AnyArray:
-        """Return PENDING, DONE or FAILED for each shot."""
-        return self._values("status")
+        """Return PENDING, DONE, FAILED or DAMAGED for each shot."""
+        damaged = self.damage.shots
+        if not damaged:
+            return self._values("status")
+        return np.array(
+            [
+                DAMAGED if index in damaged else int(self._values("status", index))
+                for index in range(len(self.names))
+            ],
+            np.int8,
+        )
 
     def report(self, index: int) -> dict[str, Any]:
-        """Return how a shot went; ``reason`` tells why it failed."""
+        """Return how a shot went; ``reason`` says why it failed, or how it is damaged."""
+        if index in self.damage.shots:
+            return {"reason": self.damage.shots[index]}
         return _parsed(self.path, [str(self._values("report", index))])[0]
 
     def reports(self) -> Sequence[dict[str, Any]]:
+        """Return how each shot went, as `report` does."""
+        if self.damage.shots:
+            return [self.report(index) for index in range(len(self.names))]
         return _parsed(self.path, self._values("report").tolist())
+
+    @cached_property
+    def damage(self) -> Damage:
+        """Return what is lost, exchanged or damaged; nothing in a store without checksums."""
+        if self._layout is None:
+            return Damage()
+        damage = find_damage(self._layout, every_byte=self._every_byte)
+        return Damage(damage.shots, (*damage.files, *self._exchanged(damage)))
+
+    @property
+    def has_checksums(self) -> bool:
+        """Whether the store has checksums, by which damage is noticed."""
+        return self._layout is not None
+
+    def _exchanged(self, damage: Damage) -> Iterator[str]:
+        """Name files with values of many shots that disagree with the shots' reports."""
+        assert self._layout is not None
+        numbers = summary_of(self.attributes)
+        for name in self._layout.of_many_shots:
+            length = self._arrays[name].chunks[0]
+            for first in range(0, len(self.names), length):
+                index = self._first_ended(first, first + length, damage)
+                if index is None or any(f"{name}/c/{first // length} " in f for f in damage.files):
+                    continue
+                report = _parsed(self.path, [str(self._values("report", index))])[0]
+                value = self._values(name, index).item()
+                expected: list[Any] = [report.get(LABELS, {}).get(name, value)]
+                if name in numbers:
+                    kind = numbers[name][0]
+                    expected = [kind(number_of(report, name, kind)), kind(nothing_yet(kind))]
+                if json.dumps(value) not in map(json.dumps, expected):
+                    yield (
+                        f"{name}/c/{first // length} does not belong to shots {first} to "
+                        f"{min(first + length, len(self.names)) - 1}"
+                    )
+
+    def _first_ended(self, first: int, end: int, damage: Damage) -> int | None:
+        """Return the first shot of some whose report can be trusted, None without one."""
+        for index in range(first, min(end, len(self.names))):
+            if index not in damage.shots and self._values("status", index) != PENDING:
+                return index
+        return None
 
     def _values(self, name: str, which: Any = ...) -> AnyArray:
         return _values(self.path, self._arrays[name], which)
@@ -249,6 +379,15 @@ class StackStore:
                 group[name][...] = np.array(values, dtype=object if kind is str else kind)
         except OSError as error:
             raise store_error(self.path, error) from error
+
+
+def check_files(store: StackStore) -> None:
+    """Refuse a store with damage to files that belong to no single shot."""
+    if store.damage.files:
+        raise FileFormatError(
+            f"{store.path} is damaged: {store.damage.files[0]}; repeat the run with --resume, or "
+            "copy the store again"
+        )
 
 
 @refusing_damage
@@ -298,7 +437,8 @@ def read_stack(path: Path) -> xarray.Dataset:
     -------
     xarray.Dataset
         Dimensions shot, y, x and component. ``status`` is 0 where a shot is pending, 1 done,
-        2 failed; the values of shots that are not done are NaN. Where shots have setups of their
+        2 failed, 3 damaged; the values of shots that are not done are NaN, and those of damaged
+        shots cannot be read. Where shots have setups of their
         own, ``setup`` has that of each, empty until it is done.
 
     Raises
@@ -317,6 +457,9 @@ def read_stack(path: Path) -> xarray.Dataset:
     dataset = update_labels(dataset)
     if dataset.sizes["shot"] > len(store.names):  # grown since
         dataset = dataset.isel(shot=slice(len(store.names)))
+    check_files(store)
+    # They hold for this folder, and not for what is made of the dataset.
+    dataset.attrs = {k: v for k, v in dataset.attrs.items() if k not in (SEAL, FIXED)}
     setup = setup_from_dataset(dataset)
     complete = _with_fields(with_own_setups(dataset), setup)
     # The folder's own order is arbitrary.
@@ -331,33 +474,6 @@ def _labels(dataset: xarray.Dataset, setup: Any) -> dict[str, Any]:
     return variable_labels(setup) if field is None else fit_labels(field, setup)
 
 
-def with_own_setups(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Add the setup of each shot, read when it is asked for, if shots have their own."""
-    if OWN_SETUPS not in dataset.attrs or "setup" not in dataset.attrs:
-        return dataset
-    texts = dataset["report"].data.map_blocks(_setups_of_block, dtype=object, meta=_NO_TEXT)
-    return with_places(dataset.assign(setup=(("shot",), texts, SETUPS_LABEL)))
-
-
-def with_places(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Add where the pixels of each shot are in metres, by the shot's own setup."""
-    sizes = of_each_setup(dataset, _pixel_size)[:, np.newaxis]
-    places = {
-        f"{name}_si": (("shot", name), sizes * dataset[name].values, place_label(name))
-        for name in ("y", "x")
-    }
-    return dataset.assign_coords(places)
-
-
-def _pixel_size(setup: Any) -> float:
-    return float(setup.object_pixel_size)
-
-
-def _setups_of_block(reports: AnyArray) -> AnyArray:
-    made = (json.loads(str(text) or "{}").get("provenance", {}) for text in reports)
-    return np.array([json.dumps(one["setup"]) if "setup" in one else "" for one in made], object)
-
-
 def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
     """Add the fields in SI units that follow from what is stored, lazily."""
     if setup is None:
@@ -370,39 +486,3 @@ def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
             continue
         found[name] = (("shot", *dims), field_in_si(dataset, origin, name, setup), labels)
     return dataset.assign(found)
-
-
-def of_each_setup(dataset: xarray.Dataset, measure: Callable[[Any], float]) -> Any:
-    """A number of the setup of each shot, NaN until it is done; None if all share one setup."""
-    if "setup" not in dataset:
-        return None
-    return dataset["setup"].data.map_blocks(_measured, measure, dtype=np.float64)
-
-
-def _measured(texts: AnyArray, measure: Callable[[Any], float]) -> FloatArray:
-    from napari_shadowinv.physics.setup import setup_from_dict
-
-    found = (measure(setup_from_dict(json.loads(text))) if text else np.nan for text in texts)
-    return np.array(list(found))
-
-
-def field_in_si(dataset: xarray.Dataset, origin: str, name: str, setup: Any) -> Any:
-    """A field of all shots in SI units, by the setup of each or by one for all; not read yet."""
-    data = dataset[origin].data
-    if "setup" not in dataset:
-        return data.map_blocks(_field_of_block, None, name, setup, dtype=np.float64)
-    texts = dataset["setup"].data[(..., *[np.newaxis] * (data.ndim - 1))]
-    return data.map_blocks(
-        _field_of_block, texts, name, setup, dtype=np.float64, chunks=data.chunks
-    )
-
-
-def _field_of_block(block: AnyArray, texts: AnyArray | None, name: str, setup: Any) -> FloatArray:
-    from napari_shadowinv.physics.setup import setup_from_dict
-
-    own = [setup] * len(block)
-    if texts is not None:
-        # What is not done yet is NaN with any setup.
-        own = [setup_from_dict(json.loads(text)) if text else setup for text in texts.flat]
-    pairs = zip(own, block, strict=True)
-    return np.stack([one.field_in_si(name, values) for one, values in pairs])

@@ -20,6 +20,7 @@ from zarr.storage import LocalStore
 
 from napari_shadowinv._system.safety import check_regular, check_size, small_text
 from napari_shadowinv.io.files import check_promise
+from napari_shadowinv.io.store_checksums import Layout, check_chunk, check_content, check_seal
 
 _METADATA, _CHUNKS = "zarr.json", "/c/"
 # Where the formats of chunks keep the number of texts, and of unpacked bytes.
@@ -40,6 +41,7 @@ class CheckedStore(LocalStore):
     def __init__(self, root: Path, *, read_only: bool = True) -> None:
         super().__init__(root, read_only=True)
         self._chunks: dict[str, _Chunk] = {}
+        self._layout: tuple[Layout | None] | None = None
         # Tells what is read now from what was read before the store grew, where dask keeps either.
         self._opened = time.time_ns()
 
@@ -50,7 +52,7 @@ class CheckedStore(LocalStore):
         byte_range: ByteRequest | None = None,
     ) -> Buffer | None:
         self._check(key)
-        return await super().get(key, prototype, byte_range)
+        return self._intact(key, await super().get(key, prototype, byte_range), byte_range)
 
     def get_sync(
         self,
@@ -60,7 +62,8 @@ class CheckedStore(LocalStore):
         byte_range: ByteRequest | None = None,
     ) -> Buffer | None:
         self._check(key)
-        return super().get_sync(key, prototype=prototype, byte_range=byte_range)
+        buffer = super().get_sync(key, prototype=prototype, byte_range=byte_range)
+        return self._intact(key, buffer, byte_range)
 
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
@@ -70,18 +73,43 @@ class CheckedStore(LocalStore):
             self._check(key)
         return await super().get_partial_values(prototype, wanted)
 
+    def _intact(
+        self, key: str, buffer: Buffer | None, byte_range: ByteRequest | None
+    ) -> Buffer | None:
+        """Return what was read of a chunk once it has matched its checksum."""
+        name, is_chunk, place = key.partition(_CHUNKS)
+        if buffer is not None and is_chunk and byte_range is None:
+            layout = self._sealed_layout()
+            if layout is not None:
+                index = int(place.partition("/")[0])
+                check_content(layout, key, name, index, buffer.to_bytes())
+        return buffer
+
     def _check(self, key: str) -> None:
         path = self.root / key
+        name, is_chunk, place = key.partition(_CHUNKS)
+        if is_chunk and (layout := self._sealed_layout()) is not None:
+            check_chunk(layout, key, name, int(place.partition("/")[0]))
         if path.is_dir() or not path.exists():
             return
         check_regular(path, "a file of the store")
-        name, is_chunk, _ = key.partition(_CHUNKS)
-        if path.name == _METADATA:
+        if key == _METADATA:
+            check_seal(path, _json(path))
+        elif path.name == _METADATA:
             small_text(path, "metadata of the store")
         elif is_chunk:
             self._check_chunk(path, name)
         else:
             check_size(path, path.stat().st_size)
+
+    def _sealed_layout(self) -> Layout | None:
+        """Return how the store's chunks are noted; None without checksums."""
+        if self._layout is None:
+            file = self.root / _METADATA
+            document = _json(file) if file.exists() else {}
+            check_seal(file, document)
+            self._layout = (Layout.of(self.root, document),)
+        return self._layout[0]
 
     def _metadata(self, name: str) -> dict[str, Any]:
         """The description of an array: the folder's own copy counts, where there is one."""

@@ -19,8 +19,8 @@ from napari_shadowinv.io.store import (
     STATUS_NAMES,
     ShotWriter,
     StackStore,
-    is_along_shots,
     number_of,
+    open_to_write,
     store_error,
     summary_of,
 )
@@ -41,12 +41,10 @@ class GrowingStore:
     """A store as the one process sees it that writes it; of each shot it keeps the name."""
 
     def __init__(self, store: StackStore, attributes: Mapping[str, Any]) -> None:
-        import zarr
-
         self.path = store.path
         self._told = attributes  # of a store that has grown so
         # Its own, as they grow: others in this process may hold those of a certain length.
-        arrays: dict[str, Any] = dict(zarr.open_group(store.path, mode="r+").arrays())
+        arrays = open_to_write(store.path)
         count = len(store.names)
         self._writer = _OpenWriter(store.path, store.attributes["store_id"], count, arrays)
         self._summary = {
@@ -93,13 +91,7 @@ class GrowingStore:
 
     def reopen(self, index: int) -> None:
         """Mark a shot as pending that is to be done again, and forget its fields."""
-        try:
-            for array in self._writer.opened.values():
-                if is_along_shots(array) and array.ndim > 1:
-                    array[index : index + 1] = array.fill_value
-            self._writer.opened["status"][index : index + 1] = np.int8(PENDING)
-        except OSError as error:
-            raise store_error(self.path, error) from error
+        self._writer.reopen(index)
         self._note(index, PENDING)
 
     def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:

@@ -23,17 +23,16 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.io.store import (
-    DONE,
-    FAILED,
     FORMAT,
-    PENDING,
     STATUS_NAMES,
     StackStore,
     is_along_shots,
     nothing_yet,
+    open_to_write,
     store_error,
     summary_of,
 )
+from napari_shadowinv.io.store_checksums import FIXED, fixed_keys, reseal, seal, stored_checksum
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
 _SMALL = 64  # values that are not worth compressing
@@ -93,10 +92,8 @@ def grow_store(
 
     The coordinates, `values`, are those of all `length` shots.
     """
-    import zarr
-
     try:
-        arrays = dict(zarr.open_group(path, mode="r+").arrays())
+        arrays = open_to_write(path)
     except OSError as error:
         raise store_error(path, error) from error
     before = arrays["status"].shape[0]
@@ -114,21 +111,27 @@ def lengthen(
 ) -> None:
     """Grow a store whose arrays are open; the coordinates, `values`, are those of new shots."""
     longer = [name for name, array in arrays.items() if is_along_shots(array)]
+    file = path / "zarr.json"
     try:
+        metadata = json.loads(file.read_text(encoding="utf-8"))
         for name in longer:
             array = arrays[name]
+            before = array.shape[0]
             # Beyond the end stated in the folder's own copy: nobody sees it yet.
             array.resize((length, *array.shape[1:]))
             if name in values:
                 array[length - len(values[name]) :] = values[name]
-        file = path / "zarr.json"
-        metadata = json.loads(file.read_text(encoding="utf-8"))
+            elif (
+                array.chunks[0] > 1
+                and (before - 1) // array.chunks[0] < (length - 1) // (array.chunks[0])
+            ):
+                array[before:] = array.fill_value  # a file that is not there has been lost
         metadata["attributes"].update(attributes)
         for name in longer:
             metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
         # From here on the store is longer.
         with replacing(file, overwrite=True) as draft:
-            draft.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
+            draft.write_text(json.dumps(reseal(metadata), indent=2), encoding="utf-8")
     except OSError as error:
         raise store_error(path, error) from error
 
@@ -155,6 +158,11 @@ def _write_template(path: Path, contents: Contents) -> None:
         # That other programs may not know it: they read the arrays' own metadata then.
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(path)
+    file = path / "zarr.json"
+    document = json.loads(file.read_text(encoding="utf-8"))
+    fixed = {key: stored_checksum(path / key) for key in fixed_keys(document)}
+    document["attributes"][FIXED] = json.dumps(fixed)
+    file.write_text(json.dumps(seal(document), indent=2), encoding="utf-8")
 
 
 def _own_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Variable]:
@@ -162,7 +170,7 @@ def _own_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Varia
     status = {
         "units": "1",
         "long_name": "Status of the shot",
-        "flag_values": [PENDING, DONE, FAILED],
+        "flag_values": list(range(len(STATUS_NAMES))),
         "flag_meanings": " ".join(STATUS_NAMES),
     }
     report = {"units": "1", "long_name": "Report, or reason for failure (JSON)"}
@@ -179,7 +187,7 @@ def _own_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Varia
 
 
 def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str, int]) -> None:
-    from zarr.codecs import BloscCodec
+    from zarr.codecs import BloscCodec, Crc32cCodec
 
     shape = tuple(sizes[dim] for dim in variable.dims)
     chunks = _chunks(variable, shape)
@@ -187,15 +195,17 @@ def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str,
     is_float = not is_text and np.dtype(variable.dtype).kind == "f"
     # Bytes that change slowly side by side: that is what makes fields compressible.
     fields = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
+    is_plain = is_text or np.prod(chunks) <= _SMALL
     array = group.create_array(
         name,
         shape=shape,
         chunks=chunks,
         dtype=variable.dtype,
         fill_value="" if is_text else np.nan if is_float else 0,
-        compressors=None if is_text or np.prod(chunks) <= _SMALL else fields,
+        compressors=[Crc32cCodec()] if is_plain else [fields, Crc32cCodec()],
         dimension_names=variable.dims,
         attributes=dict(variable.attributes),
+        config={"write_empty_chunks": True},
     )
     if variable.values is not None:
         array[...] = variable.values

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import SETUPS_LABEL, variable_labels
-from napari_shadowinv.io.store import SUMMARY, with_places
+from napari_shadowinv.io.store import SUMMARY
+from napari_shadowinv.io.store_setups import with_places
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack import _spec
 from napari_shadowinv.stack._choosing import choose_sites

@@ -12,7 +12,7 @@ import numpy as np
 from napari_shadowinv import __version__
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.store import DONE, StackStore
+from napari_shadowinv.io.store import DONE, StackStore, check_files
 from napari_shadowinv.io.store_layout import Contents, Variable, grow_store
 from napari_shadowinv.stack import _spec
 from napari_shadowinv.stack._references import checksum
@@ -113,6 +113,26 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
                 "store or choose another name"
             )
     return stack
+
+
+def reopen_damaged(store: StackStore) -> StackStore:
+    """Read all of a store, mark its damaged shots as pending, and return it as it is now.
+
+    Raises
+    ------
+    FileFormatError
+        If there is damage that cannot be repaired from the shots.
+    """
+    damage = StackStore(store.path, every_byte=True).damage
+    for index in damage.shots:
+        store.writer.reopen(index)
+    if not (damage.shots or damage.files):
+        return store
+    store = StackStore(store.path)
+    if damage.files:
+        store.summarise()
+        check_files(store := StackStore(store.path, every_byte=True))
+    return store
 
 
 def made_alike(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:

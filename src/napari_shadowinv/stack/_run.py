@@ -24,7 +24,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._choosing import choose_sites
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
 from napari_shadowinv.stack._references import Reader, read_shot
-from napari_shadowinv.stack._resuming import append_shots, contents_of, resume
+from napari_shadowinv.stack._resuming import append_shots, contents_of, reopen_damaged, resume
 from napari_shadowinv.stack._spec import STORED, describe_stack
 from napari_shadowinv.stack._stacks import Stack
 from napari_shadowinv.stack._worker import Settings, ShotOutcome, run_shots
@@ -165,6 +165,7 @@ def run_stack(
         arrived = False
         if store is not None:
             stack = resume(store, stack, kept)
+            store = reopen_damaged(store)
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
                 _Run(stack, store, (), on_progress, should_stop).tell("nothing to do")

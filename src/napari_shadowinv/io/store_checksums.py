@@ -1,0 +1,403 @@
+"""Checksums of a store, so that no damage to its files is read as data.
+
+Each chunk ends with its CRC-32C, which Zarr checks when it unpacks the chunk. Chunks that were
+lost, or that lie in the place of others, are noticed by what is noted elsewhere: the report of a
+shot holds the checksums of the shot's chunks and its name, the folder's ``zarr.json`` those of
+chunks that belong to no shot, and its own SHA-256.
+
+- note them: `seal`, `reseal`, `note_shot`
+- compare them: `check_seal`, `check_chunk`, `check_content`, `find_damage`
+
+Stores without a seal, of an earlier version or copied by another program, are not checked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import struct
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+
+from napari_shadowinv._system.safety import check_regular, check_size, small_text
+from napari_shadowinv.errors import FileFormatError
+
+SEAL = "metadata_sha256"  # attribute: checksum of the folder's description
+FIXED = "chunk_checksums"  # attribute: checksums of chunks that belong to no shot (JSON)
+CHUNKS = "chunks"  # in a shot's report: checksums of its chunks, None of those that are not there
+LABELS = "labels"  # in a shot's report: its name, and what else labels it
+_CODEC = "crc32c"
+_CRC_BYTES = 4
+_READS = 3  # of a shot that another process may be writing again
+_RECORD = ("status", "report")  # what is kept of each shot beside its fields
+
+
+class Status(IntEnum):
+    """What became of a shot; damage is noticed when a store is opened, and never stored."""
+
+    PENDING = 0
+    DONE = 1
+    FAILED = 2
+    DAMAGED = 3
+
+
+def seal(document: dict[str, Any]) -> dict[str, Any]:
+    """Return the description of a store with its checksum."""
+    attributes = {k: v for k, v in document["attributes"].items() if k != SEAL}
+    content = {**document, "attributes": attributes}
+    return {**document, "attributes": {**attributes, SEAL: _digest(content)}}
+
+
+def reseal(document: dict[str, Any]) -> dict[str, Any]:
+    """Return the changed description of a store with its new checksum, if it had one."""
+    return seal(document) if is_sealed(document) else document
+
+
+def is_sealed(document: Mapping[str, Any]) -> bool:
+    """Tell whether a store has checksums."""
+    return SEAL in document.get("attributes", {})
+
+
+def check_seal(path: Path, document: dict[str, Any]) -> None:
+    """Refuse a description of a store that has changed since it was written."""
+    if is_sealed(document) and seal(document)["attributes"][SEAL] != document["attributes"][SEAL]:
+        raise FileFormatError(
+            f"{path} is damaged: its content does not match its checksum; copy the store again, or "
+            "repeat the run with overwriting"
+        )
+
+
+def _digest(document: Mapping[str, Any]) -> str:
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The arrays of a store with checksums, by how their chunks are noted."""
+
+    root: Path
+    arrays: Mapping[str, Mapping[str, Any]] = field(repr=False)
+    fixed: Mapping[str, str]  # checksums of chunks that belong to no shot
+
+    @classmethod
+    def of(cls, root: Path, document: Mapping[str, Any]) -> Layout | None:
+        """Return the layout of a store, None of one without checksums."""
+        if not is_sealed(document):
+            return None
+        arrays = document["consolidated_metadata"]["metadata"]
+        return cls(root, arrays, json.loads(document["attributes"][FIXED]))
+
+    @cached_property
+    def shots(self) -> int:
+        return int(self.arrays["status"]["shape"][0])
+
+    @cached_property
+    def of_each_shot(self) -> tuple[str, ...]:
+        """Arrays with a chunk for each shot, but for its record."""
+        return tuple(
+            name
+            for name in self.arrays
+            if self._is_along_shots(name) and self._together(name) == 1 and name not in _RECORD
+        )
+
+    @cached_property
+    def of_many_shots(self) -> tuple[str, ...]:
+        """Arrays with the values of many shots in one chunk."""
+        return tuple(
+            name for name in self.arrays if self._is_along_shots(name) and self._together(name) > 1
+        )
+
+    def _is_along_shots(self, name: str) -> bool:
+        return bool((self.arrays[name].get("dimension_names") or [None])[0] == "shot")
+
+    def _together(self, name: str) -> int:
+        return int(self._chunk_shape(name)[0])
+
+    def _chunk_shape(self, name: str) -> list[int]:
+        return list(self.arrays[name]["chunk_grid"]["configuration"]["chunk_shape"])
+
+    def key(self, name: str, index: int) -> str:
+        """Return the key of a chunk by its first number; along other axes there is one."""
+        return "/".join([name, "c", str(index), *["0"] * (len(self.arrays[name]["shape"]) - 1)])
+
+    def keys_of_many(self) -> Iterator[str]:
+        """Yield the keys of chunks with the values of many shots."""
+        for name in self.of_many_shots:
+            for index in range(-(-self.shots // self._together(name))):
+                yield self.key(name, index)
+
+
+def fixed_keys(document: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the keys of chunks that belong to no shot; such an array has one."""
+    for name, array in document["consolidated_metadata"]["metadata"].items():
+        if (array.get("dimension_names") or [None])[0] != "shot" and array["node_type"] == "array":
+            yield "/".join([name, "c", *["0"] * len(array["shape"])])
+
+
+def has_checksums(array: Any) -> bool:
+    """Tell whether the chunks of an open Zarr array end with their checksums."""
+    names: list[str] = [codec.to_dict()["name"] for codec in array.metadata.codecs]
+    return _CODEC in names
+
+
+def note_shot(
+    root: Path, arrays: Mapping[str, Any], index: int, numbers: Collection[str]
+) -> dict[str, Any]:
+    """Return what the report of a shot says of its chunks and labels, once these are written.
+
+    The `numbers` are the arrays that are copied from the reports.
+    """
+    chunks: dict[str, str | None] = {}
+    labels: dict[str, Any] = {}
+    for name, array in arrays.items():
+        if (array.metadata.dimension_names or (None,))[0] != "shot" or name in _RECORD:
+            continue
+        if not has_checksums(array):
+            return {}
+        if array.chunks[0] == 1:
+            key = array.metadata.encode_chunk_key((index, *[0] * (array.ndim - 1)))
+            chunks[name] = stored_checksum(root / name / key)
+        elif name not in numbers:
+            labels[name] = np.asarray(array[index]).item()
+    return {CHUNKS: chunks, LABELS: labels}
+
+
+def stored_checksum(file: Path) -> str | None:
+    """Return the checksum at the end of a chunk, None where there is no chunk."""
+    try:
+        check_regular(file, "a file of the store")
+        with file.open("rb") as chunk:
+            size = chunk.seek(0, os.SEEK_END)
+            chunk.seek(max(0, size - _CRC_BYTES))
+            return chunk.read().hex()
+    except (FileFormatError, FileNotFoundError):
+        if os.path.lexists(file):
+            raise
+        return None
+
+
+def _content(file: Path) -> bytes | None:
+    """Return the bytes of a chunk without their checksum, None where there is no chunk."""
+    if stored_checksum(file) is None:
+        return None
+    check_size(file, file.stat().st_size)
+    raw = file.read_bytes()
+    if not _is_intact(raw):
+        raise FileFormatError("its content does not match its checksum")
+    return raw[:-_CRC_BYTES]
+
+
+def _is_intact(raw: bytes) -> bool:
+    """Compare the content of a chunk with the checksum at its end."""
+    content, checksum = raw[:-_CRC_BYTES], raw[-_CRC_BYTES:]
+    return struct.pack("<I", google_crc32c.value(content)) == checksum
+
+
+def _status(root: Path, index: int) -> int:
+    content = _content(root / "status" / "c" / str(index))
+    return content[0] if content else 0
+
+
+def _report(root: Path, index: int) -> dict[str, Any]:
+    """Return the report of a shot, empty where there is none."""
+    content = _content(root / "report" / "c" / str(index)) or bytes(8)
+    count, length = struct.unpack("<II", content[:8])
+    if count > 1 or length > len(content) - 8:
+        raise FileFormatError(f"its header implies {max(count, length)} bytes or texts")
+    return dict(json.loads(content[8 : 8 + length] or b"{}"))
+
+
+def check_chunk(layout: Layout, key: str, name: str, index: int) -> None:
+    """Refuse a chunk that is lost, or is not the one that was written there.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of the store.
+    key, name : str
+        The chunk and its array.
+    index : int
+        The first of the chunk's numbers.
+
+    Raises
+    ------
+    FileFormatError
+        With the shot that is damaged.
+    """
+    problem = ""
+    if name in layout.of_each_shot:
+        problem = _settled(partial(_shot_problem, layout, index, (name,)))
+    elif name not in _RECORD:
+        problem = _chunk_problem(layout, key, every_byte=False)
+    if problem:
+        raise _damage_error(layout, name, index, problem)
+
+
+def check_content(layout: Layout, key: str, name: str, index: int, raw: bytes) -> None:
+    """Refuse a chunk that has changed since it was written; arguments are those of `check_chunk`.
+
+    Parameters
+    ----------
+    raw : bytes
+        All of the chunk.
+
+    Raises
+    ------
+    FileFormatError
+        With the shot that is damaged.
+    """
+    if not _is_intact(raw):
+        thing = f"its {name}" if name in layout.of_each_shot else key
+        problem = f"{thing} is damaged (its content does not match its checksum)"
+        raise _damage_error(layout, name, index, problem)
+
+
+def _damage_error(layout: Layout, name: str, index: int, problem: str) -> FileFormatError:
+    advice = "repeat the run with --resume, or copy the store again"
+    if name in layout.of_each_shot:
+        problem = f"{_label(layout, index)}: {problem}"
+        advice = "repeat the run with --resume to invert it again"
+    return FileFormatError(f"{layout.root} is damaged: {problem}; {advice}")
+
+
+def _label(layout: Layout, index: int) -> str:
+    try:
+        return f"shot {index} ({_report(layout.root, index)[LABELS]['name']})"
+    except (OSError, ValueError, KeyError, TypeError):
+        return f"shot {index}"
+
+
+def _settled(look: Callable[[], str]) -> str:
+    """Look again at what is damaged: it may be a shot that is being written at this moment."""
+    problem = look()
+    for _ in range(_READS - 1):
+        if problem:
+            problem = look()
+    return problem
+
+
+def _shot_problem(
+    layout: Layout, index: int, names: tuple[str, ...], every_byte: bool = False
+) -> str:
+    """Say what is wrong with a shot that has ended; empty if nothing is."""
+    try:
+        report = _report(layout.root, index)
+    except (OSError, ValueError, TypeError, struct.error) as error:
+        return f"its report is damaged ({error})"
+    if CHUNKS not in report:
+        try:
+            status = _status(layout.root, index)
+        except OSError as error:
+            return f"its status is damaged ({error})"
+        lacks = status == Status.DONE or (status == Status.FAILED and "reason" not in report)
+        return "its report is missing" if lacks else ""
+    for name in names:
+        file = layout.root / layout.key(name, index)
+        expected = report[CHUNKS].get(name)
+        try:
+            if stored_checksum(file) != expected:
+                return (
+                    f"its {name} is missing"
+                    if not file.exists()
+                    else (f"its {name} is not the one that was written")
+                )
+            if every_byte:
+                _content(file)
+        except OSError as error:
+            return f"its {name} is damaged ({error})"
+    return ""
+
+
+def _chunk_problem(layout: Layout, key: str, every_byte: bool) -> str:
+    """Say what is wrong with a chunk that belongs to no single shot; empty if nothing is."""
+    file = layout.root / key
+    try:
+        checksum = stored_checksum(file)
+        if checksum is None:
+            return f"{key} is missing"
+        if checksum != layout.fixed.get(key, checksum):
+            return f"{key} is not the file that was written"
+        if every_byte:
+            _content(file)
+    except OSError as error:
+        return f"{key} is damaged ({error})"
+    return ""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """What is damaged in a store.
+
+    Attributes
+    ----------
+    shots : dict of int to str
+        Shots that have ended and cannot be trusted, with the reason.
+    files : tuple of str
+        What is wrong with files that belong to no single shot.
+    """
+
+    shots: dict[int, str] = field(default_factory=dict)
+    files: tuple[str, ...] = ()
+
+
+def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
+    """Look for files of a store that are lost, exchanged or damaged.
+
+    Parameters
+    ----------
+    layout : Layout
+    every_byte : bool, optional
+        Read all files. Otherwise only reports are read, and of chunks the checksums they hold.
+
+    Returns
+    -------
+    Damage
+    """
+    names = layout.of_each_shot
+    shots: dict[int, str] = {}
+    for index in range(layout.shots):
+        problem = _settled(partial(_record_problem, layout, index, names, every_byte))
+        if problem:
+            shots[index] = problem
+    keys = [*layout.keys_of_many(), *layout.fixed]
+    problems = [_chunk_problem(layout, key, every_byte) for key in keys]
+    if every_byte:
+        problems += [_description_problem(layout, name) for name in layout.arrays]
+    return Damage(shots, tuple(filter(None, problems)))
+
+
+def _description_problem(layout: Layout, name: str) -> str:
+    """Compare an array's own description, by which some programs go, with the folder's copy."""
+    file = layout.root / name / "zarr.json"
+    expected = dict(layout.arrays[name])
+    try:
+        found = json.loads(small_text(file, "metadata of an array"))
+        # A process that was killed while the store grew may have changed the length.
+        found["shape"] = [*expected["shape"][:1], *found["shape"][1:]]
+        return "" if _comparable(found) == _comparable(expected) else f"{name}/zarr.json is damaged"
+    except (OSError, ValueError, KeyError, TypeError):
+        return f"{name}/zarr.json is damaged or missing"
+
+
+def _comparable(description: Mapping[str, Any]) -> str:
+    """Return a description as text, without what may be left out where there is nothing."""
+    filled = {key: value for key, value in description.items() if value not in (None, {}, [])}
+    return json.dumps(filled, sort_keys=True)
+
+
+def _record_problem(layout: Layout, index: int, names: tuple[str, ...], every_byte: bool) -> str:
+    try:
+        if _status(layout.root, index) not in (Status.DONE, Status.FAILED):
+            return ""
+    except OSError as error:
+        return f"its status is damaged ({error})"
+    return _shot_problem(layout, index, names, every_byte)

@@ -1,0 +1,195 @@
+"""Damage to a store: noticed, named by its shot, and repaired by running again."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from store_content import content
+
+from command_line import flat, shadowinv
+from napari_shadowinv import FileFormatError, read
+from napari_shadowinv.io.store import DAMAGED, DONE, FAILED, PENDING, StackStore
+
+
+@pytest.fixture(scope="module")
+def finished(any_night, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("finished") / "n.shadowinv.zarr"
+    any_night.run(path)
+    return path
+
+
+@pytest.fixture
+def store(finished, tmp_path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / finished.name))
+
+
+def flip(file: Path, place: int, bit: int = 3) -> None:
+    data = bytearray(file.read_bytes())
+    data[place] ^= 1 << bit
+    file.write_bytes(data)
+
+
+def swap(first: Path, second: Path) -> None:
+    spare = first.with_name("spare")
+    first.rename(spare)
+    second.rename(first)
+    spare.rename(second)
+
+
+def field(store: Path, shot: int, name: str = "displacement") -> Path:
+    return store / name / "c" / str(shot) / ("0/0/0" if name == "displacement" else "0/0")
+
+
+def test_every_array_ends_with_a_crc32c(store):
+    for name, array in zarr.open_group(store, mode="r").arrays():
+        assert array.metadata.codecs[-1].to_dict() == {"name": "crc32c"}, name
+
+
+def test_untouched_store_has_no_damage(store):
+    opened = StackStore(store, every_byte=True)
+    assert opened.damage.shots == {}
+    assert opened.damage.files == ()
+    assert shadowinv("status", store, "--verify").exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["potential", "displacement", "caustic"])
+def test_deleted_chunk_makes_its_shot_damaged(store, name):
+    field(store, 3, name).unlink()
+    assert read(store).status.values.tolist() == [DONE] * 3 + [DAMAGED] + [DONE] * 2
+    with pytest.raises(FileFormatError, match=rf"shot 3 \(shot_3.npy\): its {name} is missing"):
+        read(store)[name].load()
+    assert np.isfinite(read(store)[name][:3].values.astype(float)).all()
+
+
+def test_swapped_chunks_damage_both_shots(store):
+    swap(field(store, 1), field(store, 4))
+    assert np.flatnonzero(read(store).status == DAMAGED).tolist() == [1, 4]
+    with pytest.raises(FileFormatError, match="its displacement is not the one that was written"):
+        read(store).displacement[4].load()
+
+
+def test_swapped_reports_damage_both_shots(store):
+    swap(store / "report" / "c" / "1", store / "report" / "c" / "4")
+    assert np.flatnonzero(read(store).status == DAMAGED).tolist() == [1, 4]
+
+
+def test_swapped_numbers_of_shots_are_refused(store):
+    swap(store / "image_residual" / "c" / "0", store / "noise_error" / "c" / "0")
+    with pytest.raises(FileFormatError, match="does not belong to shots 0 to 5"):
+        read(store)
+
+
+def test_flipped_bit_in_a_field_is_refused_on_reading(store):
+    file = field(store, 2)
+    flip(file, file.stat().st_size // 2)
+    with pytest.raises(FileFormatError):
+        read(store).displacement[2].load()
+    result = shadowinv("status", store, "--verify")
+    assert result.exit_code == 1
+    assert "shot_2.npy: its displacement is damaged" in flat(result.output)
+
+
+def test_flipped_digit_in_the_metadata_is_refused(store):
+    file = store / "zarr.json"
+    text = file.read_text()
+    assert '"n_sites\\": 100' in text or 'n_sites\\":100' in text
+    file.write_text(text.replace('n_sites\\":100', 'n_sites\\":101', 1))
+    with pytest.raises(FileFormatError, match="does not match its checksum"):
+        read(store)
+
+
+@pytest.mark.parametrize("command", ["export", "movie"])
+def test_damaged_shot_is_not_exported(store, tmp_path, command):
+    field(store, 3, "potential").unlink()
+    where = ["--format", "tiff", "--out", tmp_path / "t"] if command == "export" else []
+    where = where or ["--out", tmp_path / "film.gif"]
+    refused = shadowinv(command, store, *where)
+    assert refused.exit_code == 2
+    assert "shot 3 (shot_3.npy): its potential is missing" in flat(refused.output)
+    assert shadowinv(command, store, *where, "--shots", "0:3").exit_code == 0
+
+
+def test_run_again_redoes_only_damaged_shots(any_night, store, finished):
+    field(store, 3, "potential").unlink()
+    flip(field(store, 1), 300)
+    swap(store / "image_residual" / "c" / "0", store / "noise_error" / "c" / "0")
+    stamps = {index: field(store, index).stat().st_mtime_ns for index in range(6)}
+    written = any_night.run(store)
+    assert written.status.values.tolist() == [DONE] * 6
+    changed = [i for i in range(6) if field(store, i).stat().st_mtime_ns != stamps[i]]
+    assert changed == [1, 3]
+    assert content(store) == content(finished)
+    assert shadowinv("status", store, "--verify").exit_code == 0
+
+
+def test_damaged_shot_is_pending_until_it_is_redone(any_night, store):
+    field(store, 3, "potential").unlink()
+
+    def stop(_progress: object) -> None:
+        if _progress.engine:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        any_night.run(store, on_progress=stop)
+    assert StackStore(store).statuses().tolist() == [DONE] * 3 + [PENDING] + [DONE] * 2
+    assert np.isnan(read(store).displacement[3]).all()
+
+
+def test_done_shot_whose_file_turns_bad_loses_every_field(make_night, out):
+    night = make_night(2)
+    names = ("potential", "displacement", "caustic", "weights")
+    night.run(out, variables=names)
+    field(out, 1, "potential").unlink()
+    np.save(night.path(1), 0 * night.images[1])
+    store = StackStore(out)
+    store.writer.reopen(1)
+    written = night.run(out, variables=names)
+    assert written.status.values.tolist() == [DONE, FAILED]
+    for name in ("potential", "displacement", "weights"):
+        assert np.isnan(written[name][1]).all()
+        assert np.isfinite(written[name][0]).all()
+    assert not written.caustic[1].any()
+    assert shadowinv("status", out, "--verify").exit_code == 0
+
+
+def test_store_of_an_earlier_version_is_read_without_checksums(finished, tmp_path):
+    path = tmp_path / "old.shadowinv.zarr"
+    shutil.copytree(finished, path)
+    document = json.loads((path / "zarr.json").read_text())
+    for name in ("metadata_sha256", "chunk_checksums"):
+        del document["attributes"][name]
+    (path / "zarr.json").write_text(json.dumps(document))
+    np.testing.assert_array_equal(read(path).potential, read(finished).potential)
+    result = shadowinv("status", path, "--verify")
+    assert result.exit_code == 0
+    assert "written by an earlier version" in flat(result.output)
+
+
+def test_checksums_of_a_folder_are_not_passed_on(finished):
+    assert not {"metadata_sha256", "chunk_checksums"} & read(finished).attrs.keys()
+
+
+def test_many_shots_span_chunks_without_false_alarm(any_night, tmp_path, monkeypatch):
+    from napari_shadowinv.io import store_layout
+
+    monkeypatch.setattr(store_layout, "_TOGETHER", 2)
+    path = tmp_path / "n.shadowinv.zarr"
+    any_night.run(path, shots=[any_night.path(i) for i in range(3)])
+    any_night.run(path)
+    assert StackStore(path, every_byte=True).damage.files == ()
+    swap(path / "name" / "c" / "0", path / "name" / "c" / "1")
+    with pytest.raises(FileFormatError, match="name/c/0 does not belong to shots 0 to 1"):
+        read(path)
+
+
+def test_files_are_read_no_further_than_regular(store):
+    file = field(store, 3)
+    file.unlink()
+    os.mkfifo(file)
+    assert StackStore(store).statuses()[3] == DAMAGED
