@@ -18,7 +18,10 @@ from napari_shadowinv import (
     synthetic_image,
 )
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion.beam import beam_difference
 from napari_shadowinv.inversion.budget import ErrorEstimate
+from napari_shadowinv.inversion.noise import ImageNoise
+from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.pipeline import run
 from napari_shadowinv.preprocessing import LowPassFilter, PolynomialEstimate, Recipe
@@ -82,11 +85,11 @@ def counting(image, rng):
     return rng.poisson(300 * image).astype(float)
 
 
-def repeats(image, noise):
+def repeats(image, noise, count=50):
     rng = np.random.default_rng(3)
     options = InversionOptions(n_sites=image.size // 4, negative="clip")
     plan = plan_sites(np.ones(image.shape), options)
-    found = [invert(noise(image, rng), plan=plan, options=options) for _ in range(50)]
+    found = [invert(noise(image, rng), plan=plan, options=options) for _ in range(count)]
     return found, np.array([one.displacement for one in found])
 
 
@@ -161,10 +164,73 @@ def test_an_unmeasured_beam_is_told_by_what_other_beams_do(image):
     assert here.errors.beam.rms > 10 * here.errors.noise.rms
 
 
-def test_a_measured_beam_is_not_doubted(image):
-    assert invert(image, source=np.ones(image.shape)).errors.beam is None
+def test_a_recorded_beam_has_a_sensitivity_and_no_error(image):
+    recorded = invert(image, source=np.ones(image.shape)).errors
+    assert recorded.beam is None
     plan = plan_sites(np.ones(image.shape), measured=False)
-    assert invert(image, plan=plan).errors.beam is not None
+    assumed = invert(image, plan=plan).errors
+    assert assumed.beam == pytest.approx(np.multiply(5, recorded.beam_sensitivity), rel=1e-6)
+
+
+def test_the_total_adds_all_errors_in_squares(image):
+    errors = invert(image).errors
+    parts = np.array([errors.noise, errors.discretisation, errors.solver, errors.beam])
+    np.testing.assert_allclose(errors.total, np.sqrt((parts**2).sum(axis=0)))
+    assert errors.of_peak.cause == "beam assumed, 5 %"
+    assert errors.of_peak.share == errors.total.at_peak / errors.peak
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_a_stated_beam_variation_enters_the_total(image, measured):
+    options = InversionOptions(n_sites=900, beam_variation=0.03)
+    plan = plan_sites(np.ones(image.shape), options, measured=measured)
+    errors = invert(image, plan=plan, options=options).errors
+    assert errors.beam.rms == pytest.approx(3 * errors.beam_sensitivity.rms)
+    assert errors.of_peak.cause == "beam stated, 3 %"
+
+
+def smooth_beam(shape, variation, seed):
+    """Return a beam that varies over a quarter of the shorter side."""
+    white = np.random.default_rng(seed).normal(size=[3 * side for side in shape])
+    smooth = gaussian_filter(white, min(shape) / 4 / np.sqrt(2), mode="wrap")
+    smooth = smooth[: shape[0], : shape[1]] - smooth[: shape[0], : shape[1]].mean()
+    return 1 + variation * smooth / smooth.std()
+
+
+@pytest.mark.parametrize("source", ["recorded", "uniform"])
+def test_the_total_holds_the_error_by_another_beam(source):
+    """A reference of another shot, 1 to 10 % different: error and total agree in squares."""
+    blob = focusing()
+    rng = np.random.default_rng(12)
+    errors, totals = [], []
+    for seed, variation in enumerate([0.01, 0.03, 0.05, 0.1] * 3):
+        beam = smooth_beam((SIDE, SIDE), variation, seed)
+        shot = rng.poisson(2000 * synthetic_image(blob.displacement, beam))
+        reference = rng.poisson(2000, (SIDE, SIDE)) if source == "recorded" else None
+        found = invert(shot, source=reference, options=InversionOptions(n_sites=1500))
+        errors.append(rms(found.displacement - blob.displacement))
+        totals.append(found.errors.total.rms)
+        if variation >= 0.05 and source == "recorded":
+            assert any("image and source differ by" in text for text in found.report.warnings)
+    ratio = np.array(errors) / totals
+    assert (ratio < 2.5).all()
+    if source == "recorded":
+        assert np.sqrt((ratio**2).mean()) == pytest.approx(1, rel=0.4)
+
+
+@pytest.mark.parametrize("side", [64, 96, 128])
+@pytest.mark.parametrize("variation", [0.0, 0.04])
+def test_the_difference_outside_an_object_is_that_of_the_beams(side, variation):
+    blob = phantoms.gaussian_blob((side, side), -0.006 * side**2, 0.1 * side)
+    differences = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        beam = smooth_beam((side, side), variation, seed)
+        shot = rng.poisson(1000 * synthetic_image(blob.displacement, beam))
+        reference = rng.poisson(1000, (side, side))
+        prepared = prepare(shot, reference, InversionOptions()).in_units()
+        differences.append(beam_difference(prepared, ImageNoise(prepared)))
+    assert np.mean(differences) == pytest.approx(variation, rel=0.25, abs=2e-3)
 
 
 def test_accuracy_decides_on_the_sites_and_is_kept(image):
@@ -264,9 +330,45 @@ def test_noise_that_was_smoothed_is_not_passed_off_as_measured():
     known = options.model_copy(update={"quantum": 1.0})
     given = run(Recipe(options=known, steps=(smooth,)), image)
     assert given.errors.noise.rms == pytest.approx(plain.errors.noise.rms, rel=0.2)
-    assert filtered.errors.noise.rms < 0.5 * plain.errors.noise.rms
-    assert "measured after low-pass (smooth)" in dict(filtered.error_rows)["noise"]
-    assert "noise" not in dict(plain.error_rows) | dict(given.error_rows)
+    assert 1 / 1.6 < filtered.errors.noise.rms / plain.errors.noise.rms < 1.6
+    assert "noise, correlated over 1." in dict(filtered.error_rows)["errors"]
+    assert "noise" not in dict(filtered.error_rows) | dict(given.error_rows)
+
+
+@pytest.mark.parametrize("blur", [0.7, 1.0, 2.0])
+def test_correlated_noise_is_the_scatter_of_repeats(blur):
+    clean = synthetic_image(focusing().displacement)
+
+    def correlated(image, rng):
+        noise = gaussian_filter(rng.normal(size=image.shape), blur, mode="wrap")
+        return image + 0.05 * noise / noise.std()
+
+    found, moves = repeats(clean, correlated, count=20)
+    scatter = np.sqrt(moves.var(axis=0, ddof=1).sum(axis=0).mean())
+    ratios = np.array([one.errors.noise.rms for one in found]) / scatter
+    assert 1 / 1.5 < np.median(ratios) < 1.5
+    lengths = [one.errors.noise_correlation for one in found]
+    assert np.median(lengths) == pytest.approx(blur, rel=0.3)
+
+
+@pytest.mark.parametrize("noise", [gaussian, counting])
+def test_white_noise_is_not_called_correlated(every_image, noise):
+    for seed in range(10):
+        shot = noise(every_image, np.random.default_rng(seed))
+        prepared = prepare(shot, None, InversionOptions(negative="clip")).in_units()
+        assert ImageNoise(prepared).clumping == 1
+
+
+def test_noise_error_does_not_depend_on_the_unit_of_the_image(image):
+    """Of f · image; also with a noise level or a quantum that is stated in that unit."""
+    shot = counting(image, np.random.default_rng(2))
+    for stated in ({}, {"noise_level": 20.0}, {"quantum": 1.5}):
+        errors = []
+        for factor in (1.0, 37.0):
+            scaled = {name: factor * value for name, value in stated.items()}
+            options = InversionOptions(n_sites=900, **scaled)
+            errors.append(invert(factor * shot, options=options).errors.noise)
+        assert errors[1] == pytest.approx(errors[0], rel=1e-6)
 
 
 def test_a_dataset_keeps_the_errors_and_has_them_in_si(image, proton_setup: ProtonSetup):
@@ -326,7 +428,9 @@ def test_every_way_to_an_inversion_knows_whether_the_beam_was_measured(tmp_path)
     estimated = Recipe(options=options, source=PolynomialEstimate(degree=1))
     assert run(uniform, image).errors.beam is not None
     assert run(estimated, image).errors.beam is not None
-    assert run(uniform, image, source=np.ones(image.shape)).errors.beam is None
+    recorded = run(uniform, image, source=np.ones(image.shape)).errors
+    assert recorded.beam is None
+    assert recorded.beam_sensitivity.rms > 0
     for given, is_measured in (({}, False), ({"source": np.ones(image.shape)}, True)):
         out = tmp_path / f"{is_measured}.shadowinv.zarr"
         store = run_stack(image[None], out, options=options, **given)

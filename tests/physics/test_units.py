@@ -8,10 +8,11 @@ import pytest
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.physics.units import (
     PREFIXED_UNITS,
+    PeakError,
     intensity_limits,
     shown_fields,
     shown_potential,
-    with_errors,
+    with_error,
 )
 
 
@@ -21,28 +22,28 @@ def test_peak_is_told_in_both_units(proton_setup: ProtonSetup) -> None:
     )
     (field,) = shown_fields([displacement], proton_setup)
     assert field.peak_text() == "peak |∫B×dz| 9.7 mT·m (97 MG·µm)"
-    told = field.peak_text({"noise": 2.1 / 97, "discretisation": 0.2 / 97})
-    assert told == (
-        "peak |∫B×dz| 9.70 ± 0.21 (noise) ± 0.02 (discretisation) mT·m "
-        "(97.0 ± 2.1 (noise) ± 0.2 (discretisation) MG·µm)"
-    )
+    told = field.peak_text(PeakError(2.1 / 97, "noise"))
+    assert told == "peak |∫B×dz| 9.70 ± 0.21 mT·m (97.0 ± 2.1 MG·µm) (noise)"
+
+
+def test_peak_and_largest_leave_out_masked_pixels() -> None:
+    displacement = np.zeros((2, 3, 4))
+    displacement[0, 0, 1], displacement[1, 2, 3] = -3.0, 9.0
+    mask = np.ones((3, 4), bool)
+    mask[2, 3] = False
+    (field,) = shown_fields([displacement], None, mask=mask)
+    assert (field.peak, field.largest) == ((0, 1), 3.0)
+    assert np.isnan(field.magnitude[2, 3])
+    (field,) = shown_fields([displacement], None)
+    assert (field.peak, field.largest) == ((2, 3), 9.0)
 
 
 @pytest.mark.parametrize(
-    ("value", "errors", "written"),
-    [
-        (0.0312, {}, "0.0312"),
-        (
-            14.2,
-            {"noise": 0.1, "discretisation": 1e-5},
-            "14.2 ± 1.4 (noise) ± 0.0001 (discretisation)",
-        ),
-        (5.0, {"noise": 30.0}, "5 ± 150 (noise)"),
-        (5.0, {"noise": 0.0}, "5"),
-    ],
+    ("value", "share", "written"),
+    [(0.0312, 0.0, "0.0312"), (14.2, 0.1, "14.2 ± 1.4"), (5.0, 30.0, "5 ± 150")],
 )
-def test_a_number_has_the_figures_that_its_errors_allow(value, errors, written) -> None:
-    assert with_errors(value, errors) == written
+def test_a_number_has_the_figures_that_its_error_allows(value, share, written) -> None:
+    assert with_error(value, share) == written
 
 
 def test_light_is_shown_by_its_deflection(optical_setup: OpticalSetup) -> None:

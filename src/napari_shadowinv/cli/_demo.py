@@ -6,7 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from napari_shadowinv.cli._tables import closing_rows, inversion_rows, setup_text, two_columns
+from napari_shadowinv.cli._tables import (
+    closing_rows,
+    headline_row,
+    inversion_rows,
+    setup_text,
+    two_columns,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -63,8 +69,9 @@ def write_demo(
 def demo_table(
     inversion: Inversion, setup: ProtonSetup, fields: Fields, written: list[Path]
 ) -> Table:
-    """Tell how well the inversion went, and how far it is from the truth."""
+    """Build the table of a demo: the quality of the inversion and its distance from the truth."""
     rows = [
+        headline_row(inversion, setup),
         ("setup", setup_text(setup)),
         *inversion_rows(inversion, setup),
         ("error", _errors_text(fields, "Retrieved")),

@@ -154,6 +154,7 @@ def _result_rows(dataset: xarray.Dataset) -> _tables.Rows:
         return [("kind", kind), *experiment, *_tables.peak_rows(displacement, setup)]
     inversion = Inversion.from_dataset(dataset)
     return [
+        _tables.headline_row(inversion, setup),
         ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
         *_origin_rows(inversion.provenance),

@@ -11,7 +11,7 @@ from napari_shadowinv.cli._terminal import plain
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from napari_shadowinv._typing import AnyArray, FloatArray
+    from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
     from napari_shadowinv.cli._rerun import Again
     from napari_shadowinv.inversion import Inversion, Report
     from napari_shadowinv.inversion.budget import Errors
@@ -20,9 +20,14 @@ if TYPE_CHECKING:
 
 Rows = list[tuple[str, str]]
 
+_STYLES = {"warning": "yellow", "sound": "green", "doubtful": "bold yellow", "failed": "bold red"}
+
 
 def two_columns(title: str, rows: Rows) -> Table:
-    """Names on the left, values on the right, warnings in yellow."""
+    """Build a table with names on the left and values on the right.
+
+    Warnings are yellow; a headline has the colour of its level.
+    """
     from rich import box
     from rich.table import Table
 
@@ -30,13 +35,20 @@ def two_columns(title: str, rows: Rows) -> Table:
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in rows:
-        table.add_row(plain(name), plain(value, "yellow" if name == "warning" else ""))
+        table.add_row(plain(name), plain(value, _STYLES.get(name, "")))
     return table
 
 
+def headline_row(inversion: Inversion, setup: Setup | None) -> tuple[str, str]:
+    """The result in one line; the name of the row is the level of trust."""
+    headline = inversion.headline_in(setup)
+    return (headline.level.value, headline.text)
+
+
 def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Table:
-    """Tell what was inverted, how well it went, and where the answer is."""
+    """Build the table of an inversion: its headline, its input, its quality and its files."""
     rows = [
+        headline_row(inversion, inversion.setup),
         ("image", f"{shot.path}, {size_text(inversion.image)}"),
         *provenance_rows(inversion.provenance),
         ("setup", setup_text(inversion.setup, shot)),
@@ -47,8 +59,9 @@ def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Tabl
 
 
 def rerun_table(again: Again, written: list[Path]) -> Table:
-    """Tell what has changed since a result was made first."""
+    """Build the table of a repeated inversion: its headline and the changes."""
     rows = [
+        headline_row(again.inversion, again.inversion.setup),
         ("image", f"{again.shot.path}, {size_text(again.inversion.image)}"),
         *[("changed", text) for text in again.changes or ("nothing",)],
         ("difference", again.difference),
@@ -99,22 +112,28 @@ def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
             for name, shares in free.items()
             if shares
         ],
-        *peak_rows(inversion.displacement, setup, inversion.errors),
+        *peak_rows(inversion.displacement, setup, mask=inversion.mask, errors=inversion.errors),
         *inversion.error_rows,
     ]
 
 
-def peak_rows(displacement: FloatArray, setup: Setup | None, errors: Errors | None = None) -> Rows:
-    """The strongest point, in pixels and where there is a setup in SI units."""
-    of_peak = {} if errors is None else errors.of_peak
+def peak_rows(
+    displacement: FloatArray,
+    setup: Setup | None,
+    *,
+    mask: BoolArray | None = None,
+    errors: Errors | None = None,
+) -> Rows:
+    """The strongest point inside the mask, in pixels and where there is a setup in SI units."""
     from napari_shadowinv.physics.units import shown_fields
 
-    (pixels,) = shown_fields([displacement], None)
+    error = None if errors is None else errors.of_peak
+    (pixels,) = shown_fields([displacement], None, mask=mask)
     row, column = pixels.peak
-    rows = [("displacement", f"{pixels.peak_text(of_peak)}, at y = {row}, x = {column} px")]
+    rows = [("displacement", f"{pixels.peak_text(error)}, at y = {row}, x = {column} px")]
     if setup is not None:
-        (field,) = shown_fields([displacement], setup)
-        rows.append(("field", field.peak_text(of_peak)))
+        (field,) = shown_fields([displacement], setup, mask=mask)
+        rows.append(("field", field.peak_text(error)))
     return rows
 
 

@@ -97,16 +97,15 @@ def _shortened(name: str, room: int) -> str:
 def _told(result: Inversion | Fit) -> tuple[str, str]:
     """The numbers of a shot, and what casts doubt on them."""
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.units import shown_fields, with_errors
+    from napari_shadowinv.physics.units import shown_fields, with_error
 
     if not isinstance(result, Inversion):
         doubts = "" if result.report.converged else "  NOT converged"
         return f"{result.verdict}  χ² {result.chi2.max():.3g}", doubts
     report, errors = result.report, result.errors
-    (field,) = shown_fields([result.displacement], result.setup)
-    noise = {} if errors is None else errors.of_peak
-    known = {name: share for name, share in noise.items() if name == "noise"}
-    peak = with_errors(float(field.magnitude.max()), known).replace(" (noise)", "")
+    (field,) = shown_fields([result.displacement], result.setup, mask=result.mask)
+    error = None if errors is None else errors.of_peak
+    peak = with_error(field.largest, error.share if error else 0.0)
     count = len(report.warnings)
     warnings = f"  {count} warning{'s' if count > 1 else ''}" if count else ""
     return (

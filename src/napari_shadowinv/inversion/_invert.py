@@ -270,6 +270,8 @@ def invert(
     if finest and errors is not None and told.warnings == prepared.warnings:
         missed = errors.missed(options.accuracy, "with the most sites placed unless more are given")
         told = replace(told, warnings=(*told.warnings, *filter(None, [missed])))
+    if errors is not None:
+        told = replace(told, warnings=(*filter(None, [errors.beam_warning()]), *told.warnings))
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,

@@ -1,7 +1,7 @@
-"""What makes an answer wrong, and by how much; and when more sites would not make it better.
+"""The error budget of an inversion, and the number of sites that it needs.
 
 - the errors of a result: `Errors`, of which each is an `ErrorEstimate`
-- found while levels are solved, and asked when there are enough: `Budget`
+- computed while levels are solved, and asked whether more sites are needed: `Budget`
 
 Between two levels, one with four times the sites of the other, the displacement changes by what the
 coarser one got wrong. Changes fall by nearly the same rate from level to level, and as each is of
@@ -22,10 +22,12 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.inversion.beam import beam_difference
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.response import LinearResponse
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.units import PeakError
 from napari_shadowinv.transport.minimise import with_full_cells
 from napari_shadowinv.transport.objective import Solution
 from napari_shadowinv.transport.sites import RATIO, SitePlan
@@ -39,11 +41,19 @@ _WHOLE = 3.0  # times the sites of the level before: a whole step
 _SAFETY = 1.3
 _SOLVED = 0.1  # largest residual of a level that tells anything
 _SHARE_OF_NOISE, _MUCH_NOISE = 0.2, 0.8
-_NOTABLE = 0.02  # of the largest error
+_NOTABLE_BEAM = 0.1  # of the peak
 
 _RESPONDING = 4500  # sites, at most, whose linear response is worked out
 _NOISE_SAMPLES, _BEAM_SAMPLES, _WAVES = 16, 8, 16
 _NEAR = 2.5  # site spacings
+_LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
+
+_ASSUMED_VARIATION, _TESTED_VARIATION = 0.05, 0.01  # of a beam, r.m.s.
+_BEAM_TEXTS = {
+    "assumed": "beam assumed, {:.2g} %",
+    "stated": "beam stated, {:.2g} %",
+    "seen": "image and source differ by {:.2g} %",
+}
 
 
 class ErrorEstimate(NamedTuple):
@@ -57,22 +67,32 @@ class ErrorEstimate(NamedTuple):
 class Errors:
     """The error budget of an inversion: standard errors of the displacement, in px.
 
-    It holds what is named here. It does not hold what a blurred image, crossing rays, or a field
-    that the image's edge cuts off do.
+    It does not contain the effects of a blurred image, of crossing rays, or of a field that the
+    image's edge cuts off.
 
     Attributes
     ----------
     peak, rms : float
-        Largest displacement and its root mean square over the image, px, for comparison.
+        Largest displacement inside the mask and its root mean square, px, for comparison.
     discretisation : ErrorEstimate
-        What more sites would change; NaN if there was no coarser level to compare with.
+        Change by more sites; NaN if there was no coarser level to compare with.
     noise : ErrorEstimate
-        What the noise of image and source does.
+        Scatter by the noise of image and source.
     solver : ErrorEstimate
-        What the flux that the solver left in wrong cells does.
+        Effect of the flux that the solver left in wrong cells.
     beam : ErrorEstimate or None
-        What it would do if the beam differed from what was assumed as the options'
-        `beam_variation` and `beam_scale` say; None if the source was measured.
+        Effect of a beam that differs from the source by `beam_variation`; None if the source was
+        recorded, no variation was stated, and none was seen.
+    beam_sensitivity : ErrorEstimate or None
+        Effect of a beam that differs from the source by 1 %; None in reports of older versions.
+    beam_variation : float
+        Relative r.m.s. difference of beam and source that `beam` stands for.
+    beam_basis : str
+        Where that number is from: 'assumed' for an estimated source, 'stated' by the user, 'seen'
+        in the image outside the object.
+    noise_correlation : float
+        Standard deviation of the Gaussian blur that correlates noise as much as it was measured to
+        be, px; 0 for white noise.
     """
 
     peak: float
@@ -81,20 +101,39 @@ class Errors:
     noise: ErrorEstimate
     solver: ErrorEstimate
     beam: ErrorEstimate | None = None
+    beam_sensitivity: ErrorEstimate | None = None
+    beam_variation: float = _ASSUMED_VARIATION
+    beam_basis: str = "assumed"
+    noise_correlation: float = 0.0
 
     @property
-    def of_peak(self) -> dict[str, float]:
-        """The errors at the peak that matter, by name, as shares of the peak."""
-        least = _NOTABLE * max((one.at_peak for one in self._known.values()), default=0.0)
+    def total(self) -> ErrorEstimate:
+        """All contributions, added in squares."""
+        parts = np.array(list(self._contributions.values()))
+        return _roots(*(parts**2).sum(axis=0))
+
+    @property
+    def of_peak(self) -> PeakError | None:
+        """The total at the peak as a share of it, and its largest contribution; None for no peak.
+
+        This is the error in every headline.
+        """
         if not self.peak > 0:
-            return {}
-        shares = {name: one.at_peak / self.peak for name, one in self._known.items()}
-        return {name: share for name, share in shares.items() if share > least / self.peak}
+            return None
+        parts = self._contributions
+        cause = max(parts, key=lambda name: parts[name].at_peak)
+        return PeakError(self.total.at_peak / self.peak, cause)
 
     @property
-    def _known(self) -> dict[str, ErrorEstimate]:
-        found = {"noise": self.noise, "discretisation": self.discretisation, "solver": self.solver}
-        return {name: one for name, one in found.items() if not math.isnan(one.rms)}
+    def _contributions(self) -> dict[str, ErrorEstimate]:
+        """Known errors by their causes."""
+        noise = "noise"
+        if self.noise_correlation:
+            noise = f"noise, correlated over {self.noise_correlation:.2g} px"
+        parts = {noise: self.noise, "discretisation": self.discretisation, "solver": self.solver}
+        if self.beam is not None:
+            parts[_BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)] = self.beam
+        return {name: error for name, error in parts.items() if not math.isnan(error.rms)}
 
     def missed(self, accuracy: float, why: str) -> str:
         """Say so, and why, if discretisation misses an accuracy and shows beside the noise."""
@@ -108,46 +147,69 @@ class Errors:
         )
 
     def scaled(self, factor: float) -> Errors:
-        """Return the same in another unit, of which a displacement of 1 px is `factor`."""
-        one = {
+        """Return the budget in another unit, of which a displacement of 1 px is `factor`."""
+        lengths = {
             field.name: _times(getattr(self, field.name), factor)
             for field in dataclasses.fields(self)
+            if field.name in ("peak", "rms") or isinstance(getattr(self, field.name), ErrorEstimate)
         }
-        return Errors(**one)
+        return dataclasses.replace(self, **lengths)
 
     def rows(self, options: InversionOptions) -> list[tuple[str, str]]:
-        """Say in words what is not known of the displacement: names and texts."""
-        told = ", ".join(
-            f"{name} {_percent(one.rms, self.rms)}" for name, one in self._known.items()
+        """Describe the budget in words: names and texts."""
+        parts = ", ".join(
+            f"{_percent(error.rms, self.rms)} ({cause})"
+            for cause, error in self._contributions.items()
         )
-        told = f"{told} of the displacement (r.m.s.); blur and crossing rays are not in it"
+        text = (
+            f"{_percent(self.total.rms, self.rms)} of the displacement (r.m.s.): {parts}; blur and "
+            "crossing rays are not in it"
+        )
         if math.isnan(self.discretisation.rms):
-            told += "; discretisation was not estimated, as only one level was solved"
-        rows = [("errors", told)]
-        if self.beam is not None:
+            text += "; discretisation was not estimated, as only one level was solved"
+        rows = [("errors", text)]
+        if self.beam_sensitivity is not None:
+            length = {0.25: "a quarter"}.get(options.beam_scale, f"{options.beam_scale:.2g}")
+            basis = "recorded"
+            if self.beam is not None:
+                basis = _BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)
+                basis = basis.removeprefix("beam ")
             rows.append(
                 (
                     "beam",
-                    f"not measured: if it varies by {100 * options.beam_variation:.2g} % (r.m.s.) "
-                    f"over {options.beam_scale:.2g} of the image's shorter side, the displacement "
-                    f"is off by {_percent(self.beam.rms, self.rms)} (r.m.s.), its peak by "
-                    f"{_percent(self.beam.at_peak, self.peak)}",
+                    f"{basis}; a source that differs from it by 1 % (r.m.s.) over {length} of the "
+                    "image's shorter side moves the displacement by "
+                    f"{_percent(self.beam_sensitivity.rms, self.rms)} (r.m.s.), its peak by "
+                    f"{_percent(self.beam_sensitivity.at_peak, self.peak)}",
                 )
             )
         return rows
 
+    def beam_warning(self) -> str:
+        """Warn if image and source differ outside the object so that the peak is uncertain."""
+        if self.beam is None or self.beam_basis != "seen":
+            return ""
+        if not self.beam.at_peak > _NOTABLE_BEAM * self.peak:
+            return ""
+        return (
+            f"image and source differ by {100 * self.beam_variation:.2g} % (r.m.s.) where there is "
+            f"no object: the field may be off by {_percent(self.beam.rms, self.rms)}, its peak by "
+            f"{_percent(self.beam.at_peak, self.peak)}; use a source of the same exposure, or fit "
+            "the beam"
+        )
+
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> Errors:
-        """Rebuild them from what a file holds of them."""
-        told: dict[str, Any] = {
+        """Rebuild the budget from its form in a file."""
+        values: dict[str, Any] = {
             name: ErrorEstimate(*value) if isinstance(value, list | tuple) else value
             for name, value in content.items()
         }
-        return cls(**told)
+        return cls(**values)
 
 
 class Budget:
-    """Works out errors from the levels that are solved, and tells when there are enough."""
+    """Computation of errors from the levels that are solved so far."""
 
     def __init__(
         self,
@@ -189,7 +251,7 @@ class Budget:
         if error < _MUCH_NOISE * noise:
             response = self._response(solved)
             moves, finer = self._noisy_moves(response, solved[-1].level.spacing)
-            by_noise = (moves**2).sum(axis=2).mean(axis=1) + finer
+            by_noise = _with_finer((moves**2).sum(axis=2).mean(axis=1), finer)
             noise = math.sqrt(float((by_noise * response.shares).sum()))
         if error < _SHARE_OF_NOISE * noise:
             self.reason = f"{told}, below a fifth of what the noise does ({_percent(noise, rms)})"
@@ -201,6 +263,7 @@ class Budget:
         """Return the errors of the last solution, whose displacement was read out, (2, H, W)."""
         solved = _solved(solutions)
         mask = self._prepared.mask
+        variation, basis = self._beam_variation
         length = np.where(mask, np.hypot(*displacement), 0.0)
         row, column = np.unravel_index(length.argmax(), length.shape)
         peak = np.array([row, column], dtype=np.float64)
@@ -209,8 +272,9 @@ class Budget:
         near = _near(peak, response.places, response.spacing)
 
         def estimate(moves: FloatArray, finer: FloatArray | float = 0.0) -> ErrorEstimate:
-            squares = (moves**2).sum(axis=2).mean(axis=1) + finer
-            at_peak = ((moves * along).sum(axis=2) ** 2).mean(axis=1) + finer / 2
+            squares = _with_finer((moves**2).sum(axis=2).mean(axis=1), finer)
+            at_peak = ((moves * along).sum(axis=2) ** 2).mean(axis=1)
+            at_peak = _with_finer(at_peak, finer / 2)
             return _roots((squares * response.shares).sum(), (at_peak * near).sum())
 
         discretisation = ErrorEstimate(math.nan, math.nan)
@@ -219,14 +283,30 @@ class Budget:
             spacing = max(solved[-2].level.spacing, _stride(mask.shape))
             close = _near(peak, self._places.T, spacing)
             discretisation = _roots(squares.mean(), (squares * close).sum() / 2)
+        by_percent = estimate(_TESTED_VARIATION * response.to(self._beams(response)))
+        times = variation / _TESTED_VARIATION
         return Errors(
             peak=float(length.max()),
             rms=float(np.sqrt(np.mean(length[mask] ** 2))),
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
             solver=estimate(response.to(self._left_by_solver(response, solved[-1]))),
-            beam=None if self._plan.measured else estimate(response.to(self._beams(response))),
+            beam=_times(by_percent, times) if variation else None,
+            beam_sensitivity=by_percent,
+            beam_variation=variation,
+            beam_basis=basis,
+            noise_correlation=self._noise.correlation_length,
         )
+
+    @cached_property
+    def _beam_variation(self) -> tuple[float, str]:
+        """Relative difference of beam and source, and where it is from."""
+        stated = self._options.beam_variation
+        expected = 0.0 if self._plan.measured else _ASSUMED_VARIATION
+        seen = beam_difference(self._prepared.in_units(), self._noise)
+        if seen > (expected if stated is None else stated):
+            return seen, "seen"
+        return (expected, "assumed") if stated is None else (stated, "stated")
 
     def _move(self, solution: LevelSolution) -> FloatArray:
         """Displacement at the places, shape (2, n), as it is read out."""
@@ -281,13 +361,14 @@ class Budget:
             mean = self._prepared.source[self._prepared.mask].mean() / self._prepared.unit
             brightness = response.flux / (response.area * mean)
             variance = self._noise.variance(brightness) * mean**2 * response.area
+            variance *= self._noise.clumping
             drawn = np.sqrt(variance) * rng.normal(size=(_NOISE_SAMPLES, len(variance)))
             self._by_noise[response] = response.to(drawn), variance
         moves, variance = self._by_noise[response]
-        return moves, response.finer(variance, spacing)
+        return moves, response.finer(variance, spacing, self._noise.grain)
 
     def _beams(self, response: LinearResponse) -> FloatArray:
-        """What a beam that is not what was assumed would add to the cells."""
+        """Flux that cells gain from beams that differ from the source by 1 (r.m.s.)."""
         rng = np.random.default_rng(self._options.seed)
         mass, sites = response.level.mass, response.level.sites
         length = self._options.beam_scale * min(self._prepared.mask.shape)
@@ -297,7 +378,7 @@ class Budget:
             phases = rng.uniform(0, 2 * np.pi, _WAVES)
             sample[:] = np.cos((sites @ waves + phases).astype(np.float32)).sum(axis=1)
             sample -= (mass * sample).sum() / mass.sum()
-            sample *= self._options.beam_variation / np.sqrt((mass * sample**2).sum() / mass.sum())
+            sample /= np.sqrt((mass * sample**2).sum() / mass.sum())
         return mass * drawn
 
     def _left_by_solver(self, response: LinearResponse, solution: LevelSolution) -> FloatArray:
@@ -313,10 +394,15 @@ class Budget:
         return np.bincount(group, gap, len(response.flux)).astype(np.float64)[None]
 
 
-def _times(value: float | ErrorEstimate | None, factor: float) -> Any:
+def _times(value: float | ErrorEstimate, factor: float) -> Any:
     if isinstance(value, ErrorEstimate):
         return ErrorEstimate(factor * value.rms, factor * value.at_peak)
-    return None if value is None else factor * value
+    return factor * value
+
+
+def _with_finer(squares: FloatArray, finer: FloatArray | float) -> FloatArray:
+    """Add the mean squares of finer waves, which are negative where noise lacks waves."""
+    return np.asarray(np.maximum(squares + finer, _LEAST_NOISE * squares))
 
 
 def _solved(solutions: Sequence[LevelSolution]) -> list[LevelSolution]:

@@ -2,7 +2,10 @@
 
 Structures that the beam's path makes are smooth over a few pixels, noise is not: in
 (a - b - c + d) / 2 over four neighbours a smooth image cancels, and white noise keeps its
-variance. Noise that a filter has correlated is smaller there than it is.
+variance. A filter, a scintillator or an image plate correlates the noise of neighbouring pixels;
+then such a difference over k pixels grows with k until the pixels are independent, in all parts
+of the image alike. The variances V(k) = V(∞) (1 - ρ(k))² give the correlation ρ along one axis,
+and from it how much more noise there is in the mean of many pixels than in white noise.
 """
 
 from __future__ import annotations
@@ -12,9 +15,11 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import ndimage
 from scipy.optimize import nnls
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion.normalise import Prepared
@@ -27,6 +32,22 @@ _NORMAL_MAD = 1.4826
 _DEVIATIONS = 5.0
 _BINS, _SAMPLES = 24, 20_000  # of brightness, and the pixels that are looked at
 
+_LAGS_PX = (1, 2, 3, 4, 6, 8, 12)
+_TILE_PX, _SMALL_TILE_PX = 16, 10
+_MIN_SIDE_PX = 92  # of an image with large tiles
+_MAX_TILES = 20  # along each axis
+_MIN_TILES = 5
+_QUIET_SHARE = 0.3  # of the tiles, those with the least structure around them
+_MIN_RISE, _RISE_DEVIATIONS = 1.2, 0.8  # of V(2) over V(1): least, and in 1/√(tiles)
+_LOW_QUANTILE = 0.25  # of the quiet tiles: noise is correlated in nearly all of them
+_MIN_DEVIATION = 1e-4  # of the brightness; below are the smooth flanks of noiseless images
+_MAX_PLATEAU_RISE = 1.35  # of V at the largest lag over the one before
+_MIN_CORRELATION = 0.05
+_CLIP_DEVIATIONS = 5.0
+# White noise on pixels has waves up to 3.51 rad/px, averaged over directions of its logarithm;
+# a Gaussian blur of standard deviation b ends them at exp(-γ/2) / b.
+_GRAIN_PER_BLUR = 3.51 / math.exp(-0.5772 / 2)
+
 
 class ImageNoise:
     """The noise of an image, and of its source, as shares of the source's mean.
@@ -34,7 +55,12 @@ class ImageNoise:
     Attributes
     ----------
     largest, typical : float
-        Standard deviation with hot pixels and the finest structure, and without.
+        Standard deviation of a pixel with hot pixels and the finest structure, and without.
+    clumping : float
+        Variance of the sum of many pixels over the sum of their variances; 1 for white noise.
+    correlation_length : float
+        Standard deviation of the Gaussian blur that clumps white noise as much, px; 0 for white
+        noise.
     """
 
     def __init__(self, prepared: Prepared, options: InversionOptions | None = None) -> None:
@@ -42,22 +68,34 @@ class ImageNoise:
         self.shape = mask.shape[0], mask.shape[1]
         mean = prepared.source[mask].mean()
         excess = (image - prepared.source) / mean
-        finest = (excess[1:, 1:] - excess[1:, :-1] - excess[:-1, 1:] + excess[:-1, :-1]) / 2
         used = mask[1:, 1:] & mask[1:, :-1] & mask[:-1, 1:] & mask[:-1, :-1]
-        differences = np.abs(finest[used]) if used.any() else np.zeros(1)
-        self.largest = _rms(differences)
-        self.typical = _clipped(differences)
-        bright = (image[1:, 1:] + image[1:, :-1] + image[:-1, 1:] + image[:-1, :-1]) / (4 * mean)
+        differences = _finest(excess, used)
+        inflation, self.clumping = _correlation(excess, mask)
+        self.largest = _rms(differences) * math.sqrt(inflation)
+        self.typical = _clipped(differences) * math.sqrt(inflation)
         # The source's mean, in units of the recorded image.
         quantum = prepared.flux_scale * prepared.unit * mean
         # Of the variance: what is constant, in proportion to the brightness, and to its square.
         self._terms = np.zeros(3)
-        if options is not None and options.noise_level is not None:
-            self._terms[0] = (options.noise_level / quantum) ** 2
-        elif options is not None and options.quantum is not None:
-            self._terms[1] = options.quantum / quantum
+        level, counts = (None, None) if options is None else (options.noise_level, options.quantum)
+        if level is not None:
+            self._terms[0] = (level / quantum) ** 2
+        elif counts is not None:
+            self._terms[1] = counts / quantum
+            self.clumping = 1.0  # a blur leaves the counting noise of many pixels as it was
         elif used.any():
-            self._terms = _terms(bright[used], differences)
+            bright = image[1:, 1:] + image[1:, :-1] + image[:-1, 1:] + image[:-1, :-1]
+            self._terms = inflation * _terms(bright[used] / (4 * mean), differences)
+        if (level, counts) != (None, None):  # stated for the image, not for its source
+            self._terms[0] += _clipped(_finest(prepared.source / mean, used)) ** 2
+        self.correlation_length = 0.0
+        if self.clumping > 1:
+            self.correlation_length = math.sqrt(self.clumping / (4 * math.pi))
+
+    @property
+    def grain(self) -> float:
+        """Smallest structure of correlated noise, px, where pixels have 1; 0 for white noise."""
+        return _GRAIN_PER_BLUR * self.correlation_length
 
     def variance(self, brightness: FloatArray) -> FloatArray:
         """Return the variance of pixels that are so bright, in units of the source's mean."""
@@ -67,7 +105,16 @@ class ImageNoise:
     def displacements(self, level: float) -> tuple[float, float]:
         """R.m.s. displacement of so much noise, px, and the most that chance leaves likely."""
         mean, deviation = _response(self.shape)
+        # Of the mean, 1 / 2π for each power of e in the waves is from those that noise lacks.
+        mean = max(mean - math.log(max(self.grain, 1.0)) / (2 * math.pi), deviation)
+        level *= math.sqrt(self.clumping)
         return level * math.sqrt(mean), level * math.sqrt(mean + _DEVIATIONS * deviation)
+
+
+def _finest(values: FloatArray, used: BoolArray) -> FloatArray:
+    """Absolute differences of neighbouring pixels in which smooth structure cancels."""
+    finest = (values[1:, 1:] - values[1:, :-1] - values[:-1, 1:] + values[:-1, :-1]) / 2
+    return np.abs(finest[used]) if used.any() else np.zeros(1)
 
 
 def _rms(values: FloatArray) -> float:
@@ -78,6 +125,71 @@ def _clipped(differences: FloatArray) -> float:
     """Standard deviation without what noise does not explain."""
     limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(differences))
     return _rms(np.minimum(differences, limit)) if limit > 0 else _rms(differences)
+
+
+def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
+    """Variance of a pixel over that of the finest differences, and the clumping."""
+    side = _TILE_PX if min(excess.shape) >= _MIN_SIDE_PX else _SMALL_TILE_PX
+    lags = [lag for lag in _LAGS_PX if lag < side]
+    if _MIN_TILES * side + lags[-1] > min(excess.shape):
+        return 1.0, 1.0
+    tiles, used = _tiles(excess, mask, side, lags[-1])
+    finest = _difference_variance(tiles, side, 1)
+    used &= finest > 0
+    rise = np.where(
+        used, _difference_variance(tiles, side, lags[-1]) / np.where(used, finest, 1.0), 1.0
+    )
+    around = _around(rise)
+    quiet = used & (around <= np.quantile(around, _QUIET_SHARE))
+    count = int(quiet.sum())
+    if count < _MIN_TILES:
+        return 1.0, 1.0
+    tiles, finest = tiles[quiet], finest[quiet]
+    lowest = np.quantile(_difference_variance(tiles, side, 2) / finest, _LOW_QUANTILE)
+    if lowest < max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(count)):
+        return 1.0, 1.0
+    variances = [_difference_variance(tiles, side, lag) for lag in lags]
+    ratios = np.array([np.median(variance / finest) for variance in variances])
+    if ratios[-1] > _MAX_PLATEAU_RISE * ratios[-2]:
+        return 1.0, 1.0  # structure, which grows with the distance
+    if np.median(variances[-1]) < _MIN_DEVIATION**2:
+        return 1.0, 1.0
+    inflation = float(ratios[-2:].mean())
+    correlation = 1 - np.sqrt(np.minimum(ratios / inflation, 1.0))
+    ends = np.flatnonzero(correlation < _MIN_CORRELATION)
+    correlation[ends[0] if ends.size else len(lags) :] = 0.0
+    steps = np.arange(lags[-1] + 1)
+    along_axis = np.interp(steps, [0, *lags], [1.0, *correlation])
+    return inflation, float((2 * along_axis.sum() - 1) ** 2)
+
+
+def _tiles(
+    excess: FloatArray, mask: BoolArray, side: int, lag: int
+) -> tuple[FloatArray, BoolArray]:
+    """Tiles on a grid, each with the pixels at a lag, without hot pixels; and which are usable."""
+    size = side + lag
+    steps = [max(side, -(-(n - size) // _MAX_TILES)) for n in excess.shape]
+    places = np.s_[:: steps[0], :: steps[1]]
+    tiles = sliding_window_view(excess, (size, size))[places]
+    used = sliding_window_view(mask, (size, size))[places].all(axis=(2, 3))
+    middle = np.median(tiles[..., ::2, ::2], axis=(2, 3), keepdims=True)
+    spread = np.median(np.abs(tiles[..., ::2, ::2] - middle), axis=(2, 3), keepdims=True)
+    limit = _CLIP_DEVIATIONS * _NORMAL_MAD * spread
+    return np.clip(tiles, middle - limit, middle + limit), np.asarray(used)
+
+
+def _difference_variance(tiles: FloatArray, side: int, lag: int) -> FloatArray:
+    """Mean square of (a - b - c + d) / 2 over pixels that are so far apart, for each tile."""
+    here, there = slice(0, side), slice(lag, side + lag)
+    down = tiles[..., here, :] - tiles[..., there, :]
+    return np.asarray(((down[..., here] - down[..., there]) ** 2).mean(axis=(-2, -1)) / 4)
+
+
+def _around(values: FloatArray) -> FloatArray:
+    """Mean of tiles and their neighbours, so that tiles are hardly chosen by their noise."""
+    cross = ndimage.generate_binary_structure(2, 1).astype(np.float64)
+    sums, counts = (ndimage.convolve(v, cross, mode="constant") for v in (values, values**0))
+    return np.asarray(sums / counts)
 
 
 def _terms(bright: FloatArray, differences: FloatArray) -> FloatArray:

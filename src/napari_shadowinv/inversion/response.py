@@ -58,13 +58,15 @@ class LinearResponse:
         corners, slopes = self._slopes
         return np.asarray(-np.einsum("tik,tic->tkc", potential[corners], slopes))
 
-    def finer(self, variance: FloatArray, spacing: float) -> FloatArray:
+    def finer(self, variance: FloatArray, spacing: float, grain: float = 0.0) -> FloatArray:
         """Return each triangle's mean square displacement, px², by waves too fine for this level.
 
         Those are meant that sites with such a spacing feel. `variance` is that of the flux in each
-        cell, of noise that is independent between pixels.
+        cell, of noise that is independent between pixels, or above a `grain`, px. The result is
+        negative if this level feels finer waves than such noise has.
         """
-        powers = math.log(max(self.spacing / (_FELT * max(spacing, 1.0)), 1.0))
+        felt = self.spacing / _FELT
+        powers = math.log(felt / max(min(felt, max(spacing, 1.0)), grain))
         of_cell = variance * self.area / self.flux**2
         corners, _ = self._slopes
         return np.asarray(of_cell[corners].mean(axis=1) * powers / (2 * np.pi))

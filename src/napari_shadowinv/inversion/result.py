@@ -184,13 +184,14 @@ class Inversion:
 
     @property
     def error_rows(self) -> list[tuple[str, str]]:
-        """What is told of the errors: names and texts."""
+        """The error budget in words: names and texts."""
         if self.errors is None:
             return []
         rows = self.errors.rows(self.options)
         steps = () if self.provenance is None else self.provenance.recipe.steps
         smoothing = [step.title for step in steps if step.smooths]
-        if smoothing and self.options.noise_level is None and self.options.quantum is None:
+        is_stated = (self.options.noise_level, self.options.quantum) != (None, None)
+        if smoothing and not is_stated and not self.errors.noise_correlation:
             told = (
                 f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
                 "error is larger than told; give the noise_level or quantum of the recorded image"
@@ -206,12 +207,22 @@ class Inversion:
     @property
     def headline(self) -> Headline:
         """The warnings and the peak of the main field in one line, as every face shows it."""
-        shares = {} if self.errors is None else self.errors.of_peak
-        (field,) = shown_fields([self.displacement], self.setup)
+        return self.headline_in(self.setup)
+
+    def headline_in(self, setup: Setup | None) -> Headline:
+        """Return the headline in the units of a setup.
+
+        Parameters
+        ----------
+        setup : Setup or None
+            Gives the main field in SI units; None the displacement in px.
+        """
+        error = None if self.errors is None else self.errors.of_peak
+        (field,) = shown_fields([self.displacement], setup, mask=self.mask)
         level = Level.DOUBTFUL if self.report.warnings else Level.SOUND
         if not self.report.converged:
             level = Level.FAILED
-        return Headline(level, "; ".join([*self.report.warnings, field.peak_text(shares)]))
+        return Headline(level, "; ".join([*self.report.warnings, field.peak_text(error)]))
 
     def with_warnings(self, texts: Iterable[str]) -> Inversion:
         """Return the same inversion with more warnings in its report.

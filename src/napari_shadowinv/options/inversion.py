@@ -191,8 +191,8 @@ class InversionOptions(BaseModel):
         gt=0,
         title="Noise level",
         description=(
-            "Standard deviation of the image's noise, in its units, for the error budget. "
-            "Default: measured from the differences between neighbouring pixels."
+            "Standard deviation of the noise of one pixel of the inverted image, in its units, for "
+            "the error budget. Default: measured from the differences between neighbouring pixels."
         ),
         json_schema_extra=_BUDGET,
     )
@@ -206,14 +206,15 @@ class InversionOptions(BaseModel):
         ),
         json_schema_extra=_BUDGET,
     )
-    beam_variation: float = Field(
-        default=0.05,
-        gt=0,
+    beam_variation: float | None = Field(
+        default=None,
+        ge=0,
         lt=1,
         title="Beam variation",
         description=(
-            "If the source was not measured: the error budget tells what a beam would do that "
-            "varies by so much (r.m.s., relative)."
+            "Relative r.m.s. difference between the true beam and the source, for the error "
+            "budget. Default: 0.05 for a uniform or estimated source, 0 for a recorded one. If "
+            "image and source differ by more outside the object, that difference is used."
         ),
         json_schema_extra=_BUDGET,
     )
@@ -222,7 +223,10 @@ class InversionOptions(BaseModel):
         gt=0,
         le=1,
         title="Beam scale",
-        description="Distance over which it varies so, in shorter sides of the image.",
+        description=(
+            "Length over which the true beam differs from the source, as a share of the image's "
+            "shorter side."
+        ),
         json_schema_extra=_BUDGET,
     )
     seed: int = Field(

@@ -2,30 +2,31 @@
 
 - the field that an experimenter asks for: `shown_fields`; the potential: `shown_potential`
 - the grey limits of an image: `intensity_limits`
-- a number with its errors: `with_errors`
+- a number with its error: `with_error`, `PeakError`
 - the prefix for a number: `prefix_for`; the units that take one: `PREFIXED_UNITS`
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
-from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.physics.setup import SETUPS, Setup
 
 __all__ = [
     "PREFIXED_UNITS",
+    "PeakError",
     "ShownField",
     "intensity_limits",
     "prefix_for",
     "shown_fields",
     "shown_potential",
-    "with_errors",
+    "with_error",
 ]
 
 _SHOWN_PERCENTILES = 0.1, 99.7
@@ -52,23 +53,24 @@ def prefix_for(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> t
     return 10.0**-power, _PREFIXES[power]
 
 
-def with_errors(value: float, errors: Mapping[str, float]) -> str:
-    """Write a number with its errors, which are shares of it, to two figures of the largest.
+class PeakError(NamedTuple):
+    """Total standard error of the largest value of a field."""
 
-    >>> with_errors(97.13, {"noise": 0.0212, "discretisation": 0.0021})
-    '97.1 ± 2.1 (noise) ± 0.2 (discretisation)'
+    share: float  # of that value
+    cause: str  # the largest contribution
+
+
+def with_error(value: float, share: float = 0.0) -> str:
+    """Write a number with its error, a share of it, to two figures of the error.
+
+    >>> with_error(97.13, 0.0212)
+    '97.1 ± 2.1'
     """
-    sizes = {name: abs(value) * share for name, share in errors.items()}
-    largest = max(sizes.values(), default=0.0)
-    if not largest > 0 or not np.isfinite(largest):
+    error = abs(value) * share
+    if not error > 0 or not np.isfinite(error):
         return f"{value:.3g}"
-    decimals = max(0, 1 - math.floor(math.log10(largest)))
-
-    def written(size: float) -> str:
-        return f"{size:.{decimals}f}" if round(size, decimals) else f"{size:.1g}"
-
-    told = [f"± {written(size)} ({name})" for name, size in sizes.items()]
-    return " ".join([f"{value:.{decimals}f}", *told])
+    decimals = max(0, 1 - math.floor(math.log10(error)))
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
 
 
 @dataclass(frozen=True)
@@ -84,44 +86,53 @@ class ShownField:
 
     @property
     def magnitude(self) -> FloatArray:
-        """Length of the vectors, shape (H, W)."""
+        """Length of the vectors, shape (H, W); NaN where a mask hides the field."""
         return np.sqrt(np.sum(self.vectors**2, axis=0, dtype=np.float64))
 
     @property
+    def largest(self) -> float:
+        """Largest magnitude outside the mask."""
+        return float(np.nanmax(self.magnitude))
+
+    @property
     def peak(self) -> tuple[int, int]:
-        """Row and column of the strongest point."""
-        row, column = np.unravel_index(np.argmax(self.magnitude), self.magnitude.shape)
+        """Row and column of the strongest point outside the mask."""
+        row, column = np.unravel_index(np.nanargmax(self.magnitude), self.magnitude.shape)
         return int(row), int(column)
 
-    def peak_text(self, errors: Mapping[str, float] = MappingProxyType({})) -> str:
-        """The largest magnitude in words, path-integrated fields in MG·µm, too.
-
-        Its errors are shares of it by their names.
-        """
-        largest = float(self.magnitude.max())
-        text = f"peak {self.symbol} {with_errors(largest, errors)} {self.unit}"
-        if not self.unit.endswith("T·m"):
-            return text
-        prefix = self.unit.removesuffix("T·m")
-        power = next(power for power, name in _PREFIXES.items() if name == prefix)
-        return f"{text} ({with_errors(largest * 10.0**power / 1e-4, errors)} MG·µm)"
+    def peak_text(self, error: PeakError | None = None) -> str:
+        """Write the largest magnitude, path-integrated fields also in MG·µm."""
+        share, cause = (error.share, error.cause) if error else (0.0, "")
+        text = f"peak {self.symbol} {with_error(self.largest, share)} {self.unit}"
+        if self.unit.endswith("T·m"):
+            prefix = self.unit.removesuffix("T·m")
+            power = next(power for power, name in _PREFIXES.items() if name == prefix)
+            text += f" ({with_error(self.largest * 10.0**power / 1e-4, share)} MG·µm)"
+        return f"{text} ({cause})" if cause else text
 
 
 def shown_fields(
-    displacements: Collection[FloatArray], setup: Setup | None, deflector: str | None = None
+    displacements: Collection[FloatArray],
+    setup: Setup | None,
+    deflector: str | None = None,
+    *,
+    mask: BoolArray | None = None,
 ) -> list[ShownField]:
     """Turn displacements in px into what an experimenter asks for, in one unit for all.
 
     That is the main field of the setup's kind: the path-integrated magnetic field of particles,
     or the deflection angle of light; without a setup, the displacement in px. If it is known that
     the `deflector` is another one, such as an "electric field", its own path integral is shown.
+    Outside a `mask` of used pixels, shape (H, W), the fields are NaN.
     """
+    if mask is not None and not mask.all():
+        displacements = [np.where(mask, d, np.nan) for d in displacements]
     if setup is None:
         return [ShownField(d, "Displacement", "|d|", "px", ("dy", "dx")) for d in displacements]
     main = setup.other_fields.get(deflector or "", setup.main_field)
     (unit,) = (field.unit for field in setup.si_fields if field.name == main.name)
     fields = [setup.field_in_si(main.name, d) for d in displacements]
-    factor, prefix = prefix_for(max(float(np.hypot(*field).max()) for field in fields))
+    factor, prefix = prefix_for(max(float(np.nanmax(np.hypot(*field))) for field in fields))
     unit = prefix + unit.replace(" ", "·")
     return [
         ShownField(field * factor, main.title, main.symbol, unit, main.components, main.arrows)

@@ -33,7 +33,7 @@ def draw_intensity(
 def draw_potential(panel: Panel, potential: FloatArray, setup: Setup | None) -> None:
     """Show a potential with contours."""
     plane, unit = shown_potential(potential, setup)
-    limits = (float(plane.min()), float(plane.max()))
+    limits = (float(np.nanmin(plane)), float(np.nanmax(plane)))
     panel.show(plane, "Deflection potential", f"Potential ({unit})", "viridis", limits)
     if limits[1] > limits[0]:
         levels = np.linspace(*limits, 9)[1:-1]
@@ -51,7 +51,7 @@ def draw_field(panel: Panel, field: ShownField, title: str = "") -> None:
 
 def _strongest(field: ShownField) -> float:
     """Upper end of a colour scale, which must not be empty even if the field is."""
-    return float(field.magnitude.max()) or 1.0
+    return field.largest or 1.0
 
 
 def _label(field: ShownField) -> str:
@@ -65,11 +65,11 @@ def _draw_vectors(panel: Panel, field: ShownField, title: str, largest: float) -
     height, width = everywhere.shape
     step = max(1, round(np.sqrt(height * width) / 14))
     rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
-    strong = everywhere[rows, columns] > 0.15 * everywhere.max()
+    strong = everywhere[rows, columns] > 0.15 * field.largest
     if not strong.any():
         return
     rows, columns = rows[strong], columns[strong]
-    share = everywhere[rows, columns] / everywhere.max()
+    share = everywhere[rows, columns] / field.largest
     pixel = panel.scale.pixel
     # A square root keeps weak arrows long enough to see where they point.
     length = 0.8 * step * pixel * np.sqrt(share)
@@ -108,7 +108,7 @@ def draw_differences(
 ) -> None:
     """Show differences in red and blue, up to `largest`."""
     # Limits that a handful of pixels at a caustic cannot blow up.
-    limit = min(float(np.percentile(np.abs(plane), 99.5)) or 1.0, largest)
+    limit = min(float(np.nanpercentile(np.abs(plane), 99.5)) or 1.0, largest)
     panel.show(plane, title, label, "RdBu_r", (-limit, limit))
 
 
@@ -140,7 +140,7 @@ def _finish_cuts(panel: Panel, field: ShownField, title: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.margins(x=0)
     # Room on top for the legend, so that it never hides a curve.
-    axes.set_ylim(0, 1.0 if not field.magnitude.any() else 1.38 * float(axes.dataLim.ymax))
+    axes.set_ylim(0, 1.0 if not field.largest else 1.38 * float(axes.dataLim.ymax))
     axes.legend(loc="upper left", frameon=False, fontsize=8, handlelength=1.6, borderaxespad=0.2)
     panel.few_ticks()
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing
-from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
+from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._drawing import (
     draw_cuts,
@@ -23,7 +25,7 @@ from napari_shadowinv.plotting._drawing import (
     draw_side_by_side,
     outline_caustics,
 )
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Panel
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,7 +43,8 @@ def report_figure(
     """Show all of one shot on a page.
 
     Six panels: image, potential with contours, field with arrows, re-projection, residual and
-    profiles along the dashed lines on the field. White outlines are caustics.
+    profiles along the dashed lines on the field. White outlines are caustics; masked pixels are
+    hatched. The headline stands above the panels.
 
     Parameters
     ----------
@@ -59,20 +62,28 @@ def report_figure(
     import matplotlib as mpl
 
     shape = inversion.potential.shape
-    (field,) = shown_fields([inversion.displacement], setup)
+    (field,) = shown_fields([inversion.displacement], setup, mask=inversion.mask)
     width = _panels.choose_grid(shape, panels=6).figure_size[0]
-    footer = _footer(inversion, field, columns=int(width * 14))
+    header = _header(inversion, setup, columns=int(width * 12))
+    footer = _footer(inversion, columns=int(width * 14))
     grid = _panels.choose_grid(shape, panels=6, foot=0.12 + 0.18 * len(footer), title=bool(title))
+    grid = replace(grid, head=(0.52 if title else 0.22) + 0.18 * len(header))
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), title)
+        _panels.write_header(figure, header, grid, has_title=bool(title))
         mean = float(inversion.source.mean())
         limits = intensity_limits(inversion.image / mean)
-        draw_intensity(panels[0], inversion.image / mean, "Image", limits)
-        draw_potential(panels[1], inversion.potential, setup)
+
+        def hidden(plane: FloatArray) -> FloatArray:
+            return np.where(inversion.mask, plane, np.nan)
+
+        draw_intensity(panels[0], hidden(inversion.image / mean), "Image", limits)
+        draw_potential(panels[1], hidden(inversion.potential), setup)
         outline_caustics(panels[1], inversion.caustic)
         draw_field(panels[2], field)
         outline_caustics(panels[2], inversion.caustic)
-        draw_intensity(panels[3], inversion.reprojection / mean, "Re-projection", limits)
+        reprojection = hidden(inversion.reprojection / mean)
+        draw_intensity(panels[3], reprojection, "Re-projection", limits)
         _draw_residual(panels[4], inversion)
         draw_cuts(panels[5], field)
         _panels.write_footer(figure, footer, grid)
@@ -134,30 +145,41 @@ def save_figure(path: str | Path, figure: Figure, overwrite: bool = False) -> Pa
     return Path(path)
 
 
-def _footer(inversion: Inversion, field: ShownField, columns: int) -> list[tuple[str, str]]:
+def _header(inversion: Inversion, setup: Setup | None, columns: int) -> list[tuple[str, str]]:
+    """Lines of the headline, each with its colour, wrapped to a number of letters."""
+    headline = inversion.headline_in(setup)
+    colour = GOOD_COLOUR if headline.level == "sound" else ALARM_COLOUR
+    return [(line, colour) for line in textwrap.wrap(headline.text, columns)]
+
+
+def _footer(inversion: Inversion, columns: int) -> list[tuple[str, str]]:
     """Lines below the panels, each with its colour, wrapped to a number of letters."""
     report = inversion.report
     facts = [
         f"flux residual {report.residual:.1e} (tolerance {report.tolerance:.0e})",
         f"{report.iterations} steps in {sum(report.seconds.values()):.1f} s",
-        field.peak_text({} if inversion.errors is None else inversion.errors.of_peak),
     ]
     share = 100 * float(inversion.caustic.mean())
     if share:
         facts.append(f"caustics (outlined) {share:.2g} % of the pixels")
-    alarms = list(report.warnings)
-    if not report.converged and not any("not converged" in alarm for alarm in alarms):
-        alarms.insert(0, "not converged: do not trust the field")
+    if not inversion.mask.all():
+        facts.append(f"hatched: masked, {100 * (1 - inversion.mask.mean()):.2g} % of the pixels")
     sites = f"{report.n_sites:,} sites; {report.sites_reason}".removesuffix("; ")
-    quiet = textwrap.wrap("  ·  ".join(facts), columns) + textwrap.wrap(sites, columns)
-    lines = [(line, QUIET_COLOUR) for line in quiet]
-    for alarm in alarms:
-        lines += [(line, ALARM_COLOUR) for line in textwrap.wrap(f"⚠ {alarm}", columns)]
-    return lines
+    lines = [
+        *textwrap.wrap("  ·  ".join(facts), columns),
+        *textwrap.wrap(sites, columns),
+        *[
+            line
+            for name, text in inversion.error_rows
+            for line in textwrap.wrap(f"{name}: {text}", columns)
+        ],
+    ]
+    return [(line, QUIET_COLOUR) for line in lines]
 
 
 def _draw_residual(panel: Panel, inversion: Inversion) -> None:
     """Show image minus re-projection in percent of the mean."""
-    percent = 100 * inversion.residual / inversion.image[inversion.mask].mean()
+    residual = np.where(inversion.mask, inversion.residual, np.nan)
+    percent = 100 * residual / inversion.image[inversion.mask].mean()
     title = f"Residual: {100 * inversion.report.image_residual:.3g} % rms"
     draw_differences(panel, percent, title, "Difference (% of mean)", _LARGEST_RESIDUAL)

@@ -135,7 +135,7 @@ def _draw_fitted(
             draw_field(panel, shown, title)
             outline_caustics(panel, _crossed(fit))
         elif what == "error" and error is not None:
-            limits = 0.0, float(error.magnitude.max()) or 1.0
+            limits = 0.0, error.largest or 1.0
             label = f"σ of {shown.symbol} ({error.unit})"
             panel.show(error.magnitude, "Standard deviation", label, "cividis", limits)
         else:

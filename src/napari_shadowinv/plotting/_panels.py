@@ -136,11 +136,14 @@ def new_page(grid: Grid, scale: Scale, title: str | None) -> tuple[Figure, list[
     return figure, [Panel(figure.add_axes(box), scale, grid) for box in boxes]
 
 
-def write_header(figure: Figure, lines: list[tuple[str, str]], grid: Grid) -> None:
+def write_header(
+    figure: Figure, lines: list[tuple[str, str]], grid: Grid, *, has_title: bool = True
+) -> None:
     """Write lines, each with its colour, between the title and the panels."""
     width, height = grid.figure_size
+    top = 0.44 if has_title else 0.14
     for number, (text, colour) in enumerate(lines):
-        y = 1 - (0.44 + 0.18 * number) / height
+        y = 1 - (top + 0.18 * number) / height
         figure.text(0.2 / width, y, text, size=10, color=colour, va="top")
 
 
@@ -163,8 +166,13 @@ class Panel:
     def show(
         self, plane: FloatArray, title: str, label: str, cmap: str, limits: tuple[float, float]
     ) -> None:
-        """Show a plane in false colours; the colour bar tells where limits cut it."""
+        """Show a plane in false colours, hatched where it is NaN.
+
+        The ends of the colour bar are pointed where limits cut the plane.
+        """
         low, high = limits
+        if np.isnan(plane).any():
+            self.axes.patch.set(facecolor="0.92", edgecolor="0.6", hatch="////")
         # Smoothing would hide single bad pixels.
         choices: Any = {"vmin": low, "vmax": high, "interpolation": "nearest", "aspect": "equal"}
         extent = self.scale.extent(plane.shape)
@@ -173,7 +181,7 @@ class Panel:
         self.axes.set_xlabel(f"x ({self.scale.unit})")
         self.axes.set_ylabel(f"y ({self.scale.unit})")
         self.few_ticks()
-        below, above = bool(plane.min() < low), bool(plane.max() > high)
+        below, above = bool(np.nanmin(plane) < low), bool(np.nanmax(plane) > high)
         extend = {(True, True): "both", (True, False): "min", (False, True): "max"}
         room = self.axes.inset_axes((1 + 0.08 / self.grid.width, 0, 0.12 / self.grid.width, 1))
         figure: Any = self.axes.figure
