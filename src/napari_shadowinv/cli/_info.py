@@ -12,6 +12,7 @@ from napari_shadowinv import __version__
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli import _tables
+from napari_shadowinv.physics.setup import setup_warnings
 
 if TYPE_CHECKING:
     import xarray
@@ -110,9 +111,10 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _tables.Rows:
         if isinstance(value, int | float):
             unit = "MeV" if name == "energy" else "m"
             rows.append((f"{name.replace('_', ' ')} ({unit})", f"{value:g}"))
-    rows.append(("setup", _tables.setup_text(shot.setup, shot)))
+    rows.append(("setup", _tables.setup_text(shot.setup, shot, shot.shape)))
     rows += [("note", text) for text in shot.notes]
-    return [*rows, *[("warning", text) for text in shot.warnings]]
+    doubts = () if shot.setup is None else setup_warnings(shot.setup, shot.shape)
+    return [*rows, *[("warning", text) for text in (*shot.warnings, *doubts)]]
 
 
 def _array_rows(array: AnyArray) -> _tables.Rows:
@@ -146,7 +148,7 @@ def _result_rows(dataset: xarray.Dataset) -> _tables.Rows:
     displacement = dataset["displacement"].values
     experiment = [
         ("image", _tables.size_text(displacement[0])),
-        ("setup", _tables.setup_text(setup)),
+        ("setup", _tables.setup_text(setup, shape=displacement.shape[1:])),
     ]
     if "options" not in dataset.attrs:
         is_foreign = dataset.attrs.get("format") == "pradformat"

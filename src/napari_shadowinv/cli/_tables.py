@@ -51,7 +51,7 @@ def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Tabl
         headline_row(inversion, inversion.setup),
         ("image", f"{shot.path}, {size_text(inversion.image)}"),
         *provenance_rows(inversion.provenance),
-        ("setup", setup_text(inversion.setup, shot)),
+        ("setup", setup_text(inversion.setup, shot, inversion.image.shape)),
         *inversion_rows(inversion, inversion.setup),
         *closing_rows(inversion.report, written),
     ]
@@ -147,13 +147,22 @@ def closing_rows(report: Report, written: Iterable[Path] = ()) -> Rows:
     ]
 
 
-def setup_text(setup: Setup | None, shot: Radiograph | None = None) -> str:
-    """The experiment in a line, or what is missing for SI units."""
+def setup_text(
+    setup: Setup | None,
+    shot: Radiograph | None = None,
+    shape: tuple[int, ...] | None = None,
+) -> str:
+    """Describe the experiment in a line, or say what is missing for SI units."""
     if setup is not None:
-        return (
+        from napari_shadowinv.physics.setup import field_of_view_text
+
+        text = (
             f"{setup.probe}, magnification {setup.magnification:.4g}, "
             f"pixel {setup.object_pixel_size * 1e6:.4g} µm at the object"
         )
+        if shape is None:
+            return text
+        return f"{text}, field of view {field_of_view_text(setup, (shape[0], shape[1]))}"
     geometry = {} if shot is None else shot.metadata.get("geometry", {})
     if not geometry:
         return "none: results in pixels; give --setup for SI units"

@@ -158,7 +158,9 @@ class InversionOptions(BaseModel):
     )
     decay_length: float | None = Field(
         default=None,
-        gt=0,
+        ge=0.01,
+        le=1e6,
+        allow_inf_nan=False,
         title="Decay length (px)",
         description=(
             "Free boundary only: distance over which the potential decays beyond the edge; use "

@@ -23,7 +23,7 @@ from napari_shadowinv.fitting import Fit, compare, fit, point_spread
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.options import FIELDS, FitChoices, KindOfNoise
 from napari_shadowinv.physics.projection import default_deflector
-from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.physics.setup import Setup, setup_warnings
 from napari_shadowinv.pipeline._run import Inputs, Shot, gathered, radiograph_of
 from napari_shadowinv.pipeline.shot_table import fiducials_from
 from napari_shadowinv.preprocessing import (
@@ -376,6 +376,8 @@ def _prepared(inputs: Inputs, name: str, should_stop: ShouldStop | None) -> Radi
     """An image after the steps, with its source if that is estimated."""
     try:
         shot = inputs.prepared(should_stop)
+        if shot.setup is not None:
+            shot = shot.noted(*setup_warnings(shot.setup, shot.shape))
         estimate = inputs.recipe.estimate
         if estimate is None or isinstance(estimate, UniformEstimate):
             return shot

@@ -24,6 +24,7 @@ from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.inversion.normalise import checked_source, prepare
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.files import sha256, text_of
+from napari_shadowinv.physics.setup import deflection_warnings, setup_warnings
 from napari_shadowinv.pipeline.cache import Cache
 from napari_shadowinv.preprocessing import (
     MeasuredSource,
@@ -208,6 +209,9 @@ def run_prepared(
     inversion = replace(
         inversion, report=replace(inversion.report, seconds=seconds), provenance=provenance
     )
+    if shot.setup is not None:
+        doubts += setup_warnings(shot.setup, shot.shape)
+        doubts += deflection_warnings(shot.setup, inversion.displacement)
     return inversion.with_warnings(doubts)
 
 

@@ -25,7 +25,7 @@ from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.setup import SETUPS, Setup
+from napari_shadowinv.physics.setup import SETUPS, Setup, geometry_text, setup_warnings
 from napari_shadowinv.pipeline._run import PREVIEW_SITES
 
 _NONE = "none"
@@ -58,9 +58,11 @@ class SetupPicker(QWidget):
             "<qt>With a setup the results are in SI units; lengths can be entered as 1.3 mm or "
             "0.0013.</qt>"
         )
+        self.geometry = forms.wrapping_label()
+        self.doubts = forms.wrapping_label(style=forms.PROBLEM_STYLE)
         self.note = forms.wrapping_label()
         self.files = forms.TomlButtons("setup", self._to_save, self.load)
-        column(self, self.picker, self.note, self.files)
+        column(self, self.picker, self.geometry, self.doubts, self.note, self.files)
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
 
@@ -173,6 +175,23 @@ class SetupPicker(QWidget):
         filled = form is not None and not form.is_empty
         self.note.setText(f"{self.origin[:1].upper()}{self.origin[1:]}." if filled else "")
         self.note.setVisible(filled)
+        self._show_geometry()
+
+    def _show_geometry(self) -> None:
+        """Show field of view and magnification under the fields, and what is doubtful of them."""
+        try:
+            setup = self.setup()
+        except InputError:
+            setup = None  # the form names the field
+        shape = None
+        if self._layer is not None and not getattr(self._layer, "rgb", False):
+            height, width = self._layer.data.shape[-2:]
+            shape = height, width
+        line = "" if setup is None else geometry_text(setup, shape)
+        doubts = () if setup is None else setup_warnings(setup, shape)
+        for label, text in ((self.geometry, line), (self.doubts, "\n".join(doubts))):
+            label.setText(text)
+            label.setVisible(bool(text))
 
     def _to_save(self) -> dict[str, object]:
         setup = self.setup()

@@ -5,6 +5,8 @@
 - get it back from a file's content: `setup_from_dict`; with larger pixels: `binned_setup`
 - convert pixels to SI and back: methods of `BeamSetup`; path-integrated fields: of `ProtonSetup`;
   line integrals of the refractive index or the density: of `OpticalSetup`
+- whether its numbers can be meant: `setup_warnings`, `deflection_warnings`; for people to
+  check: `geometry_text`, `field_of_view_text`
 - the gradient of a potential in pixels: `displacement_from_potential`
 - the same object in another experiment: `napari_shadowinv.physics.projection`
 
@@ -37,6 +39,12 @@ from napari_shadowinv.physics.setup._beam import (
     displacement_from_potential,
 )
 from napari_shadowinv.physics.setup._optical import LightDeflector, OpticalSetup
+from napari_shadowinv.physics.setup._plausibility import (
+    deflection_warnings,
+    field_of_view_text,
+    geometry_text,
+    setup_warnings,
+)
 from napari_shadowinv.physics.setup._proton import (
     SPECIES,
     FieldUnit,
@@ -60,8 +68,12 @@ __all__ = [
     "Setup",
     "Species",
     "binned_setup",
+    "deflection_warnings",
     "displacement_from_potential",
+    "field_of_view_text",
+    "geometry_text",
     "setup_from_dict",
+    "setup_warnings",
 ]
 
 # A further kind of setup is added here, and nowhere else.

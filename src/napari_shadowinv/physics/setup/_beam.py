@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -46,9 +46,28 @@ class MainField:
     arrows: str = ""
 
 
-def positive_field(title: str, description: str, default: Any = ...) -> Any:
-    """Return the field of a positive, finite number."""
-    return Field(default=default, gt=0, allow_inf_nan=False, title=title, description=description)
+def positive_field(title: str, description: str, default: Any = ..., *, most: float) -> Any:
+    """Return the field of a positive number up to a limit."""
+    return Field(
+        default=default,
+        gt=0,
+        le=most,
+        allow_inf_nan=False,
+        title=title,
+        description=description,
+    )
+
+
+# Beyond any experiment, and far from the numbers that products in double precision cannot hold.
+_MAX_DISTANCE_M, _MAX_PIXEL_M = 1e9, 1e6
+_MIN_LENGTH_M = 1e-15
+_LENGTHS = {
+    "source_object_distance",
+    "object_image_distance",
+    "pixel_size",
+    "detector_pixel_size",
+    "wavelength",
+}
 
 
 class BeamSetup(BaseModel):
@@ -70,6 +89,8 @@ class BeamSetup(BaseModel):
     other_fields: ClassVar[dict[str, MainField]] = {}
     deflectors: ClassVar[tuple[str, ...]]  # what can deflect the beam; see `angle_ratio`
     in_pradformat: ClassVar[bool] = False  # whether that format can describe the beam
+    # Whether a small source magnifies the object onto a film or plate, as it does with particles.
+    projects: ClassVar[bool] = False
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
@@ -80,18 +101,22 @@ class BeamSetup(BaseModel):
         description="Distance l from the beam source to the object, in m; inf if collimated.",
     )
     object_image_distance: float = positive_field(
-        "Object to image (m)", "Distance L from the object to the detector, in m."
+        "Object to image (m)",
+        "Distance L from the object to the detector, in m.",
+        most=_MAX_DISTANCE_M,
     )
     pixel_size: float | None = positive_field(
         "Pixel size at the object (m)",
         "Pixel size in the object plane, in m. Give either this or the detector pixel size.",
         None,
+        most=_MAX_PIXEL_M,
     )
     detector_pixel_size: float | None = positive_field(
         "Pixel size at the detector (m)",
         "Pixel size in the detector plane, in m; it is divided by the magnification. Give "
         "either this or the pixel size at the object.",
         None,
+        most=_MAX_PIXEL_M,
     )
 
     @model_validator(mode="after")
@@ -102,6 +127,23 @@ class BeamSetup(BaseModel):
             raise ValueError(
                 "give either 'pixel_size' (m, in the object plane) or 'detector_pixel_size' "
                 f"(m, in the detector plane), received {received}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _lengths_in_range(self) -> BeamSetup:
+        lengths = {name: getattr(self, name) for name in self.model_fields_set & _LENGTHS}
+        for name, length in lengths.items():
+            if length is not None and length < _MIN_LENGTH_M:
+                raise ValueError(
+                    f"'{name}' is {length:g} m, expected at least {_MIN_LENGTH_M:g} m: check its "
+                    "unit"
+                )
+        distance = self.source_object_distance
+        if math.isfinite(distance) and distance > _MAX_DISTANCE_M:
+            raise ValueError(
+                f"'source_object_distance' is {distance:g} m, expected at most "
+                f"{_MAX_DISTANCE_M:g} m, or inf for a collimated beam"
             )
         return self
 
@@ -157,6 +199,15 @@ class BeamSetup(BaseModel):
         made: FloatArray = getattr(self, method)(values)
         return made
 
+    @property
+    def max_source_distance(self) -> float:
+        """Distance in m from the object beyond which such a source is unusual."""
+        return math.inf
+
+    def probe_doubts(self) -> Iterator[str]:
+        """Yield a sentence for everything about the probe itself that is unusual."""
+        yield from ()
+
     @classmethod
     def own_fields(cls) -> set[str]:
         """Names of the fields that only this kind has."""
@@ -205,3 +256,18 @@ def scaled(values: ArrayLike, factor: float) -> FloatArray:
     """Values times a factor, as float64."""
     product: FloatArray = np.asarray(values, dtype=np.float64) * factor
     return product
+
+
+_LENGTH_UNITS = ((1e3, "km"), (1.0, "m"), (1e-2, "cm"), (1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"))
+
+
+def length_text(length: float) -> str:
+    """Return a length in m in the unit that suits it, such as "2.13 cm"."""
+    size, unit = length_unit(length)
+    return f"{length / size:.3g} {unit}"
+
+
+def length_unit(length: float) -> tuple[float, str]:
+    """Return the unit that suits a length in m: its size in m, and its symbol."""
+    fitting = ((size, unit) for size, unit in _LENGTH_UNITS if length >= 0.9995 * size)
+    return next(fitting, _LENGTH_UNITS[-1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any, ClassVar, Literal, Self, get_args
 
 from numpy.typing import ArrayLike
@@ -11,7 +12,15 @@ from scipy import constants
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup._beam import BeamSetup, SIField, positive_field, scaled
+from napari_shadowinv.physics.setup._beam import (
+    BeamSetup,
+    SIField,
+    length_text,
+    positive_field,
+    scaled,
+)
+
+_USUAL_WAVELENGTHS_M = (10e-9, 20e-6)
 
 LightDeflector = Literal["plasma", "refractive index"]
 
@@ -53,11 +62,22 @@ class OpticalSetup(BeamSetup):
             "Distance l from the beam source to the object, in m. Default: inf (collimated beam)."
         ),
     )
-    wavelength: float = positive_field("Wavelength (m)", "Vacuum wavelength of the light, in m.")
+    wavelength: float = positive_field(
+        "Wavelength (m)", "Vacuum wavelength of the light, in m.", most=1e-2
+    )
 
     @property
     def probe(self) -> str:
         return f"light of {self.wavelength * 1e9:g} nm"
+
+    def probe_doubts(self) -> Iterator[str]:
+        shortest, longest = _USUAL_WAVELENGTHS_M
+        if not shortest <= self.wavelength <= longest:
+            yield (
+                f"the wavelength is {length_text(self.wavelength)}, expected "
+                f"{length_text(shortest)} to {length_text(longest)}: densities scale with its "
+                "inverse square; it is given in m"
+            )
 
     @classmethod
     def example(cls) -> Self:

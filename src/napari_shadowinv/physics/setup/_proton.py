@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
+from pydantic import Field, model_validator
 from scipy import constants
 
 from napari_shadowinv._typing import FloatArray
@@ -49,6 +50,18 @@ SPECIES: dict[Species, Particle] = {
 }
 
 
+_MIN_ENERGY_MEV, _MAX_ENERGY_MEV = 1e-6, 1e5
+_MAX_ION_SOURCE_DISTANCE_M = 0.1  # sources of ions are small and shine from centimetres
+_USUAL_ENERGIES_MEV: dict[Species, tuple[float, float]] = {
+    "proton": (0.5, 100.0),
+    "deuteron": (0.5, 100.0),
+    "triton": (0.5, 100.0),
+    "helion": (0.5, 200.0),
+    "alpha": (0.5, 200.0),
+    "electron": (0.01, 3000.0),
+}
+
+
 class ProtonSetup(BeamSetup):
     """A beam of charged particles through an object, onto a film or a plate.
 
@@ -66,6 +79,7 @@ class ProtonSetup(BeamSetup):
     beam: ClassVar = "particles"
     deflectors: ClassVar = get_args(ParticleDeflector)
     in_pradformat: ClassVar = True
+    projects: ClassVar = True
     si_fields: ClassVar = (
         *BeamSetup.si_fields,
         *(
@@ -99,7 +113,9 @@ class ProtonSetup(BeamSetup):
         default="proton", title="Kind", description="Kind of probe: a beam of charged particles."
     )
     energy: float = positive_field(
-        "Kinetic energy (MeV)", "Kinetic energy per particle (not per nucleon), in MeV."
+        "Kinetic energy (MeV)",
+        "Kinetic energy per particle (not per nucleon), in MeV.",
+        most=_MAX_ENERGY_MEV,
     )
     species: Species = Field(
         default="proton",
@@ -107,9 +123,31 @@ class ProtonSetup(BeamSetup):
         description="Particle species; electrons are deflected the opposite way.",
     )
 
+    @model_validator(mode="after")
+    def _energy_in_range(self) -> ProtonSetup:
+        if self.energy < _MIN_ENERGY_MEV:
+            raise ValueError(
+                f"'energy' is {self.energy:g} MeV, expected at least {_MIN_ENERGY_MEV:g} MeV: "
+                "check its unit"
+            )
+        return self
+
     @property
     def probe(self) -> str:
         return f"{self.energy:g} MeV {self.species}"
+
+    @property
+    def max_source_distance(self) -> float:
+        return math.inf if self.species == "electron" else _MAX_ION_SOURCE_DISTANCE_M
+
+    def probe_doubts(self) -> Iterator[str]:
+        least, most = _USUAL_ENERGIES_MEV[self.species]
+        if not least <= self.energy <= most:
+            yield (
+                f"{self.species}s of {self.energy:g} MeV are unusual in radiography, which uses "
+                f"{least:g} to {most:g} MeV: fields scale with the momentum; the energy is given "
+                "in MeV"
+            )
 
     @classmethod
     def example(cls) -> Self:
