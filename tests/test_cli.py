@@ -931,6 +931,42 @@ def test_a_result_is_made_again_bit_for_bit(
     refused("rerun", "bare.shadowinv", names=("bare.shadowinv", "does not say how it was made"))
 
 
+@pytest.mark.parametrize("place", ["{folder}/private/shot.npy", "../private/shot.npy"])
+def test_rerun_reads_no_foreign_file(
+    folder: Path, refused: Callable[..., None], place: str
+) -> None:
+    (folder / "private").mkdir()
+    (folder / "mine").mkdir()
+    np.save("private/shot.npy", np.random.default_rng(0).poisson(100, (16, 16)))
+    shadowinv("invert", "private/shot.npy", "--out", "first.shadowinv")
+    first = dataset("first.shadowinv")
+    provenance = json.loads(first.attrs["provenance"])
+    provenance["image"]["file"] = named = place.format(folder=folder)
+    write("mine/bad.shadowinv", first.assign_attrs(provenance=json.dumps(provenance)))
+    os.chdir(folder / "mine")
+
+    refused("rerun", "bad.shadowinv", names=(named, "in another folder", "--other-folders"))
+    assert shadowinv("rerun", "bad.shadowinv", "--other-folders").exit_code == 0
+    assert shadowinv("rerun", "bad.shadowinv", "../private/shot.npy", "--overwrite").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    "entry", [{"mask": "{file}"}, {"source": {"kind": "measured", "file": "{file}"}}]
+)
+def test_rerun_reads_no_file_of_a_recipe(
+    folder: Path, refused: Callable[..., None], entry: dict[str, Any]
+) -> None:
+    np.save("shot.npy", np.random.default_rng(0).poisson(100, (16, 16)))
+    shadowinv("invert", "shot.npy", "--out", "first.shadowinv")
+    first = dataset("first.shadowinv")
+    provenance = json.loads(first.attrs["provenance"])
+    foreign = json.loads(json.dumps(entry).replace("{file}", "/etc/hostname"))
+    provenance["recipe"] |= foreign
+    write("bad.shadowinv", first.assign_attrs(provenance=json.dumps(provenance)))
+
+    refused("rerun", "bad.shadowinv", names=("/etc/hostname", "in another folder"))
+
+
 def test_info_tells_what_is_inside(folder: Path) -> None:
     values = np.array([[1.0, 2.0, np.nan], [-3.0, 4.0, 5.0]])
     np.save("a.npy", values)

@@ -3,22 +3,25 @@
 - whatever a damaged file makes a reader raise is told in one sentence: `refusing_damage`
 - only regular files are opened: `check_regular`
 - a limit on what a file may unfold to in memory: `check_size`
+- a forecast of the memory that work on an image takes: `check_memory`
 - small files of text, such as setups and calibrations: `small_text`
 """
 
 from __future__ import annotations
 
 import functools
+import math
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar, cast
 
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 
-LIMIT_VARIABLE = "SHADOWINV_MAX_GB"  # the most gigabytes that a file may unfold to
+# Gigabytes that a file may unfold to and work may take.
+LIMIT_VARIABLE = "SHADOWINV_MAX_GB"
 
 # Reading needs a few copies of the image, and other programs some memory too.
 _SHARE_OF_MEMORY = 1 / 8
@@ -102,6 +105,23 @@ def check_size(path: str | Path, promised: int) -> None:
             f"{path} expands to {promised / 1e9:.3g} GB in memory, expected at most "
             f"{limit / 1e9:.3g} GB: crop or bin it, or raise the environment variable "
             f"{LIMIT_VARIABLE}"
+        )
+
+
+def memory_limit() -> int | None:
+    """Return how many bytes work may take, by `LIMIT_VARIABLE` or the memory; None if unknown."""
+    return physical_memory() if os.environ.get(LIMIT_VARIABLE) is None else size_limit()
+
+
+def check_memory(shape: Sequence[int], bytes_per_pixel: float, work: str) -> None:
+    """Refuse an image of `shape` for which `work` needs more memory than there is."""
+    limit = memory_limit()
+    needed = bytes_per_pixel * math.prod(shape)
+    if limit is not None and needed > limit:
+        raise InputError(
+            f"{work} of {' × '.join(map(str, shape))} pixels needs about {needed / 1e9:.3g} GB of "
+            f"memory, expected at most {limit / 1e9:.3g} GB: crop or bin the image first, or raise "
+            f"the environment variable {LIMIT_VARIABLE}"
         )
 
 

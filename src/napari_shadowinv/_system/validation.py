@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic._internal._model_construction import ModelMetaclass
 
 from napari_shadowinv.errors import InputError
 
@@ -19,6 +20,54 @@ _BOUNDS = {
     "less_than": ("lt", "less than"),
     "less_than_equal": ("le", "at most"),
 }
+
+
+class _CheckedMeta(ModelMetaclass):
+    """Metaclass whose classes, when called, raise an `InputError` with one sentence."""
+
+    # Only a call by name comes here: models inside of others are made by pydantic, which collects
+    # their errors.
+    if not TYPE_CHECKING:
+
+        def __call__(self, *args: Any, **values: Any) -> Any:
+            try:
+                return super().__call__(*args, **values)
+            except ValidationError as error:
+                raise InputError(f"{self.__name__}: {_sentence(self, error)}") from error
+
+
+class CheckedModel(BaseModel, metaclass=_CheckedMeta):
+    """Model that refuses a wrong value with an `InputError` of one sentence.
+
+    `model_validate` raises pydantic's own error, which lists all mistakes; see `validated`.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        try:
+            super().__setattr__(name, value)
+        except ValidationError as error:
+            raise InputError(
+                f"{type(self).__name__}: '{name}' cannot be changed, make a changed copy with "
+                "model_copy(update=…)"
+            ) from error
+
+
+def as_model(model_class: type[Model], value: Any, name: str) -> Model:
+    """Return a model as it is, the default one for None, or one made from a mapping."""
+    if isinstance(value, model_class):
+        return value
+    if value is None or isinstance(value, Mapping):
+        return validated(model_class, value or {}, name)
+    raise InputError(f"{name} is {_shown(value)}, expected {model_class.__name__}")
+
+
+def check_instance(value: object, expected: type | tuple[type, ...], name: str) -> None:
+    """Refuse what is neither None nor an instance of one of the classes."""
+    if value is None or isinstance(value, expected):
+        return
+    classes = expected if isinstance(expected, tuple) else (expected,)
+    titles = " or ".join(expected.__name__ for expected in classes)
+    raise InputError(f"{name} is {_shown(value)}, expected {titles}")
 
 
 def validated(
@@ -124,5 +173,5 @@ def _lower(text: str) -> str:
 
 
 def _shown(value: object, longest: int = 60) -> str:
-    text = repr(value)
+    text = " ".join(repr(value).split())
     return text if len(text) <= longest else f"{text[: longest - 1]}…"

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import xarray
     from rich.table import Table
 
+    from napari_shadowinv.cli._rerun import Places
     from napari_shadowinv.film import Pack
 
 LayersFormat = Literal["tiff", "pradformat"]
@@ -124,7 +125,7 @@ def write_pack(
 
 
 def pack_made_again(
-    dataset: xarray.Dataset, path: Path, outputs: list[Path], quiet: bool
+    dataset: xarray.Dataset, places: Places, outputs: list[Path], quiet: bool
 ) -> tuple[xarray.Dataset, Rows]:
     """Make a pack's dataset again from the scans that it names, and tell what has changed."""
     import numpy as np
@@ -133,7 +134,9 @@ def pack_made_again(
     from napari_shadowinv.film import Pack
 
     pack = Pack.model_validate_json(dataset.attrs["pack"])
-    _outputs.protect(outputs, [path, *pack.files])
+    for file in pack.files:
+        places.check(file, "the file")
+    _outputs.protect(outputs, [places.result, *pack.files])
     again = _made(pack, quiet)
     changes = changed_version(str(dataset.attrs["package_version"]))
     rows = [("changed", change) for change in changes]

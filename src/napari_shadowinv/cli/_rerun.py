@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,12 +16,13 @@ from napari_shadowinv.cli._terminal import inverted
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.pipeline.files import read_part
+from napari_shadowinv.preprocessing import MeasuredSource
 
 if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv._typing import BoolArray
-    from napari_shadowinv.preprocessing import Origin, Provenance, Radiograph
+    from napari_shadowinv.preprocessing import Origin, Provenance, Radiograph, Recipe
 
 SAME = "none: the same result, bit for bit"
 
@@ -37,16 +39,44 @@ class Again:
 
 @dataclass(frozen=True)
 class Places:
-    """Where the files of a result are looked for: as named now, beside it, and here."""
+    """Where the files of a result are looked for: as named now, beside it, and here.
+
+    A result may come from anybody: files in other folders are read only if they are `trusted`.
+    """
 
     result: Path
     images: Sequence[Path] = ()
     source: Path | None = None
+    trusted: bool = False
+
+    def check(self, file: Path, name: str) -> None:
+        """Refuse a file outside of the result's folder and the current one, unless trusted."""
+        path = Path(os.path.abspath(file))  # a link beside the result is the user's
+        folders = (self.result.parent, Path())
+        inside = (path.is_relative_to(os.path.abspath(folder)) for folder in folders)
+        if not self.trusted and not any(inside):
+            raise InputError(
+                f"{self.result} names {name} {file}, which is in another folder: name the file to "
+                "use, or read what the result names with --other-folders if you trust it"
+            )
+
+    def check_recipe(self, recipe: Recipe) -> None:
+        """Refuse files that a recipe names; that of a result names none."""
+        files = {
+            "a mask": recipe.mask,
+            "a source mask": recipe.source_mask,
+            "a source": recipe.source.file if isinstance(recipe.source, MeasuredSource) else None,
+        }
+        for name, file in files.items():
+            if file is not None:
+                self.check(file, name)
 
     def find(self, origin: Origin, name: str, given: Path | None = None) -> Path:
         """Return the file of an image, source, mask or table."""
         folders = (self.result.parent, Path())
         places = [folder / origin.file for folder in folders if origin.file]
+        if given is None and places:
+            self.check(places[0], name)
         path = given or next((place for place in places if place.is_file()), None)
         if path is None:
             found = f"{origin.file} is not there" if origin.file else "was not made from a file"
@@ -83,6 +113,7 @@ def inversion_again(
     made: Provenance, places: Places, outputs: list[Path], *, quiet: bool = False
 ) -> tuple[Inversion, Radiograph, list[str]]:
     """Return the inversion that a provenance describes, its shot, and what has changed."""
+    places.check_recipe(made.recipe)
     shot = places.read(made.image, "the image", next(iter(places.images), None))
     beam, own = None, (made.image.file, made.image.variable)
     if made.source is not None and (made.source.file, made.source.variable) != own:

@@ -65,6 +65,7 @@ def fit_made_again(
         inversion, shot, changes = inversion_again(made.start, places, outputs, quiet=quiet)
         again = refined(inversion, made, quiet)
         return FitAgain(again, (str(shot.path),), tuple(changes), _difference(before, again))
+    places.check_recipe(made.recipe)
     files = _Files(places, made)
     shots = [files.shot(k) for k in range(count)]
     fiducials = files.fiducials()

@@ -144,6 +144,13 @@ def rerun(
         Path | None, typer.Option(help="Result file. Default: the result's name with _again.")
     ] = None,
     report: _flags.Figure = None,
+    other_folders: Annotated[
+        bool,
+        typer.Option(
+            "--other-folders",
+            help="Also read files that the result names in other folders than its own.",
+        ),
+    ] = False,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,
 ) -> None:
@@ -165,9 +172,9 @@ def rerun(
     written = [again_out, figure]
     _outputs.check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
     dataset = read_dataset(result)
-    places = Places(result, image or (), source)
+    places = Places(result, image or (), source, other_folders)
     if is_pack(dataset.attrs):
-        remade, changes = pack_made_again(dataset, result, written, quiet)
+        remade, changes = pack_made_again(dataset, places, written, quiet)
         write_pack(remade, result.name, again_out, figure, overwrite)
         if not quiet:
             say(two_columns("Film pack, made again", changes))

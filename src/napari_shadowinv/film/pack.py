@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from napari_shadowinv._system.validation import nearest
+from napari_shadowinv._system.validation import CheckedModel, nearest
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.stopping import Stopping
@@ -25,7 +25,7 @@ __all__ = ["FILM_TYPES", "MATERIALS", "FilmType", "Material", "Pack", "PackLayer
 _CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
 
-class Material(BaseModel):
+class Material(CheckedModel):
     """What stops protons: by a table of SRIM's, or else by Bethe's formula."""
 
     model_config = _CONFIG
@@ -87,7 +87,7 @@ MATERIALS = {
 }
 
 
-class Slab(BaseModel):
+class Slab(CheckedModel):
     """One material, so thick; from a text such as ``13 um Al``, too."""
 
     model_config = _CONFIG
@@ -117,7 +117,7 @@ def _listed(value: Any) -> Any:
 Slabs = Annotated[tuple[Slab, ...], BeforeValidator(_listed)]
 
 
-class FilmType(BaseModel):
+class FilmType(CheckedModel):
     """A kind of film, in the order in which protons cross it, and how it darkens."""
 
     model_config = _CONFIG
@@ -150,7 +150,7 @@ FILM_TYPES = {
 }
 
 
-class PackLayer(BaseModel):
+class PackLayer(CheckedModel):
     """A film of the pack, and the filters in front of it."""
 
     model_config = _CONFIG
@@ -177,7 +177,7 @@ class PackLayer(BaseModel):
     )
 
 
-class Pack(BaseModel):
+class Pack(CheckedModel):
     """Films and filters, the first in front; what their types and materials are.
 
     Types and materials that are given take the place of those known by their names; what a type

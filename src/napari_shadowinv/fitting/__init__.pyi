@@ -1,7 +1,8 @@
 from ._fit import compare, fit
 from ._leave_one_out import leave_one_out
 from .agreement import LeaveOneOut
-from .measurements import FIELDS, FitOptions, point_spread
+from .blur import point_spread
+from .measurements import FIELDS, FitOptions
 from .result import Basin, Fit, FitReport, FittedField
 from .verdict import Verdict
 from .windows import FitWindows

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
+from napari_shadowinv._system.arrays import SQUARE_PIXELS, as_numbers, plain_array
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
@@ -138,7 +140,7 @@ def fit(
     >>> bool(np.abs(found.fields[0].displacement - truth).max() < 0.2)
     True
     """
-    options = options or FitOptions()
+    options = as_model(FitOptions, options, "options")
     report = Reporter(on_progress, should_stop)
     seconds: dict[str, float] = {}
     rng = np.random.default_rng(options.seed)
@@ -221,7 +223,7 @@ def compare(
             "comparing fields needs the setup of each image, and neither fields nor strengths: "
             "how much each field displaces follows from the setups"
         )
-    asked = (options or FitOptions()).model_copy(update={"evidence": True})
+    asked = as_model(FitOptions, options, "options").model_copy(update={"evidence": True})
     fits = [fit(images, fields=choice, options=asked, **keywords) for choice in choices]
     least = max(each.report.log_evidence for each in fits) - _DECIDES
 
@@ -246,7 +248,7 @@ def starts(
     scene = given.scene
     found = []
     if start is not None:
-        potential = np.array(start, dtype=np.float64)
+        potential = as_numbers("start", plain_array(start, "start", unit=SQUARE_PIXELS))
         if potential.shape != given.size or not np.isfinite(potential).all():
             raise InputError(
                 f"start has shape {potential.shape}: expected a finite potential in px² of the "

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.fitting._fit import reweighted, starts
 from napari_shadowinv.fitting.agreement import LeaveOneOut, check_count, explanation_of
@@ -86,7 +87,7 @@ def leave_one_out(
     InversionCancelled
         If `should_stop` returned true.
     """
-    options = options or FitOptions()
+    options = as_model(FitOptions, options, "options")
     usual: dict[str, Any] = {
         "strengths": None,
         "source": None,

@@ -2,7 +2,6 @@
 
 - standard deviation of an image's noise: `estimated_noise`
 - displacement by each field in each image, from the setups: `strengths_of`
-- width of the point spread, from the beam's source and the detector: `point_spread`
 """
 
 from __future__ import annotations
@@ -15,13 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
+from napari_shadowinv._system.arrays import as_numbers, join_masks, mask_of_each, unpack_planes
+from napari_shadowinv._system.safety import check_memory
+from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting.blur import checked_point_spread
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.unknowns import Fiducials
 from napari_shadowinv.options import FIELDS, KINDS_OF_NOISE, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import transferred_displacement
-from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.physics.setup import BeamSetup, Setup
 
 __all__ = [
     "FIELDS",
@@ -29,12 +32,12 @@ __all__ = [
     "Measured",
     "estimated_noise",
     "measured",
-    "point_spread",
     "strengths_of",
 ]
 
 _BLOCK = 8  # px; sides are filled up to a multiple of it, for pixels four times as wide
 _SMALLEST_SIDE = 32
+_BYTES_PER_PIXEL, _BYTES_PER_PIXEL_AND_IMAGE = 2000, 600  # measured peak
 _NORMAL_MAD = 1.4826
 _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
 _LEAST_COUNTS = 1.0
@@ -90,12 +93,19 @@ def measured(
     names: Sequence[str] | None = None,
 ) -> Measured:
     """Check what is given to a fit; see `fit` for what it may be."""
+    images, exposed = unpack_planes(images, "images")
     data = _checked_images(images)
+    exposed = mask_of_each(exposed, data)
+    if not isinstance(source, str):
+        source, lit = unpack_planes(source, "source")
+        exposed = join_masks(exposed, mask_of_each(lit, data))
     count, height, width = data.shape
+    needed = _BYTES_PER_PIXEL + count * _BYTES_PER_PIXEL_AND_IMAGE
+    check_memory((height, width), needed, f"a fit of {count} images")
     names = names or [f"image {k + 1}" for k in range(count)]
     if len(names) != count:
         raise InputError(f"received {count} images and {len(names)} names: expected one each")
-    used = _checked_mask(mask, data, names)
+    used = _checked_mask(mask, exposed, data, names)
     matrix = strengths_of(setups, fields, count, names) if strengths is None else strengths
     matrix = _checked_strengths(matrix, count)
     if strengths is not None and setups is not None:
@@ -125,7 +135,7 @@ def measured(
         weights=np.pad(weights, fill),
         strengths=matrix,
         beams=np.pad(beams / units[:, None, None], around, mode="edge"),
-        psf=_checked_psf(psf, count, size),
+        psf=checked_point_spread(psf, count, size),
         smoothness=np.zeros((matrix.shape[1], 2)),
         pad=pad,
         tie=_FREE_TIE if free else 30.0,
@@ -181,6 +191,8 @@ def strengths_of(
         return np.ones((1, len(fields)))
     if len(setups) != count:
         raise InputError(f"received {count} images and {len(setups)} setups: expected one each")
+    for setup in setups:
+        check_instance(setup, BeamSetup, "setup")
     first = setups[0]
     for k, setup in enumerate(setups):
         ratio = setup.object_pixel_size / first.object_pixel_size
@@ -201,37 +213,6 @@ def strengths_of(
             for setup in setups
         ]
     )
-
-
-def point_spread(setup: Setup, source_size: float = 0.0, resolution: float = 0.0) -> float:
-    """Return the standard deviation in px by which an image is blurred.
-
-    Parameters
-    ----------
-    setup : Setup
-        The experiment.
-    source_size : float, default 0
-        Standard deviation of the beam's source in m; a FWHM is 2.355 times as large.
-    resolution : float, default 0
-        Standard deviation of the detector's point spread in m, at the detector.
-
-    Returns
-    -------
-    float
-        σ in px at the object: a source of size s is seen as s L/l at the detector, all of it
-        divided by the magnification.
-
-    Raises
-    ------
-    InputError
-        If a length is negative or not finite.
-    """
-    for name, length in (("source_size", source_size), ("resolution", resolution)):
-        if not 0 <= length < np.inf:
-            raise InputError(f"{name} is {length}: expected a length in m, 0 or more")
-    magnification = setup.magnification
-    width = np.hypot(source_size * (magnification - 1), resolution)
-    return float(width / magnification / setup.object_pixel_size)
 
 
 def estimated_noise(image: FloatArray, used: BoolArray) -> float:
@@ -262,25 +243,24 @@ def _checked_images(images: ArrayLike) -> FloatArray:
     return data
 
 
-def _numbers(name: str, values: ArrayLike) -> FloatArray:
-    try:
-        return np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        text = " ".join(repr(values).split())
-        raise InputError(f"{name} is {text:.60}: expected numbers, as many in each row") from error
-
-
-def _checked_mask(mask: ArrayLike | None, data: FloatArray, names: Sequence[str]) -> BoolArray:
+def _checked_mask(
+    mask: ArrayLike | None, exposed: BoolArray | None, data: FloatArray, names: Sequence[str]
+) -> BoolArray:
     if mask is None:
         used = np.ones(data.shape, bool)
     else:
-        used = _numbers("mask", mask) != 0
+        mask, valid = unpack_planes(mask, "mask")
+        used = as_numbers("mask", mask) != 0
+        if valid is not None:
+            used &= valid
         if used.shape not in (data.shape, data.shape[1:]):
             raise InputError(
                 f"mask has shape {used.shape}: expected {data.shape[1:]} or {data.shape}, like the "
                 "images"
             )
         used = np.broadcast_to(used, data.shape)
+    if exposed is not None:
+        used = used & exposed
     for name, image, plane in zip(names, data, used, strict=True):
         bad = int((~np.isfinite(image) & plane).sum())
         if bad:
@@ -296,7 +276,7 @@ def _checked_mask(mask: ArrayLike | None, data: FloatArray, names: Sequence[str]
 
 
 def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
-    matrix = _numbers("strengths", strengths)
+    matrix = as_numbers("strengths", strengths)
     matrix = matrix[:, None] if matrix.ndim == 1 else matrix
     if matrix.ndim != 2 or len(matrix) != count or not np.isfinite(matrix).all():
         raise InputError(
@@ -361,7 +341,7 @@ def _checked_gains(gains: ArrayLike | str, count: int) -> tuple[bool, FloatArray
         if gains not in ("known", "free"):
             raise InputError(f"gains are {gains!r}: expected 'known', 'free' or a number an image")
         return gains == "free", np.ones(count)
-    factors = _numbers("gains", gains)
+    factors = as_numbers("gains", gains)
     if factors.shape != (count,) or not (np.isfinite(factors) & (factors > 0)).all():
         raise InputError(
             f"gains are {gains}: expected a positive number for each of {count} images"
@@ -393,7 +373,7 @@ def _checked_source(source: Any, data: FloatArray, used: BoolArray) -> FloatArra
             raise InputError(f"source is {source!r}: expected an array, None or 'unknown'")
         levels = [image[use].mean() for image, use in zip(data, used, strict=True)]
         return np.asarray(np.ones(data.shape) * np.array(levels)[:, None, None])
-    beams = _numbers("source", source)
+    beams = as_numbers("source", source)
     if beams.shape not in (data.shape, data.shape[1:]):
         raise InputError(
             f"source has shape {beams.shape}: expected {data.shape[1:]} or {data.shape}, like the "
@@ -423,7 +403,7 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
     if noise is None:
         levels = [estimated_noise(plane, use) for plane, use in zip(data, used, strict=True)]
         return np.asarray(np.ones(data.shape) * np.array(levels)[:, None, None])
-    sigma = _numbers("noise", noise)
+    sigma = as_numbers("noise", noise)
     if not sigma.size or not np.isfinite(sigma).all() or sigma.min() <= 0:
         raise InputError("noise is not positive everywhere: expected standard deviations")
     if sigma.shape == (len(data),):
@@ -459,36 +439,10 @@ def _shares(data: FloatArray, used: BoolArray, means: FloatArray) -> FloatArray:
     )
 
 
-def _checked_psf(psf: Any, count: int, size: tuple[int, int]) -> list[float | FloatArray]:
-    try:
-        alone = np.array(psf, dtype=np.float64).ndim in (0, 2)
-    except (TypeError, ValueError):  # widths and kernels, or kernels of several sizes
-        alone = not isinstance(psf, Sequence) or isinstance(psf, str)
-    each = [psf] * count if alone else list(psf)
-    if len(each) != count:
-        raise InputError(f"psf has {len(each)} entries: expected one, or one for each of {count}")
-    found: list[float | FloatArray] = []
-    for one in each:
-        values = _numbers("psf", one)
-        if not values.size or not np.isfinite(values).all() or values.min() < 0:
-            raise InputError(f"psf is {one}: expected a standard deviation in px or a kernel")
-        if values.ndim == 0:
-            if float(values) > min(size) / 8:
-                raise InputError(
-                    f"psf is {float(values):g} px: expected less than an eighth of a side"
-                )
-            found.append(float(values))
-            continue
-        if values.ndim != 2 or not all(side % 2 for side in values.shape) or not values.sum() > 0:
-            raise InputError(f"psf has shape {values.shape}: expected a kernel with odd sides")
-        found.append(values / values.sum())
-    return found
-
-
 def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fiducials | None:
     if fiducials is None:
         return None
-    table = _numbers("fiducials", fiducials)
+    table = as_numbers("fiducials", fiducials)
     if table.ndim != 2 or table.shape[1] != 5 or not np.isfinite(table).all():
         raise InputError(
             f"fiducials have shape {table.shape}: expected rows of y, x, dy, dx, σ in px"

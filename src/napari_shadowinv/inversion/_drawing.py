@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.arrays import plain_array, unpack_array
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
@@ -21,7 +22,7 @@ def noise_of(
     image: ArrayLike, noise: object, gain: float | None, mask: ArrayLike | None
 ) -> tuple[Draw, str]:
     """Return what draws a noisy image, and what to call it; the image itself is checked later."""
-    values = np.asarray(image)
+    values = np.asarray(unpack_array(image, "image")[0])
     if values.dtype.kind not in "buif":
         raise InputError(f"image has values of type {values.dtype}, expected real numbers")
     usable = np.isfinite(values)
@@ -38,7 +39,7 @@ def noise_of(
         raise InputError(
             f"gain is {gain!r} and noise a standard deviation: gain belongs to noise='poisson'"
         )
-    return _gaussian(values, np.asarray(noise), usable)
+    return _gaussian(values, np.asarray(plain_array(noise, "noise")), usable)
 
 
 def _poisson(values: FloatArray, gain: float | None) -> tuple[Draw, str]:

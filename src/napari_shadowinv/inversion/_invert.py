@@ -12,7 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.arrays import unpack_array, unpack_shot
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.safety import check_memory
+from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import normalise
@@ -73,7 +76,8 @@ def plan_sites(
     InversionCancelled
         If `should_stop` returned true.
     """
-    options = options or InversionOptions()
+    options = as_model(InversionOptions, options, "options")
+    source, _, mask = unpack_shot(source, None, mask)
     plan = _planned(source, options, mask, measured)
     if options.is_adaptive:
         return plan
@@ -126,6 +130,7 @@ class _Ground(NamedTuple):
 
 def _ground(source: ArrayLike, options: InversionOptions, mask: ArrayLike | None) -> _Ground:
     usable = None if mask is None else normalise.checked_mask(mask, np.shape(source))
+    check_memory(np.shape(source), normalise.bytes_per_pixel(options), "an inversion")
     beam = normalise.checked_source(source, usable)
     if usable is not None:
         beam = normalise.masked_source(beam, usable, options)
@@ -210,7 +215,9 @@ def invert(
     >>> float(abs(inversion.displacement).max())
     0.0
     """
-    options = options or InversionOptions()
+    options = as_model(InversionOptions, options, "options")
+    check_instance(plan, SitePlan, "plan")
+    check_instance(start, Inversion, "start")
     report = Reporter(on_progress, should_stop)
     seconds: dict[str, float] = {}
     with _timed("prepare", seconds):
@@ -222,7 +229,10 @@ def invert(
                     "contains its own source and mask"
                 )
             _check_boundary(plan, options)
+            image = _unmasked(image, plan.mask)
             source, mask = plan.source, plan.mask
+        else:
+            image, source, mask = unpack_shot(image, source, mask)
         prepared = prepare(image, source, options, mask)
         report("prepare", 1, 1)
     with _timed("sites", seconds):
@@ -313,6 +323,20 @@ def _reason(
     if levels.counts[-1] < MAX_DEFAULT_SITES:
         return "one for each pixel, the most that are placed unless more are asked for"
     return "the most that are placed unless more are asked for"
+
+
+def _unmasked(image: ArrayLike, usable: BoolArray | None) -> ArrayLike:
+    """Return the values of an image whose masked pixels a plan leaves out, too."""
+    values: ArrayLike
+    values, seen = unpack_array(image, "image")
+    if seen is not None:
+        missing = ~seen if usable is None or usable.shape != seen.shape else ~seen & usable
+        if missing.any():
+            raise InputError(
+                f"image has {int(missing.sum())} masked pixels that the plan uses: make the plan "
+                "with the image's mask (mask=~image.mask)"
+            )
+    return values
 
 
 def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:

@@ -29,8 +29,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.arrays import unpack_shot
 from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.linear_surface import WIDTH
@@ -209,11 +211,14 @@ def uncertainty(
     >>> found.potential_std.shape, found.n, found.converged
     ((24, 24), 4, (True, True, True))
     """
-    options = options or InversionOptions()
+    options = as_model(InversionOptions, options, "options")
+    check_instance(plan, SitePlan, "plan")
     if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 2:
         raise InputError(f"n is {n!r}, expected a whole number of samples, at least 2")
     if method not in ("linear", "resolve"):
         raise InputError(f"method is {method!r}, expected 'linear' or 'resolve'")
+    if plan is None:
+        image, source, mask = unpack_shot(image, source, mask)
     draw, described = noise_of(image, noise, gain, mask if plan is None else plan.mask)
     if plan is None:
         beam = prepare(image, source, options, mask).source

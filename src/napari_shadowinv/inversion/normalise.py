@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.machine import physical_memory
+from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
@@ -22,6 +23,7 @@ _SMALLEST_SIDE = 4
 _LEAST_MARGIN = 4
 _MARGIN_SHARE = 0.05  # of the image's shorter side
 _BYTES_PER_SITE = 2000  # measured peak of a whole inversion, rounded up
+_BYTES_PER_PIXEL, _BYTES_PER_PIXEL_FREE = 180, 320  # measured peak of a large image
 _NOTABLE_FLUX_CHANGE = 0.05
 _NOTABLE_MASK = 0.2  # of the pixels
 _DIMMEST, _BRIGHTEST = 1e-301, 1e301  # sums of a whole image stay within double precision
@@ -58,6 +60,7 @@ def prepare(
 ) -> Prepared:
     """Check an image and its source, and bring them to the same flux, or divide by `flux_scale`."""
     shape = _plane(image, "image").shape
+    check_memory(shape, bytes_per_pixel(options), "an inversion")
     usable = np.ones(shape, bool) if mask is None else checked_mask(mask, shape)
     values = _finite_image(image, "image", usable)
     negative = int((values < 0).sum())
@@ -264,6 +267,11 @@ def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
             f"expected at most {max(shape)} px: make it about as wide as the object"
         )
     return options.margin
+
+
+def bytes_per_pixel(options: InversionOptions) -> float:
+    """Return the memory that an inversion needs for each pixel, besides that of the sites."""
+    return _BYTES_PER_PIXEL_FREE if options.boundary == "free" else _BYTES_PER_PIXEL
 
 
 def number_of_sites(shape: tuple[int, int], options: InversionOptions) -> int:

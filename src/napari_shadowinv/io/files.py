@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from napari_shadowinv._system.machine import interrupts_put_off
+from napari_shadowinv._system.safety import check_regular
 from napari_shadowinv.errors import FileFormatError
 
 DEFLATE_RATIO = 1040  # the most that zlib can pack into one byte, a little rounded up
@@ -35,6 +36,7 @@ def check_promise(path: Path, header: str, promised: int, held: int) -> None:
 
 def sha256(path: str | Path) -> str:
     """Return the SHA-256 checksum of a file, in hexadecimal."""
+    check_regular(Path(path), "a file")
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

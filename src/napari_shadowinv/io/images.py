@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import lzma
 import math
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -19,6 +21,14 @@ from napari_shadowinv.io.colours import film_warnings, to_grey
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
 _TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
+
+
+_SMALL_STRIP = 50_000_000  # bytes, which do not matter
+_UNPACKERS: dict[str, Callable[[bytes, int], bytes]] = {
+    name: lambda packed, most: zlib.decompressobj().decompress(packed, most)
+    for name in ("ADOBE_DEFLATE", "DEFLATE")
+}
+_UNPACKERS["LZMA"] = lambda packed, most: lzma.LZMADecompressor().decompress(packed, most)
 
 
 def _check(path: Path, name: str, array: AnyArray) -> None:
@@ -77,6 +87,7 @@ def _read_page(path: Path, page: Any) -> tuple[AnyArray, dict[str, Any]]:
 @refusing_damage
 def tiff_pages(path: Path) -> int:
     """Return how many pages a TIFF has."""
+    check_regular(path, "a TIFF")
     with _opened(path) as tiff:
         return len(tiff.pages)
 
@@ -124,6 +135,25 @@ def _check_complete(path: Path, page: Any) -> None:
     check_promise(path, "TIFF", page.size * page.bitspersample // 8, packing * held)
     # One tile may be far larger than what is used of it.
     check_size(path, max(page.size, math.prod(page.chunks)) * max(8, page.dtype.itemsize))
+    if page.compression.name in _UNPACKERS:
+        _check_strips(path, page)
+
+
+def _check_strips(path: Path, page: Any) -> None:
+    """Refuse a strip or tile that unpacks to far more than its pixels, as the decoder would not."""
+    pixels = math.prod(page.chunks) * page.dtype.itemsize
+    most = max(2 * pixels, _SMALL_STRIP)
+    with path.open("rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            if count * _TIFF_RATIO <= most:
+                continue
+            file.seek(offset)
+            unpacked = len(_UNPACKERS[page.compression.name](file.read(count), most + 1))
+            if unpacked > most:
+                raise FileFormatError(
+                    f"{path} is damaged: a strip of {count} bytes unpacks to more than {most} "
+                    f"bytes, expected {pixels}; save it again"
+                )
 
 
 def read_png(path: Path) -> tuple[AnyArray, dict[str, Any]]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
     field_validator,
     model_validator,
 )
+
+from napari_shadowinv._system.validation import CheckedModel
 
 __all__ = ["FIELDS", "KINDS_OF_NOISE", "FitChoices", "FitOptions", "KindOfNoise", "Noise"]
 
@@ -24,13 +25,13 @@ FIELDS = {
 """What can deflect a beam, by the names that a fit takes."""
 
 
-class FitOptions(BaseModel):
+class FitOptions(CheckedModel):
     """Choices of a fit; all have a default that suits most images.
 
     Raises
     ------
-    pydantic.ValidationError
-        (a `ValueError`) if a value is out of range or a name is unknown.
+    InputError
+        If a value is out of range or a name is unknown.
 
     Examples
     --------
@@ -171,13 +172,13 @@ Noise = Annotated[KindOfNoise | float, BeforeValidator(_noise)]
 """The noise of an image: that of counts, a share of each pixel, or a standard deviation."""
 
 
-class FitChoices(BaseModel):
+class FitChoices(CheckedModel):
     """What a fit is to find, and what is known about the images.
 
     Raises
     ------
-    pydantic.ValidationError
-        (a `ValueError`) if a value is out of range, a name is unknown, or the point spread is
+    InputError
+        If a value is out of range, a name is unknown, or the point spread is
         given both in px and in m.
 
     Examples

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
+
+from napari_shadowinv._system.validation import CheckedModel
 
 __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
 
@@ -15,13 +17,13 @@ _BUDGET: Any = {"panel": "Error budget (docs/uncertainty.md)"}
 _BOUNDARY: Any = {"panel": "Flux across the image edge (docs/boundary.md)"}
 
 
-class InversionOptions(BaseModel):
+class InversionOptions(CheckedModel):
     """Choices of an inversion; all have a default that suits most images.
 
     Raises
     ------
-    pydantic.ValidationError
-        (a `ValueError`) if a value is out of range or a name is unknown.
+    InputError
+        If a value is out of range or a name is unknown.
 
     Examples
     --------

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solveh_banded
 
+from napari_shadowinv._system.arrays import PIXELS, VECTOR, plain_array
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.errors import InputError
@@ -150,7 +151,8 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
 
 
 def _checked_displacement(displacement: ArrayLike) -> FloatArray:
-    field = np.asarray(displacement, dtype=np.float64)
+    plain = plain_array(displacement, "displacement", VECTOR, unit=PIXELS)
+    field = np.asarray(plain, dtype=np.float64)
     if field.ndim != 3 or field.shape[0] != 2:
         raise InputError(
             f"displacement has shape {field.shape}: expected (2, height, width), "
@@ -168,7 +170,7 @@ def _checked_displacement(displacement: ArrayLike) -> FloatArray:
 def _checked_source(source: ArrayLike | None, shape: tuple[int, int]) -> FloatArray:
     if source is None:
         return np.ones(shape)
-    flux = np.ascontiguousarray(source, dtype=np.float64)
+    flux = np.ascontiguousarray(plain_array(source, "source"), dtype=np.float64)
     if flux.shape != shape:
         raise InputError(
             f"source has shape {flux.shape}, displacement describes {shape}: they must match"

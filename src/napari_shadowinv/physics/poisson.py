@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import dctn, idctn
 
+from napari_shadowinv._system.arrays import SQUARE_PIXELS, plain_array
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
@@ -69,7 +70,8 @@ def border_mean(potential: ArrayLike) -> float:
     Each pixel of the border counts once. An `InputError` if the potential, shape (H, W), is no
     plane or empty.
     """
-    values = np.asarray(potential, dtype=np.float64)
+    plain = plain_array(potential, "potential", unit=SQUARE_PIXELS)
+    values = np.asarray(plain, dtype=np.float64)
     if values.ndim != 2 or values.size == 0:
         raise InputError(f"potential has shape {values.shape}: expected (height, width)")
     border = np.ones(values.shape, dtype=bool)
@@ -92,7 +94,7 @@ def _solve_neumann(laplacian: FloatArray) -> FloatArray:
 
 
 def _checked(name: str, values: ArrayLike) -> FloatArray:
-    array = np.asarray(values, dtype=np.float64)
+    array = np.asarray(plain_array(values, name), dtype=np.float64)
     if array.ndim != 2 or array.size == 0:
         raise InputError(f"{name} has shape {array.shape}: expected (height, width)")
     bad = array.size - np.count_nonzero(np.isfinite(array))

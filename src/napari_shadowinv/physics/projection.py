@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
+from napari_shadowinv._system.arrays import PIXELS, VECTOR, plain_array
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
@@ -89,6 +90,8 @@ def project(
     InputError
         As `transferred_displacement` and `synthetic_image`.
     """
+    if source is not None:
+        source = plain_array(source, "source")
     if source is not None and shape is None:
         height, width = np.shape(source)[:2] if np.ndim(source) == 2 else (0, 0)
         shape = (height, width)
@@ -230,7 +233,8 @@ def _require_same_kind(made_with: Setup, setup: Setup) -> None:
 
 
 def _checked_field(displacement: ArrayLike) -> FloatArray:
-    field = np.asarray(displacement, dtype=np.float64)
+    plain = plain_array(displacement, "displacement", VECTOR, unit=PIXELS)
+    field = np.asarray(plain, dtype=np.float64)
     if field.ndim != 3 or field.shape[0] != 2 or min(field.shape[1:]) < _SMALLEST_SIDE:
         raise InputError(
             f"displacement has shape {field.shape}: expected (2, height, width), the y component "

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import (
@@ -51,7 +52,7 @@ class Film:
         return f"film {self.number}"
 
 
-class _Fiducial(BaseModel):
+class _Fiducial(CheckedModel):
     """A mark through the pack, in px of a film's scan."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

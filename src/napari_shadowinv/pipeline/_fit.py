@@ -363,7 +363,7 @@ def _gathered(recipe: Recipe, given: FitShot, name: str, *, unknown: bool) -> In
     arrays: Any = {key: one for key, one in masks.items() if one is not None and key not in files}
     own = recipe.model_copy(update={**files, "setup": given.setup or recipe.setup, "fit": None})
     try:
-        if unknown:
+        if unknown and isinstance(image, (Radiograph, str, Path)):
             image = replace(radiograph_of(image, "the image"), source=None)
         inputs = gathered(own, image, source=source, **arrays)
         inputs.recipe.check(inputs.shot)

@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv import __version__
+from napari_shadowinv._system.arrays import (
+    check_spacing,
+    join_masks,
+    unpack_array,
+    unpack_mask,
+)
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert
@@ -124,6 +131,7 @@ def run(
     >>> inversion.image.shape
     (8, 8)
     """
+    recipe = as_model(Recipe, recipe, "recipe")
     report = Reporter(on_progress, should_stop)
     clock = time.perf_counter()
     report("prepare", 0, None, "image and source")
@@ -252,6 +260,7 @@ def gathered(
 ) -> Inputs:
     """Bring together what a recipe is applied to: read files, fill in defaults of the shot."""
     whole = radiograph_of(shot, "the image")
+    setup = whole.setup if recipe.setup is None else recipe.setup
     beam, wanted = None, recipe.source
     if source is not None:
         beam = radiograph_of(source, "the source")
@@ -264,7 +273,11 @@ def gathered(
                 f"{whole.path or 'the shot'} contains its own source, but a filter would flatten "
                 "the image: leave the filter out, or choose the source 'uniform'"
             )
+    if setup is not None:
+        check_spacing(shot, "the image", setup.pixel_sizes)
+        check_spacing(source, "the source", setup.pixel_sizes)
     usable = _mask(mask, recipe.mask, "mask", whole) or _Mask(whole.mask, None)
+    usable = _without_masked(usable, shot, source)
     bare = _mask(source_mask, recipe.source_mask, "source mask", whole)
     bare = bare or _Mask(whole.source_mask, None)
     if wanted is None:
@@ -276,7 +289,7 @@ def gathered(
             "source": wanted,
             "mask": None,
             "source_mask": None,
-            "setup": whole.setup if recipe.setup is None else recipe.setup,
+            "setup": setup,
         }
     )
     provenance = Provenance(
@@ -321,7 +334,7 @@ class _Mask:
 
 def _mask(given: ArrayLike | None, file: Path | None, name: str, shot: Radiograph) -> _Mask | None:
     if given is not None:
-        pixels = np.asarray(given)
+        pixels = np.asarray(unpack_mask(given, name))
         if pixels.dtype != np.bool_:
             raise InputError(
                 f"{name} has values of type {pixels.dtype}, expected booleans: compare it with "
@@ -338,6 +351,18 @@ def _mask(given: ArrayLike | None, file: Path | None, name: str, shot: Radiograp
     return _Mask(pixels, file)
 
 
+def _without_masked(mask: _Mask, *images: Any) -> _Mask:
+    """Leave the masked pixels of arrays out of a mask, whatever else it leaves out."""
+    masks = [unpack_array(image, "image")[1] for image in images if not _is_file(image)]
+    if all(usable is None for usable in masks):
+        return mask
+    return _Mask(join_masks(mask.pixels, *masks), None)
+
+
+def _is_file(image: Any) -> bool:
+    return image is None or isinstance(image, (Radiograph, str, Path))
+
+
 def picture_mask(path: Path) -> BoolArray:
     """Read a mask from a picture that is 0 where a pixel is not to be used."""
     mask: BoolArray = read_radiograph(path, channel="mean").image != 0
@@ -350,7 +375,8 @@ def radiograph_of(given: Shot, name: str) -> Radiograph:
         return given
     if isinstance(given, (str, Path)):
         return read_radiograph(Path(given))
-    return Radiograph(plane_of(given, name))
+    values, usable = unpack_array(given, name)
+    return Radiograph(plane_of(values, name), mask=usable)
 
 
 def plane_of(values: Any, name: str) -> FloatArray:

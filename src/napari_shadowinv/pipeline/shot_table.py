@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from napari_shadowinv._system.safety import small_text
-from napari_shadowinv._system.validation import nearest, validated
+from napari_shadowinv._system.validation import CheckedModel, nearest, validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing, text_of
 from napari_shadowinv.io.formats import SITES
@@ -54,7 +54,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-class ShotRow(BaseModel):
+class ShotRow(CheckedModel):
     """One image, and what is known about it."""
 
     model_config = _CONFIG
@@ -128,7 +128,7 @@ _FILES = ("file", "setup", "mask", "source")
 _FOR_FITS = ("strength", "psf", "noise")
 
 
-class _Fiducial(BaseModel):
+class _Fiducial(CheckedModel):
     model_config = _CONFIG
     y: float
     x: float

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ConfigDict, ValidationError
 
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv.options import Noise
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.recipe import Origin, Provenance, Recipe
@@ -16,7 +17,7 @@ _CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 _LONGEST_MASKS, _LONGEST_FIDUCIALS = 36_000, 9_000
 
 
-class FitOrigin(BaseModel):
+class FitOrigin(CheckedModel):
     """Where an image of a fit came from, and what was known about it.
 
     Attributes
@@ -46,7 +47,7 @@ class FitOrigin(BaseModel):
     notes: tuple[str, ...] = ()
 
 
-class FitProvenance(BaseModel):
+class FitProvenance(CheckedModel):
     """How a fit was made, so that it can be made again.
 
     Attributes

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.arrays import unpack_shot
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -32,6 +33,7 @@ def checked_pixels(
 
     Masked pixels, which may be NaN, are set to the mean of the usable ones.
     """
+    image, _, mask = unpack_shot(image, None, mask)
     array = np.asarray(image)
     if array.ndim != 2 or array.size == 0:
         raise InputError(

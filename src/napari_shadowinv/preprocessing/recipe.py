@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import FitChoices, InversionOptions
@@ -75,13 +76,13 @@ else:
     ]
 
 
-class Recipe(BaseModel):
+class Recipe(CheckedModel):
     """Everything that is done to a shot, from its image to the field.
 
     Raises
     ------
-    pydantic.ValidationError
-        (a `ValueError`) if a value is out of range or a name is unknown.
+    InputError
+        If a value is out of range or a name is unknown.
 
     Examples
     --------
@@ -265,7 +266,7 @@ def _check_fall(
         )
 
 
-class Origin(BaseModel):
+class Origin(CheckedModel):
     """Where an image came from.
 
     Attributes
@@ -308,7 +309,7 @@ class Origin(BaseModel):
         return np.unpackbits(packed, count=size).reshape(self.shape).astype(bool)
 
 
-class Provenance(BaseModel):
+class Provenance(CheckedModel):
     """How a result was made, so that it can be made again.
 
     The `recipe` has the setup and the kind of source that came with the image's file, too; `setup`

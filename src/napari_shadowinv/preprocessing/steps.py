@@ -8,9 +8,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
+from pydantic import BeforeValidator, ConfigDict, Field, PlainSerializer
 from pydantic.fields import FieldInfo
 
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 
@@ -23,7 +24,7 @@ _SMALLEST_SIDE = 4  # px of a crop
 _WHOLE = 0.999  # share of a rotated pixel that must be known
 
 
-class Choice(BaseModel):
+class Choice(CheckedModel):
     """One of several ways to do something, with its parameters."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

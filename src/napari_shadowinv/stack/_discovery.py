@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from napari_shadowinv._typing import AnyArray
+from napari_shadowinv._system.arrays import PLANE, unpack_array
+from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, text_of
 from napari_shadowinv.io.formats import kind_of
@@ -38,6 +39,7 @@ class Shots:
     shape: tuple[int, int]  # that they should have
     coordinate: Any = None  # values of the coordinate ``shot`` of an xarray object
     array: Any = None  # the same images as one dask array, chunks of one shot, if they came so
+    mask: BoolArray | None = None  # pixels that can be used, if they came as masked arrays
 
     def __len__(self) -> int:
         return len(self.items)
@@ -81,7 +83,11 @@ def find_shots(
                 f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected the same "
                 "shape for all"
             )
-        shots = np.stack([np.asarray(item) for item in shots])
+        planes = [unpack_array(item, f"shots[{k}]") for k, item in enumerate(shots)]
+        shots = np.stack([np.asarray(values) for values, _ in planes])
+        if any(usable is not None for _, usable in planes):
+            masked = [np.zeros(shots.shape[1:], bool) if use is None else ~use for _, use in planes]
+            shots = np.ma.MaskedArray(shots, np.stack(masked))
     if not hasattr(shots, "ndim"):
         raise InputError(
             f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "
@@ -162,10 +168,10 @@ def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
                 "(shot, y, x), or one called 'image'; select it"
             )
         shots = shots[chosen[0]]
-    if "shot" in shots.dims:
-        shots = shots.transpose("shot", ...)
-    coordinate = shots.coords.get(shots.dims[0])
-    return _from_array(shots.data, None if coordinate is None else coordinate.values)
+    name = next((dim for dim in shots.dims if str(dim).lower() not in PLANE), "shot")
+    coordinate = shots.coords.get(name)
+    values, _ = unpack_array(shots, "shots", ("shot", *PLANE))
+    return _from_array(values, None if coordinate is None else coordinate.values)
 
 
 def _from_array(shots: Any, coordinate: Any = None) -> Shots:
@@ -179,6 +185,7 @@ def _from_array(shots: Any, coordinate: Any = None) -> Shots:
         raise InputError(
             f"shots have the unknown shape {shots.shape}: call compute_chunk_sizes() first"
         )
+    mask = _common_mask(shots)
     items: Sequence[Shot]
     if isinstance(shots, da.Array):
         array = shots.rechunk((1, -1, -1))
@@ -187,7 +194,26 @@ def _from_array(shots: Any, coordinate: Any = None) -> Shots:
         array = da.from_array(np.asarray(shots), chunks=(1, -1, -1))
         items = [_references.ArrayShot(plane) for plane in np.asarray(shots)]
     names = tuple(str(value) for value in (range(count) if coordinate is None else coordinate))
-    return Shots(items, names, (shots.shape[1], shots.shape[2]), coordinate, array)
+    return Shots(items, names, (shots.shape[1], shots.shape[2]), coordinate, array, mask)
+
+
+def _common_mask(shots: Any) -> BoolArray | None:
+    """The pixels that all shots of a masked array have in use."""
+    if isinstance(getattr(shots, "_meta", None), np.ma.MaskedArray):
+        raise InputError(
+            "shots are a dask array of masked arrays: give the mask as mask=, and the values as "
+            "dask.array.ma.getdata(shots)"
+        )
+    if not isinstance(shots, np.ma.MaskedArray) or not np.ma.getmaskarray(shots).any():
+        return None
+    masked: BoolArray = np.ma.getmaskarray(shots)
+    if (masked != masked[0]).any():
+        raise InputError(
+            "shots have different masks, expected the same in all: mask what is masked in any "
+            "(mask=~shots.mask.any(axis=0)), or describe them in a table with a mask each"
+        )
+    common: BoolArray = ~masked[0]
+    return common
 
 
 class _Blocks(Sequence[Shot]):

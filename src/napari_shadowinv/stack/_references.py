@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.arrays import unpack_array
 from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.images import read_tiff_page
 from napari_shadowinv.io.reading import read_radiograph
@@ -81,10 +83,21 @@ def doubts_of_file(shot: Radiograph) -> list[str]:
 def _read(reader: Reader, path: Path, **chosen: int) -> tuple[AnyArray, dict[str, Any]]:
     """Image of a file, and warnings if the reader can tell some."""
     if "warnings" not in inspect.signature(reader).parameters:
-        return np.asarray(reader(path, **chosen)), {}
+        return _plain(reader(path, **chosen)), {}
     warnings: list[str] = []
-    image = np.asarray(reader(path, **chosen, warnings=warnings))
+    image = _plain(reader(path, **chosen, warnings=warnings))
     return image, {"warnings": warnings} if warnings else {}
+
+
+def _plain(image: Any) -> AnyArray:
+    """Image without labels; a mask of its own is refused, as all shots share one."""
+    values, usable = unpack_array(image, "the shot")
+    if usable is not None:
+        raise InputError(
+            f"the shot has {int((~usable).sum())} masked pixels of its own: give one mask for the "
+            "whole stack, or describe the shots in a table with a mask each"
+        )
+    return np.asarray(values)
 
 
 @dataclass(frozen=True)
@@ -150,7 +163,7 @@ class BlockShot(Shot):
     block: Any = field(repr=False)
 
     def load(self) -> tuple[AnyArray, dict[str, Any]]:
-        return ArrayShot(np.asarray(self.block.compute())[0]).load()
+        return ArrayShot(_plain(self.block.compute()[0])).load()
 
 
 def checksum(array: AnyArray) -> str:

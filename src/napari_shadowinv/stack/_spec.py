@@ -12,6 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.arrays import (
+    check_spacing,
+    join_masks,
+    unpack_array,
+    unpack_mask,
+)
+from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
 from napari_shadowinv.inversion.normalise import checked_mask, checked_source
@@ -125,11 +132,17 @@ def _described(
     source_reader = reader
     if measured.variable is not None:
         source_reader = partial(reader, variable=measured.variable)
+    lit = None
+    if getattr(source, "ndim", None) == 2:
+        source, lit = unpack_array(source, "source")
     sources = find_source(source, reader=source_reader)
+    if isinstance(sources, Shots):
+        lit = sources.mask
     if sources is None and isinstance(wanted.source, MeasuredSource):
         raise InputError(
             "the recipe asks for a measured source, but names no file: name one, or give a source"
         )
+    mask, source_mask = unpack_mask(mask), unpack_mask(source_mask, "source mask")
     # Where the source tells it, no shot needs to be read for its shape.
     shape = (() if mask is None else np.shape(mask)) if sources is None else sources.shape
     known = (shape[0], shape[1]) if len(shape) == 2 else None
@@ -141,8 +154,11 @@ def _described(
         found = find_shots(shots, reader=reader, shape=known)
     if sources is not None and sources.shape != found.shape:
         raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
+    mask = join_masks(mask, found.mask, lit)
     usable = None if mask is None else checked_mask(mask, found.shape)
     bare = None if source_mask is None else checked_mask(source_mask, found.shape)
+    if wanted.setup is not None:
+        check_spacing(shots, "shots", wanted.setup.pixel_sizes)
     nothing = np.ones(found.shape)
     inputs = gathered(
         wanted.model_copy(update={"source": wanted.estimate}),
@@ -240,8 +256,10 @@ def _recipe(
     filters: Sequence[Step],
 ) -> Recipe:
     """The recipe that was given, or that the other keywords make up."""
+    check_instance(recipe, Recipe, "recipe")
     if recipe is None:
-        return Recipe(steps=tuple(filters), setup=setup, options=options or InversionOptions())
+        options = as_model(InversionOptions, options, "options")
+        return Recipe(steps=tuple(filters), setup=setup, options=options)
     given = {"options": options, "setup": setup, "filters": tuple(filters) or None}
     for name, value in given.items():
         if value is not None:

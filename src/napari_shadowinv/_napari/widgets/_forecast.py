@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Deflector, Setup
 
 
-class PhantomRecipe(BaseModel):
+class PhantomRecipe(CheckedModel):
     """An object whose field is known."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -10,8 +10,10 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
+from pydantic import ConfigDict, Field, model_serializer, model_validator
 
+from napari_shadowinv._system.arrays import plain_array, unmasked
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
@@ -70,7 +72,7 @@ _LENGTHS = {
 }
 
 
-class BeamSetup(BaseModel):
+class BeamSetup(CheckedModel):
     """Geometry that every probe has: distances, pixels, magnification.
 
     Made only as one of its kinds, which describe themselves: nothing else asks for the kind.
@@ -170,6 +172,11 @@ class BeamSetup(BaseModel):
         return self.detector_pixel_size / self.magnification
 
     @property
+    def pixel_sizes(self) -> tuple[float, float]:
+        """Side of a pixel in m in the object plane and in the detector plane."""
+        return self.object_pixel_size, self.object_pixel_size * self.magnification
+
+    @property
     def _angle_per_pixel(self) -> float:
         return self.object_pixel_size * self.magnification / self.object_image_distance
 
@@ -243,7 +250,7 @@ def displacement_from_potential(potential: ArrayLike) -> FloatArray:
     >>> displacement_from_potential(np.tile(np.arange(4.0) ** 2, (3, 1)))[1, 0, 1:]
     array([-2., -4., -6.])
     """
-    plane = np.asarray(potential, dtype=np.float64)
+    plane = np.asarray(plain_array(potential, "potential"), dtype=np.float64)
     if plane.ndim != 2 or min(plane.shape) < 3:
         raise InputError(
             f"potential has shape {plane.shape}: expected (height, width), at least 3 pixels "
@@ -254,7 +261,7 @@ def displacement_from_potential(potential: ArrayLike) -> FloatArray:
 
 def scaled(values: ArrayLike, factor: float) -> FloatArray:
     """Values times a factor, as float64."""
-    product: FloatArray = np.asarray(values, dtype=np.float64) * factor
+    product: FloatArray = np.asarray(unmasked(values, "values"), dtype=np.float64) * factor
     return product
 
 

@@ -28,7 +28,7 @@ LightDeflector = Literal["plasma", "refractive index"]
 class OpticalSetup(BeamSetup):
     """A beam of light through a transparent object, onto a detector.
 
-    A `pydantic.ValidationError` (a `ValueError`) if a value is out of range, a name is unknown, or
+    An `InputError` if a value is out of range, a name is unknown, or
     not exactly one pixel size is given. Numbers of equations are the paper's.
 
     Examples

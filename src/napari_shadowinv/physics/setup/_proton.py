@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 from scipy import constants
 
+from napari_shadowinv._system.arrays import VECTOR, plain_array
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup._beam import BeamSetup, MainField, SIField, positive_field
@@ -65,7 +66,7 @@ _USUAL_ENERGIES_MEV: dict[Species, tuple[float, float]] = {
 class ProtonSetup(BeamSetup):
     """A beam of charged particles through an object, onto a film or a plate.
 
-    A `pydantic.ValidationError` (a `ValueError`) if a value is out of range, a name is unknown, or
+    An `InputError` if a value is out of range, a name is unknown, or
     not exactly one pixel size is given.
 
     Examples
@@ -250,7 +251,7 @@ class ProtonSetup(BeamSetup):
 
 
 def _vector(name: str, values: ArrayLike) -> FloatArray:
-    field = np.asarray(values, dtype=np.float64)
+    field = np.asarray(plain_array(values, name, VECTOR), dtype=np.float64)
     if field.ndim == 0 or field.shape[0] != 2:
         raise InputError(
             f"{name} has shape {field.shape}: expected (2, ...), the y component first"

@@ -1,0 +1,197 @@
+"""Arrays as users hold them: numpy's masked arrays and xarray's labelled ones.
+
+- values in the order of the axes, and the mask: `unpack_array`
+- the same where a mask has no meaning: `plain_array`; in whatever order: `unmasked`
+- image, source and mask of one shot: `unpack_shot`; several planes: `unpack_planes`
+- numbers as floats: `as_numbers`
+- two masks together: `join_masks`; size of a pixel by the coordinates: `coordinate_spacing`
+
+Everything else, lists and dask arrays included, passes through untouched.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+
+PLANE = ("y", "x")
+VECTOR = ("component", *PLANE)
+PIXELS, SQUARE_PIXELS = "px", "px²"
+
+_UNNAMED = re.compile(r"dim_\d+")  # xarray's names for dimensions that got none
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
+_METRES |= {"metre": 1.0, "meter": 1.0, "micrometer": 1e-6, "micron": 1e-6, "millimeter": 1e-3}
+_PIXEL_NAMES = {"px", "pixel", "pixels"}
+_SQUARES = {f"{name}{power}" for name in _PIXEL_NAMES for power in ("²", "^2", "**2", "2")}
+_UNITS = {PIXELS: _PIXEL_NAMES, SQUARE_PIXELS: _SQUARES}
+_UNEVEN = 1e-2  # of the mean spacing
+
+
+def unpack_array(
+    values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = ""
+) -> tuple[Any, BoolArray | None]:
+    """Return the values in the order of `dims`, and which of them can be used (None: all).
+
+    `name` is for messages; `unit` is that of the values, where another one would be wrong. An
+    `InputError` if dimensions have other names, or pixels are not square.
+    """
+    if _is_labelled(values):
+        values = _in_order(values, name, dims, unit)
+    if not isinstance(values, np.ma.MaskedArray):
+        return values, None
+    masked = np.ma.getmaskarray(values)
+    return values.data, ~masked if masked.any() else None
+
+
+def plain_array(
+    values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = ""
+) -> ArrayLike:
+    """Return the values in the order of `dims`; refuse masked ones, which have no meaning here."""
+    plain: ArrayLike = unpack_array(unmasked(values, name), name, dims, unit=unit)[0]
+    return plain
+
+
+def unmasked(values: Any, name: str) -> Any:
+    """Return values in whatever order, unless some are masked."""
+    if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
+        raise InputError(
+            f"{name} has {int(np.ma.getmaskarray(values).sum())} masked values, expected none: "
+            f"replace them, as in {name}.filled(0)"
+        )
+    return values
+
+
+def unpack_mask(mask: Any, name: str = "mask", dims: Sequence[str] = PLANE) -> Any:
+    """Return a mask in the order of `dims`, false where it is masked itself; None for None."""
+    array, usable = unpack_array(mask, name, dims)
+    return array if usable is None else np.where(usable, array, False)
+
+
+def join_masks(*masks: Any) -> Any:
+    """Return where all masks are true; None if there is none."""
+    present = [mask for mask in masks if mask is not None]
+    if len(present) < 2:
+        return present[0] if present else None
+    arrays = [np.asarray(mask) for mask in present]
+    shapes = {array.shape for array in arrays}
+    # Masks that cannot be used are refused by name later.
+    if len(shapes) > 1 or any(array.dtype != np.bool_ for array in arrays):
+        return present[0]
+    return np.logical_and.reduce(arrays)
+
+
+def unpack_shot(image: Any, source: Any, mask: Any) -> tuple[Any, Any, Any]:
+    """Return image, source and mask as plain planes; pixels masked in either are not used."""
+    image, usable = unpack_array(image, "image")
+    if source is not None:
+        source, lit = unpack_array(source, "source")
+        usable = join_masks(usable, lit)
+    return image, source, join_masks(unpack_mask(mask), usable)
+
+
+def unpack_planes(values: Any, name: str) -> tuple[Any, BoolArray | None]:
+    """Return one plane, an array of planes or a list of them without masks, and the mask."""
+    if not isinstance(values, (list, tuple)):
+        dims = ("image", *PLANE) if np.ndim(values) == 3 else PLANE
+        return unpack_array(values, name, dims)
+    planes = [unpack_array(plane, f"{name}[{k}]") for k, plane in enumerate(values)]
+    arrays = [array for array, _ in planes]
+    if all(usable is None for _, usable in planes):
+        return arrays, None
+    masks = [np.ones(np.shape(array), bool) if use is None else use for array, use in planes]
+    # Planes of several shapes are refused by name later.
+    return arrays, np.array(masks) if len({mask.shape for mask in masks}) == 1 else None
+
+
+def mask_of_each(mask: BoolArray | None, data: FloatArray) -> BoolArray | None:
+    """Return a mask for each image, or none where its shape is wrong."""
+    fits = mask is not None and mask.shape in (data.shape, data.shape[1:])
+    return np.broadcast_to(mask, data.shape) if mask is not None and fits else None
+
+
+def as_numbers(name: str, values: ArrayLike) -> FloatArray:
+    """Return a copy of values as floats, or raise an `InputError` that shows what they are."""
+    try:
+        return np.array(unmasked(values, name), dtype=np.float64)
+    except InputError:
+        raise
+    except (TypeError, ValueError) as error:
+        text = " ".join(repr(values).split())
+        raise InputError(f"{name} is {text:.60}: expected numbers, as many in each row") from error
+
+
+def coordinate_spacing(values: Any, name: str) -> float | None:
+    """Return the size of a pixel in m by the coordinates y and x; None if they do not have it."""
+    if not _is_labelled(values):
+        return None
+    sizes = [_spacing(values, dim, name) for dim in PLANE if dim in values.dims]
+    lengths = [size for size in sizes if size is not None]
+    if len(lengths) == len(PLANE) and abs(lengths[0] - lengths[1]) > _UNEVEN * max(lengths):
+        raise InputError(
+            f"{name} has pixels of {lengths[0]:.4g} m along y and {lengths[1]:.4g} m along x by "
+            "its coordinates: expected square ones; resample it"
+        )
+    return lengths[0] if lengths else None
+
+
+def check_spacing(values: Any, name: str, sizes: Sequence[float]) -> None:
+    """Refuse an image whose coordinates contradict all pixel sizes (m) that a setup has."""
+    spacing = coordinate_spacing(values, name)
+    if spacing is None or any(abs(spacing - size) <= _UNEVEN * size for size in sizes):
+        return
+    raise InputError(
+        f"{name} has pixels of {spacing:.4g} m by its coordinates, the setup "
+        f"{' or '.join(f'{size:.4g} m' for size in sizes)}: correct the one that is wrong, or drop "
+        "the coordinates"
+    )
+
+
+def _is_labelled(values: Any) -> bool:
+    return all(hasattr(values, name) for name in ("dims", "coords", "transpose", "data"))
+
+
+def _in_order(array: Any, name: str, dims: Sequence[str], unit: str) -> Any:
+    """Values of a labelled array in the order of the dimensions."""
+    found = tuple(map(str, array.dims))
+    received = str(array.attrs.get("units", unit)).replace(" ", "")
+    if unit and received not in ("", *_UNITS[unit]):
+        raise InputError(f"{name} has the unit {received!r}, expected {unit!r}: convert it first")
+    coordinate_spacing(array, name)
+    if all(map(_UNNAMED.fullmatch, found)):
+        return array.data
+    # Only the plane's axes have names that everybody uses.
+    leading = [dim for dim in found if dim.lower() not in PLANE]
+    plane = [dim for axis in PLANE for dim in found if dim.lower() == axis]
+    if len(plane) != len(PLANE) or len(leading) != len(dims) - len(PLANE):
+        step = "rename" if len(found) == len(dims) else "select one of what is too many, or rename"
+        raise InputError(
+            f"{name} has the dimensions {', '.join(map(repr, found))}, expected "
+            f"{', '.join(map(repr, dims))}: {step} them"
+        )
+    return array.transpose(*leading, *plane).data
+
+
+def _spacing(array: Any, dim: str, name: str) -> float | None:
+    """Distance between pixels along one dimension in m, None if that is not known."""
+    if dim not in array.coords:
+        return None
+    coordinate = array.coords[dim]
+    places: AnyArray = np.asarray(coordinate.values)
+    if places.ndim != 1 or len(places) < 2 or places.dtype.kind not in "iuf":
+        return None
+    steps = np.diff(places.astype(np.float64))
+    mean = float(steps.mean())
+    if not np.isfinite(steps).all() or np.abs(steps - mean).max() > _UNEVEN * abs(mean):
+        raise InputError(
+            f"{name} has coordinates along {dim} that are not evenly spaced: expected pixels of "
+            "one size; resample it, or drop the coordinates"
+        )
+    metres = _METRES.get(str(coordinate.attrs.get("units", "")).strip())
+    return None if metres is None else abs(mean) * metres

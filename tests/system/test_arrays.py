@@ -1,0 +1,257 @@
+"""Masked and labelled arrays: masks are respected, axes are taken by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import dask.array as da
+import numpy as np
+import pytest
+import xarray as xr
+
+from napari_shadowinv import (
+    FitOptions,
+    InputError,
+    InversionOptions,
+    OpticalSetup,
+    ProtonSetup,
+    Recipe,
+    invert,
+    invert_stack,
+    plan_sites,
+    poisson_invert,
+    project,
+    run,
+    synthetic_image,
+    uncertainty,
+)
+from napari_shadowinv.fitting.measurements import measured
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.pipeline import FitShot
+from napari_shadowinv.pipeline._fit import gathered_fit
+from napari_shadowinv.preprocessing.estimates import uniform_source
+
+OPTIONS = InversionOptions(n_sites=300)
+SETUP = OpticalSetup(
+    wavelength=532e-9,
+    source_object_distance=float("inf"),
+    object_image_distance=0.1,
+    pixel_size=1e-5,
+)
+TRUTH = gaussian_blob((32, 40), 20.0, 6.0).displacement
+SHOT = 300 * synthetic_image(TRUTH)
+
+
+@pytest.fixture
+def burnt() -> np.ma.MaskedArray[Any, Any]:
+    """A shot with a saturated spot that is masked."""
+    image, mask = SHOT.copy(), np.zeros(SHOT.shape, bool)
+    mask[4:8, 5:9] = True
+    image[mask] = 1e6
+    return np.ma.MaskedArray(image, mask)
+
+
+def turned(image: Any) -> xr.DataArray:
+    """The same image, x first."""
+    return xr.DataArray(np.ascontiguousarray(np.asarray(image).T), dims=("x", "y"))
+
+
+def displaced(result: Any) -> Any:
+    return result.displacement if hasattr(result, "displacement") else result
+
+
+INVERT: dict[str, Callable[..., Any]] = {
+    "invert": lambda image, mask=None: invert(image, mask=mask, options=OPTIONS),
+    "run": lambda image, mask=None: run(Recipe(options=OPTIONS), image, mask=mask),
+    "invert_stack": lambda image, mask=None: (
+        invert_stack(_stack_of(image), mask=mask, options=OPTIONS).isel(shot=1).compute()
+    ),
+    "fit": lambda image, mask=None: _measured(image, mask),
+    "fit a list": lambda image, mask=None: _measured([image], mask),
+    "run_fit": lambda image, mask=None: _measured(
+        **gathered_fit(Recipe(), [FitShot(image, mask=mask)]).keywords
+    ),
+}
+
+
+def _measured(images: Any, mask: Any = None, **keywords: Any) -> np.ndarray[Any, Any]:
+    """Images and weights that a fit sees."""
+    inputs = {"strengths": None, "setups": None, "source": None, "noise": None, "psf": 0.0}
+    inputs |= {"gains": "known", "fiducials": None, "fields": ("B",), "options": FitOptions()}
+    scene = measured(images, mask=mask, **(inputs | keywords)).scene
+    return np.stack([scene.images, scene.weights])
+
+
+def _stack_of(image: Any) -> Any:
+    if isinstance(image, xr.DataArray):
+        return xr.concat([image, image], "shot").transpose(..., "shot")
+    return np.ma.stack([image, image]) if isinstance(image, np.ma.MaskedArray) else [image, image]
+
+
+@pytest.mark.parametrize("entry", INVERT)
+def test_masked_array_is_the_same_as_a_mask(entry: str, burnt: np.ma.MaskedArray[Any, Any]) -> None:
+    expected = displaced(INVERT[entry](burnt.data, ~burnt.mask))
+
+    assert np.array_equal(displaced(INVERT[entry](burnt)), expected)
+
+
+@pytest.mark.parametrize("entry", INVERT)
+def test_labelled_array_is_taken_by_its_names(entry: str) -> None:
+    expected = displaced(INVERT[entry](SHOT))
+
+    assert np.array_equal(displaced(INVERT[entry](turned(SHOT))), expected)
+
+
+def test_mask_of_a_source_leaves_its_pixels_out(burnt: np.ma.MaskedArray[Any, Any]) -> None:
+    beam = np.ma.MaskedArray(np.where(burnt.mask, np.nan, 300.0), burnt.mask)
+
+    inversion = invert(SHOT, source=beam, options=OPTIONS)
+
+    assert np.array_equal(inversion.mask, ~burnt.mask)
+    assert np.array_equal(plan_sites(beam, OPTIONS).mask, ~burnt.mask)
+
+
+def test_given_mask_and_that_of_the_array_both_count(burnt: np.ma.MaskedArray[Any, Any]) -> None:
+    mask = np.ones(SHOT.shape, bool)
+    mask[20:24] = False
+
+    for inversion in (
+        invert(burnt, mask=mask, options=OPTIONS),
+        run(Recipe(options=OPTIONS), burnt, mask=mask),
+    ):
+        assert np.array_equal(inversion.mask, mask & ~burnt.mask)
+
+
+def test_plan_without_the_mask_is_refused(burnt: np.ma.MaskedArray[Any, Any]) -> None:
+    plan = plan_sites(np.ones(SHOT.shape), OPTIONS)
+
+    with pytest.raises(InputError, match="16 masked pixels that the plan uses"):
+        invert(burnt, plan=plan)
+
+    masked = plan_sites(np.ones(SHOT.shape), OPTIONS, mask=~burnt.mask)
+    assert np.array_equal(invert(burnt, plan=masked, options=OPTIONS).mask, ~burnt.mask)
+
+
+def test_uncertainty_draws_no_noise_under_a_mask(burnt: np.ma.MaskedArray[Any, Any]) -> None:
+    burnt = np.ma.MaskedArray(np.rint(burnt.data), burnt.mask)
+
+    expected = uncertainty(burnt.data, 2, mask=~burnt.mask, options=OPTIONS)
+
+    found = uncertainty(burnt, 2, options=OPTIONS)
+    assert np.array_equal(found.displacement_std, expected.displacement_std)
+
+
+def test_estimate_ignores_masked_pixels(burnt: np.ma.MaskedArray[Any, Any]) -> None:
+    assert uniform_source(burnt).mean() == pytest.approx(SHOT[~burnt.mask].mean())
+
+
+def test_stack_with_different_masks_is_refused(burnt: np.ma.MaskedArray[Any, Any]) -> None:
+    shots = np.ma.stack([burnt, np.ma.MaskedArray(SHOT)])
+
+    with pytest.raises(InputError, match="different masks"):
+        invert_stack(shots, options=OPTIONS)
+    with pytest.raises(InputError, match="dask array of masked arrays"):
+        invert_stack(da.from_array(shots), options=OPTIONS)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda array: synthetic_image(TRUTH, array),
+        lambda array: poisson_invert(array),
+        lambda array: project(TRUTH, SETUP, SETUP, source=array),
+        lambda array: synthetic_image(np.ma.stack([array, array])),
+        lambda array: SETUP.potential(array),
+    ],
+    ids=["source", "poisson_invert", "project", "displacement", "potential"],
+)
+def test_masked_values_without_meaning_are_refused(
+    use: Callable[..., Any], burnt: np.ma.MaskedArray[Any, Any]
+) -> None:
+    with pytest.raises(InputError, match="masked values, expected none"):
+        use(burnt)
+
+
+def test_forward_models_take_axes_by_name() -> None:
+    field = xr.DataArray(TRUTH, dims=("component", "y", "x"), attrs={"units": "px"})
+    beam = np.linspace(1, 2, 32)[:, None] * np.ones((32, 40))
+
+    assert np.array_equal(
+        synthetic_image(field.transpose("x", "component", "y"), turned(beam)),
+        synthetic_image(TRUTH, beam),
+    )
+    assert np.array_equal(poisson_invert(turned(SHOT)), poisson_invert(SHOT))
+    proton = ProtonSetup(
+        energy=14.7, source_object_distance=0.01, object_image_distance=0.28, pixel_size=1e-5
+    )
+    assert np.array_equal(
+        proton.path_integrated_b(field.transpose("y", "x", "component")),
+        proton.path_integrated_b(TRUTH),
+    )
+
+
+def test_displacement_in_metres_is_refused() -> None:
+    field = xr.DataArray(1e-6 * TRUTH, dims=("component", "y", "x"), attrs={"units": "m"})
+
+    with pytest.raises(InputError, match="unit 'm', expected 'px'"):
+        synthetic_image(field)
+
+
+@pytest.mark.parametrize("dims", [("lat", "lon"), ("y", "time"), ("shot", "y", "x")])
+def test_strange_dimensions_are_refused_by_name(dims: tuple[str, ...]) -> None:
+    image = xr.DataArray(np.ones((8,) * len(dims)), dims=dims)
+
+    with pytest.raises(InputError, match=f"image has the dimensions '{dims[0]}'"):
+        invert(image, options=OPTIONS)
+
+
+def test_unnamed_dimensions_are_taken_in_order() -> None:
+    plain = invert(SHOT, options=OPTIONS)
+
+    assert np.array_equal(invert(xr.DataArray(SHOT), options=OPTIONS).potential, plain.potential)
+
+
+def _placed(spacing_y: float, spacing_x: float, unit: str) -> xr.DataArray:
+    height, width = SHOT.shape
+    return xr.DataArray(
+        SHOT,
+        dims=("y", "x"),
+        coords={
+            "y": ("y", spacing_y * np.arange(height), {"units": unit}),
+            "x": ("x", spacing_x * np.arange(width), {"units": unit}),
+        },
+    )
+
+
+@pytest.mark.parametrize(
+    ("image", "passes"),
+    [
+        (_placed(0.01, 0.01, "mm"), True),
+        (_placed(10.0, 10.0, "µm"), True),
+        (_placed(1.0, 1.0, "px"), True),
+        (_placed(1.0, 1.0, ""), True),
+        (_placed(0.2, 0.2, "mm"), False),
+        (_placed(0.01, 0.02, "mm"), False),
+    ],
+    ids=["mm", "um", "pixels", "bare", "contradicting", "oblong"],
+)
+def test_coordinates_must_agree_with_the_setup(image: xr.DataArray, passes: bool) -> None:
+    recipe = Recipe(setup=SETUP, options=OPTIONS)
+    stack = xr.concat([image, image], "shot")
+    if passes:
+        assert run(recipe, image).setup == SETUP
+        assert invert_stack(stack, setup=SETUP, options=OPTIONS).sizes["shot"] == 2
+        return
+    with pytest.raises(InputError, match=r"pixels of .* m"):
+        run(recipe, image)
+    with pytest.raises(InputError, match=r"pixels of .* m"):
+        invert_stack(stack, setup=SETUP, options=OPTIONS)
+
+
+def test_uneven_coordinates_are_refused() -> None:
+    image = _placed(1.0, 1.0, "mm")
+    image = image.assign_coords(y=image.y**2)
+
+    with pytest.raises(InputError, match="not evenly spaced"):
+        invert(image, options=OPTIONS)
