@@ -1,7 +1,8 @@
 """What every reader relies on: no file blocks it, fills the memory or ends it with a traceback.
 
 - whatever a damaged file makes a reader raise is told in one sentence: `refusing_damage`
-- only regular files are opened: `check_regular`
+- the same for the content of a dataset: `refusing_junk`
+- only regular files are opened: `check_regular`; links followed: `resolved_path`
 - a limit on what a file may unfold to in memory: `check_size`
 - a forecast of the memory that work on an image takes: `check_memory`
 - small files of text, such as setups and calibrations: `small_text`
@@ -13,7 +14,8 @@ import functools
 import math
 import os
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar, cast
 
@@ -27,6 +29,7 @@ LIMIT_VARIABLE = "SHADOWINV_MAX_GB"
 _SHARE_OF_MEMORY = 1 / 8
 _MEMORY_IF_UNKNOWN = 8_000_000_000
 _LARGEST_TEXT = 1_000_000
+_LONGEST_SHOWN = 300  # characters of a path
 
 P = ParamSpec("P")
 Content = TypeVar("Content")
@@ -64,6 +67,20 @@ def refusing_damage(
     return cast("Callable[Concatenate[str | Path, P], Content]", guarded)
 
 
+@contextmanager
+def refusing_junk(name: str) -> Iterator[None]:
+    """Turn whatever the content of a dataset makes its reader raise into an `InputError`."""
+    try:
+        yield
+    except (InputError, ImportError, NameError, MemoryError):
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
+        raise InputError(
+            f"{name} is damaged or was changed ({reason}): expected it as this package writes it"
+        ) from error
+
+
 def check_regular(path: Path, expected: str) -> None:
     """Refuse what is no regular file, before it is opened: a pipe would block for ever."""
     try:
@@ -74,13 +91,33 @@ def check_regular(path: Path, expected: str) -> None:
         ) from None
     except OSError as error:
         raise FileFormatError(
-            f"{path} cannot be opened ({error.strerror}): check its permissions and the path"
+            f"{_shown(path)} cannot be opened ({error.strerror}): check its permissions and the "
+            "path"
+        ) from None
+    except ValueError:
+        raise FileFormatError(
+            f"{str(path)!r} has a null character, which no path has: expected {expected}"
         ) from None
     if stat.S_ISDIR(mode):
         raise FileFormatError(f"{path} is a folder: expected {expected}")
     if not stat.S_ISREG(mode):
         found = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
         raise FileFormatError(f"{path} is a {found}: expected {expected}; save it as a file first")
+
+
+def resolved_path(path: str | Path) -> Path:
+    """Return an absolute path without links; one that cannot be followed as far as it can be."""
+    try:
+        return Path(os.path.realpath(path))
+    except ValueError:
+        raise FileFormatError(
+            f"{str(path)!r} has a null character, which no path has: correct it"
+        ) from None
+
+
+def _shown(path: Path) -> str:
+    text = str(path)
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
 
 
 def size_limit() -> int:

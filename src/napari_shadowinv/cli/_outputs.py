@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
@@ -27,7 +28,7 @@ def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tup
     if report is not None:
         return result, report
     figure = result.with_suffix(PNG.suffix)
-    if figure.resolve() == image.resolve():
+    if resolved_path(figure) == resolved_path(image):
         figure = result.with_name(f"{result.stem}_report{PNG.suffix}")
     return result, figure
 
@@ -42,11 +43,11 @@ def check_outputs(outputs: Mapping[Path, tuple[str, ...]], overwrite: bool) -> N
 
 def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
     """Refuse to overwrite what is read, whatever --overwrite says."""
-    read = {other.resolve() for other in inputs if other is not None}
+    read = {resolved_path(other) for other in inputs if other is not None}
     for path in outputs:
-        if path.resolve() in read:
+        if resolved_path(path) in read:
             raise InputError(f"{path} is both read and written: choose another name for the output")
-    if len({path.resolve() for path in outputs}) < len(outputs):
+    if len({resolved_path(path) for path in outputs}) < len(outputs):
         raise InputError(f"{outputs[0]} would be written twice: choose two names")
 
 
@@ -68,7 +69,7 @@ def save_recipe(path: Path, recipe: Recipe, inputs: list[Path | None], overwrite
 
 def protect_store(store: Path, output: Path) -> None:
     """Refuse to write among the files of a store that is read."""
-    if output.resolve().is_relative_to(store.resolve()):
+    if resolved_path(output).is_relative_to(resolved_path(store)):
         raise InputError(
             f"{output} is inside the store being read: choose another name for the output"
         )

@@ -154,6 +154,13 @@ class Calibration:
             the message tells the line.
         """
         table = _rows(path)
+        strange = ~(np.isfinite(table).all(axis=1) & (table[:, 0] >= 0))
+        if strange.any():
+            row = ", ".join(f"{value:g}" for value in table[strange][0])
+            raise InputError(
+                f"{path} has {int(strange.sum())} films with values that are negative or no "
+                f"numbers ({row}): expected doses of 0 or more; correct or delete the row"
+            )
         used = table[(table[:, 0] >= dose_range[0]) & (table[:, 0] <= dose_range[1])]
         if len(used) < 2:
             raise InputError(

@@ -22,7 +22,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.blur import checked_point_spread
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.unknowns import Fiducials
-from napari_shadowinv.options import FIELDS, KINDS_OF_NOISE, FitOptions, KindOfNoise
+from napari_shadowinv.options import FIELDS, KINDS_OF_NOISE, MAX_STRENGTH, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import BeamSetup, Setup
 
@@ -293,7 +293,14 @@ def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
             "strengths that differ between the fields; give more energies or one field"
         )
     # All in units of the first image's.
-    return np.asarray(matrix / matrix[0])
+    with np.errstate(over="ignore"):
+        relative = np.asarray(matrix / matrix[0])
+    if not np.abs(relative).max() <= MAX_STRENGTH:
+        raise InputError(
+            f"strengths are up to {np.abs(relative).max():.3g} times those of the first image: "
+            f"expected at most {MAX_STRENGTH:g}; check the energies"
+        )
+    return relative
 
 
 def _refuse_what_one_image_cannot_tell(

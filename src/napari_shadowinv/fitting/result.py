@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from napari_shadowinv._system.safety import refusing_junk
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.verdict import Verdict
@@ -266,7 +267,7 @@ class Fit:
         Raises
         ------
         InputError
-            If a variable or attribute is missing.
+            If a variable or attribute is missing or damaged.
         """
         missing = [name for name in (*_VARIABLES, "field", "basin") if name not in dataset]
         missing += [name for name in _ATTRIBUTES if name not in dataset.attrs]
@@ -274,6 +275,11 @@ class Fit:
             raise InputError(
                 f"dataset has no {', '.join(map(repr, missing))}: expected the result of a fit"
             )
+        with refusing_junk("the fit"):
+            return cls._from_parts(dataset)
+
+    @classmethod
+    def _from_parts(cls, dataset: xarray.Dataset) -> Fit:
         arrays = {name: np.ascontiguousarray(dataset[name].values) for name in _VARIABLES}
         attributes = dataset.attrs
         content = json.loads(attributes["report"])

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv._system.safety import refusing_junk
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.budget import Errors
@@ -288,7 +289,7 @@ class Inversion:
         Raises
         ------
         InputError
-            If a variable or attribute is missing.
+            If a variable or attribute is missing or damaged.
         """
         missing = [name for name in VARIABLES if name not in dataset.variables]
         missing += [name for name in ("options", "report") if name not in dataset.attrs]
@@ -297,6 +298,11 @@ class Inversion:
                 f"dataset has no {', '.join(map(repr, missing))}: expected the result of an "
                 "inversion"
             )
+        with refusing_junk("the result"):
+            return cls._from_parts(dataset)
+
+    @classmethod
+    def _from_parts(cls, dataset: xarray.Dataset) -> Inversion:
         arrays: dict[str, Any] = {
             name: np.ascontiguousarray(dataset[name].values) for name in VARIABLES
         }

@@ -10,6 +10,7 @@ in a window, and is saved with each result: there is no second list of defaults.
 from napari_shadowinv.options.fitting import (
     FIELDS,
     KINDS_OF_NOISE,
+    MAX_STRENGTH,
     FitChoices,
     FitOptions,
     KindOfNoise,
@@ -21,6 +22,7 @@ __all__ = [
     "FIELDS",
     "KINDS_OF_NOISE",
     "MAX_DEFAULT_SITES",
+    "MAX_STRENGTH",
     "FitChoices",
     "FitOptions",
     "InversionOptions",

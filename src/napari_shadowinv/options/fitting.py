@@ -14,7 +14,15 @@ from pydantic import (
 
 from napari_shadowinv._system.validation import CheckedModel
 
-__all__ = ["FIELDS", "KINDS_OF_NOISE", "FitChoices", "FitOptions", "KindOfNoise", "Noise"]
+__all__ = [
+    "FIELDS",
+    "KINDS_OF_NOISE",
+    "MAX_STRENGTH",
+    "FitChoices",
+    "FitOptions",
+    "KindOfNoise",
+    "Noise",
+]
 
 FIELDS = {
     "B": "magnetic field",
@@ -23,6 +31,10 @@ FIELDS = {
     "phase": "refractive index",
 }
 """What can deflect a beam, by the names that a fit takes."""
+
+
+MAX_STRENGTH = 1e4
+"""Largest displacement of an image, in those of the first."""
 
 
 class FitOptions(CheckedModel):
@@ -39,7 +51,7 @@ class FitOptions(CheckedModel):
     'fading'
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     smoothness: float | None = Field(
         default=None,
@@ -70,7 +82,8 @@ class FitOptions(CheckedModel):
     )
     fade_length: float | None = Field(
         default=None,
-        gt=0,
+        ge=0.1,
+        le=1e6,
         title="Decay length of the field (px)",
         description=(
             "Free edge only: length over which the potential decays beyond the edge. Default: "
@@ -187,7 +200,7 @@ class FitChoices(CheckedModel):
     ('B', 'E')
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     fields: tuple[str, ...] | None = Field(
         default=None,

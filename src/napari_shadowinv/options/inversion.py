@@ -31,7 +31,7 @@ class InversionOptions(CheckedModel):
     0.001
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     n_sites: int | None = Field(
         default=None,

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.io import read_radiograph, read_toml, replacing
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
@@ -37,8 +38,8 @@ def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None
     """
     import tomli_w
 
-    folder = Path(path).parent.resolve()
-    relative = _with_files(recipe, lambda file: Path(os.path.relpath(file.resolve(), folder)))
+    folder = resolved_path(Path(path).parent)
+    relative = _with_files(recipe, lambda file: Path(os.path.relpath(resolved_path(file), folder)))
     content = _without_defaults(relative)
     with replacing(path, overwrite) as whole:
         Path(whole).write_text(tomli_w.dumps(content), encoding="utf-8")

@@ -22,7 +22,7 @@ from napari_shadowinv._system.validation import CheckedModel, nearest, validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing, text_of
 from napari_shadowinv.io.formats import SITES
-from napari_shadowinv.options import Noise
+from napari_shadowinv.options import MAX_STRENGTH, Noise
 
 __all__ = [
     "ShotRow",
@@ -43,7 +43,10 @@ def _strength(value: Any) -> Any:
     parts = str(value).split()
     if not parts or not all(map(_is_number, parts)):
         raise ValueError("expected a number, or one for each field with spaces between them")
-    return tuple(map(float, parts))
+    strengths = tuple(map(float, parts))
+    if not all(abs(strength) <= MAX_STRENGTH for strength in strengths):
+        raise ValueError(f"expected a displacement of at most {MAX_STRENGTH:g} times the first")
+    return strengths
 
 
 def _is_number(text: str) -> bool:
@@ -265,7 +268,7 @@ def is_table(path: Path) -> bool:
     if path.suffix.lower() not in SITES.suffixes:
         return False
     lines = _lines(path)
-    return bool(lines) and not any(map(_is_number, _cells(lines[0])))
+    return bool(lines) and not any(map(_is_number, _cells(path, lines[0])))
 
 
 def _lines(path: Path) -> list[str]:
@@ -273,9 +276,15 @@ def _lines(path: Path) -> list[str]:
     return [line for line in text.splitlines() if line.strip(" ,;\t") and line.strip()[0] != "#"]
 
 
-def _cells(line: str, delimiter: str = "") -> list[str]:
+def _cells(path: Path, line: str, delimiter: str = "") -> list[str]:
     delimiter = delimiter or _delimiter(line)
-    (cells,) = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
+    try:
+        (cells,) = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
+    except csv.Error as error:
+        raise InputError(
+            f"{path} has a line that begins with {line[:30]!r} and cannot be read ({error}): "
+            "expected a table as comma-separated values; correct it"
+        ) from None
     return [cell.strip() for cell in cells]
 
 
@@ -289,13 +298,13 @@ Model = TypeVar("Model", bound=BaseModel)
 def rows_of(path: Path, model: type[Model], shared: Mapping[str, Any] | None = None) -> list[Model]:
     """Return rows of a table as models; files that it names are looked for from its own folder."""
     lines = _lines(path)
-    header = _cells(lines[0]) if lines else []
+    header = _cells(path, lines[0]) if lines else []
     _check_header(path, header, model)
     if len(lines) < 2:
         raise InputError(f"{path} has no rows below its first line: expected one for each image")
     rows = []
     for number, line in enumerate(lines[1:], 1):
-        cells = _cells(line, _delimiter(lines[0]))
+        cells = _cells(path, line, _delimiter(lines[0]))
         if len(cells) > len(header):
             raise InputError(
                 f"{path}, row {number} has {len(cells)} values, expected {len(header)}: "

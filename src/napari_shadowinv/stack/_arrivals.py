@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
 from napari_shadowinv.stack._references import stamp
@@ -44,7 +45,7 @@ def checked_folder(folder: str | Path, pattern: str) -> Path:
             f"the pattern is '{pattern}': expected one for names, such as *.tif; folders inside "
             "the folder are not watched"
         )
-    return path.resolve()
+    return resolved_path(path)
 
 
 class Arrivals:
@@ -329,7 +330,7 @@ def _share_of(folder: Path) -> str:
     except OSError:
         return ""
     best, kind = "", ""
-    place = str(folder.resolve())
+    place = str(resolved_path(folder))
     for _, point, found, *_ in (line.split() for line in lines if line.count(" ") >= 3):
         mount = point.replace("\\040", " ")
         inside = place == mount or place.startswith(mount.rstrip("/") + "/")
