@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import Calibration, find_films, straightened
-from napari_shadowinv.film.marks import usable_pixels
+from napari_shadowinv.film.marks import burnt_edges, usable_pixels
 
 SHAPE = (200, 320)
 
@@ -82,3 +82,49 @@ def test_the_writing_on_real_films_is_found(shared_data: Path, letter: str) -> N
 def test_a_film_without_colours_is_refused(calibration: Calibration) -> None:
     with pytest.raises(InputError, match=r"the scan has shape \(20, 30\)"):
         usable_pixels(np.ones((20, 30)), calibration)
+
+
+def beam() -> FloatArray:
+    """Dose of a beam that the upper edge cuts, with a sharp front across the film."""
+    y, x = np.indices(SHAPE)
+    doses = 2 + 60 * np.exp(-((y / 90) ** 2) - ((x - 150) / 120) ** 2)
+    doses = doses * np.where(x + 0.5 * y > 180, 3.0, 1.0)
+    return np.asarray(doses * (1 + 0.05 * np.random.default_rng(1).normal(size=SHAPE)))
+
+
+def test_burnt_edges_follow_the_burn() -> None:
+    depth = np.arange(SHAPE[0])[:, None]
+    burn = np.where(depth < 14, 40.0, 0.0) + 80 * np.exp(-depth / 4.0)
+    doses = beam() + burn
+    found = burnt_edges(doses)
+    excess = doses / (doses - burn) > 1.3
+    assert found[excess & (depth >= 3)].all()
+    assert not found[30:].any()
+    np.testing.assert_array_equal(burnt_edges(doses.T), found.T)
+    np.testing.assert_array_equal(burnt_edges(doses[::-1]), found[::-1])
+
+
+def test_burnt_edges_are_not_seen_in_a_beam() -> None:
+    for turns in range(4):
+        assert not burnt_edges(np.rot90(beam(), turns)).any()
+
+
+@pytest.mark.parametrize("letter", "MP")
+def test_burnt_edges_of_real_films_are_masked(shared_data: Path, letter: str) -> None:
+    folder = shared_data / "rcf"
+    scan = tifffile.imread(folder / f"RCF_18{letter}.tif")
+    red = straightened(scan, find_films(scan)[0], shape=(296, 590))[..., 0]
+    calibration = Calibration.from_csv(folder / "EBT3_2_calibration.csv")
+    known, doses = calibration.curve("red")
+    dose = np.exp(np.interp(np.log10(calibration.background[0] / red), known, np.log(doses)))
+    burnt = burnt_edges(dose)
+    # Below and beside the beam the dose is level; between the writing, nothing else disturbs it.
+    for turns in (1, 2):
+        side, masked = np.rot90(dose, -turns), np.rot90(burnt, -turns)
+        part = np.s_[:, side.shape[1] * 2 // 5 : side.shape[1] * 3 // 5]
+        profile = np.median(side[part], axis=1)
+        usable = masked[part].mean(axis=1) < 0.5
+        assert profile[6] > 2 * profile[45]
+        assert usable[45]
+        assert (profile[:45][usable[:45]] < 1.35 * profile[45]).all()
+    assert not burnt[50:-50, 50:-50].any()

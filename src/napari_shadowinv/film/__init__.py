@@ -1,7 +1,7 @@
 """Films, CR-39 and image plates: from their scans to doses, counts and luminescence.
 
 - films on a scan: `find_films`, `straightened`, `read_corners`, `write_corners`
-- where a film has no marks: `usable_pixels`
+- pixels without marks and burns: `usable_pixels`, `burnt_edges`
 - doses: `Calibration`, `dose`, `combined_dose`, `net_optical_density`
 - packs, and what each film sees of protons of which energy: `Pack`, `Response`
 - how the films of a pack lie on each other: `register`, `poses_by_fiducials`, `moved_corners`,
@@ -27,7 +27,7 @@ from napari_shadowinv.film.image_plates import (
     fuji_luminescence,
     ge_luminescence,
 )
-from napari_shadowinv.film.marks import usable_pixels
+from napari_shadowinv.film.marks import burnt_edges, usable_pixels
 from napari_shadowinv.film.pack import FilmType, Material, Pack, PackLayer, Slab
 from napari_shadowinv.film.registration import Poses, check_orientation, moved_corners, register
 from napari_shadowinv.film.response import Band, Response
@@ -53,6 +53,7 @@ __all__ = [
     "Stopping",
     "TrackImage",
     "Tracks",
+    "burnt_edges",
     "check_orientation",
     "combined_dose",
     "dose",

@@ -1,4 +1,8 @@
-"""Where a film does not tell its dose: writing, scratches, cuts and rims: `usable_pixels`."""
+"""Pixels of a film whose dose cannot be trusted.
+
+- writing, scratches, cuts and the rim: `usable_pixels`
+- edges that heat or light has darkened: `burnt_edges`
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.film.calibration import Calibration, net_optical_density
 from napari_shadowinv.film.scans import checked_scan
 
-__all__ = ["usable_pixels"]
+__all__ = ["burnt_edges", "usable_pixels"]
 
 _EVERY = 8  # px: of what is smooth, every so many are looked at
 _AROUND, _FAR_AROUND = 13, 25  # of these, for what is usual and how much that scatters
@@ -20,6 +24,16 @@ _NORMAL_MAD = 1.4826
 _UNUSUAL, _LEAST = 6.0, 0.04  # times the scatter, and in optical density
 _BLUR = 1.0  # px
 _SMALLEST, _GAPS, _MARGIN = 4, 3, 2  # px: marks have an area, close gaps, and are widened
+
+# Burnt edges, measured on real EBT3: 1.6 to 40 times the dose, over in 8 to 38 px.
+_MAX_BURNT_DEPTH_PX = 40
+_CUT_PX = 3  # the outermost pixels are partly bed
+_FALL_PX = 6
+_MIN_FALL = 0.35  # of the logarithm of the dose over that length: a factor of 1.4
+_MIN_FALL_TO_INSIDE = 3.0  # times the slope further in, so that a beam is not taken for a burn
+_MIN_RISE = 0.2  # of the logarithm, everywhere between the edge and the fall
+_ALONG_PX = 21  # along the edge, of the median that removes grain and writing
+_MIN_BURNT_SHARE = 0.3  # of a side: fire follows edges, fronts of the beam cross them
 
 
 def usable_pixels(
@@ -81,6 +95,54 @@ def usable_pixels(
         inner[rim:-rim, rim:-rim] = True
         usable &= inner
     return np.asarray(usable)
+
+
+def burnt_edges(dose: ArrayLike) -> BoolArray:
+    """Return the pixels along burnt edges of a film, which look like dose.
+
+    Heat and light darken a film as protons do, so colours do not show it. But the dose then falls
+    steeply from the edge inwards, along a good part of a side, and hardly any more further in.
+
+    Parameters
+    ----------
+    dose : array_like, shape (H, W)
+        Dose of an upright film, positive.
+
+    Returns
+    -------
+    ndarray of bool, shape (H, W)
+    """
+    logarithm = np.log(np.asarray(dose, np.float64))
+    burnt = np.zeros(logarithm.shape, dtype=bool)
+    for turns in range(4):
+        # A view: what is marked on it is marked on the film.
+        side = np.rot90(burnt, turns)
+        side |= _burnt_top(np.rot90(logarithm, turns))
+    return burnt
+
+
+def _burnt_top(logarithm: FloatArray) -> BoolArray:
+    """Burnt pixels along the upper side."""
+    height = len(logarithm)
+    reach = min(_MAX_BURNT_DEPTH_PX, height // 6)
+    burnt = np.zeros(logarithm.shape, dtype=bool)
+    if reach <= _CUT_PX or height < reach + 4 * _FALL_PX:
+        return burnt
+    top = logarithm[_CUT_PX : reach + 4 * _FALL_PX]
+    smooth = ndimage.median_filter(top, (3, _ALONG_PX), mode="nearest")
+    depths = np.arange(reach - _CUT_PX)
+    outside, inside, beyond = (smooth[depths + n * _FALL_PX] for n in (0, 1, 3))
+    fall = outside - inside
+    is_steep = fall > np.maximum(_MIN_FALL, _MIN_FALL_TO_INSIDE * (inside - beyond) / 2)
+    is_higher = np.minimum.accumulate(outside, axis=0) > inside + _MIN_RISE
+    burn_ends = is_steep & is_higher
+    ends = np.where(burn_ends, depths[:, None] + 1, 0).max(axis=0)
+    if (ends > 0).mean() < _MIN_BURNT_SHARE:
+        return burnt
+    # Under a bright beam the fall is hidden: there the burn is as deep as elsewhere on this side.
+    ends = np.where(ends > 0, ends, np.median(ends[ends > 0]))
+    ends = ndimage.maximum_filter1d(ends + _CUT_PX + _FALL_PX + _MARGIN, _ALONG_PX)
+    return np.asarray(np.arange(height)[:, None] < ends)
 
 
 def _usual_blue(calibration: Calibration, unexposed: FloatArray, red: FloatArray) -> FloatArray:

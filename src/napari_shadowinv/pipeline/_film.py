@@ -18,6 +18,7 @@ from napari_shadowinv.film import (
     Pack,
     Poses,
     Response,
+    burnt_edges,
     check_orientation,
     combined_dose,
     moved_corners,
@@ -192,6 +193,7 @@ def _doses(film: Film, shape: tuple[int, int], scale: float, rim: int) -> _Doses
     values = straightened(film.scan.pixels, film.corners, shape=shape, scale=scale)
     found = combined_dose(values, film.calibration, background=film.background)
     usable = usable_pixels(values, film.calibration, background=film.background, rim=rim)
+    usable &= ~burnt_edges(found.dose)
     if film.mask is not None:
         if film.mask.shape != shape:
             raise InputError(
