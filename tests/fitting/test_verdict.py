@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.verdict import Verdict, judged
+from napari_shadowinv.fitting.verdict import Pattern, Verdict, judged
 
 
 def blob(middle: tuple[int, int]) -> FloatArray:
@@ -28,10 +28,16 @@ GOOD: dict[str, Any] = {
     "uncertainty": 0.02,
     "ended": True,
     "gain_by_blur": -500.0,
+    "pattern": Pattern(np.array([-1.0, 1.0])),
     "displacement": blob((24, 24)),
     "edge_is_free": False,
 }
-ALONE = {"chi2": np.array([1.0]), "names": ["image 1"], "single": True}
+ALONE = {
+    "chi2": np.array([1.0]),
+    "names": ["image 1"],
+    "single": True,
+    "pattern": Pattern(np.array([-1.0])),
+}
 
 
 def test_images_that_are_explained_in_one_way_determine_the_field() -> None:
@@ -55,6 +61,34 @@ def test_images_that_are_explained_better_with_more_blur_do_not_fit() -> None:
     verdict, why = judged(**GOOD | {"gain_by_blur": 30.0})
     assert verdict is Verdict.MISFIT
     assert "give the point spread" in why
+
+
+@pytest.mark.parametrize(
+    ("strength", "cause", "expected"),
+    [
+        (3.0, "the beam", Verdict.DETERMINED),
+        (5.0, "", Verdict.DETERMINED),
+        (5.0, "the beam differs", Verdict.MISFIT),
+        (40.0, "", Verdict.MISFIT),
+    ],
+)
+def test_judged_names_a_residual_that_is_no_noise(
+    strength: float, cause: str, expected: Verdict
+) -> None:
+    pattern = Pattern(np.array([0.5, strength]), cause=cause)
+    verdict, why = judged(**GOOD | {"pattern": pattern})
+    assert verdict is expected
+    if expected is Verdict.MISFIT:
+        assert f"image 2: {strength:.0f}" in why
+        assert "image 1" not in why
+        assert (cause or "dark level") in why
+
+
+def test_judged_says_how_correlated_noise_widens_the_bars() -> None:
+    verdict, why = judged(**GOOD | {"pattern": Pattern(np.array([0.0, 0.0]), correlation=1.0)})
+    assert verdict is Verdict.DETERMINED
+    assert "correlated over 1.0 px" in why
+    assert "3.5 times" in why
 
 
 def test_unknown_error_bars_do_not_speak_against_a_field() -> None:

@@ -18,6 +18,7 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting._rivals import name_cause, with_wider_spread
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
@@ -36,7 +37,13 @@ from napari_shadowinv.fitting.search import (
     with_likely_smoothness,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.fitting.verdict import judged
+from napari_shadowinv.fitting.verdict import SUSPECT_PATTERN, Pattern, judged
+from napari_shadowinv.fitting.whiteness import (
+    blur_score,
+    correlation_length,
+    noise_amplification,
+    pattern_strength,
+)
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import FitOptions, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
@@ -52,7 +59,8 @@ _SHARES_OF_TRANSPORT = (1.0, 1.4, 1.9, 2.4)  # past caustics, transport is too w
 _ROUNDED = 8.0  # px
 _TRANSPORT_SITES = 10_000
 _DECIDES = 10.0  # in log evidence
-_WIDER = 1.5  # px; images that are blurred by 1 px or more are then explained better
+_MIN_BLUR_SCORE = 4.0  # standard deviations, for which images are fitted with more blur
+_MAX_RIVAL_CHI2 = 10.0  # a fit that ended further away is no start for a rival
 _SMOOTHED_ERRORS, _SPACING_OF_SAMPLES = 4.0, 1 / 3  # px
 
 
@@ -175,10 +183,17 @@ def fit(
             scene = reweighted(given, scene, best)
             best = settled(scene, best, tell)
         basins = _basins(scene, best, found[1:], tell)
-        # In several images it shows in χ².
-        wider = _with_wider_spread(scene, best, tell) if given.single else best
     with _timed("full size", seconds):
         fine, unknowns, value, taken, ended = refined(scene, best, options, tell)
+    with _timed("residual", seconds):
+        pattern = _find_pattern(given, fine, unknowns)
+        gain_by_blur = 0.0
+        # With several images the fit is repeated only if the residual asks for it.
+        if given.single or pattern.blur_score > _MIN_BLUR_SCORE:
+            gain_by_blur = best.value - with_wider_spread(scene, best, tell).value
+        if pattern.largest > SUSPECT_PATTERN and pattern.chi2 < _MAX_RIVAL_CHI2:
+            cause = name_cause(scene, best, fields, setups, tell)
+            pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", value))
@@ -186,9 +201,31 @@ def fit(
         evidence = float("nan")
         if options.evidence:
             evidence = _log_evidence(scene, best, fields, options, tell)
-    found_by = FitReport(value, taken, ended, seconds, float("nan"), evidence)
-    gain = best.value - wider.value
-    return _result(given, fine, unknowns, fields, setups, options, basins, errors, found_by, gain)
+        if errors is not None:
+            errors *= noise_amplification(pattern.correlation)
+    found_by = FitReport(
+        objective=value,
+        iterations=taken,
+        converged=ended,
+        seconds=seconds,
+        uncertainty=float("nan"),
+        log_evidence=evidence,
+        pattern=pattern.largest,
+        noise_correlation=pattern.correlation,
+    )
+    return _result(
+        given,
+        fine,
+        unknowns,
+        fields,
+        setups,
+        options,
+        basins,
+        errors,
+        found_by,
+        gain_by_blur,
+        pattern,
+    )
 
 
 def compare(
@@ -323,10 +360,25 @@ def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tu
     )
 
 
-def _with_wider_spread(scene: Scene, best: Found, tell: Any) -> Found:
-    """What explains the images if they are blurred more than was said; kernels stay."""
-    wider = [float(np.hypot(one, _WIDER)) if isinstance(one, float) else one for one in scene.psf]
-    return settled(replace(scene, psf=wider), best, tell, "point spread")
+def _find_pattern(given: Measured, scene: Scene, unknowns: Unknowns) -> Pattern:
+    """Test the residuals of all images for structure."""
+    height, width = given.size
+    counts = scene.ray_counts(unknowns)
+    roots = np.sqrt(scene.weights[:, :height, :width])
+    made = scene.model(unknowns, counts)[:, :height, :width]
+    residuals = roots * (scene.images[:, :height, :width] - made)
+    used = roots > 0
+    correlation = max(map(correlation_length, residuals, used))
+    strengths = [
+        pattern_strength(residual, use, correlation)
+        for residual, use in zip(residuals, used, strict=True)
+    ]
+    return Pattern(
+        strengths=np.array(strengths),
+        correlation=correlation,
+        chi2=float(scene.chi2(unknowns, counts).max()),
+        blur_score=blur_score(residuals, roots, made),
+    )
 
 
 def _log_evidence(
@@ -368,6 +420,7 @@ def _result(
     errors: FloatArray | None,
     report: FitReport,
     gain_by_blur: float,
+    pattern: Pattern,
 ) -> Fit:
     height, width = given.size
     counts = scene.ray_counts(unknowns)
@@ -409,6 +462,7 @@ def _result(
         uncertainty=uncertainty,
         ended=report.converged,
         gain_by_blur=gain_by_blur,
+        pattern=pattern,
         displacement=found.sum(axis=0),
         edge_is_free=options.edge == "free",
     )

@@ -130,6 +130,12 @@ class FitReport:
     log_evidence : float
         Logarithm of the evidence, up to what all choices of fields have in common; NaN if it was
         not asked for.
+    pattern : float
+        How far the smoothed residual of an image stands out of white noise, in standard
+        deviations; the largest of all images, NaN if not known. See `pattern_strength`.
+    noise_correlation : float
+        Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise. The
+        error bars take it into account.
     """
 
     objective: float
@@ -138,6 +144,8 @@ class FitReport:
     seconds: dict[str, float]
     uncertainty: float
     log_evidence: float = float("nan")
+    pattern: float = float("nan")
+    noise_correlation: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,290 @@
+"""Fits of images that are not as assumed: the table of docs/trust.md.
+
+    python benchmarks/imperfections.py [--seeds 1] [--side 96] [--only "beam 2 %" …]
+
+Rays are counted one by one where an exact formula puts them (`counted` of `fit.py`); the package's
+forward model is not used. Each row is one object at some energies with one imperfection of the
+experiment that the fit is not told. The columns are the L2 error of the displacement, the verdict,
+the error bars (r.m.s., with the beam's share), z of the residual's pattern, and the explanation. A
+row is SILENT if the verdict is "determined" while the field is off by more than 5 % and by more
+than three bars, and a FALSE ALARM if images that are as assumed are not called determined.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from fit import Beam, Field, blobs, counted
+from napari_shadowinv import FitOptions, fit
+from napari_shadowinv.physics.phantoms import paper_setup
+
+NOISE = 0.05
+SILENT, SILENT_BARS = 0.05, 3.0
+RAYS = 20
+
+FloatArray = NDArray[np.float64]
+Change = Callable[["Shots"], None]
+
+
+@dataclass
+class Shots:
+    """Images of one object while they are simulated, and the keywords of their fit."""
+
+    side: int
+    energies: tuple[float, ...]
+    fields: list[Field]
+    beams: list[Beam | None] = field(default_factory=list)
+    blur: float = 0.0
+    noise_blur: float = 0.0
+    gamma: float = 1.0
+    pedestal: float = 0.0
+    shift: float = 0.0
+    keywords: dict[str, Any] = field(default_factory=dict)
+
+    def strengths(self) -> FloatArray:
+        """Return the displacement of each image by each field, relative to the first image."""
+        setups = [paper_setup().model_copy(update={"energy": energy}) for energy in self.energies]
+        magnetic = [setups[0].momentum / setup.momentum for setup in setups]
+        rigid = [setup.momentum * setup.velocity for setup in setups]
+        electric = [rigid[0] / value for value in rigid]
+        return np.array([magnetic, electric][: len(self.fields)]).T
+
+    def images(self, seed: int) -> FloatArray:
+        """Return the images with noise."""
+        rng = np.random.default_rng(seed)
+        beams = self.beams or [None] * len(self.energies)
+        size = self.side, self.side
+        shots = []
+        for k, (strength, beam) in enumerate(zip(self.strengths(), beams, strict=True)):
+            fields = [_moved(each, self.shift) for each in self.fields] if k else self.fields
+            shot = counted(fields, strength, beam, size, RAYS)
+            if self.blur:
+                shot = gaussian_filter(shot, self.blur, mode="nearest")
+            noise = rng.normal(size=size)
+            if self.noise_blur:
+                noise = gaussian_filter(noise, self.noise_blur, mode="wrap")
+                noise /= noise.std()
+            shot = np.maximum(shot + self.pedestal, 0) ** self.gamma
+            shots.append(shot / (1 + self.pedestal) ** self.gamma + NOISE * noise)
+        return np.stack(shots)
+
+    def displacement(self) -> FloatArray:
+        """Return the displacement in the first image by the first field, px."""
+        y, x = np.indices((self.side, self.side), dtype=np.float64)
+        return np.stack(self.fields[0](y, x))
+
+
+def _moved(displaced: Field, shift: float) -> Field:
+    return lambda y, x: displaced(y, x - shift)
+
+
+def lumpy(side: int, rms: float, seed: int) -> Beam:
+    """Return a beam that varies smoothly over a quarter of the image."""
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(size=(2, 12)) * 4 / side
+    phases = rng.uniform(0, 2 * np.pi, 12)
+
+    def height(y: FloatArray, x: FloatArray) -> FloatArray:
+        return np.asarray(
+            sum(np.cos(a * y + b * x + c) for a, b, c in zip(*waves, phases, strict=True))
+        )
+
+    level = height(*np.indices((side, side), dtype=np.float64))
+    mean, deviation = level.mean(), level.std()
+    return lambda y, x: 1 + rms * (height(y, x) - mean) / deviation
+
+
+def ring(side: int, folded: bool) -> list[Field]:
+    """Return a Gaussian potential that spreads the beam; folded, at twice the first caustic."""
+    sigma, middle = side / 9, (side - 1) / 2
+    return [blobs([((4.0 if folded else 0.6) * sigma**2, sigma, sigma, 0, middle, middle)])]
+
+
+def ellipses(side: int, folded: bool) -> list[Field]:
+    """Return two ellipses of opposite kind."""
+    u = side / 100
+    strength = (0.9 if folded else 0.35) * u**2
+    return [
+        blobs(
+            [
+                (220 * strength, 8 * u, 13 * u, 0.35, 40 * u, 36 * u),
+                (-180 * strength, 12 * u, 7 * u, 0.2, 62 * u, 64 * u),
+            ]
+        )
+    ]
+
+
+OBJECTS = {"ring": ring, "ellipses": ellipses}
+ENERGIES = {2: (14.7, 30.0), 3: (14.7, 20.0, 30.0)}
+
+
+def beam_off(rms: float, each: bool = False) -> Change:
+    """Let the beam vary, in each image in another way if asked."""
+
+    def change(shots: Shots) -> None:
+        count = len(shots.energies)
+        shots.beams = [lumpy(shots.side, rms, 7 + k * each) for k in range(count)]
+
+    return change
+
+
+def tilt(rise: float) -> Change:
+    """Let the beam rise from one side of the image to the other."""
+
+    def change(shots: Shots) -> None:
+        side = shots.side
+
+        def beam(y: FloatArray, x: FloatArray) -> FloatArray:
+            return np.asarray(1 + rise * (x / side - 0.5))
+
+        shots.beams = [beam] * len(shots.energies)
+
+    return change
+
+
+def absorption(depth: float) -> Change:
+    """Let the middle of the object absorb a share of the beam."""
+
+    def change(shots: Shots) -> None:
+        middle, sigma = (shots.side - 1) / 2, shots.side / 8
+
+        def beam(y: FloatArray, x: FloatArray) -> FloatArray:
+            square = (y - middle) ** 2 + (x - middle) ** 2
+            return np.asarray(1 - depth * np.exp(-square / 2 / sigma**2))
+
+        shots.beams = [beam] * len(shots.energies)
+
+    return change
+
+
+def electric(share: float) -> Change:
+    """Let an electric field deflect, too, by a share of what the magnetic field does."""
+
+    def change(shots: Shots) -> None:
+        sigma, row, column = shots.side / 10, 0.42 * shots.side, 0.6 * shots.side
+        peak = np.abs(shots.displacement()).max()
+        potential = share * peak * sigma * np.exp(0.5)
+        shots.fields = [*shots.fields, blobs([(potential, sigma, sigma, 0, row, column)])]
+
+    return change
+
+
+def wires(shots: Shots) -> None:
+    """Replace the object by two wires that the edge cuts."""
+    u = shots.side / 100
+    parts = [(60, 4 * u, 30 * u, 0.1, 30 * u, 0.0), (-50, 4 * u, 30 * u, -0.1, 65 * u, 99 * u)]
+    shots.fields = [blobs([(height * u**2, *place) for height, *place in parts])]
+
+
+def hole(shots: Shots) -> None:
+    """Mask a square in the object."""
+    mask = np.ones((shots.side, shots.side), bool)
+    mask[int(0.36 * shots.side) :, int(0.5 * shots.side) :][:24, :24] = False
+    shots.keywords["mask"] = mask
+
+
+def setting(**values: float) -> Change:
+    """Set attributes of the shots."""
+
+    def change(shots: Shots) -> None:
+        for name, value in values.items():
+            setattr(shots, name, value)
+
+    return change
+
+
+CHANGES: dict[str, Change] = {
+    "none": lambda shots: None,
+    "beam 2 % off": beam_off(0.02),
+    "beam 5 % off": beam_off(0.05),
+    "beams 2 % off, each differently": beam_off(0.02, each=True),
+    "tilt 5 %": tilt(0.05),
+    "absorption 5 %": absorption(0.05),
+    "absorption 10 %": absorption(0.1),
+    "E of 30 %": electric(0.3),
+    "pedestal 10 %": setting(pedestal=0.1),
+    "pedestal 20 %": setting(pedestal=0.2),
+    "gamma 0.85": setting(gamma=0.85),
+    "gamma 1.15": setting(gamma=1.15),
+    "blur 1.5 px": setting(blur=1.5),
+    "blur 3 px": setting(blur=3.0),
+    "correlated noise 1 px": setting(noise_blur=1.0),
+    "shift 1 px": setting(shift=1.0),
+    "wires at the edge": wires,
+    "hole": hole,
+}
+
+
+def cases(side: int) -> Iterator[tuple[str, Shots, bool]]:
+    """Yield each case's name, its shots, and whether they are as assumed."""
+    for change_name, change in CHANGES.items():
+        for object_name, make in OBJECTS.items():
+            for folded in (False, True):
+                for count, energies in ENERGIES.items():
+                    shots = Shots(side, energies, make(side, folded))
+                    shots.keywords["source"] = np.ones((side, side))
+                    change(shots)
+                    kind = "folded " * folded + object_name
+                    name = f"{change_name}, {kind}, {count} energies"
+                    if change is not wires or (object_name == "ring" and not folded):
+                        yield name, shots, change_name == "none"
+
+
+def main() -> None:
+    """Print a row for each case, then the counts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--side", type=int, default=96)
+    parser.add_argument("--only", nargs="*", default=[], help="parts of the rows' names")
+    parser.add_argument("--limit", type=int, default=0, help="cases at most")
+    arguments = parser.parse_args()
+    counts = {"": 0, "SILENT": 0, "FALSE ALARM": 0}
+    print("| images | L2 error, % | bars, % | z | verdict | time, s | |")
+    print("|---|---|---|---|---|---|---|")
+    for name, shots, is_right in cases(arguments.side):
+        if arguments.only and not all(part in name for part in arguments.only):
+            continue
+        for seed in range(arguments.seeds):
+            row, mark = fitted_row(name, shots, seed, is_right)
+            counts[mark] += 1
+            print(row, flush=True)
+    print(f"\n{sum(counts.values())} fits, {counts['SILENT']} silent, "
+          f"{counts['FALSE ALARM']} false alarms")  # fmt: skip
+
+
+def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str, str]:
+    """Fit one case; return its row of the table, and its mark."""
+    begun = time.perf_counter()
+    setups = [paper_setup().model_copy(update={"energy": energy}) for energy in shots.energies]
+    result = fit(
+        shots.images(seed), setups=setups, noise=NOISE, options=FitOptions(seed=seed),
+        **shots.keywords,
+    )  # fmt: skip
+    seconds = time.perf_counter() - begun
+    truth = shots.displacement()
+    error = result.fields[0].displacement - truth
+    share = float(np.sqrt((error**2).mean() / (truth**2).mean()))
+    bars = result.report.uncertainty
+    mark = ""
+    if is_right and result.verdict != "determined":
+        mark = "FALSE ALARM"
+    elif result.verdict == "determined" and share > SILENT and share > SILENT_BARS * bars:
+        mark = "SILENT"
+    whiteness = getattr(result.report, "pattern", float("nan"))
+    row = (
+        f"| {name} | {share:.1%} | {bars:.1%} | {whiteness:+.1f} | {result.verdict.value}: "
+        f"{result.explanation} | {seconds:.0f} | {mark} |"
+    )
+    return row, mark
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""Fits with one more unknown, to name what a fit that leaves a pattern has wrong: `name_cause`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.fitting.search import Found, Tell, settled
+from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.physics.setup import Setup
+
+__all__ = ["name_cause", "with_wider_spread"]
+
+_WIDER_PX = 1.5  # images that are blurred by 1 px or more are then explained better
+# A free beam lowers Σχ² by at most 19 where the beam was right, by 584 and more where it was off.
+_MIN_GAIN = 60.0
+_AS_LIKELY = 0.7  # of the largest gain
+_BEAM_MODES, _FINE_BEAM_MODES = 8, 20
+_BEAM_SPREAD = 0.3
+_SHIFT = np.array([True, False, False] * 2)
+_PEDESTAL = 0.1  # of each image's mean
+
+
+@dataclass(frozen=True)
+class _Rival:
+    """A scene with one more unknown, where its search starts, and what a better fit means."""
+
+    scene: Scene
+    unknowns: Unknowns
+    free_numbers: int
+    cause: str
+
+
+def name_cause(
+    scene: Scene,
+    best: Found,
+    names: Sequence[str],
+    setups: Sequence[Setup] | None,
+    tell: Tell,
+) -> str:
+    """Return the likeliest reason why a fit leaves a pattern, as a clause; "" if none is likely.
+
+    Each rival frees or changes one assumption, and is fitted from the best unknowns in pixels of
+    two. The one that lowers Σχ² most, beyond one for each of its numbers, is named.
+
+    Parameters
+    ----------
+    scene, best
+        The fit that leaves a pattern, in pixels of two.
+    names : sequence of str
+        The fields.
+    setups : sequence of Setup, optional
+        The experiment of each image.
+    tell : callable
+        Receives the stage and the objective.
+    """
+    gains = []
+    for rival in _rivals(scene, best, names, setups):
+        start = Found(best.start, rival.unknowns, best.value, best.displacement)
+        end = settled(rival.scene, start, tell, "rivals")
+        gains.append((2 * (best.value - end.value) - rival.free_numbers, rival.cause))
+    gains.sort(reverse=True)
+    if not gains or gains[0][0] < _MIN_GAIN:
+        return ""
+    largest = gains[0][0]
+    likely = [cause for gain, cause in gains if gain > _AS_LIKELY * largest]
+    return f"{', or '.join(likely[:2])} (Σχ² falls by {largest:.0f})"
+
+
+def with_wider_spread(scene: Scene, best: Found, tell: Tell) -> Found:
+    """Return the fit of images that are blurred by more than was given; kernels stay."""
+    return settled(_wider(scene), best, tell, "point spread")
+
+
+def _rivals(
+    scene: Scene, best: Found, names: Sequence[str], setups: Sequence[Setup] | None
+) -> Iterator[_Rival]:
+    several = len(scene.images) > 1
+    if several:
+        yield from _with_free_beam(scene, best)
+    if several and not scene.free_frames.any():
+        shifted = replace(scene, free_frames=_SHIFT)
+        cause = (
+            "the images are not in register: a shift between them explains them better; align "
+            "them (align='shift', --align shift)"
+        )
+        yield _Rival(shifted, best.unknowns, 2 * (len(scene.images) - 1), cause)
+    if several and not scene.free_gains:
+        cause = (
+            "the brightness of an image differs from its source's: a factor for each image "
+            "explains them better; free the gains (gains='free', --gains free)"
+        )
+        yield _Rival(replace(scene, free_gains=True), best.unknowns, len(scene.images), cause)
+    if several and setups and set(names) == {"B"}:
+        yield from _with_electric_field(scene, best, setups)
+    cause = "the images are blurred by more than the point spread that was given (psf, --psf)"
+    yield _Rival(_wider(scene), best.unknowns, 0, cause)
+    yield _Rival(
+        _without_pedestal(scene),
+        best.unknowns,
+        0,
+        "a constant lies under the images: without a tenth of their mean they are explained "
+        "better; subtract the detector's dark level",
+    )
+
+
+def _with_free_beam(scene: Scene, best: Found) -> Iterator[_Rival]:
+    """Beams that differ from the assumed one on long waves, or also on those of the object."""
+    advice = "give a reference of this shot, or fit the beam (source='unknown', --source unknown)"
+    causes = {
+        _BEAM_MODES: f"the beam differs from its source, smoothly over the image; {advice}",
+        _FINE_BEAM_MODES: (
+            "the object absorbs or scatters, or the beam has finer structure than its source; "
+            "give a reference of this shot, or images in which the object absorbs less"
+        ),
+    }
+    for modes, cause in causes.items():
+        if modes <= scene.beam_modes:
+            continue
+        beam = np.zeros((modes, modes))
+        old = scene.beam_modes
+        beam[:old, :old] = best.unknowns.beam
+        freed = replace(scene, beam_modes=modes, beam_spread=_BEAM_SPREAD, free_gains=True)
+        free_numbers = int((freed.prior.beam_weights > 0).sum())
+        yield _Rival(freed, best.unknowns._replace(beam=beam), free_numbers, cause)
+
+
+def _with_electric_field(scene: Scene, best: Found, setups: Sequence[Setup]) -> Iterator[_Rival]:
+    strengths = strengths_of(setups, ("B", "E"), len(setups))
+    strengths = strengths / strengths[0]
+    if np.linalg.matrix_rank(strengths, tol=0.02) < 2:
+        return
+    both = replace(scene, strengths=strengths, smoothness=np.tile(scene.smoothness, (2, 1)))
+    potentials = np.concatenate([best.unknowns.potentials, 0 * best.unknowns.potentials])
+    # Of an added field the smoothness lets through about as many numbers as waves of 16 px.
+    free_numbers = scene.images[0].size // 64
+    cause = (
+        "an electric field deflects beside the magnetic one; fit both (fields=('B', 'E'), "
+        "--fields B,E)"
+    )
+    yield _Rival(both, best.unknowns._replace(potentials=potentials), free_numbers, cause)
+
+
+def _wider(scene: Scene) -> Scene:
+    widths = [
+        float(np.hypot(width, _WIDER_PX)) if isinstance(width, float) else width
+        for width in scene.psf
+    ]
+    return replace(scene, psf=widths)
+
+
+def _without_pedestal(scene: Scene) -> Scene:
+    """The images less a constant, brought back to their mean; so is their noise."""
+    share = 1 - _PEDESTAL
+    means = scene.images.sum(axis=(1, 2)) / np.maximum((scene.images != 0).sum(axis=(1, 2)), 1)
+    images = (scene.images - _PEDESTAL * means[:, None, None]) / share
+    return replace(scene, images=images, weights=scene.weights * share**2)
