@@ -272,15 +272,15 @@ def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str,
     truth = shots.displacement()
     error = result.fields[0].displacement - truth
     share = float(np.sqrt((error**2).mean() / (truth**2).mean()))
-    bars = result.report.uncertainty
+    bars, total = result.report.uncertainty, result.report.total
     mark = ""
     if is_right and result.verdict != "determined":
         mark = "FALSE ALARM"
-    elif result.verdict == "determined" and share > SILENT and share > SILENT_BARS * bars:
+    elif result.verdict == "determined" and share > SILENT and share > SILENT_BARS * total:
         mark = "SILENT"
     whiteness = getattr(result.report, "pattern", float("nan"))
     row = (
-        f"| {name} | {share:.1%} | {bars:.1%} | {whiteness:+.1f} | {result.verdict.value}: "
+        f"| {name} | {share:.1%} | {bars:.1%}, {total:.1%} | {whiteness:+.1f} | {result.verdict.value}: "
         f"{result.explanation} | {seconds:.0f} | {mark} |"
     )
     return row, mark

@@ -29,6 +29,7 @@ GOOD: dict[str, Any] = {
     "ended": True,
     "gain_by_blur": -500.0,
     "pattern": Pattern(np.array([-1.0, 1.0])),
+    "beam": None,
     "displacement": blob((24, 24)),
     "edge_is_free": False,
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 from zlib import crc32
 
@@ -19,6 +19,7 @@ from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting._rivals import name_cause, with_wider_spread
+from napari_shadowinv.fitting.beam_error import ASSUMED_VARIATION, BeamError, draw_variations
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
@@ -61,6 +62,7 @@ _TRANSPORT_SITES = 10_000
 _DECIDES = 10.0  # in log evidence
 _MIN_BLUR_SCORE = 4.0  # standard deviations, for which images are fitted with more blur
 _MAX_RIVAL_CHI2 = 10.0  # a fit that ended further away is no start for a rival
+_BEAM_SAMPLES, _BEAM_SEED = 3, 1
 _SMOOTHED_ERRORS, _SPACING_OF_SAMPLES = 4.0, 1 / 3  # px
 
 
@@ -198,6 +200,7 @@ def fit(
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", value))
         errors = _errors(scene, posterior, given.size, options.samples)
+        by_beam = _shifts_by_beam(given, scene, posterior, options)
         evidence = float("nan")
         if options.evidence:
             evidence = _log_evidence(scene, best, fields, options, tell)
@@ -222,6 +225,7 @@ def fit(
         options,
         basins,
         errors,
+        by_beam,
         found_by,
         gain_by_blur,
         pattern,
@@ -409,6 +413,65 @@ def _errors(
     return np.asarray(np.sqrt(smooth[..., :height, :width]))
 
 
+@dataclass(frozen=True)
+class _BeamShifts:
+    """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W).
+
+    `by_percent` is for beams that vary by 1 %, `errors` for what the images leave open of beams
+    that vary as far as `variation` says.
+    """
+
+    variation: float
+    by_percent: FloatArray
+    errors: FloatArray
+
+
+def _shifts_by_beam(
+    given: Measured, scene: Scene, posterior: Posterior, options: FitOptions
+) -> _BeamShifts | None:
+    """Return what beams that differ from their sources do; None if they are fitted."""
+    if options.samples < 2 or scene.beam_modes:
+        return None
+    variation = options.beam_variation
+    if variation is None:
+        variation = ASSUMED_VARIATION if given.assumed else 0.0
+    height, width = given.size
+    middle = posterior.scene
+    rng = np.random.default_rng([options.seed, _BEAM_SEED])
+    length = options.beam_scale * min(given.size)
+
+    def spread(samples: Sequence[FloatArray]) -> FloatArray:
+        """Root of the mean square of the displacements by beams, smoothed as these are."""
+        squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
+        for variations in samples:
+            change = finer(posterior.moved_by_beams(variations))
+            squares += np.stack([scene.rays.displacement(p) for p in change.potentials]) ** 2
+        smoothed = gaussian_filter(squares / len(samples), (0, 0, length / 3, length / 3))
+        return np.asarray(np.sqrt(smoothed[..., :height, :width]))
+
+    count = 1 if given.common else len(scene.images)
+    samples = [
+        np.broadcast_to(
+            draw_variations(middle, length / middle.bin, count, rng), middle.beams.shape
+        )
+        for _ in range(_BEAM_SAMPLES)
+    ]
+    by_percent = spread([0.01 * sample for sample in samples])
+    if not variation:
+        return _BeamShifts(variation, by_percent, 0 * by_percent)
+    if not given.common:
+        return _BeamShifts(variation, by_percent, 100 * variation * by_percent)
+    # Several images exclude most of the beams that would move the field far.
+    open_beams = posterior.open_beams(variation, _BEAM_SAMPLES, rng)
+    return _BeamShifts(variation, by_percent, spread(open_beams))
+
+
+def _largest_share(errors: FloatArray, displacements: FloatArray) -> float:
+    """The largest of all fields' r.m.s. error over r.m.s. displacement."""
+    size = np.maximum((displacements**2).mean(axis=(1, 2, 3)), 1e-12)
+    return float(np.sqrt(((errors**2).mean(axis=(1, 2, 3)) / size).max()))
+
+
 def _result(
     given: Measured,
     scene: Scene,
@@ -418,6 +481,7 @@ def _result(
     options: FitOptions,
     basins: tuple[Basin, ...],
     errors: FloatArray | None,
+    by_beam: _BeamShifts | None,
     report: FitReport,
     gain_by_blur: float,
     pattern: Pattern,
@@ -435,17 +499,25 @@ def _result(
         potential = scene.rays.values(unknowns.potentials[m])[:height, :width]
         displacement = scene.rays.displacement(unknowns.potentials[m])[:, :height, :width]
         error = None if errors is None else errors[m]
+        beam_error = None if by_beam is None else by_beam.errors[m]
         smooth = (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1]))
         fields.append(
-            FittedField(name, potential - border_mean(potential), displacement, error, smooth)
+            FittedField(
+                name, potential - border_mean(potential), displacement, error, smooth, beam_error
+            )
         )
     found = np.stack([field.displacement for field in fields])
-    uncertainty = float("nan")
-    if errors is not None:
-        size = (found**2).mean(axis=(1, 2, 3))
-        uncertainty = float(
-            np.sqrt(((errors**2).mean(axis=(1, 2, 3)) / np.maximum(size, 1e-12)).max())
+    uncertainty = float("nan") if errors is None else _largest_share(errors, found)
+    beam = None
+    if by_beam is not None:
+        beam = BeamError(
+            sensitivity=_largest_share(by_beam.by_percent, found),
+            variation=by_beam.variation,
+            share=_largest_share(by_beam.errors, found),
+            scale=options.beam_scale,
+            assumed=given.assumed,
         )
+    report = replace(report, uncertainty=uncertainty, beam=beam)
     jacobians = [
         jacobian_determinant(moved) for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, found)
     ]
@@ -463,6 +535,7 @@ def _result(
         ended=report.converged,
         gain_by_blur=gain_by_blur,
         pattern=pattern,
+        beam=beam,
         displacement=found.sum(axis=0),
         edge_is_free=options.edge == "free",
     )
@@ -481,7 +554,7 @@ def _result(
         folded=folded,
         verdict=verdict,
         explanation=explanation,
-        report=replace(report, uncertainty=uncertainty),
+        report=report,
         options=options,
         setups=tuple(setups or ()),
     )

@@ -167,6 +167,33 @@ class Scene:
         slope.beam[:] += self._of_modes(of_shape * self._beam_shape(unknowns))
         return value, self._only_free(slope)
 
+    def with_free_beam(self, modes: int, variation: float) -> Scene:
+        """Return the scene with an unknown beam that differs from the known one by an r.m.s."""
+        order = np.arange(modes)
+        square = order[:, None] ** 2 + order**2
+        used = (square > 0) & (square < modes**2)
+        # Mean square of cos cos, and of cos alone.
+        means = np.where((order[:, None] > 0) & (order > 0), 0.25, 0.5)
+        total = np.sqrt((means / np.maximum(square, 1))[used].sum())
+        return replace(self, beam_modes=modes, beam_spread=float(variation / total))
+
+    def beam_changes(self, change: Unknowns) -> FloatArray:
+        """Return the change of each image's beam as a share of it, for beams at their sources."""
+        return np.broadcast_to(self._modes(change.beam), self.beams.shape)
+
+    def changed_by_beams(
+        self, unknowns: Unknowns, counts: list[IntArray], variations: FloatArray
+    ) -> FloatArray:
+        """Return the change of all residuals by changes of the beams, shape (L, H, W).
+
+        `variations` are shares of the beams; an image is linear in its beam.
+        """
+        changes = np.empty_like(self.images)
+        for k, psi, count, beam, frame in self._shots(unknowns, counts):
+            bare = self._bare(k, psi, count, variations[k] * beam, frame)
+            changes[k] = np.sqrt(self.weights[k]) * np.exp(unknowns.gains[k]) * bare
+        return changes
+
     def linear(self, unknowns: Unknowns, counts: list[IntArray]) -> Linear:
         """Return the scene to first order around unknowns."""
         shots = list(self._shots(unknowns, counts))

@@ -61,7 +61,8 @@ class Measured:
 
     `scene` has the sides of blocks; the images are its first `size` pixels. `units` (L,) is what
     one unit is in each recorded image, `gains` (L,) how much brighter it is than its source, or
-    about where that is unknown; `counted` tells whether the noise is that of counts.
+    about where that is unknown; `counted` tells whether the noise is that of counts. The beam is
+    `assumed` if no source was given, and `common` if its source is the same for all images.
     """
 
     scene: Scene
@@ -70,6 +71,8 @@ class Measured:
     gains: FloatArray
     counted: bool
     single: bool  # one image, or several with the same information
+    assumed: bool
+    common: bool
 
     def held(self, smoothness: float | None) -> Scene:
         """Return the scene with λ as it was given, or none yet, for each field."""
@@ -113,6 +116,7 @@ def measured(
     _refuse_what_one_image_cannot_tell(matrix, source, options)
     free_gains, factors = _checked_gains(gains, count)
     beams = _checked_source(source, data, used)
+    shapes = [beam / beam.mean() for beam in beams]
     if free_gains:
         factors = _brightness(data, beams, used)
     beams = factors[:, None, None] * beams
@@ -149,7 +153,16 @@ def measured(
     )
     spread = np.linalg.norm(matrix, axis=1)
     single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
-    return Measured(scene, (height, width), units, factors, _is(noise, "poisson"), single)
+    return Measured(
+        scene=scene,
+        size=(height, width),
+        units=units,
+        gains=factors,
+        counted=_is(noise, "poisson"),
+        single=single,
+        assumed=source is None,
+        common=all(np.array_equal(beam, shapes[0]) for beam in shapes[1:]),
+    )
 
 
 _SAME_STRENGTH = 1.08  # images that differ by less tell no more than one

@@ -23,6 +23,8 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 __all__ = ["Posterior"]
 
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
+_FOR_BEAMS = 0.02  # beams are smooth, and how large their differences are is a guess
+_BEAM_MODES = 8
 _MOST_STEPS = 600
 _PROBES, _LANCZOS = 8, 25
 _LEAST_DETERMINED = 1e-3  # coefficients
@@ -55,6 +57,11 @@ class Posterior:
         self._scales = Preconditioner(scene)
         self._after_step = after_step or (lambda: None)
 
+    @property
+    def scene(self) -> Scene:
+        """The scene that is explained."""
+        return self._scene
+
     def likely_smoothness(self) -> tuple[FloatArray, float]:
         """Return λ and κ nearer to the likeliest, shape (M, 2), and by how much they have changed.
 
@@ -79,12 +86,49 @@ class Posterior:
         weights = determined / determined.sum(axis=1, keepdims=True)
         return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
 
-    def drawn(self) -> Unknowns:
+    def drawn(self, tolerance: float = _CLOSELY) -> Unknowns:
         """Return a random change of the unknowns, as large as the data leave possible."""
         noise = self._rng.normal(size=self._scene.images.shape)
         slope = self._linear.pulled(noise)
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
-        return self._scales.times(self._unknowns.like(self._solved(slope, _CLOSELY)))
+        return self._scales.times(self._unknowns.like(self._solved(slope, tolerance)))
+
+    def moved_by_beams(self, variations: FloatArray) -> Unknowns:
+        """Return the change of the unknowns if the beams differ from their sources.
+
+        Parameters
+        ----------
+        variations : ndarray, shape (L, …)
+            Differences as shares of the beams, of the shape of the scene's beams.
+        """
+        changes = self._scene.changed_by_beams(self._unknowns, self._counts, variations)
+        slope = self._linear.pulled(changes)
+        return self._scales.times(self._unknowns.like(self._solved(slope, _FOR_BEAMS)))
+
+    def open_beams(
+        self, variation: float, count: int, rng: np.random.Generator
+    ) -> list[FloatArray]:
+        """Return random differences of a common beam that the images leave possible.
+
+        Parameters
+        ----------
+        variation : float
+            R.m.s. difference that is possible before the images are looked at.
+        count : int
+            Number of samples.
+        rng : numpy.random.Generator
+            For the samples.
+
+        Returns
+        -------
+        list of ndarray, shape (L, …)
+            As `moved_by_beams` takes them.
+        """
+        freed = self._scene.with_free_beam(_BEAM_MODES, variation)
+        beam = np.zeros((_BEAM_MODES, _BEAM_MODES))
+        posterior = Posterior(freed, self._unknowns._replace(beam=beam), rng, self._after_step)
+        drawn = (posterior.drawn(_FOR_BEAMS) for _ in range(count))
+        return [freed.beam_changes(each) for each in drawn]
 
     def log_volume(self, chances: Sequence[np.random.Generator]) -> float:
         """Return half the log of the Hessian's determinant over that of the prior of potentials.

@@ -13,8 +13,10 @@ import numpy as np
 from napari_shadowinv._system.safety import refusing_junk
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.inversion.labels import (
+    BEAM_UNCERTAINTY,
     FIT_FORMAT,
     FLUX_DENSITY,
     PIXEL,
@@ -75,6 +77,9 @@ class FittedField:
         Displacement in px, axis order (y, x).
     uncertainty : ndarray, shape (2, H, W), or None
         Standard deviation of the displacement in px that the noise leaves, if it was asked for.
+    beam_uncertainty : ndarray, shape (2, H, W), or None
+        Standard deviation in px by a beam that differs from its source as far as `BeamError` says,
+        if it was asked for.
     smoothness : tuple of float
         The weights λ and κ of its squared fourth and sixth derivatives (px).
     """
@@ -84,6 +89,25 @@ class FittedField:
     displacement: FloatArray
     uncertainty: FloatArray | None
     smoothness: tuple[float, float]
+    beam_uncertainty: FloatArray | None = None
+
+    @property
+    def total_uncertainty(self) -> FloatArray | None:
+        """Standard deviation of the displacement in px by noise and beam, shape (2, H, W)."""
+        if self.uncertainty is None or self.beam_uncertainty is None:
+            return self.uncertainty
+        return np.hypot(self.uncertainty, self.beam_uncertainty)
+
+    @property
+    def error_of_peak(self) -> float:
+        """Standard deviation of the largest displacement as a share of it; NaN if not known."""
+        length = np.hypot(*self.displacement)
+        row, column = np.unravel_index(np.argmax(length), length.shape)
+        if self.total_uncertainty is None or not length[row, column] > 0:
+            return float("nan")
+        along = self.displacement[:, row, column] / length[row, column]
+        error = np.hypot(*(along * self.total_uncertainty[:, row, column]))
+        return float(error / length[row, column])
 
 
 @dataclass(frozen=True)
@@ -133,6 +157,8 @@ class FitReport:
     pattern : float
         How far the smoothed residual of an image stands out of white noise, in standard
         deviations; the largest of all images, NaN if not known. See `pattern_strength`.
+    beam : BeamError or None
+        What a beam that differs from its source does to the displacement, if it was worked out.
     noise_correlation : float
         Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise. The
         error bars take it into account.
@@ -146,6 +172,12 @@ class FitReport:
     log_evidence: float = float("nan")
     pattern: float = float("nan")
     noise_correlation: float = 0.0
+    beam: BeamError | None = None
+
+    @property
+    def total(self) -> float:
+        """R.m.s. standard deviation by noise and beam as a share of the displacement."""
+        return float(np.hypot(self.uncertainty, 0.0 if self.beam is None else self.beam.share))
 
 
 @dataclass(frozen=True)
@@ -255,6 +287,13 @@ class Fit:
             if field.uncertainty is not None:
                 vectors, *words = UNCERTAINTY
                 one["displacement_uncertainty"] = vectors, field.uncertainty, label(*words)
+            if field.beam_uncertainty is not None:
+                vectors, *words = BEAM_UNCERTAINTY
+                one["displacement_beam_uncertainty"] = (
+                    vectors,
+                    field.beam_uncertainty,
+                    label(*words),
+                )
             attrs = one.attrs
             if len(self.fields) > 1:
                 one = one.rename({name: f"{name}_{field.name}" for name in one.data_vars})
@@ -291,6 +330,8 @@ class Fit:
         arrays = {name: np.ascontiguousarray(dataset[name].values) for name in _VARIABLES}
         attributes = dataset.attrs
         content = json.loads(attributes["report"])
+        if content.get("beam") is not None:
+            content["beam"] = BeamError(**content["beam"])
         known = {field.name for field in dataclasses.fields(FitReport)}
         names = [str(name) for name in dataset["field"].values]
         fields = [
@@ -350,11 +391,16 @@ class Fit:
 
 
 def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArray) -> FittedField:
-    potential, displacement, uncertainty = (
+    potential, displacement, uncertainty, by_beam = (
         np.ascontiguousarray(dataset[variable + ending].values)
         if variable + ending in dataset
         else None
-        for variable in ("potential", "displacement", "displacement_uncertainty")
+        for variable in (
+            "potential",
+            "displacement",
+            "displacement_uncertainty",
+            "displacement_beam_uncertainty",
+        )
     )
     if potential is None or displacement is None:
         raise InputError(
@@ -362,4 +408,4 @@ def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArr
             "result of a fit"
         )
     weights = float(smoothness[0]), float(smoothness[1])
-    return FittedField(name, potential, displacement, uncertainty, weights)
+    return FittedField(name, potential, displacement, uncertainty, weights, by_beam)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.whiteness import noise_amplification
 
 __all__ = ["SUSPECT_PATTERN", "Pattern", "Verdict", "judged"]
@@ -102,6 +103,7 @@ def judged(
     ended: bool,
     gain_by_blur: float,
     pattern: Pattern,
+    beam: BeamError | None,
     displacement: FloatArray,
     edge_is_free: bool,
 ) -> tuple[Verdict, str]:
@@ -129,6 +131,8 @@ def judged(
         By how much a wider point spread lowers the objective.
     pattern : Pattern
         Structure in the residuals.
+    beam : BeamError or None
+        Response of the displacement to a beam that differs from its source, if known.
     displacement : ndarray, shape (2, H, W)
         That of all fields in the first image, px.
     edge_is_free : bool
@@ -183,6 +187,15 @@ def judged(
         return Verdict.UNCERTAIN, (
             f"the noise leaves {uncertainty:.0%} of the displacement open (r.m.s.): average "
             "shots, or take images at energies that differ more"
+        )
+    if beam is not None and np.hypot(uncertainty, beam.share) > _OPEN:
+        allowed = np.sqrt(_OPEN**2 - uncertainty**2) / beam.sensitivity
+        origin = "was assumed, not measured" if beam.assumed else "is known to that only"
+        return Verdict.UNCERTAIN, (
+            f"the beam {origin}: if it differs by {beam.variation:.1%} (r.m.s.) over "
+            f"{beam.scale:.2g} of the image, the displacement is off by {beam.share:.0%} (r.m.s.); "
+            f"measure the beam to {allowed:.1g} % (source, --source), state how uniform it is "
+            "(--beam-variation), or fit it with several energies (source='unknown')"
         )
     if not ended:
         return Verdict.UNCERTAIN, (

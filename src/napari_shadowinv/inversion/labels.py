@@ -63,6 +63,9 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
 UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement")
 """What a fit has beside potential and displacement."""
 
+BEAM_UNCERTAINTY = (_VECTORS, "px", "Standard deviation of the displacement by the beam")
+"""Another variable of a fit."""
+
 _ASSUMES = {"path_integrated_b": "B", "path_integrated_e": "E"}
 
 

@@ -121,6 +121,23 @@ class FitOptions(CheckedModel):
         title="Samples",
         description="Random fields from which the error bars are made; 0 for none.",
     )
+    beam_variation: float | None = Field(
+        default=None,
+        ge=0,
+        lt=1,
+        title="Beam variation",
+        description=(
+            "Difference of the beam from its source (r.m.s., relative) that the error bars take "
+            "into account. Default: 0.05 for a source that was assumed, 0 for one that was given."
+        ),
+    )
+    beam_scale: float = Field(
+        default=0.25,
+        gt=0,
+        le=1,
+        title="Beam scale",
+        description="Distance over which the beam varies, in shorter sides of the image.",
+    )
     evidence: bool = Field(
         default=False,
         title="Evidence",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from napari_shadowinv import __version__
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.fitting import Fit, fit
@@ -57,13 +59,20 @@ def run_refinement(
         psf=choices.psf or 0.0,
         mask=inversion.mask,
         start=inversion.potential,
-        options=choices.options,
+        options=_options(inversion, choices.options),
         on_progress=on_progress,
         should_stop=should_stop,
     )
     if inversion.provenance is None:
         return found
     return replace(found, provenance=_provenance(inversion.provenance, setup, choices))
+
+
+def _options(inversion: Inversion, options: FitOptions) -> FitOptions:
+    """The options, with the beam's variation of the inversion if its beam was assumed uniform."""
+    if options.beam_variation is not None or np.ptp(inversion.source) > 0:
+        return options
+    return options.model_copy(update={"beam_variation": inversion.options.beam_variation})
 
 
 def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0.0) -> FitChoices:
