@@ -4,10 +4,10 @@
 
 Rays are counted one by one where an exact formula puts them (`counted` of `fit.py`); the package's
 forward model is not used. Each row is one object at some energies with one imperfection of the
-experiment that the fit is not told. The columns are the L2 error of the displacement, the verdict,
-the error bars (r.m.s., with the beam's share), z of the residual's pattern, and the explanation. A
-row is SILENT if the verdict is "determined" while the field is off by more than 5 % and by more
-than three bars, and a FALSE ALARM if images that are as assumed are not called determined.
+experiment that the fit is not told. The columns are the L2 error of the displacement, its error
+bars (r.m.s., by noise alone and with the beam), the strength of the residual's pattern, and the
+verdict. A row is SILENT if the verdict is "determined" while the field is off by more than 5 % and
+by more than three bars, and a FALSE ALARM if images that are as assumed are not called determined.
 """
 
 from __future__ import annotations
@@ -278,10 +278,10 @@ def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str,
         mark = "FALSE ALARM"
     elif result.verdict == "determined" and share > SILENT and share > SILENT_BARS * total:
         mark = "SILENT"
-    whiteness = getattr(result.report, "pattern", float("nan"))
+    whiteness = result.report.pattern
     row = (
-        f"| {name} | {share:.1%} | {bars:.1%}, {total:.1%} | {whiteness:+.1f} | {result.verdict.value}: "
-        f"{result.explanation} | {seconds:.0f} | {mark} |"
+        f"| {name} | {share:.1%} | {bars:.1%}, {total:.1%} | {whiteness:+.1f} "
+        f"| {result.verdict.value}: {result.explanation} | {seconds:.0f} | {mark} |"
     )
     return row, mark
 

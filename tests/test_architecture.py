@@ -158,7 +158,8 @@ def fields_of(wanted: str) -> dict[str, list[str]]:
 def test_an_option_is_declared_once(option):
     own = {name for model in (*STEPS.values(), *ESTIMATES.values()) for name in model.parameters()}
     assert option not in own  # its flag would be that of a step
-    said_again = ["FitOptions"] if option in ("seed", "threads") else []
+    of_fits = ("seed", "threads", "beam_variation", "beam_scale")
+    said_again = ["FitOptions"] if option in of_fits else []
     found = [name for names in fields_of(option).values() for name in names]
     assert sorted(found) == [*said_again, "InversionOptions"]
 

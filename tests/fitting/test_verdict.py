@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.verdict import Pattern, Verdict, judged
+from napari_shadowinv.fitting.pattern import Pattern
+from napari_shadowinv.fitting.verdict import Verdict, judged
 
 
 def blob(middle: tuple[int, int]) -> FloatArray:
@@ -31,6 +32,8 @@ GOOD: dict[str, Any] = {
     "pattern": Pattern(np.array([-1.0, 1.0])),
     "beam": None,
     "displacement": blob((24, 24)),
+    "used": np.ones((48, 48), bool),
+    "hidden": 0.0,
     "edge_is_free": False,
 }
 ALONE = {
@@ -172,7 +175,8 @@ def test_one_image_does_not_tell_where_rays_meet_or_cross(
     jacobian = np.ones(displacement.shape[1:])
     for place in of_object[: round(share * len(of_object))]:
         jacobian[tuple(place)] = value
-    changes = {"jacobian": jacobian, "displacement": displacement}
+    used = np.ones(displacement.shape[1:], bool)
+    changes = {"jacobian": jacobian, "displacement": displacement, "used": used}
     verdict, why = judged(**GOOD | ALONE | changes)
     assert verdict.startswith(expected)
     assert ("5% of the object" in why) == (share > 0.02)

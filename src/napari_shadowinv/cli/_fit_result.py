@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -190,8 +189,7 @@ def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
         ("setup", setup_text(fit.setups[0] if fit.setups else None)),
         *[(f"field {field.name}", _field_text(fit, field)) for field in fit.fields],
     ]
-    if not math.isnan(fit.report.uncertainty):
-        rows.append(("error bars", f"{fit.report.uncertainty:.2%} of the displacement (r.m.s.)"))
+    rows += fit.error_rows
     best, *others = fit.basins
     rows += [
         (
@@ -228,8 +226,8 @@ def _field_text(fit: Fit, field: FittedField) -> str:
 
     (pixels,) = shown_fields([field.displacement], None)
     row, column = pixels.peak
-    told = f"{pixels.peak_text()}, at y = {row}, x = {column} px"
+    told = f"{fit.peak_text(field, pixels)}, at y = {row}, x = {column} px"
     if not fit.setups:
         return told
     (shown,) = shown_fields([field.displacement], fit.setups[0], FIELDS[field.name])
-    return f"{shown.peak_text()}; {told}"
+    return f"{fit.peak_text(field, shown)}; {told}"

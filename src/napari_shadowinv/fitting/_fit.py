@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 from zlib import crc32
 
@@ -18,12 +18,20 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting._error_bars import (
+    BeamShifts,
+    errors_by_noise,
+    largest_share,
+    shifts_by_beam,
+)
+from napari_shadowinv.fitting._masked import hidden_contrast
 from napari_shadowinv.fitting._rivals import name_cause, with_wider_spread
-from napari_shadowinv.fitting.beam_error import ASSUMED_VARIATION, BeamError, draw_variations
+from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import Measured, measured
+from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, find_pattern
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
@@ -38,13 +46,8 @@ from napari_shadowinv.fitting.search import (
     with_likely_smoothness,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.fitting.verdict import SUSPECT_PATTERN, Pattern, judged
-from napari_shadowinv.fitting.whiteness import (
-    blur_score,
-    correlation_length,
-    noise_amplification,
-    pattern_strength,
-)
+from napari_shadowinv.fitting.verdict import judged
+from napari_shadowinv.fitting.whiteness import noise_amplification
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import FitOptions, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
@@ -61,9 +64,9 @@ _ROUNDED = 8.0  # px
 _TRANSPORT_SITES = 10_000
 _DECIDES = 10.0  # in log evidence
 _MIN_BLUR_SCORE = 4.0  # standard deviations, for which images are fitted with more blur
+_DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 10.0  # a fit that ended further away is no start for a rival
-_BEAM_SAMPLES, _BEAM_SEED = 3, 1
-_SMOOTHED_ERRORS, _SPACING_OF_SAMPLES = 4.0, 1 / 3  # px
+_SPACING_OF_SAMPLES = 1 / 3  # px
 
 
 def fit(
@@ -188,7 +191,7 @@ def fit(
     with _timed("full size", seconds):
         fine, unknowns, value, taken, ended = refined(scene, best, options, tell)
     with _timed("residual", seconds):
-        pattern = _find_pattern(given, fine, unknowns)
+        pattern = find_pattern(fine, unknowns, given.size)
         gain_by_blur = 0.0
         # With several images the fit is repeated only if the residual asks for it.
         if given.single or pattern.blur_score > _MIN_BLUR_SCORE:
@@ -199,8 +202,8 @@ def fit(
     with _timed("samples", seconds):
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", value))
-        errors = _errors(scene, posterior, given.size, options.samples)
-        by_beam = _shifts_by_beam(given, scene, posterior, options)
+        errors = errors_by_noise(scene, posterior, given.size, options.samples)
+        by_beam = shifts_by_beam(given, scene, posterior, options)
         evidence = float("nan")
         if options.evidence:
             evidence = _log_evidence(scene, best, fields, options, tell)
@@ -364,27 +367,6 @@ def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tu
     )
 
 
-def _find_pattern(given: Measured, scene: Scene, unknowns: Unknowns) -> Pattern:
-    """Test the residuals of all images for structure."""
-    height, width = given.size
-    counts = scene.ray_counts(unknowns)
-    roots = np.sqrt(scene.weights[:, :height, :width])
-    made = scene.model(unknowns, counts)[:, :height, :width]
-    residuals = roots * (scene.images[:, :height, :width] - made)
-    used = roots > 0
-    correlation = max(map(correlation_length, residuals, used))
-    strengths = [
-        pattern_strength(residual, use, correlation)
-        for residual, use in zip(residuals, used, strict=True)
-    ]
-    return Pattern(
-        strengths=np.array(strengths),
-        correlation=correlation,
-        chi2=float(scene.chi2(unknowns, counts).max()),
-        blur_score=blur_score(residuals, roots, made),
-    )
-
-
 def _log_evidence(
     scene: Scene, best: Found, names: Sequence[str], options: FitOptions, tell: Any
 ) -> float:
@@ -398,80 +380,6 @@ def _log_evidence(
     return posterior.log_evidence(chances)
 
 
-def _errors(
-    scene: Scene, posterior: Posterior, size: tuple[int, int], samples: int
-) -> FloatArray | None:
-    """Standard deviation of each field's displacement in px, (M, 2, H, W)."""
-    if samples < 2:
-        return None
-    height, width = size
-    squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
-    for _ in range(samples):
-        change = finer(posterior.drawn())
-        squares += np.stack([scene.rays.displacement(p) for p in change.potentials]) ** 2
-    smooth = gaussian_filter(squares / samples, (0, 0, _SMOOTHED_ERRORS, _SMOOTHED_ERRORS))
-    return np.asarray(np.sqrt(smooth[..., :height, :width]))
-
-
-@dataclass(frozen=True)
-class _BeamShifts:
-    """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W).
-
-    `by_percent` is for beams that vary by 1 %, `errors` for what the images leave open of beams
-    that vary as far as `variation` says.
-    """
-
-    variation: float
-    by_percent: FloatArray
-    errors: FloatArray
-
-
-def _shifts_by_beam(
-    given: Measured, scene: Scene, posterior: Posterior, options: FitOptions
-) -> _BeamShifts | None:
-    """Return what beams that differ from their sources do; None if they are fitted."""
-    if options.samples < 2 or scene.beam_modes:
-        return None
-    variation = options.beam_variation
-    if variation is None:
-        variation = ASSUMED_VARIATION if given.assumed else 0.0
-    height, width = given.size
-    middle = posterior.scene
-    rng = np.random.default_rng([options.seed, _BEAM_SEED])
-    length = options.beam_scale * min(given.size)
-
-    def spread(samples: Sequence[FloatArray]) -> FloatArray:
-        """Root of the mean square of the displacements by beams, smoothed as these are."""
-        squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
-        for variations in samples:
-            change = finer(posterior.moved_by_beams(variations))
-            squares += np.stack([scene.rays.displacement(p) for p in change.potentials]) ** 2
-        smoothed = gaussian_filter(squares / len(samples), (0, 0, length / 3, length / 3))
-        return np.asarray(np.sqrt(smoothed[..., :height, :width]))
-
-    count = 1 if given.common else len(scene.images)
-    samples = [
-        np.broadcast_to(
-            draw_variations(middle, length / middle.bin, count, rng), middle.beams.shape
-        )
-        for _ in range(_BEAM_SAMPLES)
-    ]
-    by_percent = spread([0.01 * sample for sample in samples])
-    if not variation:
-        return _BeamShifts(variation, by_percent, 0 * by_percent)
-    if not given.common:
-        return _BeamShifts(variation, by_percent, 100 * variation * by_percent)
-    # Several images exclude most of the beams that would move the field far.
-    open_beams = posterior.open_beams(variation, _BEAM_SAMPLES, rng)
-    return _BeamShifts(variation, by_percent, spread(open_beams))
-
-
-def _largest_share(errors: FloatArray, displacements: FloatArray) -> float:
-    """The largest of all fields' r.m.s. error over r.m.s. displacement."""
-    size = np.maximum((displacements**2).mean(axis=(1, 2, 3)), 1e-12)
-    return float(np.sqrt(((errors**2).mean(axis=(1, 2, 3)) / size).max()))
-
-
 def _result(
     given: Measured,
     scene: Scene,
@@ -481,7 +389,7 @@ def _result(
     options: FitOptions,
     basins: tuple[Basin, ...],
     errors: FloatArray | None,
-    by_beam: _BeamShifts | None,
+    by_beam: BeamShifts | None,
     report: FitReport,
     gain_by_blur: float,
     pattern: Pattern,
@@ -493,6 +401,7 @@ def _result(
     data = scene.images[:, :height, :width] * units
     made = scene.model(unknowns, counts)[:, :height, :width] * units
     gains = np.exp(unknowns.gains)
+    beams = scene.beam(unknowns)[:, :height, :width] * units * gains[:, None, None]
     chi2 = scene.chi2(unknowns, counts)
     fields = []
     for m, name in enumerate(names):
@@ -507,13 +416,13 @@ def _result(
             )
         )
     found = np.stack([field.displacement for field in fields])
-    uncertainty = float("nan") if errors is None else _largest_share(errors, found)
+    uncertainty = float("nan") if errors is None else largest_share(errors, found)
     beam = None
     if by_beam is not None:
         beam = BeamError(
-            sensitivity=_largest_share(by_beam.by_percent, found),
+            sensitivity=largest_share(by_beam.by_percent, found),
             variation=by_beam.variation,
-            share=_largest_share(by_beam.errors, found),
+            share=largest_share(by_beam.errors, found),
             scale=options.beam_scale,
             assumed=given.assumed,
         )
@@ -537,6 +446,8 @@ def _result(
         pattern=pattern,
         beam=beam,
         displacement=found.sum(axis=0),
+        used=np.asarray(used.any(axis=0)),
+        hidden=hidden_contrast(made / np.maximum(beams, _DARKEST * units) - 1, used),
         edge_is_free=options.edge == "free",
     )
     return Fit(
@@ -544,7 +455,7 @@ def _result(
         mask=used,
         strengths=scene.strengths,
         fields=tuple(fields),
-        source=scene.beam(unknowns)[:, :height, :width] * units * gains[:, None, None],
+        source=beams,
         gains=gains * given.gains,
         frames=unknowns.frames,
         reprojection=made,

@@ -26,6 +26,7 @@ from napari_shadowinv.fitting.minimise import product
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.rays import at_rest
 from napari_shadowinv.fitting.search import (
+    COARSE_GAIN,
     FIRST_SMOOTHNESS,
     HELD,
     MIDDLE,
@@ -288,12 +289,11 @@ class _Work:
         found: Found,
         members: list[int],
         name: str,
-        least_gain: float | None = None,
+        least_gain: float = COARSE_GAIN,
     ) -> Found:
         """What some of the images tell; gains and frames of the others stay."""
         first = replace(found, unknowns=found.unknowns.only(members))
-        known = {} if least_gain is None else {"least_gain": least_gain}
-        end = settled(scene.only(members), first, self._tell, name, **known)
+        end = settled(scene.only(members), first, self._tell, name, least_gain)
         return replace(end, unknowns=found.unknowns.with_those(members, end.unknowns))
 
     @staticmethod

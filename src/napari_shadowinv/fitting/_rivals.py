@@ -15,13 +15,17 @@ from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["name_cause", "with_wider_spread"]
 
-_WIDER_PX = 1.5  # images that are blurred by 1 px or more are then explained better
+_WIDER_PX, _MUCH_WIDER_PX = (
+    1.5,
+    3.0,
+)  # images that are blurred by 1 px or more are then explained better
 # A free beam lowers Σχ² by at most 19 where the beam was right, by 584 and more where it was off.
 _MIN_GAIN = 60.0
 _AS_LIKELY = 0.7  # of the largest gain
 _BEAM_MODES, _FINE_BEAM_MODES = 8, 20
 _BEAM_SPREAD = 0.3
 _SHIFT = np.array([True, False, False] * 2)
+_STEPS = 12
 _PEDESTAL = 0.1  # of each image's mean
 
 
@@ -61,19 +65,20 @@ def name_cause(
     gains = []
     for rival in _rivals(scene, best, names, setups):
         start = Found(best.start, rival.unknowns, best.value, best.displacement)
-        end = settled(rival.scene, start, tell, "rivals")
+        end = settled(rival.scene, start, tell, "rivals", steps=_STEPS)
         gains.append((2 * (best.value - end.value) - rival.free_numbers, rival.cause))
     gains.sort(reverse=True)
     if not gains or gains[0][0] < _MIN_GAIN:
         return ""
     largest = gains[0][0]
-    likely = [cause for gain, cause in gains if gain > _AS_LIKELY * largest]
-    return f"{', or '.join(likely[:2])} (Σχ² falls by {largest:.0f})"
+    # Two rivals may have the same cause.
+    likely = dict.fromkeys(cause for gain, cause in gains if gain > _AS_LIKELY * largest)
+    return f"{', or '.join(list(likely)[:2])} (Σχ² falls by {largest:.0f})"
 
 
 def with_wider_spread(scene: Scene, best: Found, tell: Tell) -> Found:
     """Return the fit of images that are blurred by more than was given; kernels stay."""
-    return settled(_wider(scene), best, tell, "point spread")
+    return settled(_wider(scene, _WIDER_PX), best, tell, "point spread")
 
 
 def _rivals(
@@ -98,7 +103,8 @@ def _rivals(
     if several and setups and set(names) == {"B"}:
         yield from _with_electric_field(scene, best, setups)
     cause = "the images are blurred by more than the point spread that was given (psf, --psf)"
-    yield _Rival(_wider(scene), best.unknowns, 0, cause)
+    for width in (_WIDER_PX, _MUCH_WIDER_PX):
+        yield _Rival(_wider(scene, width), best.unknowns, 0, cause)
     yield _Rival(
         _without_pedestal(scene),
         best.unknowns,
@@ -145,10 +151,9 @@ def _with_electric_field(scene: Scene, best: Found, setups: Sequence[Setup]) -> 
     yield _Rival(both, best.unknowns._replace(potentials=potentials), free_numbers, cause)
 
 
-def _wider(scene: Scene) -> Scene:
+def _wider(scene: Scene, added: float) -> Scene:
     widths = [
-        float(np.hypot(width, _WIDER_PX)) if isinstance(width, float) else width
-        for width in scene.psf
+        float(np.hypot(width, added)) if isinstance(width, float) else width for width in scene.psf
     ]
     return replace(scene, psf=widths)
 

@@ -27,6 +27,7 @@ from napari_shadowinv.inversion.labels import (
 )
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
+from napari_shadowinv.physics.units import ShownField
 from napari_shadowinv.preprocessing import FitProvenance
 
 if TYPE_CHECKING:
@@ -241,6 +242,28 @@ class Fit:
     options: FitOptions
     setups: tuple[Setup, ...] = ()
     provenance: FitProvenance | None = None
+
+    @property
+    def error_rows(self) -> list[tuple[str, str]]:
+        """The errors of the displacement in words: names and texts."""
+        report = self.report
+        if np.isnan(report.uncertainty):
+            return []
+        text = f"{report.uncertainty:.2%} of the displacement by noise (r.m.s.)"
+        if report.noise_correlation > 0:
+            text += f", which is correlated over {report.noise_correlation:.1f} px"
+        if report.beam is None:
+            return [("error bars", text)]
+        if report.beam.variation:
+            text = f"{report.total:.2%} of the displacement in total (r.m.s.); {text}"
+        return [("error bars", text), ("beam", report.beam.text)]
+
+    def peak_text(self, field: FittedField, shown: ShownField) -> str:
+        """Return the largest magnitude of a field with its total error, in the unit shown."""
+        share = field.error_of_peak
+        if np.isnan(share):
+            return shown.peak_text()
+        return shown.peak_text({self.report.beam.name if self.report.beam else "noise": share})
 
     def to_dataset(
         self,

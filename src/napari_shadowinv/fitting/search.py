@@ -18,6 +18,7 @@ from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.poisson import border_mean
 
 __all__ = [
+    "COARSE_GAIN",
     "FIRST_SMOOTHNESS",
     "HELD",
     "MIDDLE",
@@ -35,7 +36,7 @@ Tell = Callable[[str, float], None]
 MIDDLE = 2  # pixels in which starts are compared and λ is found
 FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
 _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
-_COARSE_STEPS, _COARSE_GAIN, _FINE_GAIN = 60, 3.0, 2.0
+_COARSE_STEPS, COARSE_GAIN, _FINE_GAIN = 60, 3.0, 2.0
 _LAST_GAIN = 0.5  # in pixels of two, where it costs little
 _HELD_BEAM = 0.01  # spread of an unknown beam's cosines before the field has been found
 _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
@@ -143,7 +144,7 @@ def _descended(scene: Scene, found: Found, stage: tuple[int, float], tell: Tell)
         now,
         unknowns,
         iterations=_COARSE_STEPS,
-        least_gain=_COARSE_GAIN,
+        least_gain=COARSE_GAIN,
         after_step=lambda now: tell(found.start, now),
     )
     return Found(found.start, unknowns, value, _displacement(now, unknowns), factor)
@@ -182,14 +183,15 @@ def settled(
     found: Found,
     tell: Tell,
     name: str = "smoothness",
-    least_gain: float = _COARSE_GAIN,
+    least_gain: float = COARSE_GAIN,
+    steps: int = _ROUND_STEPS,
 ) -> Found:
     """Return where a descent ends with other λ and κ, in pixels of two and without blur."""
     middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
     unknowns, value, _, _ = settle(
         middle,
         found.unknowns,
-        steps=_ROUND_STEPS,
+        steps=steps,
         least_gain=least_gain,
         after_step=lambda now: tell(name, now),
     )

@@ -7,7 +7,6 @@ perfectly by a wrong field. What tells is whether other fields explain them as w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -15,15 +14,12 @@ from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.beam_error import BeamError
+from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern
 from napari_shadowinv.fitting.whiteness import noise_amplification
+from napari_shadowinv.inversion.edges import TURNED_BACK, inner_sides, turned_back
 
-__all__ = ["SUSPECT_PATTERN", "Pattern", "Verdict", "judged"]
+__all__ = ["Verdict", "judged"]
 
-SUSPECT_PATTERN = 3.5
-"""Standard deviations of a smoothed residual beyond which the fit has to find a cause."""
-# Of fits with a right model it is -5 to 2, on small images up to 3; with a beam that is 2 % off 18
-# and more, with absorption of 5 % 5.6 on 64 × 64 px and 15 on 96 × 96.
-_CERTAIN_PATTERN = 8.0  # without a cause
 
 # Of rings that fold 14 % of one image, the found field was 20 % wrong with 7 to 10 % folded and χ²
 # 0.93: where rays meet or cross, one image can be explained by fields of other folds.
@@ -42,6 +38,7 @@ _LOST = 0.01  # of the rays
 # nothing is cut, 0.18 and more where the error is 5 %; with a free edge 0.31.
 _AT_EDGE, _AT_FREE_EDGE = 0.3, 0.7
 _BENT, _BENT_AT_FREE_EDGE = 0.15, 0.3
+_HIDDEN_STRUCTURE = 0.5  # of the strongest contrast
 _SMOOTHED, _FROM_EDGE = 2.0, 2  # px
 
 
@@ -54,41 +51,6 @@ class Verdict(StrEnum):
     UNCERTAIN = "too uncertain"
     EDGE = "reaches the edge"
     MISFIT = "does not fit"
-
-
-@dataclass(frozen=True)
-class Pattern:
-    """Structure in the residuals of a fit.
-
-    Attributes
-    ----------
-    strengths : ndarray, shape (L,)
-        Of each image, in standard deviations; see `pattern_strength`.
-    correlation : float
-        Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise.
-    chi2 : float
-        The largest of all images.
-    blur_score : float
-        See `whiteness.blur_score`.
-    cause : str
-        The likeliest cause, as a clause; "" if none is likely or none was looked for.
-    """
-
-    strengths: FloatArray
-    correlation: float = 0.0
-    chi2: float = 1.0
-    blur_score: float = 0.0
-    cause: str = ""
-
-    @property
-    def largest(self) -> float:
-        """The strongest pattern of all images."""
-        return float(self.strengths.max())
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether the model is wrong: by the pattern alone, or because a cause explains it."""
-        return self.largest > (SUSPECT_PATTERN if self.cause else _CERTAIN_PATTERN)
 
 
 def judged(
@@ -105,6 +67,8 @@ def judged(
     pattern: Pattern,
     beam: BeamError | None,
     displacement: FloatArray,
+    used: BoolArray,
+    hidden: float,
     edge_is_free: bool,
 ) -> tuple[Verdict, str]:
     """Return the verdict on a fit, and a sentence that says why.
@@ -135,6 +99,10 @@ def judged(
         Response of the displacement to a beam that differs from its source, if known.
     displacement : ndarray, shape (2, H, W)
         That of all fields in the first image, px.
+    used : ndarray of bool, shape (H, W)
+        The pixels that were fitted in any image.
+    hidden : float
+        Contrast around the mask's holes as a share of the strongest; see `hidden_contrast`.
     edge_is_free : bool
         Whether the field was let go on beyond the edge.
     """
@@ -201,6 +169,13 @@ def judged(
         return Verdict.UNCERTAIN, (
             "the search ran out of steps before it ended: allow more (steps, --steps)"
         )
+    if hidden > _HIDDEN_STRUCTURE:
+        return Verdict.UNCERTAIN, (
+            f"the mask hides part of the object where its image has {hidden:.0%} of its strongest "
+            "contrast: folds beneath were not seen, the field there is the smoothest that the "
+            "surroundings allow, and the error bars do not include that; unmask what is sound, or "
+            "add an image in which it is seen"
+        )
     free = edge_is_free
     at_edge, bent = _share_at_edge(np.hypot(*displacement)), _share_bent_at_edge(displacement)
     if at_edge > (_AT_FREE_EDGE if free else _AT_EDGE) or bent > (
@@ -211,6 +186,13 @@ def judged(
             f"diverge {bent:.0%} as much as anywhere: what lies beyond bends the field everywhere; "
             "record a larger field of view"
             + ("" if free else ", or try a free edge (edge='free', --edge free)")
+        )
+    if not free and (turned := _share_turned_back(displacement, used)) > TURNED_BACK:
+        return Verdict.EDGE, (
+            f"near the edge the field displaces rays towards or away from it on all sides, by "
+            f"{turned:.0%} of its r.m.s. displacement: it goes on beyond, which bends it "
+            "everywhere; record a larger field of view, or try a free edge (edge='free', --edge "
+            "free)"
         )
     unchecked = "" if np.isfinite(uncertainty) else "; error bars were not worked out"
     if pattern.correlation > 0:
@@ -261,6 +243,13 @@ def _share_at_edge(values: FloatArray, inwards: int = 0) -> float:
     first, last = inwards, -1 - inwards
     sides = values[first], values[last], values[:, first], values[:, last]
     return float(max(side.max() for side in sides) / max(values.max(), 1e-12))
+
+
+def _share_turned_back(displacement: FloatArray, used: BoolArray) -> float:
+    """The mean displacement across the edge over the r.m.s. one; 0 if a mask covers the edge."""
+    sides = inner_sides(displacement, used)
+    rms = float(np.sqrt((displacement**2).sum(axis=0).mean()))
+    return 0.0 if sides is None else turned_back(sides) / max(rms, 1e-12)
 
 
 def _share_bent_at_edge(displacement: FloatArray) -> float:

@@ -52,6 +52,7 @@ import numpy as np
 from scipy import ndimage
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.inversion.edges import TURNED_BACK, inner_sides, turned_back
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion.noise import ImageNoise
@@ -79,12 +80,9 @@ _LEAST_STRIP = 0.003  # of the pixels
 _LEAST_CAUSTIC = 0.01  # of a strip
 _ENOUGH_PIXELS = 300  # of a side, to see how wide a strip is
 
-_INSIDE = 0.05  # of the shorter side
-_TURNED_BACK = 0.07  # of the r.m.s. displacement
 _BAND_DEVIATIONS = 5.0
 _AT_EDGE = 0.8  # of the peak
 _CROSSING = 0.1  # of the displacement along the edge
-_MASKED_EDGE = 0.2  # of a side
 
 
 def image_residual(image: FloatArray, reprojection: FloatArray, mask: BoolArray) -> float:
@@ -281,22 +279,19 @@ def _share_where_widest(jacobian: FloatArray, inner: float, outer: float, least:
 
 def _cut_off(displacement: FloatArray, mask: BoolArray, noise: ImageNoise, rms: float) -> str:
     """The field does not end at the closed edge."""
-    depth = max(2, round(_INSIDE * min(mask.shape)))
-    y, x = np.where(mask, displacement, np.nan)
-    outwards = -y[depth], y[-1 - depth], -x[:, depth], x[:, -1 - depth]
-    along = x[0], x[-1], y[:, 0], y[:, -1]
-    if any(np.isnan(side).mean() > _MASKED_EDGE for side in (*outwards, *along)):
-        return ""  # the used part of the image ends elsewhere
-    sides = [float(np.nanmean(side)) for side in outwards]
-    turned = min(abs(float(np.mean(sides))), abs(float(np.median(sides))))
-    by_noise = noise.largest * np.sqrt(depth / sum(side.size for side in outwards))
-    if turned > max(_TURNED_BACK * rms, _BAND_DEVIATIONS * by_noise):
+    sides = inner_sides(displacement, mask)
+    if sides is None:
+        return ""
+    turned = turned_back(sides)
+    by_noise = noise.largest * np.sqrt(sides.depth / sum(side.size for side in sides.outwards))
+    peak = float(np.hypot(*displacement)[mask].max())
+    if turned > max(TURNED_BACK * rms, _BAND_DEVIATIONS * by_noise):
         how = (
             f"near the edge it displaces rays by {turned:.2g} px towards or away from the edge "
             "on all sides"
         )
     elif rms > 2 * noise.displacements(noise.largest)[1] and _is_strongest_at_edge(
-        np.concatenate(outwards), np.concatenate(along), float(np.nanmax(np.hypot(y, x)))
+        np.concatenate(sides.outwards), np.concatenate(sides.along), peak
     ):
         how = "it is strongest at the edge"
     else:

@@ -175,9 +175,8 @@ def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
 
 
 def _footer(fit: Fit, shown: list[ShownField], letters: int) -> list[tuple[str, str]]:
-    facts = [field.peak_text() for field in shown]
-    if not np.isnan(fit.report.uncertainty):
-        facts.append(f"error bars {fit.report.uncertainty:.2%} of the displacement (r.m.s.)")
+    facts = [fit.peak_text(*each) for each in zip(fit.fields, shown, strict=True)]
+    facts += [f"{name}: {text}" for name, text in fit.error_rows]
     facts.append(f"gains {', '.join(f'{gain:.3g}' for gain in fit.gains)}")
     if fit.folded:
         facts.append(f"rays cross over {fit.folded:.1%} of the image")

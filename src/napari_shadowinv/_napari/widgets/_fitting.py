@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 from napari.utils.notifications import show_warning
 from qtpy.QtCore import QSignalBlocker, Qt
 from qtpy.QtWidgets import QDoubleSpinBox, QPushButton, QWidget
@@ -15,6 +14,7 @@ from qtpy.QtWidgets import QDoubleSpinBox, QPushButton, QWidget
 from napari_shadowinv._napari.fit_jobs import FitAnswer, FitJob
 from napari_shadowinv._napari.fit_layers import (
     answer_layers,
+    setup_of_fit,
     start_in_words,
     verdict_in_words,
 )
@@ -31,7 +31,8 @@ from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel
 from napari_shadowinv._napari.widgets._plots import ObjectiveCurve
 from napari_shadowinv._napari.widgets._qt import column, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_together
-from napari_shadowinv.fitting import Fit, Verdict
+from napari_shadowinv.fitting import FIELDS, Fit, FittedField, Verdict
+from napari_shadowinv.physics.units import shown_fields
 
 _DRAW_EVERY, _DRAW_SHARE = 500, 10  # ms, and at least so many times what drawing takes
 _WIDEST_BLUR = 100.0  # px
@@ -193,9 +194,18 @@ def fit_rows(found: Fit, names: Sequence[str] = ()) -> list[tuple[str, str]]:
             told.append(f"shifted by {shift[0]:.2f}, {shift[1]:.2f} px (y, x)")
         rows.append((f"Image {k + 1}", ", ".join(told)))
     report = found.report
-    if np.isfinite(report.uncertainty):
-        rows.append(("Error bars", f"{report.uncertainty:.1%} of the displacement (r.m.s.)"))
+    rows += [(_peak_name(found, field), _peak_text(found, field)) for field in found.fields]
+    rows += [(name.capitalize(), text) for name, text in found.error_rows]
     rows.append(("Rays cross", f"over {found.folded:.1%} of the pixels"))
     rows.append(("Converged", "yes" if report.converged else "NO"))
     rows.append(("Time", f"{sum(report.seconds.values()):.1f} s"))
     return rows
+
+
+def _peak_name(found: Fit, field: FittedField) -> str:
+    return "Peak" if len(found.fields) == 1 else f"Peak of {field.name}"
+
+
+def _peak_text(found: Fit, field: FittedField) -> str:
+    (shown,) = shown_fields([field.displacement], setup_of_fit(found), FIELDS[field.name])
+    return found.peak_text(field, shown).removeprefix("peak ")

@@ -1,0 +1,96 @@
+"""Error bars of a fit, drawn around its best unknowns: `errors_by_noise`, `shifts_by_beam`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.beam_error import ASSUMED_VARIATION, draw_variations
+from napari_shadowinv.fitting.descent import finer
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.measurements import Measured
+from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.options import FitOptions
+
+__all__ = ["BeamShifts", "errors_by_noise", "largest_share", "shifts_by_beam"]
+
+_BEAM_SAMPLES, _BEAM_SEED = 3, 1
+_SMOOTHED_ERRORS = 4.0  # px
+
+
+def errors_by_noise(
+    scene: Scene, posterior: Posterior, size: tuple[int, int], samples: int
+) -> FloatArray | None:
+    """Return the standard deviation of each field's displacement in px, (M, 2, H, W)."""
+    if samples < 2:
+        return None
+    height, width = size
+    squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
+    for _ in range(samples):
+        change = finer(posterior.drawn())
+        squares += np.stack([scene.rays.displacement(p) for p in change.potentials]) ** 2
+    smooth = gaussian_filter(squares / samples, (0, 0, _SMOOTHED_ERRORS, _SMOOTHED_ERRORS))
+    return np.asarray(np.sqrt(smooth[..., :height, :width]))
+
+
+@dataclass(frozen=True)
+class BeamShifts:
+    """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W).
+
+    `by_percent` is for beams that vary by 1 %, `errors` for what the images leave open of beams
+    that vary as far as `variation` says.
+    """
+
+    variation: float
+    by_percent: FloatArray
+    errors: FloatArray
+
+
+def shifts_by_beam(
+    given: Measured, scene: Scene, posterior: Posterior, options: FitOptions
+) -> BeamShifts | None:
+    """Return what beams that differ from their sources do; None if they are fitted."""
+    if options.samples < 2 or scene.beam_modes:
+        return None
+    variation = options.beam_variation
+    if variation is None:
+        variation = ASSUMED_VARIATION if given.assumed else 0.0
+    height, width = given.size
+    middle = posterior.scene
+    rng = np.random.default_rng([options.seed, _BEAM_SEED])
+    length = options.beam_scale * min(given.size)
+
+    def spread(samples: Sequence[FloatArray]) -> FloatArray:
+        """Root of the mean square of the displacements by beams, smoothed as these are."""
+        squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
+        for variations in samples:
+            change = finer(posterior.moved_by_beams(variations))
+            squares += np.stack([scene.rays.displacement(p) for p in change.potentials]) ** 2
+        smoothed = gaussian_filter(squares / len(samples), (0, 0, length / 3, length / 3))
+        return np.asarray(np.sqrt(smoothed[..., :height, :width]))
+
+    count = 1 if given.common else len(scene.images)
+    samples = [
+        np.broadcast_to(
+            draw_variations(middle, length / middle.bin, count, rng), middle.beams.shape
+        )
+        for _ in range(_BEAM_SAMPLES)
+    ]
+    by_percent = spread([0.01 * sample for sample in samples])
+    if not variation:
+        return BeamShifts(variation, by_percent, 0 * by_percent)
+    if not given.common:
+        return BeamShifts(variation, by_percent, 100 * variation * by_percent)
+    # Several images exclude most of the beams that would move the field far.
+    open_beams = posterior.open_beams(variation, _BEAM_SAMPLES, rng)
+    return BeamShifts(variation, by_percent, spread(open_beams))
+
+
+def largest_share(errors: FloatArray, displacements: FloatArray) -> float:
+    """Return the largest of all fields' r.m.s. error over r.m.s. displacement."""
+    size = np.maximum((displacements**2).mean(axis=(1, 2, 3)), 1e-12)
+    return float(np.sqrt(((errors**2).mean(axis=(1, 2, 3)) / size).max()))
