@@ -27,7 +27,7 @@ from napari_shadowinv.inversion.labels import (
 )
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
-from napari_shadowinv.physics.units import ShownField
+from napari_shadowinv.physics.units import PeakError, ShownField
 from napari_shadowinv.preprocessing import FitProvenance
 
 if TYPE_CHECKING:
@@ -263,7 +263,8 @@ class Fit:
         share = field.error_of_peak
         if np.isnan(share):
             return shown.peak_text()
-        return shown.peak_text({self.report.beam.name if self.report.beam else "noise": share})
+        cause = self.report.beam.name if self.report.beam else "noise"
+        return shown.peak_text(PeakError(share, cause))
 
     def to_dataset(
         self,
