@@ -22,6 +22,7 @@ from napari_shadowinv._napari.layer_metadata import (
     slot_of,
     unit_of,
 )
+from napari_shadowinv._napari.layer_state import missing_layers
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv.fitting import Fit, FitOptions, Verdict, fit
 from napari_shadowinv.inversion import Inversion
@@ -83,10 +84,17 @@ def shown(viewer: ViewerModel, content: Fit, **place: Any) -> dict[str, Any]:
     return {slot_of(layer): layer for layer in layers}
 
 
+def more(viewer: ViewerModel, layers: dict[str, Any]) -> dict[str, Any]:
+    """All layers of a result of which only the main ones are shown."""
+    missing = add_layers(viewer, missing_layers(viewer, layers["field"]))
+    return layers | {slot_of(layer): layer for layer in missing}
+
+
 def test_a_file_of_the_command_shows_all_of_a_fit(
     viewer: ViewerModel, two_fields: Fit, tmp_path: Path, told: list[str]
 ) -> None:
     layers = opened(viewer, write(tmp_path / "pack.shadowinv", two_fields))
+    layers = more(viewer, layers)
     in_each = ["potential", "field y", "field x", "field", "uncertainty", "arrows"]
     of_fields = ["field arrows", *(f"{role}{part}" for role in in_each for part in ("", " E"))]
     of_answers = [f"{role} {name} 1" for role in ("field", "arrows") for name in "BE"]
@@ -117,12 +125,12 @@ def test_a_verdict_cannot_be_missed(
     for layer in layers.values():
         assert mark_of(layer)["verdict"] == "one of several"
         assert mark_of(layer)["explanation"] == WHY
-    assert layers["field"].name.startswith("pack (one of several) |∫B×dz|")
+    assert layers["field"].name == "|∫B×dz| (µT·m) – pack (one of several)"
     good = replace(doubtful, verdict=Verdict.DETERMINED, explanation="all starts lead to one")
     layers = opened(viewer, write(tmp_path / "good.shadowinv", good))
     assert len(told) == 1
     assert mark_of(layers["field"])["verdict"] == "determined"
-    assert layers["field"].name.startswith("good |∫B×dz|")
+    assert layers["field"].name == "|∫B×dz| (µT·m) – good"
 
 
 def test_warnings_of_a_saved_inversion_are_told(
@@ -150,7 +158,7 @@ def test_any_layer_stands_for_the_fit_when_it_is_saved(
             np.testing.assert_array_equal(one.displacement, other.displacement)
         viewer.layers.clear()
         reopened = opened(viewer, path)
-        assert {slot for slot, one in reopened.items() if one.visible} <= set(kept)
+        assert {slot for slot, one in reopened.items() if one.visible} <= {"field", "arrows", *kept}
         assert reopened["field E"].colormap.name == "viridis"
         assert tuple(reopened["field"].translate) == (3, 4)
         np.testing.assert_array_equal(reopened["field"].rotate, turned["rotate"])

@@ -22,16 +22,24 @@ def by_role(layers: list[Any]) -> dict[str, Any]:
     return {str(role_of(layer)): layer for layer in layers}
 
 
-def test_all_of_a_result_is_there_and_the_field_and_arrows_are_visible(
+def test_result_shows_its_main_layers(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
 ) -> None:
     layers = by_role(add_inversion(viewer, solved, proton_setup, name="shot 7"))
+    assert list(layers) == ["residual", "field", "caustic", "arrows"]
+    assert {role for role, layer in layers.items() if layer.visible} == {"field", "arrows"}
+
+
+def test_all_of_a_result_is_there_on_request(
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
+) -> None:
+    layers = by_role(add_inversion(viewer, solved, proton_setup, name="shot 7", all_layers=True))
     assert list(layers) == [
         "image", "reprojection", "residual", "potential", "field y", "field x", "field",
         "caustic", "field arrows", "arrows", "sites",
     ]  # fmt: skip
     assert {role for role, layer in layers.items() if layer.visible} == {"field", "arrows"}
-    assert all(layer.name.startswith("shot 7 ") for layer in viewer.layers)
+    assert all(layer.name.endswith(" – shot 7") for layer in viewer.layers)
     overlays = getattr(getattr(viewer, "canvas", None), "overlays", viewer)  # napari before 0.9
     assert overlays.scale_bar.visible
     assert viewer.layers.selection.active is layers["field"]
@@ -40,7 +48,7 @@ def test_all_of_a_result_is_there_and_the_field_and_arrows_are_visible(
 def test_values_are_those_of_the_result_in_the_unit_that_the_layer_names(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved, proton_setup))
+    layers = by_role(add_inversion(viewer, solved, proton_setup, all_layers=True))
     field = proton_setup.path_integrated_b(solved.displacement)
     factor = {"mT·m": 1e3, "µT·m": 1e6, "T·m": 1.0}[unit_of(layers["field"])]
     np.testing.assert_allclose(layers["field"].data, factor * np.hypot(*field))
@@ -70,7 +78,7 @@ def test_light_shows_the_deflection_angle(
 def test_signed_layers_have_symmetric_limits_and_a_white_middle(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved))
+    layers = by_role(add_inversion(viewer, solved, all_layers=True))
     for role in ("residual", "field y", "field x"):
         low, high = layers[role].contrast_limits
         assert low == -high
@@ -165,7 +173,7 @@ def test_no_field_makes_no_arrow(viewer: ViewerModel, solved: Inversion) -> None
 def test_features_of_the_sites_agree_with_the_report(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
-    sites = by_role(add_inversion(viewer, solved))["sites"]
+    sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
     features = sites.features
     assert list(features) == ["weight", "mass", "displacement", "flux residual"]
     np.testing.assert_array_equal(features["weight"], solved.weights)
@@ -176,7 +184,7 @@ def test_features_of_the_sites_agree_with_the_report(
 
 
 def test_sites_are_coloured_by_displacement(viewer: ViewerModel, solved: Inversion) -> None:
-    sites = by_role(add_inversion(viewer, solved))["sites"]
+    sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
     order = np.argsort(sites.features["displacement"])
     brightness = sites.face_color[order][:, :3].sum(axis=1)
     assert brightness[-1] > brightness[0] + 1
@@ -212,7 +220,7 @@ def test_many_sites_are_thinned_and_the_name_says_so(
     viewer: ViewerModel, solved: Inversion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("napari_shadowinv._napari.layers._MOST_SITES_SHOWN", 200)
-    sites = by_role(add_inversion(viewer, solved))["sites"]
+    sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
     np.testing.assert_array_equal(sites.data, solved.sites[::3])
     assert sites.name == "sites (1 in 3)"
     np.testing.assert_array_equal(sites.features["weight"], solved.weights[::3])

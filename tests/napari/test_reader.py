@@ -17,7 +17,8 @@ from scipy.io import savemat
 
 from napari_shadowinv import FileFormatError, ProtonSetup, write
 from napari_shadowinv._napari.layer_metadata import mark_of, result_of, role_of, setup_of, source_of
-from napari_shadowinv._napari.layers import thinned_arrows
+from napari_shadowinv._napari.layer_state import missing_layers
+from napari_shadowinv._napari.layers import add_layers, thinned_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
 from napari_shadowinv._napari.stores import follow_shots
 from napari_shadowinv._napari.widgets._layers import warnings_of
@@ -209,7 +210,7 @@ def test_a_pradformat_inversion_shows_its_field(
 ) -> None:
     write(tmp_path / "field.h5", solved, setup=proton_setup)
     layers = {role_of(layer): layer for layer in viewer.open(tmp_path / "field.h5", plugin=PLUGIN)}
-    assert list(layers) == ["potential", "field y", "field x", "field", "field arrows", "arrows"]
+    assert list(layers) == ["field", "arrows"]
     field = proton_setup.path_integrated_b(solved.displacement)
     np.testing.assert_allclose(layers["field"].data, 1e3 * np.hypot(*field), rtol=1e-9)
     np.testing.assert_allclose(layers["field"].scale, 1.5)
@@ -220,12 +221,13 @@ def test_a_result_of_the_command_line_opens_whole(
 ) -> None:
     write(tmp_path / "shot9.shadowinv", solved, setup=proton_setup)
     layers = viewer.open(tmp_path / "shot9.shadowinv", plugin=None)
-    assert all(layer.name.startswith("shot9 ") for layer in layers)
+    assert all(layer.name.endswith(" – shot9") for layer in layers)
     assert setup_of(layers[0]) == proton_setup
     result = result_of(layers[0])
     assert result is not None
     assert result.content.options == solved.options
-    by_role = {role_of(layer): layer for layer in layers}
+    missing = add_layers(viewer, missing_layers(viewer, layers[0]))
+    by_role = {role_of(layer): layer for layer in (*layers, *missing)}
     np.testing.assert_array_equal(by_role["reprojection"].data, solved.reprojection)
 
 
@@ -285,10 +287,11 @@ def test_a_store_opens_as_lazy_layers(
     viewer: ViewerModel, store: Path, solved: Inversion, proton_setup: ProtonSetup
 ) -> None:
     layers = {role_of(layer): layer for layer in viewer.open(store, plugin=PLUGIN)}
-    assert set(layers) == {
-        "image", "reprojection", "residual", "potential", "field y", "field x", "field", "caustic",
-        "arrows",
-    }  # fmt: skip
+    assert set(layers) == {"residual", "field", "caustic", "arrows"}
+    missing = add_layers(viewer, missing_layers(viewer, layers["field"]))
+    layers |= {role_of(layer): layer for layer in missing}
+    more = {"image", "reprojection", "potential", "field y", "field x"}
+    assert set(layers) == {"residual", "field", "caustic", "arrows"} | more
     arrows = layers.pop("arrows")
     assert arrows.visible
     np.testing.assert_allclose(arrows.scale, layers["field"].scale)
@@ -297,7 +300,7 @@ def test_a_store_opens_as_lazy_layers(
         assert layer.data.shape[0] == 3
         assert layer.axis_labels == ("shot", "y", "x")
         np.testing.assert_allclose(layer.scale, [1, 1.5, 1.5])
-        assert layer.name.startswith("night ")
+        assert layer.name.endswith(" – night")
         assert setup_of(layer) == proton_setup
     field = proton_setup.path_integrated_b(solved.displacement)
     np.testing.assert_allclose(layers["field"].data[1].compute(), 1e3 * np.hypot(*field))

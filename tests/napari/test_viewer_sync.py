@@ -28,29 +28,29 @@ def test_only_the_image_that_is_seen_has_a_colour_bar(
     add_inversion(viewer, solved, name="a")
     add_inversion(viewer, solved, name="b")
     layers = viewer.layers
-    assert bars(viewer) == ["b |d| (px)"]
-    layers["b |d| (px)"].visible = False
-    assert bars(viewer) == ["a |d| (px)"]
-    layers["b potential (px²)"].visible = True
-    assert bars(viewer) == ["b potential (px²)"]
-    layers.move(layers.index("a |d| (px)"), len(layers))
-    assert bars(viewer) == ["a |d| (px)"]
+    assert bars(viewer) == ["|d| (px) – b"]
+    layers["|d| (px) – b"].visible = False
+    assert bars(viewer) == ["|d| (px) – a"]
+    layers["potential (px²) – b"].visible = True
+    assert bars(viewer) == ["potential (px²) – b"]
+    layers.move(layers.index("|d| (px) – a"), len(layers))
+    assert bars(viewer) == ["|d| (px) – a"]
     # What covers them is no image of this plugin's.
     viewer.add_image(np.ones((40, 52)), name="other")
     assert bars(viewer) == []
     layers.remove("other")
-    assert bars(viewer) == ["a |d| (px)"]
-    layers.remove("a |d| (px)")
-    assert bars(viewer) == ["b potential (px²)"]
+    assert bars(viewer) == ["|d| (px) – a"]
+    layers.remove("|d| (px) – a")
+    assert bars(viewer) == ["potential (px²) – b"]
 
 
 def test_a_colour_bar_that_was_switched_off_stays_off(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
     add_inversion(viewer, solved, name="a")
-    viewer.layers["a |d| (px)"].colorbar.visible = False
-    viewer.layers["a |d| (px)"].visible = False
-    viewer.layers["a potential (px²)"].visible = True
+    viewer.layers["|d| (px) – a"].colorbar.visible = False
+    viewer.layers["|d| (px) – a"].visible = False
+    viewer.layers["potential (px²) – a"].visible = True
     assert not any(one.colorbar.visible for one in viewer.layers if hasattr(one, "colorbar"))
 
 
@@ -64,7 +64,7 @@ def test_an_image_of_the_same_size_lies_on_the_result(
         told.clear()
         other = viewer.add_image(data, name="other")
         assert frame_of(other) == frame
-        assert f"'{other.name}' has the same size in pixels as 'a |∫B×dz| (mT·m)'" in told[-1]
+        assert f"'{other.name}' has the same size in pixels as '|∫B×dz| (mT·m) – a'" in told[-1]
         assert "1.5 µm" in told[-1]
     np.savetxt(tmp_path / "other.txt", np.ones((40, 52)))
     (opened,) = viewer.open(tmp_path / "other.txt", plugin="napari-shadowinv")

@@ -71,7 +71,7 @@ def test_all_layers_come_back_as_they_were(
     proton_setup: ProtonSetup,
     tmp_path: Path,
 ) -> None:
-    before = add_inversion(viewer, solved, proton_setup, name="shot 7", cells=True)
+    before = add_inversion(viewer, solved, proton_setup, name="shot 7", cells=True, all_layers=True)
     layers = by_role(before)
     layers["residual"].visible = True
     layers["field"].colormap = "magma"
@@ -103,23 +103,25 @@ def test_nothing_of_the_result_is_lost(
     assert dataset.attrs["setup_origin"] == "typed"
 
 
-def test_one_layer_stands_for_all_and_the_others_come_back_hidden(
+def test_one_saved_layer_stands_for_the_main_ones(
     viewer: ViewerModel, other_viewer: ViewerModel, solved: Inversion, tmp_path: Path
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved))
+    layers = by_role(add_inversion(viewer, solved, name="shot", all_layers=True))
     layers["potential"].visible = True
     viewer.layers.selection = {layers["potential"]}
     viewer.layers.save(str(tmp_path / "a.shadowinv"), selected=True, plugin=PLUGIN)
     back = other_viewer.open(tmp_path / "a.shadowinv", plugin=PLUGIN)
-    assert len(back) == len(layers)
-    assert [role_of(layer) for layer in back if layer.visible] == ["potential"]
+    roles = ["image", "residual", "potential", "field", "caustic", "arrows"]
+    assert [role_of(layer) for layer in back] == roles
+    assert [role_of(one) for one in back if one.visible] == ["potential", "field", "arrows"]
+    assert all(layer.name.endswith(" – shot") for layer in back)
 
 
 def test_a_place_that_no_setup_tells_comes_back(
     viewer: ViewerModel, other_viewer: ViewerModel, solved: Inversion, tmp_path: Path
 ) -> None:
     place = {"scale": (3.0, 3.0), "translate": (7.5, 9.0), "units": ("mm", "mm")}
-    before = add_inversion(viewer, solved, **place)
+    before = add_inversion(viewer, solved, **place, all_layers=True)
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     after = other_viewer.open(tmp_path / "a.shadowinv", plugin=PLUGIN)
     for one, two in zip(before, after, strict=True):
@@ -138,7 +140,7 @@ def test_painted_caustics_are_kept(viewer: ViewerModel, solved: Inversion, tmp_p
 def test_a_layer_that_was_changed_is_named(
     viewer: ViewerModel, solved: Inversion, tmp_path: Path, told: list[str]
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved))
+    layers = by_role(add_inversion(viewer, solved, all_layers=True))
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     assert told == []
     layers["potential"].data = layers["potential"].data + 1
@@ -166,7 +168,7 @@ def test_pradformat_needs_protons(viewer: ViewerModel, solved: Inversion, tmp_pa
 def test_sites_are_written_with_all_that_is_known(
     viewer: ViewerModel, solved: Inversion, tmp_path: Path
 ) -> None:
-    sites = by_role(add_inversion(viewer, solved))["sites"]
+    sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
     viewer.layers.selection = {sites}
     viewer.layers.save(str(tmp_path / "a.csv"), selected=True, plugin=PLUGIN)
     rows = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)

@@ -62,6 +62,7 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
 
         layers = main_layers(store_layers(Path(path)))
         follow_once_added(layers)
+        _show_in_window(layers)
         return list(layers)
     if "*" in path:
         return list(stack_layers(_matches(path)))
@@ -85,9 +86,6 @@ def _read_file(path: Path) -> list[FullLayerData]:
     from napari_shadowinv._napari.layer_metadata import result_of
     from napari_shadowinv._napari.layer_state import doubts_of, layers_of_dataset
     from napari_shadowinv._napari.shots import radiograph_layers
-    from napari_shadowinv._napari.stores import viewer_in_window
-    from napari_shadowinv._napari.viewer_sync import keep_in_step, select_once_added
-    from napari_shadowinv.inversion.labels import is_pack
     from napari_shadowinv.io import Radiograph, read
 
     content = read(path)
@@ -96,12 +94,19 @@ def _read_file(path: Path) -> list[FullLayerData]:
             show_caution(f"{path.name}: {text}")
         return radiograph_layers(content)
     layers = layers_of_dataset(content, path.stem)
-    viewer = viewer_in_window()
-    if viewer is not None:
-        keep_in_step(viewer)
-        if not is_pack(content.attrs):
-            select_once_added(viewer, layers)
+    _show_in_window(layers)
     result = result_of(layers[0][1])
     for text in () if result is None else doubts_of(result):
         show_caution(f"{path.name}: {text}")
     return layers
+
+
+def _show_in_window(layers: Sequence[FullLayerData]) -> None:
+    """Give a result that is being opened in a window its colour bar, scale bar and selection."""
+    from napari_shadowinv._napari.stores import viewer_in_window
+    from napari_shadowinv._napari.viewer_sync import keep_in_step, select_once_added
+
+    viewer = viewer_in_window()
+    if viewer is not None:
+        keep_in_step(viewer)
+        select_once_added(viewer, layers)

@@ -32,21 +32,25 @@ def show_scale_bar(viewer: Any) -> None:
 
 def select_once_added(viewer: Any, described: Sequence[Any]) -> None:
     """Select the field of a result, with a scale bar, once napari has added its last layer."""
-    results = [mark_of(keywords).get("result") for _, keywords, _ in described]
+    from qtpy.QtCore import QTimer
 
-    def select(event: Any) -> None:
-        layers = [layer for layer in viewer.layers if mark_of(layer).get("result") is results[0]]
-        if len(layers) < len(described):
-            return
-        viewer.layers.events.inserted.disconnect(select)
+    added: list[Any] = []
+
+    def select() -> None:
         show_scale_bar(viewer)
-        fields = [layer for layer in layers if role_of(layer) == "field"]
+        fields = [layer for layer in added if role_of(layer) == "field" and layer in viewer.layers]
         shown = [layer for layer in fields if layer.visible] or fields
         if shown:
             viewer.layers.selection.active = shown[-1]
 
-    if results and results[0] is not None:
-        viewer.layers.events.inserted.connect(select)
+    def collect(event: Any) -> None:
+        added.append(event.value)
+        if len(added) == len(described):
+            viewer.layers.events.inserted.disconnect(collect)
+            # napari selects a layer after it has announced it.
+            QTimer.singleShot(0, select)
+
+    viewer.layers.events.inserted.connect(collect)
 
 
 def _follow_top_image(viewer: Any, events: Any) -> None:

@@ -177,7 +177,7 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
     assert texts(tool, BEAM)[0] == "14.7"
 
 
-def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any) -> None:
+def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qtbot: Any) -> None:
     tool.options.set_values({"samples": 2, "steps": 5, "spacing": 0.25})
     found = run(tool)
     assert found.verdict is Verdict.DETERMINED
@@ -193,6 +193,8 @@ def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any) ->
     shown = layer_of(window, "uncertainty")
     np.testing.assert_allclose(shown.data, sigma, rtol=1e-6)
     assert unit_of(shown) == unit_of(field)
+    tool.more_layers.click()
+    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     np.testing.assert_array_equal(layer_of(window, "reprojection").data, found.reprojection)
     residual = layer_of(window, "residual").data
     assert residual.shape == (2, *SHAPE)

@@ -144,7 +144,7 @@ def test_an_image_deleted_during_the_run_is_told_once(
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     assert len(told) == 1
     assert "was deleted" in told[0]
-    assert layer_of(window, "potential").data.any()
+    assert layer_of(window, "field").data.any()
 
 
 def test_one_click_inverts_the_image_in_si_units(
@@ -277,9 +277,17 @@ def test_cancel_ends_the_work_itself(
 
 
 def test_a_run_replaces_the_last_result_of_its_shot(
-    window: Any, tool: Any, run: Any, shot: Array, proton_setup: ProtonSetup, told: list[str]
+    window: Any,
+    tool: Any,
+    run: Any,
+    shot: Array,
+    proton_setup: ProtonSetup,
+    told: list[str],
+    qtbot: Any,
 ) -> None:
     run(tool)
+    tool.more_layers.click()
+    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     first = list(window.layers)
     layer_of(window, "caustic").visible = True
     layer_of(window, "sites").visible = True
@@ -465,30 +473,30 @@ def test_the_preview_follows_in_its_own_layers(
     window.window._qt_window.resize(900, 600)
     tool.options.set_values({})
     tool.live.setChecked(True)
-    qtbot.waitUntil(lambda: len(tool.previewed.layers) == 3 and settled(tool), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: len(tool.previewed.layers) == 2 and settled(tool), timeout=PATIENCE)
     before = tool.previewed.layers
-    potential = layer_of(window, "potential", "preview")
+    field = layer_of(window, "field", "preview")
 
     def follows(change: Any) -> None:
         """Wait until the layer follows a change."""
         qtbot.waitUntil(lambda: settled(tool), timeout=PATIENCE)
         qtbot.wait(100)  # the last picture is drawn
-        old = potential.data
+        old = field.data
         change()
-        qtbot.waitUntil(lambda: potential.data is not old, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: field.data is not old, timeout=PATIENCE)
 
     tool.masks.paint()
     follows(lambda: tool.steps.add("low-pass"))
     follows(lambda: tool.steps.forms[0].form.editors["width"].set_value(2.0))
     follows(lambda: tool.options.editors["floor"].set_value(0.5))
     follows(lambda: tool.masks.layer.paint((30, 10), 1))
-    assert not result_of(potential).content.mask.all()
+    assert not result_of(field).content.mask.all()
     tool.masks.layer = None
     tool.options.set_values({})
     tool._draw_crop()
     corners = np.array([[0, 0], [0, 150], [199, 150], [199, 0]])
     follows(lambda: tool.crop.layer.add_rectangles(corners))
-    assert potential.data.shape == (200, 151)
+    assert field.data.shape == (200, 151)
     follows(lambda: setattr(tool.crop, "layer", None))
     follows(lambda: tool.source.picker.set_kind("low-pass"))
     width = tool.source.picker.form.editors["width"]
@@ -501,7 +509,7 @@ def test_the_preview_follows_in_its_own_layers(
     assert outcomes[-1].tag.recipe.source.width == pytest.approx(60)
     assert outcomes[-1].value is not None
     assert len(outcomes) < 21
-    assert [a is b for a, b in zip(before, tool.previewed.layers, strict=True)] == [True] * 3
+    assert [a is b for a, b in zip(before, tool.previewed.layers, strict=True)] == [True] * 2
     assert told == []
 
 

@@ -84,7 +84,7 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     shown(4)
     assert window.dims.current_step[0] == 0
     assert field.contrast_limits[1] > limits
-    assert np.isfinite(np.asarray(layer_of(window, "potential").data[3])).all()
+    assert np.isfinite(np.asarray(layer_of(window, "field").data[3])).all()
     assert list(tool.failures.texts()) == ["shot_2.npy"]
     assert mark_of(field)["shots"] == [f"shot_{index}.npy" for index in range(4)]
     status = tool.panel.status

@@ -258,6 +258,16 @@ class SourcePicker(forms.RowPicker):
         assert isinstance(model, preprocessing.Estimate)
         return f"estimate: {model.described}" if self.is_guessed else model.described
 
+    @property
+    def short_name(self) -> str:
+        """The source in the name of a result; empty for a uniform one and for the shot's."""
+        kind = self.picker.kind
+        if kind in (_OWN, "uniform"):
+            return ""
+        if kind == _LAYER:
+            return "" if self.layers.layer is None else str(self.layers.layer.name)
+        return Path(self.file.path).name if kind == _FILE else f"{kind} source"
+
     def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource:
         """What a recipe says of the source, or an `InputError`."""
         model = self.picker.model()

@@ -191,9 +191,7 @@ class ForwardModel(ToolPanel):
                 source=source,
             )
             name = str(about.mark_of(layer).get("name") or layer.name)
-            return _Request(
-                job, f"forward image – {name}", frame_of(layer), self.setup.origin, layer
-            )
+            return _Request(job, f"{name} image", frame_of(layer), self.setup.origin, layer)
         recipe: Any = self.object.model()
         shape = (self.height_px.value(), self.width_px.value())
         if source is not None:
@@ -201,7 +199,7 @@ class ForwardModel(ToolPanel):
         job = ForwardJob(recipe, shape=shape, setup=setup, source=source)
         name = type(recipe).title
         frame = frame_for(shape, setup)
-        return _Request(job, f"forward image – {name}", frame, self.setup.origin, name)
+        return _Request(job, f"{name} image", frame, self.setup.origin, name)
 
     def _image_to_save(self) -> Savable:
         layers = [] if self.results is None else self.results.layers

@@ -10,7 +10,14 @@ from napari.utils.notifications import show_warning
 from napari_shadowinv._napari.fit_course import duration_in_words
 from napari_shadowinv._napari.fit_jobs import FitAnswer, FitJob, name_of_result, refinement
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.layer_metadata import KEY, SOURCE, Result, result_of, role_of
+from napari_shadowinv._napari.layer_metadata import (
+    KEY,
+    SOURCE,
+    Result,
+    mark_of,
+    result_of,
+    role_of,
+)
 from napari_shadowinv._napari.shots import loaded, radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
@@ -121,6 +128,7 @@ class _Request:
     frame: Frame
     origins: Origins
     preview: bool
+    name: str
 
     def inversion(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
@@ -141,7 +149,7 @@ class _Request:
         inversion = self.inversion(on_progress, should_stop)
         from napari_shadowinv._napari.layers import result_layers
 
-        name = f"{self.image.name} preview" if self.preview else self.image.name
+        name = f"{self.name} preview" if self.preview else self.name
         result = Result(inversion, inversion.setup, self.origins.attributes())
         described = result_layers(result, self.frame, name)
         bare = self.shot.source_mask
@@ -210,8 +218,8 @@ class InvertShot(InversionInputs, LivePanel):
         )
         layers.LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
         # Also for a run that is cancelled, or refused before it starts.
-        for signal in (self.panel.button.clicked, self.panel.runner.started):
-            signal.connect(self._empty_report)
+        self.panel.button.clicked.connect(self._empty_report)
+        self.panel.runner.started.connect(self._on_start)
         while_alive(self, self.viewer.layers.selection.events.active, self._follow_result)
         changes = [one.changed for one in self.inputs]
         for signal in (*changes, self.crop.picked, edits.edited):
@@ -239,6 +247,9 @@ class InvertShot(InversionInputs, LivePanel):
             result_frame(layer, recipe),
             self.origins(layer, layer.name),
             preview,
+            ", ".join(
+                filter(None, (mark_of(layer).get("name", layer.name), self.source.short_name))
+            ),
         )
 
     @notify_errors
@@ -281,6 +292,11 @@ class InvertShot(InversionInputs, LivePanel):
             assert isinstance(value, _Answer)
             self._show_inversion(value, request)
 
+    def _on_start(self) -> None:
+        # The verdict on a preview stays until the next one's.
+        if not self._running_preview:
+            self._empty_report()
+
     def _empty_report(self) -> None:
         self._told = None
         self.verdict.empty()
@@ -307,6 +323,7 @@ class InvertShot(InversionInputs, LivePanel):
             self.fit_view.empty()
             self._report(result.content, [])
             self._told = result
+            self.reveal(self.verdict)
 
     def _report(self, inversion: Inversion, given: list[tuple[str, str]]) -> None:
         self.verdict.show_headline(inversion.headline)
