@@ -17,6 +17,7 @@ from napari_shadowinv._napari.layers import (
     layer_name,
     symmetric_limits,
 )
+from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import FIELDS
 from napari_shadowinv.physics.units import intensity_limits
@@ -101,7 +102,7 @@ def doubt_in_words(fit: Fit) -> str:
 
 def verdict_in_words(fit: Fit) -> str:
     """Return the verdict and why, in a sentence."""
-    return f"the fit's verdict is '{fit.verdict.value}': {fit.explanation}"
+    return f"the fit's verdict is '{fit.verdict.value}': {window_text(fit.explanation)}"
 
 
 def setup_of_fit(fit: Fit) -> Setup | None:

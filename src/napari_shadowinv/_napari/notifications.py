@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -13,6 +14,32 @@ MISTAKES = (InputError, OSError, MemoryError)
 """What a user can mend; all else is a fault of the program, whose traceback is needed."""
 
 Answer = TypeVar("Answer")
+
+# Hints for the command line or for Python, and names of options outside such hints.
+_HINT = re.compile(r"\s*\([^()]*(?:--[a-z]|\b[a-z_]+=)[^()]*\)")
+_OPTION = re.compile(r"--([a-z][a-z-]*)|\b([a-z]+(?:_[a-z]+)+)\b")
+
+
+def window_text(text: str) -> str:
+    """Replace flags and keys of options by the labels of the forms, and leave out hints on them."""
+
+    def label(match: re.Match[str]) -> str:
+        key = (match[1] or match[2]).replace("-", "_")
+        return f"'{_labels()[key]}'" if key in _labels() else match[0]
+
+    return _OPTION.sub(label, _HINT.sub("", text))
+
+
+@functools.cache
+def _labels() -> dict[str, str]:
+    from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
+
+    return {
+        name: str(field.title).partition(" (")[0]
+        for model in (FitChoices, FitOptions, InversionOptions)
+        for name, field in model.model_fields.items()
+        if field.title
+    }
 
 
 def in_event_loop() -> bool:
@@ -48,7 +75,7 @@ def show_mistake(error: BaseException) -> None:
     """Show a mistake as one notification."""
     from napari.utils.notifications import show_error
 
-    text = str(error) or "there is not enough memory for this"
+    text = window_text(str(error)) or "there is not enough memory for this"
     show_error(text[:1].upper() + text[1:])
 
 
@@ -56,4 +83,4 @@ def show_caution(text: str) -> None:
     """Show what the user should know before trusting a file."""
     from napari.utils.notifications import show_warning
 
-    show_warning(text)
+    show_warning(window_text(text))

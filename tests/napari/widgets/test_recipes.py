@@ -442,7 +442,7 @@ def test_the_menu_asks_for_a_file(
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (path, ""))
     tool = opened()
     load, save = tool.recipes.menu().actions()
-    assert (load.text(), save.text()) == ("Load…", "Save…")
+    assert (load.text(), save.text()) == ("Load recipe…", "Save…")
     tool.steps.add("bin")
     save.trigger()
     tool.steps.show_steps(())

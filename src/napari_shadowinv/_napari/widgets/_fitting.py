@@ -20,6 +20,7 @@ from napari_shadowinv._napari.fit_layers import (
 )
 from napari_shadowinv._napari.layer_metadata import Result, result_of
 from napari_shadowinv._napari.layers import main_layers
+from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
@@ -103,8 +104,9 @@ class FitView(QWidget):
         if job.layer not in self._viewer.layers:
             show_warning(f"'{job.names[0]}' was deleted during its fit; the result is shown anyway")
         here = [one for one in (job.layer, *job.companions) if one in self._viewer.layers]
+        moved = False
         if here and job.recipe.setup is not None:
-            place_together(self._viewer, here[0], job.recipe.setup, here[1:])
+            moved = place_together(self._viewer, here[0], job.recipe.setup, here[1:])
         self._tell(found)
         if found.verdict is not Verdict.DETERMINED:
             text = verdict_in_words(found)
@@ -114,7 +116,7 @@ class FitView(QWidget):
         self._job, self._result = job, answer.result
         self._fill_answers(found)
         results = last.next_of((job.layer, job.name))
-        results.show(main_layers(answer.described, also=results.slots))
+        results.show(main_layers(answer.described, also=results.slots), fit=moved)
         self.results = results
         return results
 
@@ -132,7 +134,8 @@ class FitView(QWidget):
 
     def _tell(self, found: Fit) -> None:
         good = found.verdict is Verdict.DETERMINED
-        sentence = f"{found.explanation[:1].upper()}{found.explanation[1:]}."
+        explanation = window_text(found.explanation)
+        sentence = f"{explanation[:1].upper()}{explanation[1:]}."
         self.verdict.setText(
             f"<b>Verdict: {html.escape(found.verdict.value)}</b><br>{html.escape(sentence)}"
         )

@@ -316,7 +316,7 @@ def save_text(text: str, name: str | Path, suffix: str) -> Path:
 
 
 class TomlButtons(QtWidgets.QWidget):
-    """Load… and Save…; `take` gets what was loaded and its path, `values` returns what to save."""
+    """Load and Save buttons; `take` gets the content of a file and its path, `values` gives it."""
 
     def __init__(
         self,
@@ -326,7 +326,7 @@ class TomlButtons(QtWidgets.QWidget):
     ) -> None:
         super().__init__()
         self._what, self._values, self._take = what, values, take
-        self.load_button = QtWidgets.QPushButton("Load…")
+        self.load_button = QtWidgets.QPushButton(f"Load {what}…")
         self.save_button = QtWidgets.QPushButton("Save…")
         self.load_button.setToolTip(f"Read {what} from a TOML file.")
         self.save_button.setToolTip(

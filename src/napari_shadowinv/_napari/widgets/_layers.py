@@ -196,6 +196,10 @@ def _added(viewer: Any, image: Any, kind: str, data: Any, title: str, **keywords
     return layer
 
 
+_BLOCK_PX = 8
+_MORE_STRUCTURE = 2.0  # as a ratio
+
+
 class LayerPicker(SteadyComboBox):
     """A combo box of layers; `none` stands for no layer, without it the latest is chosen."""
 
@@ -259,11 +263,47 @@ class LayerPicker(SteadyComboBox):
             self.picked.emit()
 
 
-def shot_picker(viewer: Any) -> LayerPicker:
-    """A picker of the layer that is a shot."""
-    return LayerPicker(
-        viewer, ("image",), "The shot: a greyscale image layer.", suits=about.may_be_shot
-    )
+class ShotPicker(LayerPicker):
+    """A picker of the layer that is a shot.
+
+    Until the user chooses one, it prefers an image with structure to one without: a reference
+    that was opened first is no shot.
+    """
+
+    def __init__(self, viewer: Any) -> None:
+        self.is_chosen = False
+        super().__init__(
+            viewer, ("image",), "The shot: a greyscale image layer.", suits=about.may_be_shot
+        )
+        self.activated.connect(self._choose)
+
+    def _choose(self, _: int = 0) -> None:
+        self.is_chosen = True
+
+    def _on_insertion(self, event: Any) -> None:
+        super()._on_insertion(event)
+        chosen, new = self.layer, event.value
+        if self.is_chosen or chosen is None or new is chosen or new not in self.offered:
+            return
+        if _structure(new) > _MORE_STRUCTURE * _structure(chosen) > 0:
+            self.layer = new
+
+
+def _structure(layer: Any) -> float:
+    """Return the relative r.m.s. of structures between noise and the beam's shape; 0 if unknown."""
+    data = layer.data
+    if not isinstance(data, np.ndarray) or data.ndim != 2 or min(data.shape) < 4 * _BLOCK_PX:
+        return 0.0
+    height, width = (side // _BLOCK_PX * _BLOCK_PX for side in data.shape)
+    blocks = data[:height, :width].reshape(height // _BLOCK_PX, _BLOCK_PX, -1, _BLOCK_PX)
+    means = blocks.mean(axis=(1, 3), dtype=np.float64)
+    mean = means.mean()
+    if not np.isfinite(mean) or mean <= 0:
+        return 0.0
+    y, x = np.mgrid[-1 : 1 : means.shape[0] * 1j, -1 : 1 : means.shape[1] * 1j].reshape(2, -1)
+    beam = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    fitted = beam @ np.linalg.lstsq(beam, means.ravel(), rcond=None)[0]
+    return float(np.std(means.ravel() - fitted) / mean)
 
 
 # By the mask's title: what paint marks, and what that means.

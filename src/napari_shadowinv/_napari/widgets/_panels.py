@@ -12,7 +12,7 @@ from qtpy import QtWidgets
 from qtpy.QtCore import QSize, Qt
 
 from napari_shadowinv._napari.layers import main_layers
-from napari_shadowinv._napari.notifications import MISTAKES
+from napari_shadowinv._napari.notifications import MISTAKES, window_text
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, section, wrapping_label
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
@@ -309,7 +309,7 @@ class VerdictLine(QtWidgets.QLabel):
     def show_headline(self, headline: Headline, before: str = "") -> None:
         """Show a headline; `before` says whose it is, such as a preview's."""
         level = headline.level.value.capitalize()
-        text = html.escape(headline.text)
+        text = html.escape(window_text(headline.text))
         self.setText(f"<b>{html.escape(before)}{level}</b><br>{text[:1].upper()}{text[1:]}")
         self.setStyleSheet(_LEVEL_STYLES[headline.level])
         self.setVisible(True)
@@ -439,14 +439,16 @@ class LivePanel(ToolPanel):
     def request(self, preview: bool = False) -> Any:
         raise NotImplementedError
 
-    def show_layers(self, shot: Any, described: Sequence[FullLayerData], preview: bool) -> None:
+    def show_layers(
+        self, shot: Any, described: Sequence[FullLayerData], preview: bool, fit: bool = False
+    ) -> None:
         """Show layers of a preview, or instead of them those of what the button has run."""
         if preview:
-            self.previewed.show(described, select=False)
+            self.previewed.show(described, select=False, fit=fit)
             return
         self.previewed.hide()
         self.results = self._last.next_of(shot)
-        self.results.show(main_layers(described, also=self.results.slots))
+        self.results.show(main_layers(described, also=self.results.slots), fit=fit)
 
     def on_change(self) -> None:
         """Something that the result depends on has changed."""

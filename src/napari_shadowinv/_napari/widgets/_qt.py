@@ -12,7 +12,7 @@ from napari.utils.notifications import show_error
 from qtpy.QtCore import QObject, QSettings, Qt, QTimer
 from qtpy.QtWidgets import QDockWidget, QHBoxLayout, QMainWindow, QVBoxLayout, QWidget
 
-from napari_shadowinv._napari.notifications import MISTAKES
+from napari_shadowinv._napari.notifications import MISTAKES, window_text
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -78,7 +78,7 @@ def while_alive(thing: QObject, emitter: Any, method: Callable[..., Any]) -> Non
 
 def error_text(error: BaseException | str) -> str:
     """What is wrong and what to do; of a fault of the program's, at least its name."""
-    text = str(error)
+    text = window_text(str(error))
     if isinstance(error, MemoryError) and not text:
         text = "there is not enough memory for this"
     elif not isinstance(error, (str, *MISTAKES)):
@@ -111,26 +111,49 @@ def notify_errors(method: Method) -> Method:
 
 
 class Docked(QWidget):
-    """A widget that joins the docks on its side as a tab; napari would squeeze it below them."""
+    """A widget that joins the docks on its side as a tab; napari would squeeze it below them.
 
-    _has_place = False
+    Choosing it again in the menu while it is a tab in the background brings it to the front,
+    where napari would hide it.
+    """
+
+    _dock: QDockWidget | None = None
+    _in_front = True
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
-        if not self._has_place:
-            self._has_place = True
+        if self._dock is None:
             # Now napari is still about to lay out the docks.
             QTimer.singleShot(0, self._join)
+
+    def hideEvent(self, event: Any) -> None:
+        super().hideEvent(event)
+        dock = self._dock
+        if dock is not None and dock.isHidden() and not self._in_front:
+            QTimer.singleShot(0, self._come_to_front)
+
+    def _come_to_front(self) -> None:
+        if self._dock is not None and self._dock.parent().isVisible():
+            self._dock.show()
+            self._dock.raise_()
+
+    def _on_visibility(self, visible: bool) -> None:
+        if self._dock is not None and not self._dock.isHidden():
+            self._in_front = visible
 
     def _join(self) -> None:
         dock = self.parent()
         while dock is not None and not isinstance(dock, QDockWidget):
             dock = dock.parent()
         window = None if dock is None else dock.parent()
-        if dock is None or not isinstance(window, QMainWindow) or dock.isFloating():
+        if self._dock is not None or dock is None or not isinstance(window, QMainWindow):
             return
+        self._dock = dock
+        dock.visibilityChanged.connect(self._on_visibility)
         side = window.dockWidgetArea(dock)
-        if side == Qt.DockWidgetArea.NoDockWidgetArea or window.tabifiedDockWidgets(dock):
+        if dock.isFloating() or side == Qt.DockWidgetArea.NoDockWidgetArea:
+            return
+        if window.tabifiedDockWidgets(dock):
             return
         for other in window.findChildren(QDockWidget):
             here = other is not dock and window.dockWidgetArea(other) == side and other.isVisible()

@@ -48,7 +48,7 @@ class RecipeButton(QPushButton):
         )
         self.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Fixed)
         menu = QMenu(self)
-        menu.addAction("Load…").triggered.connect(lambda: self._ask_and_load())
+        menu.addAction("Load recipe…").triggered.connect(lambda: self._ask_and_load())
         menu.addAction("Save…").triggered.connect(lambda: self._ask_and_save())
         self.setMenu(menu)
 

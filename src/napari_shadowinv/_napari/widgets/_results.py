@@ -32,8 +32,8 @@ def result_frame(image: Any, recipe: Recipe) -> Frame:
     return frame.beneath(recipe.matrix((height, width)))
 
 
-def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> None:
-    """Give an image, and what lies on it, the setup's pixels; the camera follows."""
+def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> bool:
+    """Give an image, and what lies on it, the setup's pixels; return whether that moved it."""
     # Pixels and lengths side by side would make napari warn at each layer.
     before = frame_of(image)
     others = [
@@ -46,11 +46,12 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
     followers = [layer for layer in (*companions, *others) if frame_of(layer) == before]
     place(image, setup)
     if frame_of(image) == before:
-        return
+        return False
     for layer in followers:
         layer.scale = (*layer.scale[:-2], *image.scale[-2:])
         layer.units = (*layer.units[:-2], *image.units[-2:])
     viewer.reset_view()
+    return True
 
 
 class ResultLayers(QObject):
@@ -64,7 +65,7 @@ class ResultLayers(QObject):
         self._layers: dict[str, Any] = {}
         self._order: list[str] = []
         self._waiting: list[FullLayerData] = []
-        self._select, self._before = True, None
+        self._select, self._before, self._fit = True, None, False
         self._timer = timer(self, 0, self._add_next)
 
     @property
@@ -76,10 +77,15 @@ class ResultLayers(QObject):
     def busy(self) -> bool:
         return bool(self._timer.isActive())
 
-    def show(self, described: Sequence[FullLayerData], *, select: bool = True) -> None:
-        """Replace the data of the layers, the lowest first; add those that are not there."""
+    def show(
+        self, described: Sequence[FullLayerData], *, select: bool = True, fit: bool = False
+    ) -> None:
+        """Replace the data of the layers, the lowest first; add those that are not there.
+
+        The camera is then fitted to all layers if that is asked for.
+        """
         # Adding a layer takes napari some tenths of a second: one by one, the window stays alive.
-        self._select = select
+        self._select, self._fit = select, fit
         self._before = self._viewer.layers.selection.active
         here = self.layers
         self._order = [slot_of(keywords) for _, keywords, _ in described]
@@ -99,7 +105,7 @@ class ResultLayers(QObject):
         if self._waiting:
             self._timer.start()
         else:
-            self.complete.emit()
+            self._finish()
 
     def extend(self, described: Sequence[FullLayerData]) -> None:
         """Add layers of the same result below the others, without a change of the selection."""
@@ -145,7 +151,14 @@ class ResultLayers(QObject):
                 self._viewer.layers.selection.active = active
         if not self._waiting:
             self._timer.stop()
-            self.complete.emit()
+            self._finish()
+
+    def _finish(self) -> None:
+        if self._fit:
+            # Layers of an earlier result have the new units only now.
+            self._fit = False
+            self._viewer.reset_view()
+        self.complete.emit()
 
     def _next_above(self, slot: str) -> Any | None:
         """The lowest layer of the result that lies above this one and is there already."""

@@ -10,7 +10,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.shots import loaded
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
-from napari_shadowinv._napari.widgets._layers import LayerWatch, MaskPicker, image_of, shot_picker
+from napari_shadowinv._napari.widgets._layers import LayerWatch, MaskPicker, ShotPicker, image_of
 from napari_shadowinv._napari.widgets._panels import LivePanel, RunPanel
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -47,7 +47,7 @@ class EstimateSource(LivePanel):
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         tip = "Create an image layer with the estimated beam."
         super().__init__(viewer, "estimate-source", RunPanel("Estimate source", "Estimate", tip))
-        self.image = shot_picker(viewer)
+        self.image = ShotPicker(viewer)
         tip = "Labels or shapes marking pixels that the estimate ignores."
         self.masks = MaskPicker(viewer, lambda: self.image.layer, ("labels", "shapes"), tip)
         self.method = ModelPicker("Method", kinds_of(ESTIMATES))

@@ -18,6 +18,7 @@ from napari_shadowinv._napari.layer_metadata import (
     result_of,
     role_of,
 )
+from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv._napari.shots import loaded, radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
@@ -177,7 +178,7 @@ class InvertShot(InversionInputs, LivePanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.image = layers.shot_picker(self.viewer)
+        self.image = layers.ShotPicker(self.viewer)
         self.make_inputs(
             lambda: self.image.layer,
             ("labels", "shapes"),
@@ -251,6 +252,11 @@ class InvertShot(InversionInputs, LivePanel):
                 filter(None, (mark_of(layer).get("name", layer.name), self.source.short_name))
             ),
         )
+
+    def _result_name(self, layer: Any) -> str:
+        """Name the result of an image, which may be that of a saved result, by its source, too."""
+        name = mark_of(layer).get("name") or layer.name
+        return ", ".join(filter(None, (name, self.source.short_name)))
 
     @notify_errors
     def refine(self, psf: float) -> None:
@@ -336,22 +342,23 @@ class InvertShot(InversionInputs, LivePanel):
             show_warning(
                 f"'{image.name}' was deleted during its inversion; the result is shown anyway"
             )
+        moved = False
         if request.recipe.setup is not None:
-            place_together(self.viewer, image, request.recipe.setup, request.companions)
+            moved = place_together(self.viewer, image, request.recipe.setup, request.companions)
         if request.preview:
-            self.show_layers(image, value.described, preview=True)
+            self.show_layers(image, value.described, preview=True, fit=moved)
             self.verdict.show_headline(headline, "Preview: ")
             self.panel.say(f"Image residual {image_residual_text(value.inversion)}")
             return
         self._report(value.inversion, request.origins.rows())
         self._told = result_of(value.described[0][1])
         if headline.level is not Level.SOUND:
-            show_warning(f"{headline.level.value.capitalize()}: {headline.text}")
+            show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
         self.reveal(self.verdict)
         self._learn_pace(value.inversion)
         # They refine an earlier result, and lie above the new one.
         self._refined.hide()
-        self.show_layers(image, value.described, preview=False)
+        self.show_layers(image, value.described, preview=False, fit=moved)
 
     def on_change(self) -> None:
         super().on_change()

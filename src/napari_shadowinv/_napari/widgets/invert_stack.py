@@ -422,6 +422,8 @@ class InvertStack(InversionInputs, ToolPanel):
         request: StackRequest = outcome.tag
         books = request.job.books
         if not books.total:
+            if outcome.error is not None:
+                return  # the panel shows why
             if self.shots.is_watched:
                 self.panel.say("Ended: no shot has arrived.")
             return
