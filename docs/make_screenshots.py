@@ -117,10 +117,10 @@ def press_run(widget: Any) -> None:
     bar.setValue(bar.maximum())
 
 
-def show_only(viewer: napari.Viewer, *endings: str) -> None:
-    """Switch on the layers whose names end so, and off all others."""
+def show_only(viewer: napari.Viewer, *titles: str) -> None:
+    """Switch on the layers whose names begin with these titles, and off all others."""
     for layer in viewer.layers:
-        layer.visible = layer.name.endswith(endings)
+        layer.visible = layer.name.startswith(titles)
 
 
 def toroid_window() -> None:
@@ -161,7 +161,7 @@ def first_windows() -> None:
     bar.setValue(bar.maximum() - 15)  # begin with a whole row
     photograph(viewer, "tutorial-first-field.png", close=False)
     show_only(viewer, "residual (% of mean)")
-    viewer.layers.selection.active = viewer.layers["toroid residual (% of mean)"]
+    viewer.layers.selection.active = viewer.layers["residual (% of mean) – toroid"]
     photograph(viewer, "tutorial-first-residual.png", close=False)
     show_only(viewer, "|∫B×dz| (mT·m)")
     profile = open_widget(viewer, "Line profile")
@@ -169,7 +169,7 @@ def first_windows() -> None:
     profile.lines.layer.add([[99.5, 5.0], [99.5, 194.0]], shape_type="line")
     for layer in profile.checked():
         profile.check(layer, False)
-    profile.check(viewer.layers["toroid |∫B×dz| (mT·m)"])
+    profile.check(viewer.layers["|∫B×dz| (mT·m) – toroid"])
     photograph(viewer, "tutorial-first-profile.png")
 
 
@@ -190,7 +190,7 @@ def proton_windows() -> None:
         invert_shot.setup.picker.changed.emit()
         photograph(viewer, "tutorial-proton-setup.png", close=False)
         press_run(invert_shot)
-        viewer.layers["shot caustics"].visible = True
+        viewer.layers["caustics – shot, reference.tif"].visible = True
         photograph(viewer, "tutorial-proton-field.png")
 
 
@@ -222,7 +222,7 @@ def night_window() -> None:
         print(invert_stack.panel.status.text(), [layer.name for layer in viewer.layers])
         viewer.dims.set_current_step(0, 10)
         settle(3.0)
-        viewer.layers["night displacement arrows"].length = NIGHT_ARROWS
+        viewer.layers["displacement arrows – night"].length = NIGHT_ARROWS
         photograph(viewer, "tutorial-night.png")
 
 

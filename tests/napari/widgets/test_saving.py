@@ -1,0 +1,174 @@
+"""Saving a result with a button, and using what comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from qtpy.QtWidgets import QFileDialog, QMessageBox
+
+from napari_shadowinv import ProtonSetup, read
+from napari_shadowinv._napari.layer_metadata import mark, result_of, role_of
+from napari_shadowinv.physics.phantoms import paper_setup
+
+PATIENCE = 60_000  # ms
+
+
+@pytest.fixture
+def choose(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Answer the dialog of files with a path, and the question about replacing."""
+
+    def answer(path: Path | str, replace: bool = False) -> None:
+        def ask(parent: Any, title: str, proposal: str, filters: str, **_: Any) -> Any:
+            return str(path), filters.split(";;")[0]
+
+        button = QMessageBox.StandardButton.Yes if replace else QMessageBox.StandardButton.No
+        monkeypatch.setattr(QFileDialog, "getSaveFileName", ask)
+        monkeypatch.setattr(QMessageBox, "question", lambda *_: button)
+
+    return answer
+
+
+@pytest.fixture
+def tool(window: Any, open_widget: Callable[[str], Any], shot: Any) -> Any:
+    window.add_image(shot, name="shot", metadata=mark("shot", "", paper_setup()))
+    widget = open_widget("Invert shot")
+    widget.options.set_values({"n_sites": 300})
+    return widget
+
+
+def run(tool: Any, qtbot: Any) -> None:
+    before = getattr(tool, "results", None)
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: getattr(tool, "results", None) is not before, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
+
+
+def test_saved_result_comes_back_and_is_inverted_again(
+    window: Any, tool: Any, qtbot: Any, tmp_path: Path, choose: Any, told: list[str]
+) -> None:
+    run(tool, qtbot)
+    verdict, peak = tool.verdict.text(), window.layers.selection.active.data.max()
+    choose(tmp_path / "a")
+    tool.save_result.click()
+    path = tmp_path / "a.shadowinv"
+    assert str(path) in tool.panel.status.text()
+    assert str(path) in told[-1]
+    names = [layer.name for layer in window.layers if result_of(layer) is not None]
+    window.layers.clear()
+    assert tool.verdict.text() != verdict
+    window.open(str(path), plugin="napari-shadowinv")
+    qtbot.waitUntil(lambda: role_of(window.layers.selection.active) == "field", timeout=PATIENCE)
+    field = window.layers.selection.active
+    assert field.colorbar.visible
+    assert (tool.verdict.text(), field.data.max()) == (verdict, peak)
+    assert [layer.name for layer in window.layers if role_of(layer) != "image"] == names
+    assert {role_of(layer) for layer in window.layers if layer.visible} == {"field", "arrows"}
+    # The image has its setup and source, and is a shot again.
+    assert role_of(tool.image.layer) == "image"
+    assert tool.setup.setup() == paper_setup()
+    run(tool, qtbot)
+    assert window.layers.selection.active.data.max() == pytest.approx(peak, rel=1e-6)
+
+
+def test_save_asks_before_it_replaces_a_file(
+    tool: Any, qtbot: Any, tmp_path: Path, choose: Any
+) -> None:
+    run(tool, qtbot)
+    path = tmp_path / "a.shadowinv"
+    path.write_text("precious")
+    choose(tmp_path / "a")
+    tool.save_result.click()
+    assert path.read_text() == "precious"
+    choose(tmp_path / "a", replace=True)
+    tool.save_result.click()
+    assert read(path)["displacement"].shape == (2, 48, 60)
+
+
+def test_save_without_a_result_says_what_to_do(
+    tool: Any, tmp_path: Path, choose: Any, told: list[str]
+) -> None:
+    choose(tmp_path / "a")
+    tool.save_result.click()
+    assert told == ["There is no result yet: press Run first, or select a layer of a result"]
+    assert not list(tmp_path.glob("a*"))
+
+
+def test_save_that_fails_leaves_no_file(
+    tool: Any, qtbot: Any, tmp_path: Path, choose: Any, told: list[str]
+) -> None:
+    run(tool, qtbot)
+    choose(tmp_path / "nowhere" / "a")
+    tool.save_result.click()
+    assert "nowhere" in told[-1]
+    assert "\n" not in told[-1]
+    assert tool.panel.status.text() == told[-1]
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_more_layers_adds_those_that_are_missing(tool: Any, window: Any, qtbot: Any) -> None:
+    run(tool, qtbot)
+    few = [role_of(layer) for layer in window.layers]
+    assert few == ["shot", "residual", "field", "caustic", "arrows"]
+    tool.more_layers.click()
+    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
+    added = {role_of(layer) for layer in window.layers} - set(few)
+    assert added == {
+        "reprojection", "potential", "field y", "field x", "field arrows", "sites"
+    }  # fmt: skip
+    assert {role_of(one) for one in window.layers if one.visible} == {"shot", "field", "arrows"}
+    count = len(window.layers)
+    tool.more_layers.click()
+    run(tool, qtbot)
+    assert len(window.layers) == count
+
+
+def test_forward_image_is_saved_with_its_pixels(
+    window: Any, open_widget: Any, qtbot: Any, tmp_path: Path, choose: Any
+) -> None:
+    tool = open_widget("Forward model")
+    tool.height_px.setValue(40)
+    tool.width_px.setValue(50)
+    tool.panel.button.click()
+    qtbot.waitUntil(
+        lambda: tool.results is not None and bool(tool.results.layers), timeout=PATIENCE
+    )
+    choose(tmp_path / "image")
+    tool.save_result.click()
+    saved = tifffile.imread(tmp_path / "image.tif")
+    np.testing.assert_allclose(saved, tool.results.layers[0].data, rtol=1e-6)
+
+
+def test_shot_of_a_store_is_saved_alone(
+    window: Any, open_widget: Any, qtbot: Any, tmp_path: Path, choose: Any, shot: Any,
+    proton_setup: ProtonSetup,
+) -> None:  # fmt: skip
+    stack = np.stack([shot, shot[:, ::-1]])
+    window.add_image(stack, name="run", metadata=mark("shot", "", proton_setup))
+    tool = open_widget("Invert stack")
+    tool.options.set_values({"n_sites": 300})
+    tool.store.edit.setText(str(tmp_path / "run.shadowinv.zarr"))
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
+    qtbot.waitUntil(
+        lambda: not tool.panel.runner.running and not tool.results.busy, timeout=PATIENCE
+    )
+    window.dims.set_current_step(0, 1)
+    choose(tmp_path / "second")
+    tool.save_result.click()
+    field = read(tmp_path / "second.shadowinv")["displacement"].values
+    # The second shot is the first one's mirror image.
+    blob = field[1][:, field.shape[2] // 2 :]
+    assert np.abs(field[1]).max() > 0.5
+    assert np.abs(blob).max() < np.abs(field[1]).max() * 1.001
+    window.layers.clear()
+    (layer, *_) = [
+        one
+        for one in window.open(str(tmp_path / "second.shadowinv"), plugin="napari-shadowinv")
+        if role_of(one) == "field"
+    ]
+    assert "mT·m" in layer.name or "µT·m" in layer.name
