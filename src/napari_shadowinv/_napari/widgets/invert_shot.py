@@ -60,6 +60,7 @@ from napari_shadowinv.preprocessing import Radiograph, Recipe
 if TYPE_CHECKING:
     import napari
     from napari_shadowinv._napari.layers import FullLayerData
+    from napari_shadowinv.physics.setup import Setup
 
 _PREVIEW_ROLES = ("field", "caustic")
 # Measured on two cores, images of 0.25 to 4 Mpx with 5,000 to 1,000,000 sites; a window's layers
@@ -327,12 +328,14 @@ class InvertShot(InversionInputs, LivePanel):
             self.fit_view.follow()
         elif isinstance(result.content, Inversion):
             self.fit_view.empty()
-            self._report(result.content, [])
+            self._report(result.content, result.setup, [])
             self._told = result
             self.reveal(self.verdict)
 
-    def _report(self, inversion: Inversion, given: list[tuple[str, str]]) -> None:
-        self.verdict.show_headline(inversion.headline)
+    def _report(
+        self, inversion: Inversion, setup: Setup | None, given: list[tuple[str, str]]
+    ) -> None:
+        self.verdict.show_headline(inversion.headline_in(setup))
         self.report.show_rows([*given, *report_rows(inversion)], solver_rows(inversion))
 
     def _show_inversion(self, value: _Answer, request: _Request) -> None:
@@ -350,7 +353,7 @@ class InvertShot(InversionInputs, LivePanel):
             self.verdict.show_headline(headline, "Preview: ")
             self.panel.say(f"Image residual {image_residual_text(value.inversion)}")
             return
-        self._report(value.inversion, request.origins.rows())
+        self._report(value.inversion, value.inversion.setup, request.origins.rows())
         self._told = result_of(value.described[0][1])
         if headline.level is not Level.SOUND:
             show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
