@@ -1,0 +1,278 @@
+"""The tutorials by their clicks: menus, labels and buttons as the pages name them."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from qtpy import QtWidgets
+from qtpy.QtCore import Qt
+from typer.testing import CliRunner
+
+from napari_shadowinv._napari.layer_metadata import result_of, role_of, unit_of
+from napari_shadowinv.cli import app
+from napari_shadowinv.io.store import DONE
+
+PAGES = Path(__file__).parents[3] / "docs" / "tutorials"
+PLUGIN = "Shadowgrams and proton radiographs"
+PATIENCE_MS = 120_000
+
+
+def page(name: str) -> str:
+    return (PAGES / name).read_text(encoding="utf-8")
+
+
+def plain(text: str) -> str:
+    """The text of a menu's entry or a button without its marks."""
+    return re.sub(r"[&…]|\.\.\.", "", text).strip()
+
+
+@pytest.fixture
+def choose(window: Any, qtbot: Any) -> Callable[[str], None]:
+    """Choose an entry of napari's menus, written as on the pages."""
+
+    def trigger(path: str) -> None:
+        owner: Any = window.window._qt_window.menuBar()
+        *menus, entry = (plain(part) for part in path.split(">"))
+        for name in menus:
+            (owner,) = [
+                action.menu()
+                for action in owner.actions()
+                if action.menu() is not None and plain(action.text()) == name
+            ]
+            owner.aboutToShow.emit()
+        matching = [action for action in owner.actions() if entry in plain(action.text())]
+        assert len(matching) == 1, [action.text() for action in owner.actions()]
+        assert matching[0].isEnabled()
+        matching[0].trigger()
+        qtbot.wait(50)
+
+    return trigger
+
+
+@pytest.fixture
+def press(qtbot: Any) -> Callable[[Any, str], None]:
+    """Press the visible button of a widget that has this text."""
+
+    def click(tool: Any, text: str) -> None:
+        (button,) = [
+            button
+            for button in tool.findChildren(QtWidgets.QAbstractButton)
+            if plain(button.text()) == plain(text) and button.isVisibleTo(tool)
+        ]
+        assert button.isEnabled()
+        button.click()
+
+    return click
+
+
+@pytest.fixture
+def answer_dialogs(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+    """Answer all dialogs that ask for a file with this path."""
+
+    def answer(path: Path) -> None:
+        for name in ("getSaveFileName", "getOpenFileName"):
+            monkeypatch.setattr(QtWidgets.QFileDialog, name, lambda *_, **__: (str(path), ""))
+
+    return answer
+
+
+def tool_of(window: Any, title: str) -> Any:
+    """The widget that a menu has opened."""
+    (tool,) = [
+        dock.widget()
+        for dock in window.window._qt_window.findChildren(QtWidgets.QDockWidget)
+        if title in dock.windowTitle()
+    ]
+    return tool
+
+
+def select(tool: Any, text: str) -> None:
+    """Choose an entry of the one list that offers it."""
+    (box,) = [
+        box
+        for box in tool.findChildren(QtWidgets.QComboBox)
+        if box.isVisibleTo(tool) and box.findText(text) >= 0
+    ]
+    box.setCurrentIndex(box.findText(text))
+    box.activated.emit(box.currentIndex())
+
+
+def editor_of(tool: Any, title: str) -> Any:
+    """The editor beside a label of the form that is shown."""
+    for form in tool.findChildren(QtWidgets.QFormLayout):
+        for row in range(form.rowCount()):
+            label = form.itemAt(row, QtWidgets.QFormLayout.ItemRole.LabelRole)
+            if label is not None and label.widget().text() == title:
+                editor = form.itemAt(row, QtWidgets.QFormLayout.ItemRole.FieldRole).widget()
+                if editor.isVisibleTo(tool):
+                    return editor
+    raise AssertionError(f"no field {title!r}")
+
+
+def enter(tool: Any, title: str, text: str) -> None:
+    """Type a value, such as "1.3 mm", and leave the field."""
+    editor = editor_of(tool, title)
+    for box in editor.findChildren(QtWidgets.QCheckBox):
+        box.setChecked(True)
+    (line,) = editor.findChildren(QtWidgets.QLineEdit)
+    line.setText(text)
+    line.editingFinished.emit()
+
+
+def wait_for_layers(tool: Any, qtbot: Any) -> None:
+    """Wait until a run has ended and its layers are there; the Run button stands there again."""
+    qtbot.waitUntil(lambda: tool.panel.button.text() == "Run", timeout=PATIENCE_MS)
+    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE_MS)
+    qtbot.wait(50)
+
+
+def layer_of(window: Any, role: str) -> Any:
+    return [layer for layer in window.layers if role_of(layer) == role][-1]
+
+
+def report_of(tool: Any) -> str:
+    return "\n".join(
+        " ".join(
+            item.text() for column in range(2) if (item := table.item(row, column)) is not None
+        )
+        for table in tool.findChildren(QtWidgets.QTableWidget)
+        for row in range(table.rowCount())
+    )
+
+
+def save_reload(window: Any, path: Path) -> None:
+    """Save the result, close everything and open the file."""
+    window.layers.selection.active = layer_of(window, "field")
+    window.layers.save(str(path), selected=True, plugin="napari-shadowinv")
+    assert path.exists()
+    window.layers.clear()
+    window.open(path, plugin="napari-shadowinv")
+
+
+def test_first_shadowgram_is_clicked_to_its_end(
+    window: Any, choose: Any, press: Any, answer_dialogs: Any, qtbot: Any, tmp_path: Path
+) -> None:
+    text = page("first-shadowgram.md")
+    choose(f"File > Open Sample > {PLUGIN} > Toroidal field below caustics")
+    assert [layer.name for layer in window.layers if layer.visible] == ["toroid"]
+    choose(f"Plugins > {PLUGIN} > Invert shot")
+    tool = tool_of(window, "Invert shot")
+    assert tool.image.layer is window.layers["toroid"]
+    press(tool, "Run")
+    wait_for_layers(tool, qtbot)
+    field = layer_of(window, "field")
+    assert field.visible
+    assert "9.7 mT·m" in text
+    assert float(field.data.max()) == pytest.approx(9.7, rel=0.03)
+    (residual,) = re.findall(r"image residual of ([\d.]+ %)", text)
+    assert residual.replace(" ", "") in report_of(tool).replace(" ", "")
+    assert "Warning" not in report_of(tool)
+
+    choose(f"Plugins > {PLUGIN} > Line profile")
+    profile = tool_of(window, "Line profile")
+    press(profile, "✎")
+    middle = field.extent.world.mean(axis=0)
+    ends = np.array([field.extent.world[0], field.extent.world[1]])
+    ends[:, 0] = middle[0]
+    lines = profile.lines.layer
+    lines.add_lines(np.array([lines.world_to_data(end) for end in ends]))
+    for item in range(profile.layers.count()):
+        on = profile.layers.item(item).text() == field.name
+        state = Qt.CheckState.Checked if on else Qt.CheckState.Unchecked
+        profile.layers.item(item).setCheckState(state)
+    qtbot.waitUntil(lambda: [one.name for one in profile.profiles] == [field.name], timeout=5000)
+    flanks = np.array_split(profile.profiles[0].values, 2)
+    for flank in flanks:
+        assert np.nanmax(flank) == pytest.approx(9.7, rel=0.04)
+
+    answer_dialogs(tmp_path / "recipe.toml")
+    (save,) = [one for one in tool.recipes.menu().actions() if one.text() == "Save…"]
+    save.trigger()
+    assert (tmp_path / "recipe_source.npy").exists()
+    values = np.asarray(field.data)
+    save_reload(window, tmp_path / "toroid.shadowinv")
+    again = layer_of(window, "field")
+    np.testing.assert_array_equal(np.asarray(again.data), values)
+    assert unit_of(again) == "mT·m"
+    assert result_of(again) is not None
+
+
+def test_proton_radiograph_is_clicked_to_its_end(
+    window: Any,
+    choose: Any,
+    press: Any,
+    answer_dialogs: Any,
+    qtbot: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    text = page("proton-radiograph.md")
+    monkeypatch.chdir(tmp_path)
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(block, "proton-radiograph.md", "exec"), {})
+    window.open("shot.tif", plugin="napari")
+    choose(f"Plugins > {PLUGIN} > Invert shot")
+    tool = tool_of(window, "Invert shot")
+    select(tool, "a file")
+    answer_dialogs(tmp_path / "reference.tif")
+    tool.source.file.edit.setText(str(tmp_path / "reference.tif"))
+    tool.source.file.edit.editingFinished.emit()
+    select(tool, "particles (protons, …)")
+    for title, value in re.findall(r"^\| ([\w ]+) \| (?:check the box, )?`(.*?)` \|", text, re.M):
+        enter(tool, title, value)
+    answer_dialogs(tmp_path / "setup.toml")
+    press(tool.setup, "Save…")
+    press(tool, "Run")
+    wait_for_layers(tool, qtbot)
+    report = report_of(tool)
+    assert "8.25" in report
+    assert "0.00% of the pixels" in report
+    assert "Warning" not in report
+    field = layer_of(window, "field")
+    assert unit_of(field) == "mT·m"
+    assert float(field.data.max()) == pytest.approx(15.0, rel=0.02)
+    assert str(field.units[-1]) == "micrometer"
+    save_reload(window, tmp_path / "shot.shadowinv")
+    assert float(layer_of(window, "field").data.max()) == pytest.approx(15.0, rel=0.02)
+
+
+def test_stack_is_clicked_to_its_end(
+    window: Any,
+    choose: Any,
+    press: Any,
+    qtbot: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    text = page("stack.md")
+    monkeypatch.chdir(tmp_path)
+    choose(f"File > Open Sample > {PLUGIN} > Plasma wave, 20 optical shots")
+    choose(f"Plugins > {PLUGIN} > Invert stack")
+    tool = tool_of(window, "Invert stack")
+    select(tool, "high-pass")
+    tool.store.edit.setText(str(tmp_path / "night.shadowinv.zarr"))
+    tool.store.edit.editingFinished.emit()
+    press(tool, "Run")
+    wait_for_layers(tool, qtbot)
+    field = layer_of(window, "field")
+    assert field.data.shape[0] == 20
+    window.dims.set_current_step(0, 12)
+    qtbot.wait(50)
+
+    (command,) = re.findall(r"^    shadowinv (status .*)$", text, re.M)
+    result = CliRunner().invoke(app, shlex.split(command))
+    assert result.exit_code == 0, result.output
+    names: dict[str, Any] = {}
+    (lines,) = re.findall(r"^    import xarray\n(?:    .*\n)+", text, re.M)
+    exec(re.sub("^    ", "", lines, flags=re.M), names)
+    night = names["night"]
+    assert (night.status == DONE).all()
+    window.layers.clear()
+    window.open(tmp_path / "night.shadowinv.zarr", plugin="napari-shadowinv")
+    assert layer_of(window, "field").data.shape[0] == 20
