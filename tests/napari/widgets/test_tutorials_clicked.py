@@ -146,10 +146,10 @@ def report_of(tool: Any) -> str:
     )
 
 
-def save_reload(window: Any, path: Path) -> None:
+def save_reload(window: Any, tool: Any, path: Path, press: Any, answer_dialogs: Any) -> None:
     """Save the result, close everything and open the file."""
-    window.layers.selection.active = layer_of(window, "field")
-    window.layers.save(str(path), selected=True, plugin="napari-shadowinv")
+    answer_dialogs(path)
+    press(tool, "Save result…")
     assert path.exists()
     window.layers.clear()
     window.open(path, plugin="napari-shadowinv")
@@ -196,7 +196,7 @@ def test_first_shadowgram_is_clicked_to_its_end(
     save.trigger()
     assert (tmp_path / "recipe_source.npy").exists()
     values = np.asarray(field.data)
-    save_reload(window, tmp_path / "toroid.shadowinv")
+    save_reload(window, tool, tmp_path / "toroid.shadowinv", press, answer_dialogs)
     again = layer_of(window, "field")
     np.testing.assert_array_equal(np.asarray(again.data), values)
     assert unit_of(again) == "mT·m"
@@ -238,7 +238,7 @@ def test_proton_radiograph_is_clicked_to_its_end(
     assert unit_of(field) == "mT·m"
     assert float(field.data.max()) == pytest.approx(15.0, rel=0.02)
     assert str(field.units[-1]) == "micrometer"
-    save_reload(window, tmp_path / "shot.shadowinv")
+    save_reload(window, tool, tmp_path / "shot.shadowinv", press, answer_dialogs)
     assert float(layer_of(window, "field").data.max()) == pytest.approx(15.0, rel=0.02)
 
 
