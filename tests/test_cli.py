@@ -16,13 +16,15 @@ import pytest
 import tifffile
 import xarray as xr
 from scipy.io import savemat
+from typer.main import get_command
+from typer.testing import CliRunner
 
 from command_line import content, flat, interrupted, shadowinv
 from napari_shadowinv import __version__
 from napari_shadowinv import preprocessing as filters
 from napari_shadowinv import preprocessing as sources
 from napari_shadowinv._system.machine import physical_memory
-from napari_shadowinv.cli import _info
+from napari_shadowinv.cli import _info, app
 from napari_shadowinv.cli._flags import recipe_of
 from napari_shadowinv.cli._inputs import setup_for
 from napari_shadowinv.errors import InputError
@@ -108,9 +110,46 @@ def dataset(path: str | Path) -> xr.Dataset:
 
 def test_version_and_help() -> None:
     assert shadowinv("--version").output.split() == ["shadowinv", __version__]
-    text = shadowinv("invert", "--help").output
+    text = shadowinv("invert", "--help-all").output
     for word in ("--source", "--bin", "--clip-negative", "shadowinv invert shot.tif", "energy"):
         assert word in text
+
+
+COMMANDS = (
+    "invert", "rerun", "fit", "film", "forward", "info", "demo", "batch", "watch", "status",
+    "export", "movie",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_a_command_fits_a_screen(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = shadowinv(command, "--help").output
+    lines = text.splitlines()
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 80
+    assert shadowinv(command, "-h").output == text
+    if "Examples" in lines:
+        assert lines.index("Examples") < lines.index("Options")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_complete_help_of_a_command_shows_all_its_flags(command: str) -> None:
+    text = shadowinv(command, "--help-all").output
+    words = set(re.findall(r"--[\w-]+", text))
+    parameters = get_command(app).commands[command].params  # type: ignore[attr-defined]
+    flags = {flag for one in parameters for flag in one.opts if flag.startswith("--")}
+    assert flags <= words
+    for kind in ("<bool>", "BOOLEAN", "<path>", "<str>"):
+        assert kind not in text
+
+
+def test_commands_are_completed_in_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
+    environment = {"_SHADOWINV_COMPLETE": "complete_bash", "COMP_WORDS": "shadowinv inv"}
+    result = CliRunner().invoke(
+        app, [], prog_name="shadowinv", env={**environment, "COMP_CWORD": "1"}
+    )
+    assert result.output.split() == ["invert"]
 
 
 def test_help_needs_no_heavy_import() -> None:
@@ -260,7 +299,8 @@ def test_grey_film_is_told_but_a_linear_image_is_not(folder: Path) -> None:
         for command in ("info", "invert"):
             result = shadowinv(command, name)
             assert ("the rim is as bright as anything" in flat(result.stdout)) == said
-    assert "--channel" not in flat(shadowinv("invert", "--help").stdout.split("Examples")[1])
+    examples = shadowinv("invert", "--help").stdout.split("Examples")[1].split("Options")[0]
+    assert "--channel" not in examples
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="such names are not allowed there")

@@ -274,7 +274,7 @@ def test_options_come_from_a_file_and_flags_override_it(given: dict[str, Any]) -
 
 
 def test_every_option_of_a_fit_has_a_flag() -> None:
-    text = flat(shadowinv("fit", "--help").stdout)
+    text = flat(shadowinv("fit", "--help-all").stdout)
     for name in FitOptions.model_fields:
         assert f"--{name.replace('_', '-')}" in text
     flags = {"bin": 2, "ambiguous": True, "beam_modes": 4}

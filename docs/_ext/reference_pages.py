@@ -184,7 +184,7 @@ def command_page() -> str:
     group: Any = get_command(app)
     parts = [
         "# The command `shadowinv`",
-        plain(group.help) + " `shadowinv COMMAND --help` shows what is below in the terminal.",
+        plain(group.help) + " `shadowinv COMMAND --help-all` shows what is below in the terminal.",
         *(command_section(name, command) for name, command in group.commands.items()),
     ]
     return "\n\n".join(parts) + "\n"

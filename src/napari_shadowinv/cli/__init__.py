@@ -20,6 +20,7 @@ from napari_shadowinv.cli import (
     _stack_commands,
     _watch_command,
 )
+from napari_shadowinv.cli._help import HELP_NAMES, HelpfulCommand, HelpfulGroup
 
 __all__ = ["app"]
 
@@ -27,7 +28,8 @@ app = typer.Typer(
     name="shadowinv",
     help="Shadowgrams and proton radiographs to deflection potentials and fields.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": list(HELP_NAMES)},
+    cls=HelpfulGroup,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
@@ -55,15 +57,15 @@ def main(
             stream.reconfigure(errors="replace")
 
 
-app.command(epilog=_shot_commands.INVERT_EPILOG)(_shot_commands.invert)
-app.command()(_shot_commands.rerun)
-app.command(epilog=_fit_command.EPILOG)(_fit_command.fit)
-app.command(epilog=_film_command.EPILOG)(_film_command.film)
-app.command(epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
-app.command()(_shot_commands.info)
-app.command()(_shot_commands.demo)
-app.command(epilog=_stack_commands.BATCH_EPILOG)(_stack_commands.batch)
-app.command(epilog=_watch_command.EPILOG)(_watch_command.watch)
-app.command()(_stack_commands.status)
-app.command()(_stack_commands.export)
-app.command()(_stack_commands.movie)
+app.command(cls=HelpfulCommand, epilog=_shot_commands.INVERT_EPILOG)(_shot_commands.invert)
+app.command(cls=HelpfulCommand)(_shot_commands.rerun)
+app.command(cls=HelpfulCommand, epilog=_fit_command.EPILOG)(_fit_command.fit)
+app.command(cls=HelpfulCommand, epilog=_film_command.EPILOG)(_film_command.film)
+app.command(cls=HelpfulCommand, epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
+app.command(cls=HelpfulCommand)(_shot_commands.info)
+app.command(cls=HelpfulCommand)(_shot_commands.demo)
+app.command(cls=HelpfulCommand, epilog=_stack_commands.BATCH_EPILOG)(_stack_commands.batch)
+app.command(cls=HelpfulCommand, epilog=_watch_command.EPILOG)(_watch_command.watch)
+app.command(cls=HelpfulCommand)(_stack_commands.status)
+app.command(cls=HelpfulCommand)(_stack_commands.export)
+app.command(cls=HelpfulCommand)(_stack_commands.movie)

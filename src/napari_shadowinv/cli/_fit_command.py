@@ -99,7 +99,7 @@ def fit(
     *,
     flags: dict[str, Any],
 ) -> None:
-    """Find the fields, and the beam, that explain one or several images of one object.
+    """Find the fields and the beam that explain one or several images of an object.
 
     Rays may cross, images may be blurred, the beam may be unknown. Writes fields with error
     bars, re-projections, residuals and a verdict to one file, and a figure next to it.
