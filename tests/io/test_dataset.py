@@ -3,6 +3,7 @@ import hashlib
 import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -159,3 +160,40 @@ def test_damaged_result_is_named(tmp_path: Path, inversion: Inversion) -> None:
     path.write_bytes(path.read_bytes()[:-2000])
     with pytest.raises(FileFormatError, match=r"shot\.shadowinv .*damaged"):
         read(path)
+
+
+def test_every_dataset_of_a_result_has_fletcher32(tmp_path, inversion, proton_setup):
+    path = write(tmp_path / "a.shadowinv", inversion, setup=proton_setup)
+    with h5py.File(path) as file:
+        numbers = {name: item for name, item in file.items() if item.dtype.kind in "fiu"}
+        stored = {name: item for name, item in numbers.items() if item.chunks}
+        assert {"potential", "displacement", "weights", "caustic", "y"} <= stored.keys()
+        for name, item in stored.items():
+            assert item.fletcher32, name
+            assert item.dtype.kind != "f" or np.isnan(item.fillvalue), name
+
+
+def test_flipped_bits_of_a_result_are_refused(tmp_path, inversion, proton_setup):
+    path = write(tmp_path / "a.shadowinv", inversion, setup=proton_setup)
+    content = path.read_bytes()
+    places = np.random.default_rng(5).integers(0, 8 * len(content) - 8 * 81, 40)
+    for place in [*places, 8 * content.index(b'"energy"') + 2]:
+        damaged = bytearray(content)
+        damaged[place // 8] ^= 1 << (place % 8)
+        path.write_bytes(damaged)
+        with pytest.raises(FileFormatError):
+            read(path)
+
+
+def test_result_changed_by_another_program_is_read(tmp_path, inversion):
+    path = write(tmp_path / "a.shadowinv", inversion)
+    with h5py.File(path, "r+") as file:
+        file.attrs["note"] = "mine"
+    assert read(path).attrs["note"] == "mine"
+
+
+def test_result_without_checksum_is_read(tmp_path, inversion):
+    path = write(tmp_path / "a.shadowinv", inversion)
+    before = read(path)
+    path.write_bytes(path.read_bytes()[:-81])
+    assert read(path).identical(before)

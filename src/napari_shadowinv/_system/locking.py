@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import secrets
@@ -14,8 +15,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, cast
 
+from napari_shadowinv._system.hidden_files import MAX_NAME_BYTES
 from napari_shadowinv.errors import FileFormatError
 
+_MAX_LOCKED_BYTES = MAX_NAME_BYTES - len("..lock")
 _BEAT = 2.0  # seconds between two signs of life
 _WATCH = 30.0  # seconds without one after which a lock is stale
 _SETTLE = 1.0  # seconds after which another that took a stale lock, too, has been seen
@@ -27,7 +30,7 @@ def locked(path: Path) -> Iterator[None]:
     # The operating system takes the lock from a process that dies. Where a file system has no
     # locks, or is shared and they do not reach other hosts, signs of life stand in for them: a
     # lock whose file does not change while one watches is stale, whatever the clocks say.
-    lock = path.with_name(f".{path.name}.lock")
+    lock = path.with_name(f".{_shortened(path.name)}.lock")
     file, is_new = _opened(path, lock)
     with file:
         _take(path, lock, file, is_new)
@@ -44,6 +47,15 @@ def locked(path: Path) -> Iterator[None]:
         finally:
             ended.set()
             _give_back(file, lock)
+
+
+def _shortened(name: str) -> str:
+    """Return a name that leaves room for the ending of its lock."""
+    raw = os.fsencode(name)
+    if len(raw) <= _MAX_LOCKED_BYTES:
+        return name
+    digest = hashlib.sha256(raw).hexdigest()[:16]
+    return raw[: _MAX_LOCKED_BYTES - len(digest)].decode("utf-8", errors="ignore") + digest
 
 
 def _opened(path: Path, lock: Path) -> tuple[BinaryIO, bool]:

@@ -1,11 +1,15 @@
-"""Memory, threads and Ctrl-C: `physical_memory`, `in_ranges`, `interrupts_put_off`."""
+"""Memory, threads and signals.
+
+- `physical_memory`, `available_threads`, `in_ranges`
+- Ctrl-C, SIGTERM and SIGHUP: `interrupts_put_off`, `clear_up_when_terminated`, `handling`
+"""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
@@ -62,17 +66,50 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_helpers.cache_clear)  # threads are not copied
 
 
+# Ctrl-C, and what a scheduler of jobs or a terminal that closes sends.
+ENDING_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+
+
 @contextmanager
 def interrupts_put_off() -> Iterator[None]:
-    """Put a Ctrl-C off until the end of a short block that must not be left half done."""
-    if threading.current_thread() is not threading.main_thread():  # Ctrl-C never reaches those
-        yield
-        return
+    """Put Ctrl-C, SIGTERM and SIGHUP off until the end of a block that must not be left half done.
+
+    The block should be short.
+    """
     late: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: late.append(number))
+    with handling(ENDING_SIGNALS, lambda number, frame: late.append(number)):
+        yield
+    for number in late[:1]:
+        signal.raise_signal(number)
+
+
+@contextmanager
+def clear_up_when_terminated() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the process only after the block has cleared up.
+
+    Only where they would otherwise end it at once; a program's own handlers are kept.
+    """
+
+    def leave(number: int, frame: Any) -> None:
+        raise SystemExit(128 + number)
+
+    fatal = [one for one in ENDING_SIGNALS if signal.getsignal(one) is signal.SIG_DFL]
+    with handling(fatal, leave):
+        yield
+
+
+@contextmanager
+def handling(numbers: Iterable[int], handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Handle signals in a block of the main thread, but for those that are ignored."""
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():  # they never reach others
+        for number in numbers:
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                before[number] = signal.signal(number, handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-        if late:
-            signal.raise_signal(signal.SIGINT)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)

@@ -21,8 +21,8 @@ from rich.table import Table
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli._tables import Rows, options_text, two_columns
 from napari_shadowinv.cli._terminal import (
-    EXIT_CANCELLED,
     EXIT_NOT_CONVERGED,
+    cancelled_code,
     interrupted,
     plain,
     say,
@@ -111,7 +111,7 @@ def run_batch(
     except (KeyboardInterrupt, InversionCancelled):
         state = _counts_text(StackStore(out)) if out.exists() else "nothing written"
         say_on_stderr(f"Cancelled: {state}. Repeat the command with --resume to continue.")
-        raise typer.Exit(EXIT_CANCELLED) from None
+        raise typer.Exit(cancelled_code()) from None
     store = StackStore(out)
     if not quiet:
         say(_summary(store, ledger))

@@ -13,13 +13,14 @@ import threading
 import time
 import unicodedata
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
 
 import typer
 from pydantic import ValidationError
 
+from napari_shadowinv._system.machine import ENDING_SIGNALS, handling
 from napari_shadowinv.errors import InputError, InversionCancelled
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 
 EXIT_MISTAKE = 2
 EXIT_NOT_CONVERGED = 3
-EXIT_CANCELLED = 130
 
 # Controls, invisible marks of direction, halves of characters, and ends of lines.
 _UNSEEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -42,6 +42,7 @@ _ONE_WISH = 2.0  # seconds in which impatient fingers mean one and the same Ctrl
 P = ParamSpec("P")
 
 _ctrl_c = threading.Event()
+_ending_signal: int = signal.SIGINT
 
 
 def plain(text: object, style: str = "") -> Text:
@@ -143,12 +144,13 @@ def notify_errors(command: Callable[P, None]) -> Callable[P, None]:
                 # Some libraries make another error of Ctrl-C.
                 isinstance(error, Exception) and interrupted()
             ):
-                code, text = EXIT_CANCELLED, "Cancelled"
+                code, text = cancelled_code(), "Cancelled"
             elif isinstance(error, OSError | MemoryError | InputError | ValidationError):
                 code, text = EXIT_MISTAKE, str(error) or "There is not enough memory for this"
             else:
                 raise  # a mistake of ours deserves its traceback
-            say_on_stderr(text)
+            with suppress(OSError):  # a terminal that was closed
+                say_on_stderr(text)
             raise typer.Exit(code) from None
 
     return run
@@ -169,18 +171,27 @@ def interrupted() -> bool:
     return _ctrl_c.is_set()
 
 
+def cancelled_code() -> int:
+    """Return the exit code of a command that a signal has ended, as shells count."""
+    return 128 + _ending_signal
+
+
 @contextmanager
 def _noting_interrupts() -> Iterator[None]:
-    """Note Ctrl-C for `interrupted`, should compiled code swallow it, and raise it as usual."""
+    """Note Ctrl-C for `interrupted`, should compiled code swallow it, and raise it as usual.
+
+    SIGTERM and SIGHUP count as Ctrl-C, so that nothing half written is left behind.
+    """
     _ctrl_c.clear()
     pressed = float("-inf")
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    global _ending_signal
+    _ending_signal = signal.SIGINT
 
     def stop(number: int, frame: object) -> None:
+        global _ending_signal
         nonlocal pressed
         _ctrl_c.set()
+        _ending_signal = number
         if time.monotonic() < pressed + _ONE_WISH:
             return  # it would interrupt the clearing up after the first
         pressed = time.monotonic()
@@ -188,8 +199,5 @@ def _noting_interrupts() -> Iterator[None]:
         sys.unraisablehook = lambda _: None
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, stop)
-    try:
+    with handling(ENDING_SIGNALS, stop):
         yield
-    finally:
-        signal.signal(signal.SIGINT, before)

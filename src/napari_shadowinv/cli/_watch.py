@@ -13,7 +13,7 @@ import typer
 
 from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_good, names_of
 from napari_shadowinv.cli._terminal import (
-    EXIT_CANCELLED,
+    cancelled_code,
     interrupted,
     plain,
     say,
@@ -161,7 +161,7 @@ def _sum_up(now: WatchProgress | None, out: Path, quiet: bool) -> None:
         text = f"Ended: {done} done, {failed} failed{left}; repeat the command to go on with {out}."
     if stopped:
         say_on_stderr(text)
-        raise typer.Exit(EXIT_CANCELLED)
+        raise typer.Exit(cancelled_code())
     if not quiet:
         say(text)
     if done:

@@ -9,7 +9,7 @@ import numpy as np
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import FORMAT, is_fit, is_pack, update_labels
-from napari_shadowinv.io.hdf5 import check_arrays, hdf5_in_memory
+from napari_shadowinv.io.hdf5 import check_arrays, check_hdf5_seal, hdf5_in_memory
 
 if TYPE_CHECKING:
     import xarray
@@ -18,19 +18,27 @@ _SITE_COLUMNS = "y_px,x_px,weight_px2,mass,flux,displacement_y_px,displacement_x
 
 
 def write_result(path: Path, dataset: xarray.Dataset) -> None:
-    """Write a dataset as NetCDF4, moderately compressed."""
+    """Write a dataset as NetCDF4, moderately compressed and with checksums."""
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
     encoding: dict[str, dict[str, Any]] = {}
     for name, variable in dataset.variables.items():
         packed = {"zlib": True, "shuffle": True, "complevel": 4} if variable.size > 64 else {}
-        if variable.dtype.kind in "fiub":
-            encoding[str(name)] = {**packed, "_FillValue": None}
+        kind = variable.dtype.kind
+        if kind in "fiub":
+            # What the index loses is read as NaN, not as 0.
+            fill = {"_FillValue": np.nan if kind == "f" else None}
+            checked = {"fletcher32": True} if variable.ndim else {}
+            encoding[str(name)] = {**packed, **checked, **fill}
     # A field that was read from a file of another format still says so.
     says_so = is_fit(dataset.attrs) or is_pack(dataset.attrs)
     marked = dataset if says_so else dataset.assign_attrs(format=FORMAT)
-    with hdf5_in_memory(path) as content, h5netcdf.File(content, "w") as file:
+    # From this version of the format on, the file's own structures have checksums.
+    with (
+        hdf5_in_memory(path, seal=True) as content,
+        h5netcdf.File(content, "w", libver=("v110", "v110")) as file,
+    ):
         marked.dump_to_store(H5NetCDFStore(file), encoding=encoding)
 
 
@@ -38,6 +46,7 @@ def read_result(path: Path) -> xarray.Dataset:
     """Read a dataset that `write_result` wrote, all of it into memory."""
     import xarray as xr
 
+    check_hdf5_seal(path)
     check_arrays(path)
     # Nothing in it is a time, whatever its units look like.
     return update_labels(xr.load_dataset(path, engine="h5netcdf", decode_times=False))

@@ -12,12 +12,12 @@ import errno
 import hashlib
 import os
 import re
-import secrets
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from napari_shadowinv._system.machine import interrupts_put_off
+from napari_shadowinv._system.hidden_files import MAX_NAME_BYTES, hidden_name, sweep
+from napari_shadowinv._system.machine import clear_up_when_terminated, interrupts_put_off
 from napari_shadowinv._system.safety import check_regular
 from napari_shadowinv.errors import FileFormatError
 
@@ -89,6 +89,7 @@ def check_output(
             f"{path} cannot be written: its ending is {found}, expected one of "
             f"{', '.join(sorted(suffixes))}"
         )
+    check_folder_of(path)
     if path.is_dir():
         raise FileFormatError(f"{path} is a folder: give a file name")
     if path.exists() and not overwrite:
@@ -96,12 +97,17 @@ def check_output(
             f"{path} exists: choose another name or allow overwriting (overwrite=True, or "
             "--overwrite on the command line)"
         )
-    check_folder_of(path)
     return path
 
 
 def check_folder_of(path: Path) -> None:
     """Refuse a path that has no folder to lie in, or one that nothing can be written to."""
+    length = len(os.fsencode(path.name))
+    if length > MAX_NAME_BYTES:
+        raise FileFormatError(
+            f"{path} cannot be written: its name has {length} bytes, expected at most "
+            f"{MAX_NAME_BYTES}; shorten it"
+        )
     if not path.parent.is_dir():
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} does not exist; create it first"
@@ -137,7 +143,13 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     'done'
     """
     path = check_output(path, overwrite)
-    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
+    sweep(path.parent)
+    temporary = hidden_name(path, path.suffix)
+    with clear_up_when_terminated():
+        yield from _written(path, temporary, overwrite)
+
+
+def _written(path: Path, temporary: Path, overwrite: bool) -> Iterator[Path]:
     try:
         yield temporary
         # Someone else may have written the file during the work.

@@ -2,7 +2,7 @@
 
 - the array that the user names: `read_hdf5`, as an image `read_plane`; the choice: `held_arrays`
 - for those who know the layout: an item, `member`; its values, `load_dataset`; `check_arrays`
-- write one: `hdf5_in_memory`
+- write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
 
 An HDF5 file can point to others: by external links, external storage and virtual arrays. No
 reader follows them, because whatever lies there would pass for the file's own pixels.
@@ -10,7 +10,9 @@ reader follows them, because whatever lies there would pass for the file's own p
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -25,6 +27,8 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
 _MOST_LISTED = 30
+_SEAL = b"\nshadowinv sha256 "
+_BLOCK_BYTES = 1 << 20
 _MOST_LINKS = 16
 
 
@@ -118,11 +122,44 @@ def _all_datasets(path: Path, group: Any) -> Iterator[Any]:
 
 
 @contextmanager
-def hdf5_in_memory(path: Path) -> Iterator[BytesIO]:
-    """Make an HDF5 file in memory, and write it to the disk in one go when the block ends well."""
+def hdf5_in_memory(path: Path, *, seal: bool = False) -> Iterator[BytesIO]:
+    """Make an HDF5 file in memory, and write it to the disk in one go when the block ends well.
+
+    With `seal`, the checksum of all its bytes follows its end, where the HDF5 library never looks:
+    the checksums of the format leave out texts of variable length, such as attributes.
+    """
     content = BytesIO()  # on a full disk, the HDF5 library would end the process
     yield content
+    if seal:
+        checksum = hashlib.sha256(content.getbuffer()).hexdigest()
+        content.seek(0, os.SEEK_END)
+        content.write(_SEAL + checksum.encode())
     path.write_bytes(content.getbuffer())
+
+
+def check_hdf5_seal(path: Path) -> None:
+    """Refuse a file that has changed since `hdf5_in_memory` sealed it; others pass.
+
+    A program that changes the file by the HDF5 library removes the seal.
+    """
+    length = len(_SEAL) + 2 * hashlib.sha256().digest_size
+    remaining = path.stat().st_size - length
+    if remaining <= 0:
+        return
+    with path.open("rb") as file:
+        file.seek(remaining)
+        end = file.read(length)
+        if not end.startswith(_SEAL):
+            return
+        file.seek(0)
+        checksum = hashlib.sha256()
+        while remaining > 0 and (block := file.read(min(_BLOCK_BYTES, remaining))):
+            checksum.update(block)
+            remaining -= len(block)
+    if checksum.hexdigest().encode() != end.removeprefix(_SEAL):
+        raise FileFormatError(
+            f"{path} is damaged: its content does not match its checksum; copy it again"
+        )
 
 
 @refusing_damage

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from napari_shadowinv._system.hidden_files import hidden_name, sweep
 from napari_shadowinv._system.machine import interrupts_put_off
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
@@ -66,13 +67,14 @@ def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> 
     """Make a store, all its shots pending; it appears whole or not at all."""
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
-    new = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+    sweep(path.parent)
+    new = hidden_name(path)
     try:
         # Zarr writes in a thread of its own, which would go on behind our back.
         with interrupts_put_off():
             _write_template(new, contents)
         if path.exists():
-            old = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+            old = hidden_name(path)
             os.replace(path, old)
             os.replace(new, path)
             shutil.rmtree(old, ignore_errors=True)
@@ -83,6 +85,18 @@ def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> 
     finally:
         shutil.rmtree(new, ignore_errors=True)
     return StackStore(path)
+
+
+def remove_unfinished(path: Path) -> None:
+    """Remove the halves of chunks that killed processes left in a store.
+
+    The run must hold the store's lock. A worker of an earlier run that still writes loses its
+    chunk, and its shot stays pending.
+    """
+    for folder, _, names in os.walk(path):
+        for name in names:
+            if name.endswith(".partial"):
+                Path(folder, name).unlink(missing_ok=True)
 
 
 def grow_store(

@@ -14,9 +14,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from multiprocessing import resource_tracker
-from tempfile import TemporaryDirectory
 from typing import Any
 
+from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv._system.machine import interrupts_put_off
 
 _ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
@@ -33,7 +33,7 @@ def local_client(count: int) -> Iterator[Any]:
         opened.enter_context(dask.config.set(_settings(environment)))
         opened.enter_context(_forgotten(_TRIMMING, environment.get(_TRIMMING)))
         # Data spilled to disk when memory is short could be exchanged for code.
-        own = opened.enter_context(TemporaryDirectory(prefix="shadowinv-"))
+        own = str(opened.enter_context(temporary_folder("shadowinv")))
         # A cluster that is half made cannot be closed.
         with interrupts_put_off(), _hidden_from_workers():
             cluster = distributed.LocalCluster(

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.locking import locked
+from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
-from napari_shadowinv.io.store_layout import create_store
+from napari_shadowinv.io.store_layout import create_store, remove_unfinished
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._choosing import choose_sites
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
@@ -160,7 +161,8 @@ def run_stack(
     if is_here(scheduler):
         # Once for all workers, which would each be at it during their first shot.
         ensure_compiled(lambda news: prepare(f"compiling, {news.message}"), should_stop)
-    with locked(path):
+    with clear_up_when_terminated(), locked(path):
+        remove_unfinished(path)
         store = StackStore(path) if path.exists() and not overwrite else None
         arrived = False
         if store is not None:

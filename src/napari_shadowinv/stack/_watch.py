@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.locking import locked
+from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.formats import NEW_SHOTS
 from napari_shadowinv.io.store import check_store_path
+from napari_shadowinv.io.store_layout import remove_unfinished
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._arrivals import Arrivals, checked_folder, observing
 from napari_shadowinv.stack._references import Reader, read_shot
@@ -136,7 +138,8 @@ def watch_stack(
         ensure_compiled(lambda news: books.prepare(f"compiling, {news.message}"), should_stop)
     except InversionCancelled:
         return None
-    with locked(path):
+    with clear_up_when_terminated(), locked(path):
+        remove_unfinished(path)
         stacks = StackMaker(describe, place, reader, chained=warm_start)
         watch = Watch(path, kept, stacks, arrivals, books, should_stop)
         watch.open(overwrite=overwrite, redo_failed=redo_failed)

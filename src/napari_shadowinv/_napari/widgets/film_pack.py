@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
+from contextlib import ExitStack
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -31,6 +31,7 @@ from napari_shadowinv._napari.widgets._pack_work import PackAnswer, PackJob, edi
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._plots import COLOURS, Plot
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
+from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import RESULT
@@ -87,8 +88,9 @@ class FilmPack(ToolPanel):
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         tip = "Compute dose and fluence of each film of the pack."
         super().__init__(viewer, "film-pack", RunPanel("Film pack", "Run", tip))
-        self._scratch = tempfile.TemporaryDirectory(prefix="film-pack-")
-        qt.when_destroyed(self, self._scratch.cleanup)
+        opened = ExitStack()
+        self._scratch = opened.enter_context(temporary_folder("film-pack"))
+        qt.when_destroyed(self, opened.close)
         self._folders = count(1)
         self._last = LastResults(viewer, self)
         self.results = ResultLayers(viewer, self)
@@ -337,7 +339,7 @@ class FilmPack(ToolPanel):
             return
         is_named = name.lower().endswith(RESULT.suffix)
         path = Path(name if is_named else name + RESULT.suffix)
-        scratch = Path(self._scratch.name)
+        scratch = self._scratch
         result = result_of(layer)
         assert result is not None
         kept = Result(
@@ -349,7 +351,7 @@ class FilmPack(ToolPanel):
         show_info(f"Wrote {write(path, dataset_of_layers(own, kept), overwrite=is_named)}")
 
     def _new_folder(self) -> Path:
-        return Path(self._scratch.name) / str(next(self._folders))
+        return self._scratch / str(next(self._folders))
 
 
 def _rows(dataset: xarray.Dataset) -> list[tuple[str, str]]:
