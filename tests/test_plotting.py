@@ -117,7 +117,7 @@ def test_image_and_reprojection_share_a_scale(inversion: Inversion) -> None:
     assert image.images[0].get_clim() == reprojection.images[0].get_clim()
 
 
-def test_footer_tells_sites_warnings_and_failure(make_inversion: Make) -> None:
+def test_figure_shows_sites_warnings_and_failure(make_inversion: Make) -> None:
     good = report_figure(make_inversion((30, 30)))
     bad = report_figure(make_inversion((30, 30), converged=False, warnings=()))
     text = " ".join(item.get_text() for item in good.texts)

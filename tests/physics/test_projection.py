@@ -24,6 +24,7 @@ GREEN = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=12
 RED = GREEN.model_copy(update={"wavelength": 633e-9})
 # Rest energies in MeV (CODATA), independent of the package's constants.
 REST = {"proton": 938.27208816, "deuteron": 1875.61294257, "alpha": 3727.3794066}
+REST["electron"] = 0.51099895
 
 
 def momentum(kinetic: float, rest: float) -> float:
@@ -68,6 +69,16 @@ def test_other_particles_have_other_momentum_and_charge(field: np.ndarray) -> No
     alpha = FAST.model_copy(update={"energy": 3.5, "species": "alpha"})
     ratio = 2 * momentum(14.7, REST["proton"]) / momentum(3.5, REST["alpha"])
     np.testing.assert_allclose(transferred_displacement(field, FAST, alpha), ratio * field, 1e-8)
+
+
+@pytest.mark.parametrize("deflector", ["magnetic field", "electric field"])
+def test_electrons_are_deflected_against_protons(field: np.ndarray, deflector: str) -> None:
+    electrons = FAST.model_copy(update={"energy": 150.0, "species": "electron"})
+    moved = transferred_displacement(field, FAST, electrons, deflector=deflector)
+    ratio = momentum(14.7, REST["proton"]) / momentum(150.0, REST["electron"])
+    if deflector == "electric field":
+        ratio *= velocity(14.7, REST["proton"]) / velocity(150.0, REST["electron"])
+    np.testing.assert_allclose(moved, -ratio * field, rtol=1e-7)
 
 
 @pytest.mark.parametrize("deflector", ["magnetic field", "electric field"])

@@ -275,7 +275,7 @@ def invert(
         coarse = len(answer.weights)
     with _timed("errors", seconds):
         errors = budget.errors(solutions, fields.displacement) if answer.converged else None
-    told = _report(prepared.in_units(), noise, solutions, fields, seconds, options)
+    told = _report(prepared.in_units(), noise, solutions, fields, seconds, budget)
     finest = adaptive and len(answer.weights) == levels.counts[-1]
     if finest and errors is not None and told.warnings == prepared.warnings:
         missed = errors.missed(options.accuracy, "with the most sites placed unless more are given")
@@ -437,9 +437,9 @@ def _report(
     solutions: list[LevelSolution],
     fields: _Fields,
     seconds: dict[str, float],
-    options: InversionOptions,
+    budget: Budget,
 ) -> Report:
-    finest = solutions[-1]
+    finest, options = solutions[-1], budget.options
     found: tuple[str, ...] = (
         f"not converged: flux residual {finest.residual:.2g} per cell, tolerance "
         f"{options.tolerance:.2g}; {finest.reason}",
@@ -447,7 +447,14 @@ def _report(
     if finest.converged:
         moves, n_sites = fields.displacement, len(finest.weights)
         found = doubts(
-            prepared, noise, moves, fields.reprojection, fields.jacobian, n_sites, options
+            prepared,
+            noise,
+            moves,
+            fields.reprojection,
+            fields.jacobian,
+            n_sites,
+            options,
+            is_beam_different=budget.beam_difference > 0,
         )
     return Report(
         converged=finest.converged,

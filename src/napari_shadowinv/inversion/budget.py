@@ -219,7 +219,7 @@ class Budget:
         options: InversionOptions,
     ) -> None:
         self._plan, self._prepared = plan, prepared
-        self._noise, self._options = noise, options
+        self._noise, self.options = noise, options
         self._places = _places(prepared)
         self._moves: dict[LevelSolution, FloatArray] = {}
         self._responses: dict[LevelSolution, LinearResponse] = {}
@@ -228,7 +228,7 @@ class Budget:
 
     @cached_property
     def _target(self) -> Target:
-        return Target.of(self._prepared.floored_image, self._plan.margin, self._options)
+        return Target.of(self._prepared.floored_image, self._plan.margin, self.options)
 
     def needed(self, solutions: Sequence[LevelSolution]) -> float:
         """Return how many times as many sites are needed.
@@ -242,9 +242,9 @@ class Budget:
         squares, power = self._change(solved)
         error = float(np.sqrt(squares.mean()))
         told = f"their discretisation error is about {_percent(error, rms)} of the displacement"
-        allowed = self._options.accuracy * rms
+        allowed = self.options.accuracy * rms
         if error <= allowed:
-            self.reason = f"{told}, below the accuracy of {100 * self._options.accuracy:.2g} %"
+            self.reason = f"{told}, below the accuracy of {100 * self.options.accuracy:.2g} %"
             return 0.0
         # About, in a uniform beam; where that is small enough, it need not be known better.
         noise, _ = self._noise.displacements(self._noise.typical)
@@ -299,11 +299,16 @@ class Budget:
         )
 
     @cached_property
+    def beam_difference(self) -> float:
+        """Relative r.m.s. difference of image and source outside the object."""
+        return beam_difference(self._prepared.in_units(), self._noise)
+
+    @cached_property
     def _beam_variation(self) -> tuple[float, str]:
         """Relative difference of beam and source, and where it is from."""
-        stated = self._options.beam_variation
+        stated = self.options.beam_variation
         expected = 0.0 if self._plan.measured else _ASSUMED_VARIATION
-        seen = beam_difference(self._prepared.in_units(), self._noise)
+        seen = self.beam_difference
         if seen > (expected if stated is None else stated):
             return seen, "seen"
         return (expected, "assumed") if stated is None else (stated, "stated")
@@ -357,7 +362,7 @@ class Budget:
     ) -> tuple[FloatArray, FloatArray]:
         """Displacements by noise, and the mean square of what only sites so close feel."""
         if response not in self._by_noise:
-            rng = np.random.default_rng(self._options.seed)
+            rng = np.random.default_rng(self.options.seed)
             mean = self._prepared.source[self._prepared.mask].mean() / self._prepared.unit
             brightness = response.flux / (response.area * mean)
             variance = self._noise.variance(brightness) * mean**2 * response.area
@@ -369,9 +374,9 @@ class Budget:
 
     def _beams(self, response: LinearResponse) -> FloatArray:
         """Flux that cells gain from beams that differ from the source by 1 (r.m.s.)."""
-        rng = np.random.default_rng(self._options.seed)
+        rng = np.random.default_rng(self.options.seed)
         mass, sites = response.level.mass, response.level.sites
-        length = self._options.beam_scale * min(self._prepared.mask.shape)
+        length = self.options.beam_scale * min(self._prepared.mask.shape)
         drawn = np.empty((_BEAM_SAMPLES, len(mass)))
         for sample in drawn:
             waves = rng.normal(size=(2, _WAVES)) / length
@@ -438,4 +443,7 @@ def _roots(square: float, square_at_peak: float) -> ErrorEstimate:
 
 
 def _percent(error: float, whole: float) -> str:
-    return f"{100 * error / whole:.2g} %" if whole > 0 else "0 %"
+    if not whole > 0:
+        return "0 %"
+    percent = 100 * error / whole
+    return f"{percent:.0f} %" if percent >= 100 else f"{percent:.2g} %"

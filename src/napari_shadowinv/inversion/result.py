@@ -220,10 +220,13 @@ class Inversion:
         """
         error = None if self.errors is None else self.errors.of_peak
         (field,) = shown_fields([self.displacement], setup, mask=self.mask)
-        level = Level.DOUBTFUL if self.report.warnings else Level.SOUND
+        warnings = list(self.report.warnings)
+        level = Level.DOUBTFUL if warnings else Level.SOUND
         if not self.report.converged:
             level = Level.FAILED
-        return Headline(level, "; ".join([*self.report.warnings, field.peak_text(error)]))
+            if not any("not converged" in text for text in warnings):
+                warnings.insert(0, "not converged: do not trust the field")
+        return Headline(level, "; ".join([*warnings, field.peak_text(error)]))
 
     def with_warnings(self, texts: Iterable[str]) -> Inversion:
         """Return the same inversion with more warnings in its report.
