@@ -29,6 +29,7 @@ from napari_shadowinv.inversion.trust import doubts, image_residual, is_coarse, 
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.preprocessing.image_checks import image_warnings
 from napari_shadowinv.transport.margin import Margin, edge_flux
 from napari_shadowinv.transport.sites import Levels, SitePlan, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fitted_flux, solve
@@ -282,6 +283,10 @@ def invert(
         told = replace(told, warnings=(*told.warnings, *filter(None, [missed])))
     if errors is not None:
         told = replace(told, warnings=(*filter(None, [errors.beam_warning()]), *told.warnings))
+    with _timed("prepare", seconds):
+        beam = prepared.source if plan.measured else None
+        signs = image_warnings(prepared.image, beam, prepared.mask)
+        told = replace(told, warnings=(*told.warnings, *signs))
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,

@@ -169,7 +169,9 @@ def _warnings(
     size = int(usable.sum())
     if abs(ratio - 1) > _NOTABLE_FLUX_CHANGE:
         warnings.append(
-            f"the image's flux is {ratio:.3g} times the source's; it was scaled to match"
+            f"the image's flux is {ratio:.3g} times the source's; it was scaled to match, which is "
+            "right after another exposure, and wrong if a dark level was left in one of them "
+            "(--dark), if one is a negative, or if light was lost in the object or past the edge"
         )
     if clipped:
         warnings.append(f"negative pixels set to zero: {clipped} ({clipped / size:.2%})")

@@ -38,6 +38,7 @@ from napari_shadowinv.preprocessing import (
     estimated_source,
 )
 from napari_shadowinv.preprocessing.fit_provenance import short_fiducials, short_masks
+from napari_shadowinv.preprocessing.image_checks import image_warnings
 
 __all__ = [
     "COMPARED",
@@ -376,8 +377,10 @@ def _prepared(inputs: Inputs, name: str, should_stop: ShouldStop | None) -> Radi
     """An image after the steps, with its source if that is estimated."""
     try:
         shot = inputs.prepared(should_stop)
+        doubts = image_warnings(shot.image, shot.source, shot.mask)
         if shot.setup is not None:
-            shot = shot.noted(*setup_warnings(shot.setup, shot.shape))
+            doubts += setup_warnings(shot.setup, shot.shape)
+        shot = replace(shot, warnings=(*shot.warnings, *doubts))
         estimate = inputs.recipe.estimate
         if estimate is None or isinstance(estimate, UniformEstimate):
             return shot

@@ -1,0 +1,442 @@
+"""Signs in an image and its reference that they are not what an inversion takes them for.
+
+- all of them, in sentences: `image_warnings`
+- of one image: `dark_level`, `saturated_share`, `stray_pixels`
+- of an image and its reference: `ReferencePair`
+
+An image shall be linear in the fluence, without offset, and on the same pixels as its reference.
+Nothing here changes an image: each sentence says what was seen, what it does to the field, and
+which step helps. What images cannot show is listed in docs/trust.md: the offset of an image
+without deep shadows, the gamma of a detector.
+
+The limits were chosen with `benchmarks/wrong_inputs.py`, which counts how many wrong inputs are
+noticed, and how often right ones cause an alarm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import fft, ndimage
+from scipy.optimize import nnls
+
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+
+__all__ = [
+    "ReferencePair",
+    "dark_level",
+    "image_warnings",
+    "saturated_share",
+    "stray_pixels",
+]
+
+_NORMAL_MAD = 1.4826
+
+# Dark level
+_DARK_SAMPLES = 120_000
+_DARK_BINS = 20
+_BRIGHTEST_LEFT_OUT = 0.05  # share of the pixels: bright lines are not smooth
+_CLIPPED_AT, _CLIPPED_VARIANCE = 3.0, 0.9733  # standard deviations; variance of a clipped normal
+_MIN_DARK_PIXELS = 4000
+_WIDE_RANGE, _MIN_RANGE = 2.0, 1.3  # brightest over dimmest bin
+_MIN_DARK = 0.05  # of the mean
+_MIN_DARK_GAIN, _MIN_DARK_GAIN_NARROW = 8.0, 40.0  # in χ², over χ² per degree of freedom
+_MAX_DARK_CHI2 = 3.0  # per degree of freedom
+
+# Saturation
+_MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE = 10, 5e-4
+_PLATEAU_RISE = 1.15  # of the maximum over the median
+_BELOW_PLATEAU = 0.02  # of the range from median to maximum
+_PLATEAU_EXCESS = 4.0  # pixels at the maximum over those just below
+
+# Hot and dead pixels
+_STRAY_RATIO, _STRAY_DEVIATIONS = 1.5, 10.0
+_ALONE = 0.3  # of the surroundings' brightness, by which a neighbour may differ
+_STRAY_STEP = 0.05  # of the mean, from the pixel on the left
+_NOISE_SAMPLES = 100_000
+
+# Reference
+_COARSE_SIDE_PX = 128
+_MIN_BLOCKS = 16
+_USABLE = 0.999  # share of a block's pixels
+_RING = 0.2  # of the side: there is rarely an object
+_MAX_SHIFT = 0.2  # of the side
+_MIN_SHIFT = 0.6  # coarse pixels
+_MATCH = 0.5  # of the mismatch that may be left after a shift
+_MIN_OVERLAP = 0.4  # of the ring
+_MIN_CONTRAST = 0.01  # of the mean
+_NEGATIVE_CORRELATION = -0.4
+_DETAIL = 9  # coarse pixels
+_SWAPPED = 0.75  # see `is_swapped`
+
+
+def image_warnings(
+    image: FloatArray, source: FloatArray | None = None, mask: BoolArray | None = None
+) -> tuple[str, ...]:
+    """Return a sentence for everything in an image and its reference that looks wrong.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W)
+        The shot, in any unit.
+    source : ndarray, shape (H, W), optional
+        The beam, if it was measured; an estimate says nothing about the detector.
+    mask : ndarray of bool, shape (H, W), optional
+        True at usable pixels.
+
+    Returns
+    -------
+    tuple of str
+        Empty if nothing looks wrong.
+    """
+    usable = np.ones(image.shape, bool) if mask is None else mask
+    if not usable.all():
+        image = np.where(usable, image, 0.0)
+        source = None if source is None else np.where(usable, source, 0.0)
+    if source is not None and not np.ptp(source[usable]) > 0:
+        source = None  # a uniform beam was assumed
+    return tuple(_warnings(image, source, usable))
+
+
+def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -> Iterator[str]:
+    if dark := max(dark_level(image, usable), 0 if source is None else dark_level(source, usable)):
+        yield (
+            f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
+            "zero, so the detector's dark level seems to be left in it: the field comes out too "
+            "weak, by about the same share; subtract it from image and source (step 'dark', "
+            "--dark)"
+        )
+    strays = np.zeros(image.shape, bool)
+    for name, plane in (("image", image), ("source", source)):
+        if plane is None:
+            continue
+        stray = stray_pixels(plane, usable)
+        strays |= stray
+        if (share := saturated_share(plane, usable & ~stray)) > 0:
+            yield (
+                f"saturation: {share:.2%} of the {name}'s pixels are at its maximum: bright lines "
+                "are cut off there, and the field around them is too weak; mask these pixels, or "
+                "record with less exposure"
+            )
+        if count := int(stray.sum()):
+            yield (
+                f"hot pixels: {count} pixel{'s' * (count > 1)} of the {name} differ"
+                f"{'s' * (count == 1)} from all neighbours by far more than the noise, and each "
+                "bends the field around it; replace them (step 'hot-pixels', --hot-pixels)"
+            )
+    if source is None:
+        return
+    pair = ReferencePair(image, source, usable & ~strays)
+    if pair.is_negative:
+        yield (
+            "negative: the image is dark where it should be bright, as in a negative or a scan of "
+            "film: the field would have the wrong sign and size; invert its brightness, or "
+            "convert the film to dose"
+        )
+    elif pair.is_swapped:
+        yield (
+            "swapped: the source has far more structure than the image, so the two seem to be "
+            "swapped: the field would have the wrong sign; swap the files"
+        )
+    elif pair.shift is not None:
+        down, right = pair.shift
+        yield (
+            "register: at its borders the image fits the source best after a shift by "
+            f"{down:+.0f} px in y and {right:+.0f} px in x: the shift would be taken for a field; "
+            "align source and image, or cut both to the same part of the beam (step 'crop')"
+        )
+
+
+def dark_level(image: FloatArray, mask: BoolArray | None = None) -> float:
+    """Estimate an offset that was left in an image, as a share of its mean, from its noise.
+
+    The variance of counts is proportional to the signal, so it vanishes where the signal does
+    (photon transfer). Noise of reading moves that point below the offset, never above.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W)
+    mask : ndarray of bool, shape (H, W), optional
+        True at usable pixels.
+
+    Returns
+    -------
+    float
+        0 unless the noise cannot be explained without an offset, by any sum of a constant
+        variance, one in proportion to the signal, and one to its square. That takes deep
+        shadows and noise of counting.
+    """
+    brightness, deviation = _local_noise(image, mask)
+    if brightness.size < _MIN_DARK_PIXELS:
+        return 0.0
+    mean = brightness.mean()
+    if not mean > 0:
+        return 0.0
+    order = np.argsort(brightness, kind="stable")
+    order = order[: int((1 - _BRIGHTEST_LEFT_OUT) * order.size)]
+    bins = np.array_split(order, _DARK_BINS)
+    levels = np.array([brightness[part].mean() for part in bins]) / mean
+    if not levels[0] > _MIN_DARK or levels[-1] < _MIN_RANGE * levels[0]:
+        return 0.0
+    variances = np.array([_clipped_variance(deviation[part]) for part in bins]) / mean**2
+    if not (variances > 0).all():
+        return 0.0
+    # Neighbouring differences share pixels: a third fewer count.
+    weights = np.sqrt(np.array([len(part) for part in bins]) / 3) / variances
+    powers = np.stack([np.ones_like(levels), levels, levels**2], axis=1)
+    without = nnls(powers * weights[:, None], variances * weights)[1] ** 2
+    # Weighted least squares of v = g (m - D).
+    line = np.stack([levels, -np.ones_like(levels)], axis=1) * weights[:, None]
+    (gain, offset), *_ = np.linalg.lstsq(line, variances * weights, rcond=None)
+    with_offset = float((((gain * levels - offset) - variances) ** 2 * weights**2).sum())
+    if not gain > 0:
+        return 0.0
+    dark = float(offset / gain)
+    chi2 = max(1.0, with_offset / (_DARK_BINS - 2))
+    is_wide = levels[-1] > _WIDE_RANGE * levels[0]
+    least = (_MIN_DARK_GAIN if is_wide else _MIN_DARK_GAIN_NARROW) * chi2
+    explained = chi2 < _MAX_DARK_CHI2 and without - with_offset > least
+    return dark if explained and dark > _MIN_DARK else 0.0
+
+
+def _local_noise(image: FloatArray, mask: BoolArray | None) -> tuple[FloatArray, FloatArray]:
+    """Mean of 3 × 3 pixels, and a deviation in which all but noise cancels, where usable."""
+    rows = max(1, image.size // _DARK_SAMPLES)  # of long images, lines far apart
+    starts = np.arange(0, image.shape[0] - 2, rows)
+    above, here, below = (image[starts + shift] for shift in range(3))
+    column_sums, bends = above + here + below, above - 2 * here + below
+    means = (column_sums[:, 2:] + column_sums[:, 1:-1] + column_sums[:, :-2]) / 9
+    deviations = np.abs(bends[:, 2:] - 2 * bends[:, 1:-1] + bends[:, :-2]) / 6
+    if mask is None or mask.all():
+        return means.ravel(), deviations.ravel()
+    inside = np.asarray(sliding_window_view(mask, (3, 3)).all(axis=(2, 3)))[starts]
+    return means[inside], deviations[inside]
+
+
+def _clipped_variance(deviations: FloatArray) -> float:
+    limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(deviations))
+    usual = deviations[deviations <= limit]
+    return float((usual**2).mean()) / _CLIPPED_VARIANCE
+
+
+def saturated_share(image: FloatArray, mask: BoolArray | None = None) -> float:
+    """Return the share of pixels on a plateau at the maximum; 0 if there is none.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W)
+    mask : ndarray of bool, shape (H, W), optional
+        True at usable pixels.
+    """
+    values = image.ravel() if mask is None or mask.all() else image[mask]
+    top = float(values.max())
+    at_top = int((values == top).sum())
+    if at_top < max(_MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE * values.size):
+        return 0.0
+    median = float(np.median(values))
+    if not top > _PLATEAU_RISE * median:
+        return 0.0
+    just_below = int((values > top - _BELOW_PLATEAU * (top - median)).sum()) - at_top
+    return at_top / values.size if at_top > _PLATEAU_EXCESS * just_below else 0.0
+
+
+def stray_pixels(image: FloatArray, mask: BoolArray | None = None) -> BoolArray:
+    """Return the pixels that are far brighter, or darker, than each of their neighbours.
+
+    A quick look for broken pixels; `remove_hot_pixels` searches more thoroughly.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W)
+    mask : ndarray of bool, shape (H, W), optional
+        True at usable pixels; pixels with a neighbour that is not are left out.
+    """
+    stray = np.zeros(image.shape, bool)
+    part = image[:: max(1, image.size // _NOISE_SAMPLES)]
+    mean = float(part.mean() if mask is None else image[mask].mean())
+    if not mean > 0:
+        return stray
+    bends = part[:, 3:] - 3 * part[:, 2:-1] + 3 * part[:, 1:-2] - part[:, :-3]
+    noise = _NORMAL_MAD * float(np.median(np.abs(bends))) / math.sqrt(20)
+    step = np.abs(image[1:-1, 1:-1] - image[1:-1, :-2])
+    # Few pixels differ enough from the one on their left to be compared with all.
+    rows, columns = np.nonzero(step > max(_STRAY_DEVIATIONS * noise, _STRAY_STEP * mean))
+    if not rows.size:
+        return stray
+    rows, columns = rows + 1, columns + 1
+    next_to = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x]
+    neighbours = np.stack([image[rows + y, columns + x] for y, x in next_to])
+    centre, highest, lowest = image[rows, columns], neighbours.max(axis=0), neighbours.min(axis=0)
+    # Noise of counting grows with the brightness.
+    limit = _STRAY_DEVIATIONS * noise * np.sqrt(np.maximum(highest / mean, 1.0))
+    is_hot = centre - highest > np.maximum(limit, (_STRAY_RATIO - 1) * highest)
+    is_dead = (lowest - centre > limit) & (lowest > _STRAY_RATIO * centre)
+    # A focus lifts its neighbours, too; a broken pixel is alone.
+    height, width = image.shape
+    ring = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if max(abs(y), abs(x)) == 2]
+    inside = [
+        (np.clip(rows + y, 0, height - 1), np.clip(columns + x, 0, width - 1)) for y, x in ring
+    ]
+    level = np.median([image[place] for place in inside], axis=0)
+    alone = np.abs(neighbours - level).max(axis=0) < limit / 3 + _ALONE * np.abs(level)
+    stray[rows, columns] = (is_hot | is_dead) & alone
+    if mask is not None and not mask.all():
+        stray &= ndimage.binary_erosion(mask, np.ones((3, 3)))
+    return stray
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePair:
+    """An image and its reference, compared in blocks of pixels.
+
+    Attributes
+    ----------
+    image, source : ndarray, shape (H, W)
+        In any units.
+    mask : ndarray of bool, shape (H, W)
+        True at usable pixels.
+    """
+
+    image: FloatArray
+    source: FloatArray
+    mask: BoolArray
+
+    @cached_property
+    def is_negative(self) -> bool:
+        """Whether the image is dark at its borders where its beam is bright."""
+        shot, beam, _ = self._blocks
+        if not self._has_border:
+            return False
+        return _correlation(shot[self._ring], beam[self._ring]) < _NEGATIVE_CORRELATION
+
+    @cached_property
+    def is_swapped(self) -> bool:
+        """Whether the source contains the structure that the image lacks.
+
+        An object adds to a beam a difference that is not in the beam. That difference is
+        correlated with the image (by its variance) and not with the source. For a mere shift of a
+        beam it is half and half; where the two are swapped, the source has it all.
+        """
+        shot, beam, usable = self._blocks
+        if usable.sum() < _MIN_BLOCKS:
+            return False
+        difference = _details(np.where(usable, shot - beam, 0.0))
+        beam = _details(np.where(usable, beam - 1, 0.0))
+        size = _neighbour_covariance(difference, difference, usable)
+        if size < _MIN_CONTRAST**2:
+            return False
+        return -_neighbour_covariance(difference, beam, usable) > _SWAPPED * size
+
+    @cached_property
+    def shift(self) -> tuple[float, float] | None:
+        """How far (y, x), in px, the image lies from the source; None if nothing says so.
+
+        The borders of both are compared, where an object displaces least.
+        """
+        if not self._has_border:
+            return None
+        shot, beam, _ = self._blocks
+        ring, step = self._ring, _coarse_step(self.image.shape)
+        mismatch = _mismatch(shot, beam, ring)
+        reach = [max(2, round(_MAX_SHIFT * side)) for side in shot.shape]
+        near = mismatch[np.ix_(*(np.arange(-side, side + 1) for side in reach))]
+        best = np.unravel_index(int(near.argmin()), near.shape)
+        shift = np.array([int(place) - side for place, side in zip(best, reach, strict=True)])
+        if (np.abs(shift) == reach).any():
+            return None
+        unmoved, remaining = float(near[reach[0], reach[1]]), float(near[best])
+        if not shift.any():
+            # Below a block: the differences lie along the gradient of the beam.
+            slopes = np.stack([np.gradient(beam, axis=axis)[ring] for axis in (0, 1)], axis=1)
+            difference = (shot - beam)[ring]
+            fraction, *_ = np.linalg.lstsq(slopes, -difference, rcond=None)
+            remaining = float(((difference + (slopes * fraction).sum(axis=1)) ** 2).mean())
+            shift = shift + fraction
+        if np.hypot(*shift) < _MIN_SHIFT or remaining > _MATCH * unmoved:
+            return None
+        return float(shift[0] * step), float(shift[1] * step)
+
+    @cached_property
+    def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Image and source in blocks of pixels, of mean 1, and the blocks that are usable."""
+        step = _coarse_step(self.image.shape)
+        usable = _block_mean(self.mask, step) > _USABLE
+        planes = []
+        for plane in (self.image, self.source):
+            blocks = _block_mean(plane, step)
+            planes.append(blocks / max(float(blocks[usable].mean()), 1e-300))
+        return planes[0], planes[1], usable
+
+    @cached_property
+    def _ring(self) -> BoolArray:
+        """Usable blocks near the border, where there is rarely an object."""
+        usable = self._blocks[2]
+        depth = [max(2, round(_RING * side)) for side in usable.shape]
+        ring = usable.copy()
+        ring[depth[0] : -depth[0], depth[1] : -depth[1]] = False
+        return ring
+
+    @cached_property
+    def _has_border(self) -> bool:
+        """Whether the source has structure at its borders by which to compare the image."""
+        if self._ring.sum() < _MIN_BLOCKS:
+            return False
+        return _contrast(self._blocks[1], self._ring) >= _MIN_CONTRAST
+
+
+def _coarse_step(shape: tuple[int, ...]) -> int:
+    return max(1, -(-max(shape) // _COARSE_SIDE_PX))
+
+
+def _block_mean(values: AnyArray, step: int) -> FloatArray:
+    rows, columns = (side // step for side in values.shape)
+    cut = values[: rows * step, : columns * step]
+    return np.asarray(cut.reshape(rows, step, columns, step).mean(axis=(1, 3)))
+
+
+def _contrast(values: FloatArray, usable: BoolArray) -> float:
+    """R.m.s. of what neighbouring blocks have in common, which noise is not."""
+    return float(np.sqrt(max(_neighbour_covariance(values, values, usable), 0.0)))
+
+
+def _neighbour_covariance(first: FloatArray, second: FloatArray, usable: BoolArray) -> float:
+    pair = usable[:, 1:] & usable[:, :-1]
+    if pair.sum() < 2:
+        return 0.0
+    forth = first[:, 1:][pair], second[:, :-1][pair]
+    back = first[:, :-1][pair], second[:, 1:][pair]
+    return float(
+        np.mean([((one - one.mean()) * (two - two.mean())).mean() for one, two in (forth, back)])
+    )
+
+
+def _details(values: FloatArray) -> FloatArray:
+    return np.asarray(values - ndimage.uniform_filter(values, _DETAIL))
+
+
+def _correlation(first: FloatArray, second: FloatArray) -> float:
+    first, second = first - first.mean(), second - second.mean()
+    # Not by BLAS, whose threads would wait in circles.
+    product = float((first * second).sum())
+    return product / max(float(np.sqrt((first**2).sum() * (second**2).sum())), 1e-300)
+
+
+def _mismatch(image: FloatArray, source: FloatArray, ring: BoolArray) -> FloatArray:
+    """Mean square difference at every shift of the image against the source, both in a ring."""
+    shape = [fft.next_fast_len(2 * side, real=True) for side in image.shape]
+    weights = ring.astype(float)
+    # About 1, where both are, so that rounding stays small.
+    shot, beam = (np.where(ring, plane - 1, 0.0) for plane in (image, source))
+    ring_, shot_, beam_, shot2_, beam2_ = (
+        fft.rfft2(values, shape) for values in (weights, shot, beam, shot**2, beam**2)
+    )
+    squares = shot2_ * np.conj(ring_) + ring_ * np.conj(beam2_) - 2 * shot_ * np.conj(beam_)
+    count = fft.irfft2(ring_ * np.conj(ring_), shape)
+    total = fft.irfft2(squares, shape)
+    overlaps = count > _MIN_OVERLAP * weights.sum()
+    return np.asarray(np.where(overlaps, total / np.where(overlaps, count, 1.0), np.inf))
