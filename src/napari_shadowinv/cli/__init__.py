@@ -6,6 +6,7 @@ mistake answer at once.
 
 from __future__ import annotations
 
+import os
 import sys
 from io import TextIOWrapper
 from typing import Annotated
@@ -21,6 +22,8 @@ from napari_shadowinv.cli import (
     _watch_command,
 )
 from napari_shadowinv.cli._help import HELP_NAMES, HelpfulCommand, HelpfulGroup
+from napari_shadowinv.cli._terminal import notify_errors
+from napari_shadowinv.errors import InputError
 
 __all__ = ["app"]
 
@@ -41,6 +44,19 @@ def _show_version(asked: bool) -> None:
         raise typer.Exit
 
 
+@notify_errors
+def _check_environment() -> None:
+    """Refuse variables with which numba cannot be imported; drop one that figures do not need."""
+    threads = os.environ.get("NUMBA_NUM_THREADS", "")
+    if threads.strip().lstrip("-").isdecimal() and int(threads) < 1:
+        raise InputError(
+            f"the environment variable NUMBA_NUM_THREADS is {threads}: expected 1 or more; unset "
+            "it, or use --threads"
+        )
+    # Figures are drawn to files; matplotlib refuses to be imported with a backend unknown to it.
+    os.environ.pop("MPLBACKEND", None)
+
+
 @app.callback()
 def main(
     version: Annotated[
@@ -51,6 +67,7 @@ def main(
     ] = False,
 ) -> None:
     """Shadowgrams and proton radiographs to deflection potentials and fields."""
+    _check_environment()
     for stream in (sys.stdout, sys.stderr):
         # A terminal that knows no ∫ or µ is no reason to fail after the work is done.
         if isinstance(stream, TextIOWrapper):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv.cli._outputs import make_folder, protect_store
+from napari_shadowinv.cli._terminal import visible
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import display_unit, setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
@@ -24,6 +25,7 @@ from napari_shadowinv.preprocessing import Provenance
 if TYPE_CHECKING:
     import xarray
 
+_FORMULA_SIGNS = ("=", "+", "-", "@")
 FORMATS = ("tiff", "pradformat", "csv")
 # Columns of the table: what a shot's report says, and how it says it.
 _REPORTED = {
@@ -187,8 +189,14 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
             report = (reports[index].get(name, "") for name in reported.values())
             peak = (f"{columns[name][index]:.9g}" for name in names)
             status = STATUS_NAMES[statuses[index]]
-            rows.writerow([index, content.names[index], status, *report, *peak])
+            rows.writerow([index, _cell(content.names[index]), status, *report, *peak])
     return out
+
+
+def _cell(text: str) -> str:
+    """Text that neither a terminal nor a spreadsheet takes for a command."""
+    cell = visible(text)
+    return f"'{cell}" if cell.startswith(_FORMULA_SIGNS) else cell
 
 
 def write_movie(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -101,12 +102,30 @@ def made_again(
     before = Inversion.from_dataset(dataset)
     made = before.provenance
     if made is None:
+        check_readable(dataset, places.result)
         raise InputError(
             f"{places.result} does not say how it was made, as results of scripts that call "
             "invert() do not: make it again with a recipe (docs/recipes.md)"
         )
     inversion, shot, changes = inversion_again(made, places, outputs, quiet=quiet)
     return Again(inversion, shot, tuple(changes), _difference(before, inversion))
+
+
+def check_readable(dataset: xarray.Dataset, result: Path) -> None:
+    """Refuse a provenance that is there, but which this version does not understand."""
+    text = dataset.attrs.get("provenance", "")
+    if not text:
+        return
+    try:
+        version = json.loads(text)["version"]
+    except (TypeError, ValueError, KeyError, RecursionError):
+        raise InputError(
+            f"{result} has a damaged provenance: make it again with a recipe (docs/recipes.md)"
+        ) from None
+    raise InputError(
+        f"{result} was made by version {str(version)[:20]}, and version {__version__} does not "
+        "understand how: use that version, or make it again with a recipe (docs/recipes.md)"
+    )
 
 
 def inversion_again(

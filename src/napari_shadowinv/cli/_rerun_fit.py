@@ -17,6 +17,7 @@ from napari_shadowinv.cli._rerun import (
     Places,
     changed_file,
     changed_version,
+    check_readable,
     inversion_again,
 )
 from napari_shadowinv.cli._tables import two_columns
@@ -51,6 +52,7 @@ def fit_made_again(
     before = _fit_in(places.result, dataset)
     made = before.provenance
     if made is None:
+        check_readable(dataset, places.result)
         raise InputError(
             f"{places.result} does not say how it was made, as fits of scripts that call fit() do "
             "not: make it again with shadowinv fit (docs/fit.md)"

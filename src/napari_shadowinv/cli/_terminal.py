@@ -49,12 +49,17 @@ def plain(text: object, style: str = "") -> Text:
     """Text to print as it is, without markup; what cannot be seen becomes a visible escape."""
     from rich.text import Text
 
-    def seen(character: str) -> str:
-        if unicodedata.category(character) in _UNSEEN:
-            return character.encode("unicode_escape").decode()
-        return character
+    return Text(visible(text), style=style)
 
-    return Text("".join(map(seen, str(text))), style=style)
+
+def visible(text: object) -> str:
+    """Text in which characters that cannot be seen are escapes."""
+    return "".join(
+        character.encode("unicode_escape").decode()
+        if unicodedata.category(character) in _UNSEEN
+        else character
+        for character in str(text)
+    )
 
 
 def say(content: str | Table) -> None:

@@ -186,7 +186,7 @@ class Calibration:
         blocks = isotonic_regression(density).blocks
         count = np.diff(blocks)
         density = np.add.reduceat(density, blocks[:-1]) / count
-        if len(density) < 2:
+        if len(density) < 2 or self.doses.min() == self.doses.max():
             raise InputError(
                 f"the calibration's {channel} channel does not darken with dose: expected lower "
                 "pixels for larger doses; choose another channel or check the table"

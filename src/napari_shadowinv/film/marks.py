@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.calibration import Calibration, net_optical_density
 from napari_shadowinv.film.scans import checked_scan
 
@@ -69,9 +70,14 @@ def usable_pixels(
     Raises
     ------
     InputError
-        If the film has no colours.
+        If the film has no colours, or the rim leaves nothing of it.
     """
     values = checked_scan(film)
+    if not 0 <= 2 * rim < min(values.shape[:2]):
+        raise InputError(
+            f"the rim is {rim} px on a film of {values.shape[0]} × {values.shape[1]} px: expected "
+            "a few px"
+        )
     unexposed = np.asarray(calibration.background if background is None else background, float)
     red, blue = (
         net_optical_density(np.maximum(values, 1), unexposed, channel)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import lzma
 import math
+import threading
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -177,11 +178,25 @@ def read_eight_bits(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     return array, {"bits": 8}
 
 
-def _read_with_pillow(path: Path, index: int = 0) -> AnyArray:
-    import imageio.v3 as iio
+_PILLOW_LIMIT = threading.Lock()
 
+
+def _opened_picture(file: BinaryIO) -> Any:
+    """Open a picture without pillow's limit of pixels; ours on memory follows."""
+    import imageio.v3 as iio
+    from PIL import Image
+
+    with _PILLOW_LIMIT:
+        before, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            return iio.imopen(file, "r", plugin="pillow")
+        finally:
+            Image.MAX_IMAGE_PIXELS = before
+
+
+def _read_with_pillow(path: Path, index: int = 0) -> AnyArray:
     # A file object, because imageio would believe the name.
-    with path.open("rb") as file, iio.imopen(file, "r", plugin="pillow") as picture:
+    with path.open("rb") as file, _opened_picture(file) as picture:
         shape = picture.properties(index=index).shape
         # A pixel has one bit at least.
         check_promise(path, "picture", math.prod(shape) // 8, DEFLATE_RATIO * path.stat().st_size)

@@ -95,6 +95,7 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
         calibration, background, bits = calibrations[layer.film]
         _check_bits(layer.file or pack.scan, scan, bits)
         mask = None if layer.mask is None else read_radiograph(layer.mask).image > 0
+        _check_on_scan(fiducials.get(number, []), scan, pack.fiducials)
         lay = scan, layer.turned, layer.mirrored
         marks = {
             one.name: _where_it_lay(np.array([one.y, one.x]), *lay)
@@ -124,6 +125,17 @@ def _fiducials(pack: Pack) -> dict[int, list[_Fiducial]]:
             )
         found.setdefault(row.film, []).append(row)
     return found
+
+
+def _check_on_scan(marks: Sequence[_Fiducial], scan: Scan, table: Path | None) -> None:
+    """Reject a mark that lies outside of its film's scan."""
+    height, width = scan.pixels.shape[:2]
+    for mark in marks:
+        if not (-0.5 <= mark.y <= height - 0.5 and -0.5 <= mark.x <= width - 0.5):
+            raise InputError(
+                f"{table} has the mark '{mark.name}' of film {mark.film} at y = {mark.y:g}, "
+                f"x = {mark.x:g}, outside of its scan of {height} × {width} px: correct it"
+            )
 
 
 def _check_different(pack: Pack, films: list[Film]) -> None:
