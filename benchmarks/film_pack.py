@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from napari_shadowinv import FitOptions, Recipe
-from napari_shadowinv.film import write_corners
+from napari_shadowinv.film import moved_corners, write_corners
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.setup import setup_from_dict
@@ -138,7 +138,9 @@ class Images:
                 dataset["usable"].values, dataset["fluence"].values.astype(float), strict=True
             )
         ]
-        _, middle, _ = upright(dataset["corners"].values[0])
+        first = dataset.isel(layer=0)
+        pose = first["shift"].values, float(first["turn"])
+        _, middle, _ = upright(moved_corners(first["corners"].values, *pose, 1.0))
         place = truth.placements[0]
         offset = np.array(place.axes) @ (middle - np.array(place.middle)) + np.array(place.slip)
         setups = setups_of(dataset, dataset["energy"].values)

@@ -116,3 +116,41 @@ def test_of_a_symmetric_beam_nothing_is_said() -> None:
 def test_other_shapes_are_refused() -> None:
     with pytest.raises(InputError, match=r"images have shape .*expected both as \(films, height"):
         register(np.zeros((2, 30, 30)), np.ones((2, 30, 31), bool))
+
+
+def exposed(fall: float) -> np.ndarray:
+    """Logarithm of a smooth dose that falls from film to film, by a table with a kink."""
+    y, x = np.indices(SHAPE)
+    smooth = 3.0 - ((x - 100) / 90) ** 2 - ((y - 20) / 80) ** 2 - fall
+    kinked = smooth + 1.5 * np.maximum(smooth - 1.2, 0)
+    return np.asarray(kinked + 0.01 * np.random.default_rng(int(1e3 * fall)).normal(size=SHAPE))
+
+
+def test_a_line_of_equal_dose_does_not_move_films() -> None:
+    films = [exposed(fall) for fall in (0.0, 0.25, 0.5)]
+    poses = register(films, [ALL] * 3)
+    assert np.abs(poses.shifts).max() < 0.5
+    assert np.abs(poses.turns).max() < 0.002
+
+
+def test_a_turn_that_edges_exclude_is_refused() -> None:
+    for turn, is_seen in ((0.018, True), (0.026, False)):
+        poses = register([film((0, 0), noise=1), film((2.0, 1.0), turn, noise=2)], [ALL] * 2)
+        assert list(poses.by_images) == [is_seen] * 2
+
+
+def test_a_large_move_needs_a_third_film_of_the_same_kind() -> None:
+    films = [film((0, 0), noise=1), film((12.0, 0), noise=2), film((0, 0), noise=3)]
+    assert not register(films[:2], [ALL] * 2).by_images.any()
+    confirmed = register(films, [ALL] * 3, kinds=["EBT3"] * 3)
+    np.testing.assert_allclose(np.diff(confirmed.shifts[:, 0]), [12, -12], atol=0.3)
+    alone = register(films, [ALL] * 3, kinds=["EBT3", "EBT3", "HDV2"])
+    assert list(alone.by_images) == [True, False, True]
+
+
+def test_edges_of_a_kind_are_trusted_by_films_of_that_kind() -> None:
+    nothing = 0.3 * np.random.default_rng(5).normal(size=(2, *SHAPE))
+    torn = [film((7.0, 0), noise=7), film((-7.0, 0), noise=8), film((7.0, 0), noise=9)]
+    poses = register([*torn, *nothing], [ALL] * 5, kinds=["torn"] * 4 + ["cut"])
+    assert poses.errors[3] > 4
+    assert poses.errors[4] < 3.5

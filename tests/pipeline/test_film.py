@@ -14,7 +14,7 @@ from scipy import ndimage
 from simulated_pack import Truth, simulate
 
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
-from napari_shadowinv.film import Pack, read_corners, write_corners
+from napari_shadowinv.film import Pack, moved_corners, read_corners, write_corners
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.io import read, read_toml, write
 from napari_shadowinv.pipeline import read_pack, run_film, write_layers
@@ -53,9 +53,16 @@ def changed(truth: Truth, tmp_path: Path) -> Callable[..., Path]:
     return write_pack
 
 
+def laid(truth: Truth, dataset, layer: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions and middle of the upright film on its scan, after its shift and turn."""
+    scale = truth.scene.magnifications[layer] / truth.scene.magnifications[0]
+    pose = dataset["shift"].values[layer], float(dataset["turn"][layer])
+    return upright(moved_corners(dataset["corners"].values[layer], *pose, scale))[:2]
+
+
 def on_films(truth: Truth, dataset, plane: Callable[[int], np.ndarray], layer: int) -> np.ndarray:
     """What is true on a film's pixels, as the dataset's pixels lie on it."""
-    axes, middle, _ = upright(dataset["corners"].values[layer])
+    axes, middle = laid(truth, dataset, layer)
     place = truth.placements[layer]
     scale = truth.scene.magnifications[layer] / truth.scene.magnifications[0]
     steps = np.moveaxis(np.indices((dataset.sizes["y"], dataset.sizes["x"]), dtype=float), 0, -1)
@@ -104,7 +111,7 @@ def test_fluences_are_those_of_the_beam(truth: Truth, dataset) -> None:
 def test_films_lie_on_each_other(truth: Truth, dataset) -> None:
     places = []
     for layer, place in enumerate(truth.placements):
-        axes, middle, _ = upright(dataset["corners"].values[layer])
+        axes, middle = laid(truth, dataset, layer)
         away = np.array(place.axes) @ (middle - np.array(place.middle)) + np.array(place.slip)
         places.append(away)
         turned = np.arctan2(axes[0, 1], axes[0, 0]) - np.arctan2(*place.axes[0][::-1])
@@ -216,6 +223,29 @@ def test_films_laid_another_way_round(truth: Truth, dataset, changed, way) -> No
     assert gap.max() < 0.1
 
 
+def test_corners_are_those_of_the_films_on_their_scans(truth: Truth, dataset) -> None:
+    assert np.abs(dataset["shift"].values).max() > 0.5
+    np.testing.assert_allclose(dataset["corners"], truth.corners, atol=0.1)
+
+
+def test_corners_given_again_change_nothing(truth: Truth, dataset, changed, tmp_path: Path) -> None:
+    again = dict(zip("1234", dataset["corners"].values, strict=True))
+    write_corners(tmp_path / "corners.csv", again)
+    found = run_film(read_pack(changed(first='corners = "corners.csv"')))
+    # Shifts are found again, and so are the warnings that they bring.
+    np.testing.assert_allclose(found["shift"], dataset["shift"], atol=0.05)
+    assert "which fields displace, too" in found.attrs["warnings"]
+    assert len(found.attrs["warnings"]) == len(dataset.attrs["warnings"])
+
+
+def test_a_corner_inside_the_film_is_refused(truth: Truth, changed, tmp_path: Path) -> None:
+    corners = {str(k + 1): one.copy() for k, one in enumerate(truth.corners)}
+    corners["3"][2] -= 30
+    write_corners(tmp_path / "corners.csv", corners)
+    with pytest.raises(InputError, match=r"the corners of film 3 are up to \d+ px from those of a"):
+        run_film(read_pack(changed(first='corners = "corners.csv"')))
+
+
 def test_corners_from_a_table(truth: Truth, dataset, changed, tmp_path: Path) -> None:
     write_corners(
         tmp_path / "corners.csv", {str(k + 1): one for k, one in enumerate(truth.corners)}
@@ -248,7 +278,7 @@ def places_of(truth: Truth, dataset) -> np.ndarray:
     """Where the middles of the upright films are in the pack, px, and how they are turned."""
     places = []
     for layer, place in enumerate(truth.placements[: dataset.sizes["layer"]]):
-        axes, middle, _ = upright(dataset["corners"].values[layer])
+        axes, middle = laid(truth, dataset, layer)
         away = np.array(place.axes) @ (middle - np.array(place.middle)) + np.array(place.slip)
         turn = np.arctan2(axes[0, 1], axes[0, 0]) - np.arctan2(*place.axes[0][::-1])
         places.append([*away, turn])

@@ -6,12 +6,13 @@ several films show alike, the fine structure of the beam, tells them within one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft, ndimage
+from scipy.optimize import isotonic_regression
 
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -28,8 +29,14 @@ _REACH = 12  # of these: how far films may be from where their edges are
 # Fields displace what films show by different amounts, too: of films with exact edges, by which
 # fields came out 4 to 6 % wrong, images shifted by less than this made it 10 to 17 %.
 _AS_EDGES = 1.5  # px
-_LIKELY = 4.0  # times what edges tell: a comparison that is further off has found something else
-_TURN = 0.005  # rad: as for how much they are turned
+# How far a comparison may move the corners of two films against each other, over the error of their
+# edges: less if no third film of their kind confirms it, because what moves may be the beam.
+_MAX_MOVE, _MAX_UNCONFIRMED_MOVE = 4.0, 2.5
+_TURN = 0.005  # rad: error of a film's direction by its edges
+_MAX_TURN = 3.0  # times that of two films: sides of half a thousand pixels exclude more
+_CLOSING, _CLOSED_PX = 3.0, 1.0  # times its error, and at least so far, a triangle may stay open
+# A kink of the calibration table shows as a line of equal dose, which moves with the dose.
+_DOSE_STEPS = 24  # of the map from the dose of one film to that of another
 _STEPS, _CLOSE = 25, 1e-3
 _BLOCKS, _FILLED = (3, 5), 0.5  # parts of a film that must agree, if half of their pixels count
 _ALIKE, _AGREEING = 0.3, 0.6  # correlation, and share of the parts that have it
@@ -76,6 +83,14 @@ class Poses(NamedTuple):
         )
 
 
+class _Film(NamedTuple):
+    image: FloatArray
+    usable: BoolArray
+    level: FloatArray  # smoothed, on the pixels that are compared
+    texture: FloatArray
+    counts: BoolArray  # where the texture is known
+
+
 class _Pair(NamedTuple):
     first: int
     second: int
@@ -90,12 +105,17 @@ def register(
     usable: ArrayLike,
     *,
     spread: float | ArrayLike = EDGES,
+    kinds: Sequence[Hashable] | None = None,
     report: Reporter | None = None,
 ) -> Poses:
     """Find how films lie on each other by what they show.
 
     Each film is compared with the next two: shift and turn by least squares on the fine structure,
-    which must agree all over the film. Comparisons and edges together give the poses, each
+    which must agree all over the film. Before, the dose of one film is mapped to that of the other
+    by a monotone function, so that lines of equal dose, such as kinks of a calibration table, are
+    not structure. A comparison is refused if it turns films more than three times the error of
+    their edges, or moves a corner by more than 2.5 times that error; 4 times, if comparisons with a
+    third film of the same kind agree. Comparisons and edges together give the poses, each
     weighted by its error. Where no comparison is further than 1.5 px from what edges tell, edges
     count alone: fields displace what films show by different amounts, which looks like a shift.
 
@@ -107,6 +127,9 @@ def register(
         Where it is known.
     spread : float or array_like, shape (n,), default 3
         Standard deviation in px of what edges or marks tell of a film's place.
+    kinds : sequence of hashable, length n, optional
+        Films of one kind were cut alike, so that the edges of one are as far off as those of
+        another. Default: all are.
 
     Raises
     ------
@@ -121,21 +144,24 @@ def register(
         )
     report = report or Reporter(None, None)
     edges = np.broadcast_to(np.asarray(spread, np.float64), len(values))
-    textures = [_texture(*film) for film in zip(values, known, strict=True)]
-    pairs = []
-    for first in range(len(textures)):
-        report("register", first, len(textures))
-        for second in range(first + 1, min(first + 1 + _NEXT, len(textures))):
-            pair = _compared(first, second, textures)
-            likely = _LIKELY * np.hypot(edges[first], edges[second])
-            if pair is not None and np.abs(pair.shift).max() < likely:
-                pairs.append(pair)
+    alike: list[Hashable] = [None] * len(values) if kinds is None else list(kinds)
+    films = [_film(*film) for film in zip(values, known, strict=True)]
+    compared = []
+    for first in range(len(films)):
+        report("register", first, len(films))
+        for second in range(first + 1, min(first + 1 + _NEXT, len(films))):
+            pair = _compared(first, second, films)
+            if pair is not None:
+                compared.append(pair)
+    pairs = _credible(compared, edges, alike, values.shape[1:])
     poses = _settled(pairs, edges)
-    if pairs:
-        # How far edges were off where images tell it is how far they can be where these do not.
-        off = float(np.sqrt(np.mean(poses.shifts[poses.by_images] ** 2)))
-        by_edges = np.maximum(poses.errors, off)
-        poses = poses._replace(errors=np.where(poses.by_images, poses.errors, by_edges))
+    errors = poses.errors.copy()
+    for k in np.flatnonzero(~poses.by_images):
+        # Edges are as far off as those of films of the same kind that can be compared.
+        peers = [j for j in np.flatnonzero(poses.by_images) if alike[j] == alike[k]]
+        if peers:
+            errors[k] = max(errors[k], np.sqrt(np.mean(poses.shifts[peers] ** 2)))
+    poses = poses._replace(errors=errors)
     if not pairs or max(np.abs(pair.shift).max() for pair in pairs) > _AS_EDGES:
         return poses
     return poses._replace(
@@ -181,7 +207,69 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
             )
 
 
-def _texture(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, BoolArray]:
+def _credible(
+    pairs: list[_Pair], edges: FloatArray, kinds: list[Hashable], shape: tuple[int, ...]
+) -> list[_Pair]:
+    """Comparisons that the edges of both films do not exclude."""
+    credible = []
+    to_corner = float(np.hypot(shape[0], shape[1])) / 2
+    for pair in pairs:
+        move = np.hypot(*pair.shift) + abs(pair.turn) * to_corner
+        factor = _MAX_MOVE if _is_confirmed(pair, pairs, kinds) else _MAX_UNCONFIRMED_MOVE
+        is_within = move < factor * np.hypot(edges[pair.first], edges[pair.second])
+        if is_within and abs(pair.turn) < _MAX_TURN * np.sqrt(2) * _TURN:
+            credible.append(pair)
+    return credible
+
+
+def _is_confirmed(pair: _Pair, pairs: list[_Pair], kinds: list[Hashable]) -> bool:
+    """Whether comparisons of both films with a third one of their kind agree with a pair."""
+    by_films: dict[tuple[int, int], tuple[FloatArray, float]] = {}
+    for item in pairs:
+        by_films[item.first, item.second] = item.shift, item.error
+        by_films[item.second, item.first] = -item.shift, item.error
+    for third, kind in enumerate(kinds):
+        there, back = by_films.get((pair.first, third)), by_films.get((third, pair.second))
+        is_alike = kind == kinds[pair.first] == kinds[pair.second]
+        if not is_alike or there is None or back is None:
+            continue
+        gap = np.abs(there[0] + back[0] - pair.shift).max()
+        error = np.sqrt(there[1] ** 2 + back[1] ** 2 + pair.error**2)
+        if gap < max(_CLOSED_PX, _CLOSING * error):
+            return True
+    return False
+
+
+def _film(image: FloatArray, usable: BoolArray) -> _Film:
+    """Film with its texture."""
+    return _Film(image, usable, *_texture(image, usable))
+
+
+def _with_dose_of(film: _Film, onto: _Film) -> tuple[FloatArray, BoolArray]:
+    """Texture of a film whose dose is mapped to that of another by a monotone function."""
+    both = film.counts & onto.counts
+    if both.sum() < _DOSE_STEPS**2:
+        return film.texture, film.counts
+    order = np.argsort(film.level[both])
+    levels, values = (
+        np.array([part.mean() for part in np.array_split(plane[both][order], _DOSE_STEPS)])
+        for plane in (film.level, onto.level)
+    )
+    values = isotonic_regression(values).x
+    levels, starts = np.unique(levels, return_index=True)
+    values = values[starts]
+    if len(levels) < 2:
+        return film.texture, film.counts
+    mapped = np.asarray(np.interp(film.image, levels, values))
+    # It goes on straight beyond its ends, where it would otherwise have kinks.
+    slopes = np.diff(values) / np.diff(levels)
+    mapped += slopes[0] * np.minimum(film.image - levels[0], 0.0)
+    mapped += slopes[-1] * np.maximum(film.image - levels[-1], 0.0)
+    return _texture(mapped, film.usable)[1:]
+
+
+def _texture(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Smoothed image, fine structure, and where that is known, on fewer pixels."""
     weight = usable.astype(np.float64)
     filled = np.where(usable, image, 0.0)
 
@@ -195,14 +283,13 @@ def _texture(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, BoolArra
     inner[margin:-margin, margin:-margin] = True
     counts = inner & usable & (share > 0.9)
     few = np.s_[_EVERY // 2 :: _EVERY, _EVERY // 2 :: _EVERY]
-    return np.where(counts, fine - coarse, 0.0)[few], counts[few]
+    return fine[few], np.where(counts, fine - coarse, 0.0)[few], counts[few]
 
 
-def _compared(
-    first: int, second: int, textures: list[tuple[FloatArray, BoolArray]]
-) -> _Pair | None:
-    """How the second film lies against the first, or None if they do not show the same."""
-    (one, in_one), (other, in_other) = textures[first], textures[second]
+def _compared(first: int, second: int, films: list[_Film]) -> _Pair | None:
+    """Pose of the second film against the first, or None if they do not show the same."""
+    one, in_one = films[first].texture, films[first].counts
+    other, in_other = _with_dose_of(films[second], films[first])
     shift, correlation = _coarse_shift(one, in_one, other, in_other)
     if correlation < _ALIKE:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
@@ -45,6 +45,7 @@ __all__ = ["run_film"]
 _ODD_SIZE = 0.1  # of the usual one
 _ODD_PIXEL = 0.01
 _DARK = 0.01  # of a film's pixels
+_CUT_APART_PX = 3.0  # films whose sides differ by more were not cut together
 _PER_AREA = "1/(m² MeV)"
 _UNITS = {"dose": "Gy", "dose_error": "Gy", "fluence": _PER_AREA, "fluence_error": _PER_AREA}
 _UNITS |= {"usable": "1", "by_images": "1", "sha256": "1", "turn": "rad"}
@@ -84,8 +85,9 @@ def run_film(
         first film, each with its standard deviation, and ``usable``. By layer: ``energy`` of the
         protons that its fluence shows, that of the Bragg ``peak`` in its film and the band around
         it (MeV); ``strength``, by which a magnetic field displaces these protons relative to
-        the first layer's; with a setup ``time_of_flight`` (s); ``shift`` and ``shift_error`` (px)
-        and ``turn`` (rad) against the film's edges, whether ``by_images``, and the ``corners``.
+        the first layer's; with a setup ``time_of_flight`` (s); the ``corners`` of the film on its
+        scan (px), and ``shift`` and ``shift_error`` (px) and ``turn`` (rad) by which the film was
+        moved from there, and whether ``by_images``.
         Attribute ``warnings``: what one should know before trusting it.
 
     Raises
@@ -111,12 +113,13 @@ def run_film(
         report("dose", film.number - 1, len(pack.layers), film.name)
         return _doses(film, shape, scales[film.number - 1], pack.rim)
 
+    cut = {film.number: film.corners for film in films}
     # Marks through the pack lie behind each other, what the films show lies on rays.
     marked = any(film.fiducials for film in films)
     if not marked:
         films = _about_axis(films, pack, scales)
     edges = in_parallel(doses_of, films)
-    poses = _poses(films, edges, pack.align, scales, report)
+    poses = _poses(films, edges, pack, scales, report)
     laid = [
         replace(film, corners=moved_corners(film.corners, shift, turn, scales[film.number - 1]))
         for film, shift, turn in zip(films, poses.shifts, poses.turns, strict=True)
@@ -137,23 +140,21 @@ def run_film(
     )
     planes["dose_error"] *= planes["dose"]
     planes |= {"fluence": spectra.fluence, "fluence_error": spectra.error}
-    by_film = _by_film(pack, _about_axis(laid, pack, scales, back=True), poses)
+    by_film = _by_film(pack, films, cut, poses)
     warnings = _warnings(laid, doses, poses, pack.align)
     setups = pack.setups(spectra.energies, pixel)
     return _dataset(pack, response, spectra.energies, setups, pixel, planes, by_film, warnings)
 
 
-def _about_axis(
-    films: list[Film], pack: Pack, scales: FloatArray, *, back: bool = False
-) -> list[Film]:
-    """Films whose corners are moved so that their scales are about the axis, or moved back."""
+def _about_axis(films: list[Film], pack: Pack, scales: FloatArray) -> list[Film]:
+    """Films whose corners are moved so that their scales are about the axis."""
     if pack.axis is None:
         return films
     away = np.array(pack.axis) - (upright(films[0].corners)[2] - 1) / 2
     moved = []
     for film in films:
         scale = scales[film.number - 1]
-        shift = (scale - 1 if back else 1 - scale) / scale * away
+        shift = (1 - scale) / scale * away
         moved.append(replace(film, corners=moved_corners(film.corners, shift, 0.0, scale)))
     return moved
 
@@ -211,8 +212,28 @@ def _doses(film: Film, shape: tuple[int, int], scale: float, rim: int) -> _Doses
     return _Doses(found.dose, error, usable, float(dark.mean()))
 
 
+def _cuts(films: list[Film], kinds: Sequence[str]) -> list[tuple[object, ...]]:
+    """Kind of each film, and the group of its height and width among films of that kind."""
+    sizes = np.array([upright(film.corners)[2] for film in films])
+    groups = np.zeros(sizes.shape, dtype=int)
+    for kind in set(kinds):
+        of_kind = np.array([name == kind for name in kinds])
+        for axis in (0, 1):
+            lengths = sizes[of_kind, axis]
+            order = np.argsort(lengths)
+            is_wider = np.diff(lengths[order], prepend=lengths[order[0]]) > _CUT_APART_PX
+            group = np.empty(len(lengths), dtype=int)
+            group[order] = np.cumsum(is_wider)
+            groups[of_kind, axis] = group
+    return [(kind, *map(int, group)) for kind, group in zip(kinds, groups, strict=True)]
+
+
 def _poses(
-    films: list[Film], doses: list[_Doses], align: str, scales: FloatArray, report: Reporter
+    films: list[Film],
+    doses: list[_Doses],
+    pack: Pack,
+    scales: FloatArray,
+    report: Reporter,
 ) -> Poses:
     usable = np.array([one.usable for one in doses])
     logarithms = np.log(np.array([one.dose for one in doses]))
@@ -224,8 +245,9 @@ def _poses(
             [scales[film.number - 1] for film in films],
             [film.name for film in films],
         )
-    if align == "images":
-        return register(logarithms, usable, report=report)
+    if pack.align == "images":
+        kinds = [pack.layers[film.number - 1].film for film in films]
+        return register(logarithms, usable, kinds=_cuts(films, kinds), report=report)
     return Poses.by_edges(len(films))
 
 
@@ -244,7 +266,9 @@ def _planes(
     return planes
 
 
-def _by_film(pack: Pack, films: list[Film], poses: Poses) -> ByLayer:
+def _by_film(
+    pack: Pack, films: list[Film], corners: Mapping[int, FloatArray], poses: Poses
+) -> ByLayer:
     count = len(pack.layers)
     values: ByLayer = {
         "shift": (("layer", "component"), np.full((count, 2), np.nan)),
@@ -262,8 +286,8 @@ def _by_film(pack: Pack, films: list[Film], poses: Poses) -> ByLayer:
         values["by_images"][1][at] = poses.by_images[k]
         values["sha256"][1][at] = film.scan.checksum
         layer = pack.layers[at]
-        _, corners = as_it_lay(film.scan, film.corners, layer.turned, layer.mirrored)
-        values["corners"][1][at] = corners
+        _, on_scan = as_it_lay(film.scan, corners[film.number], layer.turned, layer.mirrored)
+        values["corners"][1][at] = on_scan
     return values
 
 

@@ -23,6 +23,7 @@ from napari_shadowinv.film import (
     read_corners,
     unexposed_pixel,
 )
+from napari_shadowinv.film.scans import upright
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.scans import Scan, read_scan
 from napari_shadowinv.pipeline.shot_table import rows_of
@@ -30,6 +31,8 @@ from napari_shadowinv.pipeline.shot_table import rows_of
 __all__ = ["Film", "as_it_lay", "in_parallel", "read_films"]
 
 _SAME_SCANNER = (0.98, 1.2)  # unexposed film over the lightest film of the table
+# Films are cut at right angles, but by hand: by share of the diagonal, and in metres.
+_MAX_ASKEW_SHARE, _MAX_ASKEW_M = 0.015, 2e-3
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -92,6 +95,8 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
             scan = read_scan(layer.file)
             given = known.get(str(number))
             corners = _only_film(layer.file, scan) if given is None else given
+        if str(number) in known:
+            _check_rectangle(number, corners, scan.pixel_size)
         calibration, background, bits = calibrations[layer.film]
         _check_bits(layer.file or pack.scan, scan, bits)
         mask = None if layer.mask is None else read_radiograph(layer.mask).image > 0
@@ -107,6 +112,22 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
     films = in_parallel(film, used)
     _check_different(pack, films)
     return films
+
+
+def _check_rectangle(number: int, corners: FloatArray, pixel_size: float | None) -> None:
+    """Reject corners that somebody gave and that are far from those of a rectangle."""
+    axes, middle, size = upright(corners)
+    signs = np.array([(-1, -1), (-1, 1), (1, 1), (1, -1)])
+    away = np.hypot(*(corners - middle - signs * size / 2 @ axes).T).max()
+    limit = _MAX_ASKEW_SHARE * np.hypot(*size)
+    if pixel_size is not None:
+        limit = min(limit, _MAX_ASKEW_M / pixel_size)
+    if away > limit:
+        raise InputError(
+            f"the corners of film {number} are up to {away:.0f} px from those of a rectangle: "
+            "expected the four corners of the film itself; correct the one that lies inside or "
+            "beside the film"
+        )
 
 
 def _fiducials(pack: Pack) -> dict[int, list[_Fiducial]]:
