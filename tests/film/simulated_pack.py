@@ -657,6 +657,7 @@ def _write_table(path: Path, first: int) -> None:
 
 def _write_pack(path: Path, layers: int) -> None:
     lines = [
+        'seen_from = "source"',
         "[setup]",
         'kind = "proton"',
         f"source_object_distance = {TO_OBJECT}",

@@ -107,6 +107,14 @@ def test_a_film_the_other_way_round_is_told(way: tuple[slice, ...], message: str
     check_orientation(films[:2], [ALL] * 2, names[:2])
 
 
+def test_all_films_the_other_way_round_are_named() -> None:
+    films = [film((0, 0), noise=k) for k in range(6)]
+    mirrored = [films[0][:, ::-1], films[1], films[2], films[3][::-1, ::-1], *films[4:]]
+    message = "film 1 was scanned mirrored left.*mirrored = true; film 4 was scanned upside down"
+    with pytest.raises(InputError, match=f"2 films do not lie as the others do .*{message}"):
+        check_orientation(mirrored, [ALL] * 6, [f"film {k}" for k in range(1, 7)])
+
+
 def test_of_a_symmetric_beam_nothing_is_said() -> None:
     y, x = np.indices(SHAPE) - np.array(SHAPE).reshape(2, 1, 1) / 2 + 0.5
     beam = -(y**2 + x**2) / 3000

@@ -246,6 +246,28 @@ def test_a_corner_inside_the_film_is_refused(truth: Truth, changed, tmp_path: Pa
         run_film(read_pack(changed(first='corners = "corners.csv"')))
 
 
+def test_films_seen_from_the_detector_are_mirrored(truth: Truth, dataset, changed) -> None:
+    pack = changed(('seen_from = "source"', 'seen_from = "detector"'))
+    for file in truth.files:
+        (pack.parent / file.name).unlink()
+        scan = tifffile.imread(file)[:, ::-1]
+        dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
+        tifffile.imwrite(pack.parent / file.name, scan, photometric="rgb", **dots)
+    found = run_film(read_pack(pack))
+    np.testing.assert_allclose(found["dose"], dataset["dose"], rtol=1e-3)
+    assert "from the detector, mirrored" in found.attrs["seen_from"]
+    # Corners are those on the scans as they are.
+    width = scan.shape[1]
+    expected = dataset["corners"].values[:, [1, 0, 3, 2]] * [1, -1] + [0, width - 1]
+    np.testing.assert_allclose(found["corners"], expected, atol=0.1)
+
+
+def test_the_side_of_the_films_is_asked_for(truth: Truth, changed) -> None:
+    found = run_film(read_pack(changed(('seen_from = "source"\n', ""))))
+    assert "B has the wrong sign; give seen_from" in found.attrs["warnings"]
+    assert found.attrs["seen_from"] == "the source (assumed)"
+
+
 def test_corners_from_a_table(truth: Truth, dataset, changed, tmp_path: Path) -> None:
     write_corners(
         tmp_path / "corners.csv", {str(k + 1): one for k, one in enumerate(truth.corners)}

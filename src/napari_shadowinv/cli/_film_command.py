@@ -36,6 +36,7 @@ shadowinv film pack.toml --layers layers
 shadowinv fit layers/layers.csv --gains free --source unknown
 
 [bold]pack.toml[/bold] (files are looked for beside it)
+seen_from = "source"                          # or detector: decides the sign of B
 scan = "scan.tif"                             # all films on one scan; or a file for each layer
 \[setup]                                       # distances, if they are known
 source_object_distance = 0.01
@@ -187,4 +188,6 @@ def pack_rows(dataset: xarray.Dataset) -> Rows:
     rows = [("images", f"{sizes['layer']} of {sizes['y']} × {sizes['x']} px, [y, x]")]
     if "scan_pixel_size" in dataset.attrs:
         rows.append(("pixel", f"{1e6 * dataset.attrs['scan_pixel_size']:.4g} µm on the film"))
+    if "seen_from" in dataset.attrs:
+        rows.append(("seen from", dataset.attrs["seen_from"]))
     return rows + [("warning", text) for text in json.loads(dataset.attrs["warnings"])]

@@ -230,6 +230,12 @@ class Pack(CheckedModel):
         title="Pixel size of the scans (m)",
         description="Default: as their files say.",
     )
+    seen_from: Literal["source", "detector"] | None = Field(
+        default=None,
+        title="Films seen from",
+        description="Side from which the upright films are seen: source, as the beam does, or "
+        "detector, which mirrors them and reverses the sign of B. Default: source, with a warning.",
+    )
     rim: int = Field(
         default=6,
         ge=0,
@@ -295,6 +301,10 @@ class Pack(CheckedModel):
     def film(self, layer: PackLayer) -> FilmType:
         """The type of a layer's film."""
         return self.kinds[layer.film]
+
+    def is_mirrored(self, layer: PackLayer) -> bool:
+        """Whether the scan of a layer shows its film mirrored, as seen from the source."""
+        return layer.mirrored != (self.seen_from == "detector")
 
     def setups(self, energies: ArrayLike, pixel_size: float | None) -> tuple[Setup, ...]:
         """Setup of each layer, on common pixels at the object; none if the pack has no setup.

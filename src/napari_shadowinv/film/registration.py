@@ -7,7 +7,7 @@ several films show alike, the fine structure of the beam, tells them within one.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,6 +43,12 @@ _ALIKE, _AGREEING = 0.3, 0.6  # correlation, and share of the parts that have it
 _FAR = 5.0  # px: parts that are further away count as so far
 _LEAST_ERROR = 0.1  # px
 _NEXT = 2  # films before and behind that one is compared with
+# Ways in which a film may lie, as flips of its rows and columns.
+_WAYS_AROUND = {
+    (True, True): "upside down: give its layer turned = 180",
+    (False, True): "mirrored left to right: give its layer mirrored = true",
+    (True, False): "mirrored top to bottom: give its layer mirrored = true, turned = 180",
+}
 # Of large structure, for the way a film lies.
 _LARGE, _BEST, _BETTER = 8, 0.7, 0.35  # px, correlation, and share of what it lacks to 1
 
@@ -181,30 +187,59 @@ def moved_corners(corners: ArrayLike, shift: ArrayLike, turn: float, scale: floa
 
 
 def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]) -> None:
-    """Reject a film that lies another way round than the film before it.
+    """Reject films that lie another way round than most films do, and name all of them.
 
-    It must show the same large structure, turned or mirrored: where the films show too little, or
-    what they show is symmetric, nothing is said.
+    Neighbours must show the same large structure, turned or mirrored: where the films show too
+    little, or their structure is symmetric, they are not rejected.
+
+    Raises
+    ------
+    InputError
+        If a film lies another way round; the message says how each of them was scanned.
     """
-    small = [_large(*film) for film in zip(np.asarray(images), np.asarray(usable), strict=True)]
-    for number in range(1, len(small)):
-        one, other = small[number - 1], small[number]
-        as_is = _greatest_correlation(one, other)
-        ways: dict[str, Any] = {
-            "upside down: give its layer turned = 180": np.s_[::-1, ::-1],
-            "mirrored left to right: give its layer mirrored = true": np.s_[:, ::-1],
-            "mirrored top to bottom: give its layer mirrored = true, turned = 180": np.s_[::-1],
+    planes = [_large(*film) for film in zip(np.asarray(images), np.asarray(usable), strict=True)]
+    flips = [(False, False)]  # of the rows and columns, so that films lie as the first
+    clues = {}
+    for number in range(1, len(planes)):
+        before, film = (_flipped(planes[k], flips[-1]) for k in (number - 1, number))
+        as_is = _greatest_correlation(before, film)
+        turned = {
+            flip: _greatest_correlation(before, _flipped(film, flip)) for flip in _WAYS_AROUND
         }
-        found = {
-            way: _greatest_correlation(one, (other[0][turn], other[1][turn]))
-            for way, turn in ways.items()
-        }
-        best = max(found, key=lambda way: found[way])
-        if found[best] > _BEST and 1 - found[best] < _BETTER * (1 - as_is):
-            raise InputError(
-                f"{names[number]} does not lie as {names[number - 1]} does (correlation "
-                f"{as_is:.3f}, turned over {found[best]:.3f}): one of them was scanned {best}"
-            )
+        best = max(turned, key=lambda flip: turned[flip])
+        if turned[best] > _BEST and 1 - turned[best] < _BETTER * (1 - as_is):
+            clues[number] = f"correlation {as_is:.3f}, turned over {turned[best]:.3f}"
+            rows, columns = flips[-1]
+            flips.append((rows != best[0], columns != best[1]))
+        else:
+            flips.append(flips[-1])
+    if not clues:
+        return
+    usual = max(flips, key=flips.count)
+    ways = {
+        number: _WAYS_AROUND[flip[0] != usual[0], flip[1] != usual[1]]
+        for number, flip in enumerate(flips)
+        if flip != usual
+    }
+    (first, way), *others = ways.items()
+    clue = clues.get(first) or clues[min(clues)]
+    neighbour = names[first - 1 if first else first + 1]
+    if not others:
+        subject = "one of them" if len(names) == 2 else "it"
+        raise InputError(
+            f"{names[first]} does not lie as {neighbour} does ({clue}): {subject} was scanned {way}"
+        )
+    raise InputError(
+        f"{len(ways)} films do not lie as the others do ({clue}): "
+        + "; ".join(f"{names[number]} was scanned {way}" for number, way in ways.items())
+    )
+
+
+def _flipped(
+    planes: tuple[FloatArray, FloatArray], flip: tuple[bool, bool]
+) -> tuple[FloatArray, FloatArray]:
+    turn = np.s_[:: -1 if flip[0] else 1, :: -1 if flip[1] else 1]
+    return planes[0][turn], planes[1][turn]
 
 
 def _credible(

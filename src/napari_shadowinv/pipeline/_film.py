@@ -50,6 +50,12 @@ _PER_AREA = "1/(m² MeV)"
 _UNITS = {"dose": "Gy", "dose_error": "Gy", "fluence": _PER_AREA, "fluence_error": _PER_AREA}
 _UNITS |= {"usable": "1", "by_images": "1", "sha256": "1", "turn": "rad"}
 
+_SEEN_FROM = {
+    None: "the source (assumed)",
+    "source": "the source",
+    "detector": "the source (scans from the detector, mirrored)",
+}
+
 ByLayer = dict[str, tuple[tuple[str, ...], Any]]
 
 
@@ -88,7 +94,9 @@ def run_film(
         the first layer's; with a setup ``time_of_flight`` (s); the ``corners`` of the film on its
         scan (px), and ``shift`` and ``shift_error`` (px) and ``turn`` (rad) by which the film was
         moved from there, and whether ``by_images``.
-        Attribute ``warnings``: what one should know before trusting it.
+        Attribute ``warnings``: what one should know before trusting it. Films are seen from the
+        source, on which the sign of a magnetic field depends; attribute ``seen_from`` says how the
+        pack describes its scans.
 
     Raises
     ------
@@ -141,7 +149,7 @@ def run_film(
     planes["dose_error"] *= planes["dose"]
     planes |= {"fluence": spectra.fluence, "fluence_error": spectra.error}
     by_film = _by_film(pack, films, cut, poses)
-    warnings = _warnings(laid, doses, poses, pack.align)
+    warnings = _warnings(laid, doses, poses, pack)
     setups = pack.setups(spectra.energies, pixel)
     return _dataset(pack, response, spectra.energies, setups, pixel, planes, by_film, warnings)
 
@@ -286,12 +294,14 @@ def _by_film(
         values["by_images"][1][at] = poses.by_images[k]
         values["sha256"][1][at] = film.scan.checksum
         layer = pack.layers[at]
-        _, on_scan = as_it_lay(film.scan, corners[film.number], layer.turned, layer.mirrored)
+        _, on_scan = as_it_lay(
+            film.scan, corners[film.number], layer.turned, pack.is_mirrored(layer)
+        )
         values["corners"][1][at] = on_scan
     return values
 
 
-def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, align: str) -> list[str]:
+def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) -> list[str]:
     found = [
         f"{film.name} is darker than its calibration reaches over {one.too_dark:.0%} of it: left "
         "out"
@@ -304,7 +314,7 @@ def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, align: str) 
         why = "show too little in common with those beside them"
         if any(film.fiducials for film in films):
             why = "have no fiducials"
-        elif align == "edges":
+        elif pack.align == "edges":
             why = "are not compared with each other"
         found.append(
             f"films {', '.join(map(str, loose))} {why}: laid by their edges, to some "
@@ -320,6 +330,11 @@ def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, align: str) 
         found.append(
             f"films were moved by up to {furthest:.1f} px by what they show, which fields "
             "displace, too: a fit of E beside B by these layers can be wrong without a sign of it"
+        )
+    if pack.setup is not None and pack.seen_from is None:
+        found.append(
+            "the pack does not say from which side its films are seen, and the source was assumed: "
+            "if they are seen from the detector, B has the wrong sign; give seen_from"
         )
     return found
 
@@ -359,6 +374,7 @@ def _dataset(
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "pack": pack.model_dump_json(exclude_defaults=True),
         "warnings": json.dumps(warnings),
+        "seen_from": _SEEN_FROM[pack.seen_from],
     }
     if pixel is not None:
         attributes["scan_pixel_size"] = pixel

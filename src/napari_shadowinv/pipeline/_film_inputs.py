@@ -101,12 +101,13 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
         _check_bits(layer.file or pack.scan, scan, bits)
         mask = None if layer.mask is None else read_radiograph(layer.mask).image > 0
         _check_on_scan(fiducials.get(number, []), scan, pack.fiducials)
-        lay = scan, layer.turned, layer.mirrored
+        is_mirrored = pack.is_mirrored(layer)
+        lay = scan, layer.turned, is_mirrored
         marks = {
             one.name: _where_it_lay(np.array([one.y, one.x]), *lay)
             for one in fiducials.get(number, [])
         }
-        scan, corners = as_it_lay(scan, corners, layer.turned, layer.mirrored)
+        scan, corners = as_it_lay(scan, corners, layer.turned, is_mirrored)
         return Film(number, scan, corners, calibration, background, mask, marks)
 
     films = in_parallel(film, used)

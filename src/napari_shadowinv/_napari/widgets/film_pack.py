@@ -362,6 +362,8 @@ def _rows(dataset: xarray.Dataset) -> list[tuple[str, str]]:
         ("Films", f"{len(energies)}, {energies[0]:.3g} to {energies[-1]:.3g} MeV"),
         ("Pixels", f"{sizes['y']} × {sizes['x']}, {dataset['usable'].values.mean():.0%} usable"),
     ]
+    if "seen_from" in dataset.attrs:
+        rows.append(("Seen from", dataset.attrs["seen_from"]))
     if empty.any():
         rows.append(("Left out", "film " + ", ".join(map(str, dataset["layer"].values[empty]))))
     return rows + [("Warning", text) for text in packs.warnings_of_pack(dataset)]
