@@ -89,6 +89,21 @@ def test_a_film_that_tells_nothing_is_bridged(response: Response) -> None:
     assert found.error[3, 2, 2] > 3 * found.error[3, 0, 0]
 
 
+def test_a_bridged_film_keeps_its_bend(response: Response) -> None:
+    spectrum = falling(response, 8.0)
+    bent = spectrum * (1 + 0.3 * (response.energies / 3) ** -0.75)
+    # A pixel whose protons are displaced, among 99 plain ones that set the usual spectrum.
+    doses = np.stack([doses_of(response, one)[:, 0, 0] for one in [bent] + 99 * [spectrum]], axis=1)
+    doses = doses.reshape(len(doses), 10, 10)
+    errors = np.full(doses.shape, 0.01)
+    for film in range(1, len(doses) - 1):
+        bridged = errors.copy()
+        bridged[film, 0, 0] = np.inf
+        found = unfold(doses, bridged, response)
+        seen = found.fluence[film, 0, 0] / found.fluence[film, 5, 5] - 1
+        assert seen == pytest.approx(0.3 * (found.energies[film] / 3) ** -0.75, rel=0.06)
+
+
 def test_twice_the_dose_is_twice_the_fluence(response: Response) -> None:
     doses = (
         np.random.default_rng(2).uniform(5, 10, (8, *SHAPE)) * np.arange(9, 1, -1)[:, None, None]
