@@ -137,11 +137,11 @@ def left_out_table(found: LeaveOneOut, fit: Fit, names: Sequence[str]) -> Table:
     headings = ["image", "energy", "χ² left out", "χ² alone", "up to", "r.m.s.", "verdict"]
     table = _table("Left out", headings, found.explanation)
     energies = [getattr(setup, "energy", None) for setup in fit.setups] or [None] * len(names)
-    for k, (name, energy) in enumerate(zip(names, energies, strict=True)):
+    for k, (name, energy) in enumerate(zip(short_names(names), energies, strict=True)):
         explained = bool(found.explained[k])
         table.add_row(
             plain(name),
-            "" if energy is None else f"{energy:g} MeV",
+            "" if energy is None else f"{energy:.4g} MeV",
             f"{found.chi2[k]:.3g}",
             f"{found.alone[k]:.3g}",
             f"{found.limit[k]:.3g}",
@@ -149,6 +149,16 @@ def left_out_table(found: LeaveOneOut, fit: Fit, names: Sequence[str]) -> Table:
             plain(_verdict(explained), "" if explained else "yellow"),
         )
     return table
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Return file names without folders and endings, unless two of them become equal.
+
+    >>> short_names(["layers/layer_03.tif", "layers/layer_04.tif"])
+    ['layer_03', 'layer_04']
+    """
+    stems = [Path(name).stem for name in names]
+    return stems if len(set(stems)) == len(stems) else list(names)
 
 
 def windows_table(found: FitWindows) -> Table:
