@@ -42,6 +42,7 @@ def found(folded_shots: list[FloatArray]) -> Fit:
     return fit(
         noisy(folded_shots, NOISE),
         strengths=STRENGTHS,
+        source=np.ones(SIZE),
         noise=NOISE,
         options=FitOptions(samples=4, threads=1),
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.verdict import Verdict, judged
 
@@ -86,6 +87,45 @@ def test_judged_names_a_residual_that_is_no_noise(
         assert f"image 2: {strength:.0f}" in why
         assert "image 1" not in why
         assert (cause or "dark level") in why
+
+
+def test_judged_takes_a_pattern_of_a_cut_object_for_the_edge() -> None:
+    cut = {"displacement": blob((24, 46)), "pattern": Pattern(np.array([0.0, 40.0]))}
+    verdict, why = judged(**GOOD | cut)
+    assert verdict is Verdict.EDGE
+    assert "larger field of view" in why
+    assert "no noise" in why
+
+
+def test_judged_finds_a_field_that_is_turned_back_on_all_sides() -> None:
+    """Weak at the edge, but towards it everywhere: as 1/r of a wire that ends there."""
+    y, x = (np.indices((48, 48)) - 23.5) / 20
+    outward = 0.1 * np.stack([y, x]) * np.exp(-((y**2 + x**2) ** 4) / 8)
+    displacement = blob((24, 24)) + outward
+    verdict, why = judged(**GOOD | {"displacement": displacement})
+    assert verdict is Verdict.EDGE
+    assert "on all sides" in why
+    masked = np.ones((48, 48), bool)
+    masked[:, :8] = False
+    at_mask = {"displacement": displacement, "used": masked}
+    assert judged(**GOOD | at_mask)[0] is Verdict.DETERMINED
+
+
+@pytest.mark.parametrize(("hidden", "expected"), [(0.3, "determined"), (0.8, "too uncertain")])
+def test_judged_names_a_mask_over_the_strongest_structure(hidden: float, expected: str) -> None:
+    verdict, why = judged(**GOOD | {"hidden": hidden})
+    assert verdict == expected
+    assert ("mask hides" in why) == (hidden > 0.5)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.03, "determined"), (0.2, "too uncertain")])
+def test_judged_asks_for_the_beam_where_it_was_assumed(share: float, expected: str) -> None:
+    beam = BeamError(sensitivity=0.1, variation=0.05, share=share, scale=0.25, assumed=True)
+    verdict, why = judged(**GOOD | {"beam": beam})
+    assert verdict == expected
+    if share > 0.05:
+        # √(0.05² - 0.02²) / 0.1
+        assert "measure the beam to 0.5 %" in why
 
 
 def test_judged_says_how_correlated_noise_widens_the_bars() -> None:

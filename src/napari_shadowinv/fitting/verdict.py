@@ -131,8 +131,6 @@ def judged(
             "a wider point spread explains the image better: it is blurred more than was said, by "
             "source or detector; give the point spread (psf, or source size and resolution)"
         )
-    if pattern.is_certain:
-        return Verdict.MISFIT, _pattern_text(pattern, names)
     if single and (lost := _share_lost(displacement)) > _LOST:
         return Verdict.AMBIGUOUS, (
             f"the object sends {lost:.0%} of the rays past the image, and one image does not tell "
@@ -144,6 +142,11 @@ def judged(
             "which came from where: the same bright lines come from fields with other folds; take "
             "another energy"
         )
+    at_edge = _edge_text(displacement, used, edge_is_free)
+    if pattern.is_certain:
+        # An object that the edge cuts leaves a pattern, too.
+        verdict = Verdict.EDGE if at_edge else Verdict.MISFIT
+        return verdict, "; ".join(filter(None, [at_edge, _pattern_text(pattern, names)]))
     rivals = [away for worse, away in others if worse < _AS_GOOD and away > _OTHER_FIELD]
     if rivals:
         return Verdict.SEVERAL, (
@@ -176,24 +179,8 @@ def judged(
             "surroundings allow, and the error bars do not include that; unmask what is sound, or "
             "add an image in which it is seen"
         )
-    free = edge_is_free
-    at_edge, bent = _share_at_edge(np.hypot(*displacement)), _share_bent_at_edge(displacement)
-    if at_edge > (_AT_FREE_EDGE if free else _AT_EDGE) or bent > (
-        _BENT_AT_FREE_EDGE if free else _BENT
-    ):
-        return Verdict.EDGE, (
-            f"at the image's edge the field has {at_edge:.0%} of its peak, and rays converge or "
-            f"diverge {bent:.0%} as much as anywhere: what lies beyond bends the field everywhere; "
-            "record a larger field of view"
-            + ("" if free else ", or try a free edge (edge='free', --edge free)")
-        )
-    if not free and (turned := _share_turned_back(displacement, used)) > TURNED_BACK:
-        return Verdict.EDGE, (
-            f"near the edge the field displaces rays towards or away from it on all sides, by "
-            f"{turned:.0%} of its r.m.s. displacement: it goes on beyond, which bends it "
-            "everywhere; record a larger field of view, or try a free edge (edge='free', --edge "
-            "free)"
-        )
+    if at_edge:
+        return Verdict.EDGE, at_edge
     unchecked = "" if np.isfinite(uncertainty) else "; error bars were not worked out"
     if pattern.correlation > 0:
         unchecked += (
@@ -222,6 +209,28 @@ def _pattern_text(pattern: Pattern, names: Sequence[str]) -> str:
     return (
         f"the residual is no noise: smoothed, it stands out by {'; '.join(patterned)} standard "
         f"deviations, so the field may be wrong by many times its error bars: {cause}"
+    )
+
+
+def _edge_text(displacement: FloatArray, used: BoolArray, free: bool) -> str:
+    """How the field goes on beyond the image's edge; "" if it does not."""
+    at_edge, bent = _share_at_edge(np.hypot(*displacement)), _share_bent_at_edge(displacement)
+    most, most_bent = (_AT_FREE_EDGE, _BENT_AT_FREE_EDGE) if free else (_AT_EDGE, _BENT)
+    turned = 0.0 if free else _share_turned_back(displacement, used)
+    if at_edge <= most and bent <= most_bent and turned <= TURNED_BACK:
+        return ""
+    if at_edge > most or bent > most_bent:
+        sign = (
+            f"at the image's edge the field has {at_edge:.0%} of its peak, and rays converge or "
+            f"diverge {bent:.0%} as much as anywhere"
+        )
+    else:
+        sign = (
+            "near the image's edge the field displaces rays towards or away from it on all sides, "
+            f"by {turned:.0%} of its r.m.s. displacement"
+        )
+    return f"{sign}: what lies beyond bends the field everywhere; record a larger field of view" + (
+        "" if free else ", or try a free edge (edge='free', --edge free)"
     )
 
 
