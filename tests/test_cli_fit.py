@@ -104,7 +104,7 @@ def provenance_in(path: str) -> FitProvenance:
 
 
 def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
-    result = shadowinv(*PAIR, "--samples", 2, "--noise", 20)
+    result = shadowinv(*PAIR, "--samples", 2, "--noise", 20, "--beam-variation", 0)
     assert result.exit_code == 0, result.output
     names = {"a.tif", "b.tif", "setup.toml", "a_fit.shadowinv", "a_fit.png"}
     assert set(content(folder)) == names
@@ -112,13 +112,15 @@ def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
     assert fit.verdict is Verdict.DETERMINED
     assert np.abs(fit.fields[0].displacement - TRUTH).max() < 0.2
     assert fit.setups == (FIRST, SECOND)
-    assert fit.options == FitOptions(samples=2)
+    assert fit.options == FitOptions(samples=2, beam_variation=0)
     assert setup_from_dataset(dataset) == FIRST
     told = flat(result.stdout)
     assert "verdict determined" in told
     assert fit.explanation in told
     assert "image 2 b.tif, 5 MeV proton, χ²" in told
-    assert "MG·µm); peak |d|" in told
+    assert "MG·µm)" in told
+    assert "; peak |d|" in told
+    assert "a beam that differs by 1 %" in told
 
     described = flat(shadowinv("info", "a_fit.shadowinv").stdout)
     for words in ("kind fit of shadowinv", "verdict determined", "image 1 a.tif, 14.7 MeV proton"):

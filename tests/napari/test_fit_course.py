@@ -55,7 +55,8 @@ def test_a_forecast_grows_with_what_is_asked_for() -> None:
     def seconds(side: int, count: int, fields: int = 1, source: str | None = None) -> float:
         return forecast_of((side, side), count, fields, source, FitOptions()).seconds
 
-    assert 2 < seconds(200, 2) < 8
+    assert 4 < seconds(200, 2) < 8
+    assert 1.5 < seconds(64, 2) < 4
     assert seconds(400, 2) > 3 * seconds(200, 2)
     assert seconds(200, 4) > 1.5 * seconds(200, 2)
     assert seconds(200, 2, fields=2) > 1.3 * seconds(200, 2)
@@ -68,8 +69,8 @@ def test_the_next_forecast_follows_the_last_fit() -> None:
     forecast = forecast_of((1000, 1000), 3, 2, None, FitOptions())
     pace = Pace()
     text = forecast.text(pace)
-    assert text.startswith("3 images of 1000 × 1000 px, 2 fields: about 3 min, and several times")
+    assert text.startswith("3 images of 1000 × 1000 px, 2 fields: about 4 min, up to 16 min")
     pace.learn(forecast, 3 * forecast.seconds)
-    assert "about 9 min, judging by the last fit" in forecast.text(pace)
+    assert "about 12 min, judging by the last fit" in forecast.text(pace)
     one = forecast_of((200, 200), 1, 1, "unknown", FitOptions())
     assert one.text(Pace()).startswith("one image of 200 × 200 px, unknown beam: about ")

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.fitting import FitOptions
 
-# Measured on two cores, two to four images of 64² to 400² px whose rays do not cross.
-_SECONDS, _SECONDS_PER_PIXEL = 0.4, 4e-5
+# Measured on two cores, two to four images of 64² to 400² px whose rays do not cross; and by what
+# factor fits take longer where they do (1.9 to 4), or where the cause of a misfit is looked for.
+_SECONDS, _SECONDS_PER_PIXEL = 1.5, 5e-5
+_WITH_CROSSING_RAYS = 4.0
 _WITH_TWO_FIELDS, _WITH_A_BEAM = 1.5, 1.6  # times that
 # Of the time that all else takes, and steps: those of the error bars. What beam and field can trade
 # is found slowly.
@@ -24,7 +26,12 @@ _WEIGHTS = {"starts": 0.4, "smoothness": 0.4, "full size": 0.2}
 _STEPS = {"starts": 140.0, "smoothness": 180.0, "full size": 20.0}
 _ERROR_BARS = "error bars"
 _WORDS = {"smoothness": "smoothness", "other starts": "smoothness", "full size": "full size"}
-_WORDS |= {"point spread": "smoothness", "samples": _ERROR_BARS, "evidence": _ERROR_BARS}
+_WORDS |= {
+    "point spread": "full size",
+    "rivals": "full size",
+    "samples": _ERROR_BARS,
+    "evidence": _ERROR_BARS,
+}
 _STEP = re.compile(r"^(?P<stage>.*), objective (?P<value>\S+)$")
 _PARTS = 1000  # of the bar
 
@@ -86,10 +93,11 @@ class Forecast:
             what += f", {self.fields} fields"
         if self.beam_is_unknown:
             what += ", unknown beam"
-        told = f"{what}: about {duration_in_words((pace.factor or 1) * self.seconds)}"
+        time = duration_in_words((pace.factor or 1) * self.seconds)
         if pace.factor is None:
-            return f"{told}, and several times as long where rays cross."
-        return f"{told}, judging by the last fit."
+            longest = duration_in_words(_WITH_CROSSING_RAYS * self.seconds)
+            return f"{what}: about {time}, up to {longest} where rays cross."
+        return f"{what}: about {time}, judging by the last fit."
 
 
 PACE = Pace()

@@ -20,8 +20,9 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, compare, fit, point_spread
+from napari_shadowinv.fitting.beam_error import ASSUMED_VARIATION
 from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.options import FIELDS, FitChoices, KindOfNoise
+from napari_shadowinv.options import FIELDS, FitChoices, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import Setup, setup_warnings
 from napari_shadowinv.pipeline._run import Inputs, Shot, gathered, radiograph_of
@@ -142,6 +143,15 @@ class FitInputs:
         )
 
     @property
+    def options(self) -> FitOptions:
+        """The options; of a beam that is estimated from its image the variation is assumed."""
+        options, estimate = self.choices.options, self.provenance.recipe.estimate
+        is_estimated = estimate is not None and self.choices.beam == "known"
+        if options.beam_variation is not None or not is_estimated:
+            return options
+        return options.model_copy(update={"beam_variation": ASSUMED_VARIATION})
+
+    @property
     def keywords(self) -> dict[str, Any]:
         """What `fit` and `compare` take of it, fields and options not among it."""
         strengths = _of_all(self.names, [one.strength for one in self.given], "strength")
@@ -258,7 +268,7 @@ def run_fit(
     found = fit(
         **inputs.keywords,
         fields=inputs.choices.fields or ("B",),
-        options=inputs.choices.options,
+        options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -278,7 +288,7 @@ def run_comparison(
     found = compare(
         **inputs.keywords,
         choices=COMPARED,
-        options=inputs.choices.options,
+        options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )

@@ -62,7 +62,7 @@ def run_leave_one_out(
     found = leave_one_out(
         **inputs.only(order).keywords,
         fields=inputs.choices.fields or ("B",),
-        options=inputs.choices.options,
+        options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -120,7 +120,7 @@ def run_windows(
         found = fit(
             **part.keywords,
             fields=part.choices.fields or ("B",),
-            options=part.choices.options,
+            options=part.options,
             on_progress=tell,
             should_stop=should_stop,
         )
