@@ -128,6 +128,24 @@ def test_judged_asks_for_the_beam_where_it_was_assumed(share: float, expected: s
         assert "measure the beam to 0.5 %" in why
 
 
+@pytest.mark.parametrize(
+    ("share", "beam_unknown", "words"),
+    [(0.1, True, ""), (0.5, False, "about 1.4 times"), (0.5, True, "about 2.4 times")],
+)
+def test_judged_says_that_bars_beyond_deep_folds_are_small(
+    share: float, beam_unknown: bool, words: str
+) -> None:
+    displacement = blob((24, 24))
+    of_object = np.argwhere(np.hypot(*displacement) > 0.1)
+    jacobian = np.ones((48, 48))
+    for place in of_object[: round(share * len(of_object))]:
+        jacobian[tuple(place)] = -0.5
+    verdict, why = judged(**GOOD | {"jacobian": jacobian, "beam_unknown": beam_unknown})
+    assert verdict is Verdict.DETERMINED
+    assert words in why
+    assert ("deep folds" in why) == bool(words)
+
+
 def test_judged_says_how_correlated_noise_widens_the_bars() -> None:
     verdict, why = judged(**GOOD | {"pattern": Pattern(np.array([0.0, 0.0]), correlation=1.0)})
     assert verdict is Verdict.DETERMINED

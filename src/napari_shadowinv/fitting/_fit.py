@@ -65,7 +65,7 @@ _TRANSPORT_SITES = 10_000
 _DECIDES = 10.0  # in log evidence
 _MIN_BLUR_SCORE = 4.0  # standard deviations, for which images are fitted with more blur
 _DARKEST = 1e-3  # of a beam's mean
-_MAX_RIVAL_CHI2 = 10.0  # a fit that ended further away is no start for a rival
+_MAX_RIVAL_CHI2 = 3.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
 
 
