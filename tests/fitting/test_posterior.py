@@ -161,3 +161,60 @@ def test_the_likeliest_smoothness_is_that_of_the_field(true: float) -> None:
         if change < 0.1:
             break
     assert 0.5 < smoothness[0, 0] / true < 2
+
+
+def test_moved_by_beams_is_the_response_of_the_best_field() -> None:
+    """Against a dense solution, with the images' change by differences."""
+    scene = replace(weak_scene((12, 16), (30.0, 100.0)), beam_modes=0)
+    unknowns = scene.nothing()
+    y, x = np.indices(scene.rays.shape)
+    unknowns.potentials[0] = 2 * np.exp(-((y - 6) ** 2 + (x - 7) ** 2) / 6)
+    wave = np.cos(np.arange(scene.beams.shape[2]) / 4) * np.ones(scene.beams.shape)
+    counts = scene.ray_counts(unknowns)
+    brighter = replace(scene, beams=scene.beams * (1 + 0.01 * wave))
+    change = brighter.model(unknowns, counts) - scene.model(unknowns, counts)
+    residuals = np.sqrt(scene.weights) * change
+    np.testing.assert_allclose(
+        scene.changed_by_beams(unknowns, counts, 0.01 * wave), residuals, atol=1e-9
+    )
+    matrix, free = dense_hessian(scene, unknowns)
+    slope = scene.linear(unknowns, counts).pulled(residuals).flat()[free]
+    expected = unknowns.flat() * 0
+    expected[free] = np.linalg.pinv(matrix[np.ix_(free, free)], rcond=1e-10, hermitian=True) @ slope
+    posterior = Posterior(scene, unknowns, np.random.default_rng(0))
+    moved = posterior.moved_by_beams(0.01 * wave)
+    shift, dense = (
+        scene.rays.displacement(each.potentials[0]) for each in (moved, unknowns.like(expected))
+    )
+    assert np.abs(dense).max() > 1e-4
+    assert np.abs(shift - dense).max() < 0.1 * np.abs(dense).max()
+
+
+@pytest.mark.parametrize("modes", [4, 8])
+def test_with_free_beam_spreads_beams_by_the_variation(modes: int) -> None:
+    scene = weak_scene((24, 32), (30.0, 100.0)).with_free_beam(modes, 0.05)
+    rng = np.random.default_rng(1)
+    weights = scene.prior.beam_weights
+    spread = np.divide(1, np.sqrt(weights), out=np.zeros_like(weights), where=weights > 0)
+    squares = []
+    for _ in range(300):
+        change = scene.nothing()._replace(beam=spread * rng.normal(size=weights.shape))
+        squares.append((scene.beam_changes(change)[0] ** 2).mean())
+    assert np.sqrt(np.mean(squares)) == pytest.approx(0.05, rel=0.1)
+
+
+def test_open_beams_are_those_that_several_energies_cannot_exclude() -> None:
+    """One image excludes none; images of different strengths exclude those that show."""
+    scene = replace(weak_scene((24, 32), (0.1, 1.0)), beam_modes=0, free_gains=False)
+    unknowns = scene.nothing()
+
+    def spread(strengths: list[float]) -> float:
+        shots = replace(
+            scene, strengths=np.array(strengths)[:, None], weights=np.full((2, 24, 32), 1e6)
+        )
+        posterior = Posterior(shots, unknowns, np.random.default_rng(0))
+        drawn = posterior.open_beams(0.05, 4, np.random.default_rng(2))
+        return float(np.sqrt(np.mean([one[0] ** 2 for one in drawn])))
+
+    assert spread([1.0, 1.0]) > 0.02
+    assert spread([1.0, 0.5]) < 0.01
