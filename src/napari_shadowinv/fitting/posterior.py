@@ -23,7 +23,7 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 __all__ = ["Posterior"]
 
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
-_FOR_BEAMS = 0.02  # beams are smooth, and how large their differences are is a guess
+_FOR_BEAMS = 0.05  # beams are smooth, and how large their differences are is a guess
 _BEAM_MODES = 8
 _MOST_STEPS = 600
 _PROBES, _LANCZOS = 8, 25
