@@ -18,7 +18,7 @@ from napari_shadowinv.options import FitOptions
 
 __all__ = ["BeamShifts", "errors_by_noise", "largest_share", "shifts_by_beam"]
 
-_BEAM_SAMPLES, _BEAM_SEED = 3, 1
+_BEAM_SAMPLES, _OPEN_BEAM_SAMPLES, _BEAM_SEED = 2, 3, 1
 _SMOOTHED_ERRORS = 4.0  # px
 
 
@@ -86,7 +86,7 @@ def shifts_by_beam(
     if not given.common:
         return BeamShifts(variation, by_percent, 100 * variation * by_percent)
     # Several images exclude most of the beams that would move the field far.
-    open_beams = posterior.open_beams(variation, _BEAM_SAMPLES, rng)
+    open_beams = posterior.open_beams(variation, _OPEN_BEAM_SAMPLES, rng)
     return BeamShifts(variation, by_percent, spread(open_beams))
 
 

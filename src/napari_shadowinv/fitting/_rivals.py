@@ -26,7 +26,7 @@ _BEAM_MODES, _FINE_BEAM_MODES = 8, 20
 _BEAM_SPREAD = 0.3
 _SHIFT = np.array([True, False, False] * 2)
 _STEPS = 12
-_PEDESTAL = 0.1  # of each image's mean
+_PEDESTALS = 0.09, 0.17  # of each image's mean: dark levels of 10 and 20 % of the beam
 
 
 @dataclass(frozen=True)
@@ -105,13 +105,12 @@ def _rivals(
     cause = "the images are blurred by more than the point spread that was given (psf, --psf)"
     for width in (_WIDER_PX, _MUCH_WIDER_PX):
         yield _Rival(_wider(scene, width), best.unknowns, 0, cause)
-    yield _Rival(
-        _without_pedestal(scene),
-        best.unknowns,
-        0,
-        "a constant lies under the images: without a tenth of their mean they are explained "
-        "better; subtract the detector's dark level",
+    cause = (
+        "a constant lies under the images: with less of it they are explained better; subtract "
+        "the detector's dark level"
     )
+    for pedestal in _PEDESTALS:
+        yield _Rival(_without_pedestal(scene, pedestal), best.unknowns, 0, cause)
 
 
 def _with_free_beam(scene: Scene, best: Found) -> Iterator[_Rival]:
@@ -158,9 +157,9 @@ def _wider(scene: Scene, added: float) -> Scene:
     return replace(scene, psf=widths)
 
 
-def _without_pedestal(scene: Scene) -> Scene:
+def _without_pedestal(scene: Scene, pedestal: float) -> Scene:
     """The images less a constant, brought back to their mean; so is their noise."""
-    share = 1 - _PEDESTAL
+    share = 1 - pedestal
     means = scene.images.sum(axis=(1, 2)) / np.maximum((scene.images != 0).sum(axis=(1, 2)), 1)
-    images = (scene.images - _PEDESTAL * means[:, None, None]) / share
+    images = (scene.images - pedestal * means[:, None, None]) / share
     return replace(scene, images=images, weights=scene.weights * share**2)

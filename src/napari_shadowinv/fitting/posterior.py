@@ -23,7 +23,7 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 __all__ = ["Posterior"]
 
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
-_FOR_BEAMS = 0.05  # beams are smooth, and how large their differences are is a guess
+_FOR_BEAMS = 0.01  # beams are smooth, and how large their differences are is a guess
 _BEAM_MODES = 8
 _MOST_STEPS = 600
 _PROBES, _LANCZOS = 8, 25
@@ -86,12 +86,12 @@ class Posterior:
         weights = determined / determined.sum(axis=1, keepdims=True)
         return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
 
-    def drawn(self, tolerance: float = _CLOSELY) -> Unknowns:
+    def drawn(self) -> Unknowns:
         """Return a random change of the unknowns, as large as the data leave possible."""
         noise = self._rng.normal(size=self._scene.images.shape)
         slope = self._linear.pulled(noise)
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
-        return self._scales.times(self._unknowns.like(self._solved(slope, tolerance)))
+        return self._scales.times(self._unknowns.like(self._solved(slope, _CLOSELY)))
 
     def moved_by_beams(self, variations: FloatArray) -> Unknowns:
         """Return the change of the unknowns if the beams differ from their sources.
@@ -127,7 +127,7 @@ class Posterior:
         freed = self._scene.with_free_beam(_BEAM_MODES, variation)
         beam = np.zeros((_BEAM_MODES, _BEAM_MODES))
         posterior = Posterior(freed, self._unknowns._replace(beam=beam), rng, self._after_step)
-        drawn = (posterior.drawn(_FOR_BEAMS) for _ in range(count))
+        drawn = (posterior.drawn() for _ in range(count))
         return [freed.beam_changes(each) for each in drawn]
 
     def log_volume(self, chances: Sequence[np.random.Generator]) -> float:
