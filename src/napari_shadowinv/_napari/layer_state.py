@@ -132,9 +132,10 @@ def _inputs_shown(viewer: Any, result: Result | None) -> set[str]:
     """Roles of what a viewer shows already as a shot and its source, because no step changed it."""
     content = None if result is None else result.content
     recipe = getattr(getattr(content, "provenance", None), "recipe", None)
-    if recipe is None or recipe.steps:
+    image = getattr(content, "image", None)  # a fit has several
+    if image is None or recipe is None or recipe.steps:
         return set()
-    shape = content.image.shape  # type: ignore[union-attr]
+    shape = image.shape
     inputs = {SHOT: "image", SOURCE: "source", None: "image"}
     return {
         inputs[role_of(shown)]
