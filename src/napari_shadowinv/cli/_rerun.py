@@ -66,6 +66,7 @@ class Places:
         files = {
             "a mask": recipe.mask,
             "a source mask": recipe.source_mask,
+            "a dark frame": recipe.dark_file,
             "a source": recipe.source.file if isinstance(recipe.source, MeasuredSource) else None,
         }
         for name, file in files.items():
@@ -143,7 +144,10 @@ def inversion_again(
     # What else its file holds was not used, unless the provenance says so.
     image = shot.image if made.gain is None else shot.image / made.gain
     alone = replace(shot, image=image, setup=None, mask=None, source_mask=None)
-    inversion = inverted(made.recipe, alone, beam, quiet, **drawn)
+    recipe = made.recipe
+    if made.dark is not None:
+        recipe = recipe.with_dark_file(places.find(made.dark, "the dark frame"))
+    inversion = inverted(recipe, alone, beam, quiet, **drawn)
     if inversion.provenance is not None:
         told = inversion.provenance.model_copy(update={"gain": made.gain})
         inversion = replace(inversion, provenance=told)
@@ -169,6 +173,7 @@ def _changes(before: Provenance, again: Inversion) -> list[str]:
         *changed_version(before.version),
         *changed_file("image", before.image, now.image),
         *changed_file("source", before.source, now.source),
+        *changed_file("dark frame", before.dark, now.dark),
     ]
 
 

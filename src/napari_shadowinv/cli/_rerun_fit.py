@@ -72,7 +72,12 @@ def fit_made_again(
     shots = [files.shot(k) for k in range(count)]
     fiducials = files.fiducials()
     protect(outputs, [places.result, *files.read])
-    again = fitted(made.recipe, shots, fiducials, quiet)
+    from napari_shadowinv.preprocessing import Origin
+
+    recipe, dark = made.recipe, made.recipe.dark_file
+    if dark is not None:
+        recipe = recipe.with_dark_file(places.find(Origin(file=dark.name), "the dark frame"))
+    again = fitted(recipe, shots, fiducials, quiet)
     names = [str(files.read[k]) for k in range(count)]
     changes = [*changed_version(made.version), *_changes(made, again), *files.changes]
     return FitAgain(again, tuple(names), tuple(changes), _difference(before, again))

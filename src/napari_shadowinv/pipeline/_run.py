@@ -292,11 +292,15 @@ def gathered(
             "setup": setup,
         }
     )
+    dark = _dark_frame(recipe, whole)
+    if dark is not None:
+        resolved = resolved.with_dark_file(Path(_origin(dark).file))
     provenance = Provenance(
         version=__version__,
         recipe=resolved,
         image=_origin(whole),
         source=None if beam is None else _origin(beam),
+        dark=None if dark is None else _origin(dark),
         mask=usable.origin,
         source_mask=bare.origin,
     )
@@ -307,8 +311,25 @@ def gathered(
         warnings=(*whole.warnings, *(() if beam is None else beam.warnings)),
         mask=usable.pixels,
         source_mask=bare.pixels,
+        dark=None if dark is None else dark.image,
     )
     return Inputs(resolved, complete, provenance)
+
+
+def _dark_frame(recipe: Recipe, shot: Radiograph) -> Radiograph | None:
+    """Image of the detector without light that the recipe subtracts, if it names a file."""
+    file = recipe.dark_file
+    if file is None:
+        return None
+    frame = read_radiograph(file)
+    if frame.shape != shot.shape:
+        raise InputError(
+            f"{file}: the dark frame has shape {frame.shape}, image {shot.shape}: they must match"
+        )
+    bad = int((~np.isfinite(frame.image)).sum())
+    if bad:
+        raise InputError(f"{file}: the dark frame has {bad} pixels that are NaN or infinite")
+    return frame
 
 
 def _source_file(wanted: MeasuredSource, shot: Radiograph) -> Path | None:

@@ -77,6 +77,8 @@ def _with_files(recipe: Recipe, moved: Any) -> Recipe:
         for name in ("mask", "source_mask")
         if getattr(recipe, name) is not None
     }
+    if (dark := recipe.dark_file) is not None:
+        recipe = recipe.with_dark_file(moved(dark))
     source = recipe.source
     if isinstance(source, MeasuredSource) and source.file is not None:
         changes["source"] = source.model_copy(update={"file": moved(source.file)})

@@ -1,7 +1,8 @@
 """What is done to a shot before its inversion, and the recipe that says so.
 
 - the shot: `Radiograph`; the recipe: `Recipe`; what it was applied to: `Provenance`
-- steps: `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,
+- whether image and source look right: `image_warnings`, `ReferencePair`
+- steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,
   `high_pass`, `butterworth`, `remove_background`, `remove_hot_pixels`
 - estimates of the source by name in `ESTIMATES`; as functions `uniform_source`,
   `isotropic_source`, `gaussian_source`, `polynomial_source`, `low_pass_source`,

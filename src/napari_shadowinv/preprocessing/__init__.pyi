@@ -25,6 +25,7 @@ from .filters import (
 from .fit_provenance import FitOrigin, FitProvenance
 from .gaussian import GaussianEstimate, gaussian_source
 from .hot_pixels import HotPixelFilter, remove_hot_pixels
+from .image_checks import ReferencePair, image_warnings
 from .isotropic import IsotropicEstimate, isotropic_source, uniform_warnings
 from .pixels import fit_polynomial
 from .radiograph import Radiograph
@@ -40,7 +41,7 @@ from .recipe import (
     check_masks,
     estimated_source,
 )
-from .steps import Bin, Choice, Crop, Rotate, Step
+from .steps import Bin, Choice, Crop, Dark, Rotate, Step
 
 __all__ = [
     "ESTIMATES",
@@ -52,6 +53,7 @@ __all__ = [
     "ButterworthFilter",
     "Choice",
     "Crop",
+    "Dark",
     "Estimate",
     "Filter",
     "FitOrigin",
@@ -69,6 +71,7 @@ __all__ = [
     "Provenance",
     "Radiograph",
     "Recipe",
+    "ReferencePair",
     "Rotate",
     "Step",
     "TotalVariationEstimate",
@@ -79,6 +82,7 @@ __all__ = [
     "fit_polynomial",
     "gaussian_source",
     "high_pass",
+    "image_warnings",
     "interpolated_source",
     "isotropic_source",
     "low_pass",

@@ -58,6 +58,10 @@ class Filter(Step):
     function: ClassVar[Callable[..., FloatArray]]
     """Filters an image by the parameters."""
 
+    @property
+    def moves_pixels(self) -> bool:
+        return False
+
     def filtered(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
     ) -> FloatArray:

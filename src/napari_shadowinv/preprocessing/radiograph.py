@@ -35,6 +35,8 @@ class Radiograph:
         True where a pixel can be used; where the object is not, and the source can be estimated.
     warnings : tuple of str
         What the user should know before trusting what the file says.
+    dark : ndarray, shape (H, W), or None
+        Image of the detector without light, for a step `Dark` with a file.
     """
 
     image: FloatArray
@@ -45,6 +47,7 @@ class Radiograph:
     mask: BoolArray | None = None
     source_mask: BoolArray | None = None
     warnings: tuple[str, ...] = ()
+    dark: FloatArray | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -69,6 +72,7 @@ class Radiograph:
             self,
             image=values(self.image),
             source=None if self.source is None else values(self.source),
+            dark=None if self.dark is None else values(self.dark),
             mask=None if self.mask is None else masks(self.mask),
             source_mask=None if self.source_mask is None else masks(self.source_mask),
         )

@@ -28,7 +28,7 @@ from napari_shadowinv.preprocessing import gaussian, hot_pixels, isotropic  # no
 from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.filters import Filter
 from napari_shadowinv.preprocessing.radiograph import Radiograph
-from napari_shadowinv.preprocessing.steps import Choice, Step, choices_of
+from napari_shadowinv.preprocessing.steps import Choice, Dark, Step, choices_of
 
 if TYPE_CHECKING:
     from napari_shadowinv._system.progress import OnWarning, ShouldStop
@@ -124,6 +124,22 @@ class Recipe(CheckedModel):
     )
 
     @property
+    def dark_file(self) -> Path | None:
+        """File of the dark frame to subtract; an `InputError` if there are several."""
+        files = {step.frame_file for step in self.steps if isinstance(step, Dark)} - {None}
+        if len(files) > 1:
+            raise InputError(f"got {len(files)} dark frames, expected one: average them first")
+        return files.pop() if files else None
+
+    def with_dark_file(self, file: Path) -> Recipe:
+        """Return the same with its dark frame in another place."""
+        steps = tuple(
+            Dark(level=file) if isinstance(step, Dark) and step.frame_file else step
+            for step in self.steps
+        )
+        return self.model_copy(update={"steps": steps})
+
+    @property
     def estimate(self) -> Estimate | None:
         """How the source is estimated; None if it is measured, or uniform by default."""
         return self.source if isinstance(self.source, Estimate) else None
@@ -145,7 +161,7 @@ class Recipe(CheckedModel):
     def moved(self, shot: Radiograph) -> Radiograph:
         """Return a shot after those steps alone that move pixels, such as for its masks."""
         for step in self.steps:
-            if not isinstance(step, Filter):
+            if step.moves_pixels:
                 shot = step.applied(shot)
         return shot
 
@@ -322,6 +338,7 @@ class Provenance(CheckedModel):
     recipe: Recipe
     image: Origin = Origin()
     source: Origin | None = None
+    dark: Origin | None = None
     mask: Origin | None = None
     source_mask: Origin | None = None
     setup: Setup | None = None

@@ -1,10 +1,15 @@
-"""Steps of a recipe that move pixels: `Rotate`, `Crop`, `Bin`; what all steps share: `Step`."""
+"""Steps of a recipe that are no filters, and what all steps share: `Step`.
+
+- subtract the detector's dark level: `Dark`
+- move pixels: `Rotate`, `Crop`, `Bin`
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -103,6 +108,11 @@ class Step(Choice):
         return False
 
     @property
+    def moves_pixels(self) -> bool:
+        """Whether it changes where pixels are, and leaves their values."""
+        return True
+
+    @property
     def smooths(self) -> bool:
         """Whether it takes noise from pixels that it leaves in their mean over many."""
         return False
@@ -122,6 +132,78 @@ class Step(Choice):
     def matrix(self, shape: tuple[int, int]) -> FloatArray:
         """Return the matrix that takes (y, x, 1) after this step to (y, x, 1) before it."""
         return np.eye(3)
+
+
+def _as_level(value: Any) -> Any:
+    """Read a number, or else the name of a file."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return float(value)
+    except ValueError:
+        return Path(value)
+
+
+Level = Annotated[
+    Annotated[float, Field(allow_inf_nan=False)] | Path,
+    BeforeValidator(_as_level),
+    PlainSerializer(
+        lambda level: str(level) if isinstance(level, Path) else level, when_used="json"
+    ),
+]
+"""A number of counts, or a file with an image of them."""
+
+
+class Dark(Step):
+    """Subtract the detector's dark level from image and source.
+
+    An image without it is linear in the fluence, as an inversion assumes. Pixels of a source that
+    are negative then are set to zero; those of the image are left to the inversion's options.
+    """
+
+    title = "subtract dark level"
+    primary = "level"
+    place = 5
+    step: Literal["dark"] = "dark"
+    level: Level = Field(
+        default=0.0,
+        title="Level",
+        description=(
+            "Counts of the detector without light, or an image of them, which is subtracted from "
+            "image and source."
+        ),
+        json_schema_extra={"metavar": "COUNTS|FILE"},
+    )
+
+    @property
+    def moves_pixels(self) -> bool:
+        return False
+
+    @property
+    def frame_file(self) -> Path | None:
+        """File of the image to subtract; None for a number."""
+        return self.level if isinstance(self.level, Path) else None
+
+    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+        dark: Any = self.level
+        name = f"level {dark:g}" if self.frame_file is None else f"frame {self.frame_file.name}"
+        if self.frame_file is not None:
+            if shot.dark is None:
+                raise InputError(
+                    f"the dark {name} has not been read: run the recipe, or put the image in the "
+                    "shot's 'dark'"
+                )
+            dark = shot.dark
+        usable = np.isfinite(shot.image) if shot.mask is None else shot.mask
+        image = shot.image - dark
+        if usable.any() and not image[usable].mean() > 0:
+            raise InputError(
+                f"the dark {name} is not below the image's mean of "
+                f"{shot.image[usable].mean():.4g}: expected the counts without light, in the "
+                "units of the image"
+            )
+        source = None if shot.source is None else np.maximum(shot.source - dark, 0.0)
+        return replace(shot, image=image, source=source).noted(f"dark {name} subtracted")
 
 
 def _turned(array: AnyArray, turns: int) -> Any:

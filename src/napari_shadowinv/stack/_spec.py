@@ -274,9 +274,10 @@ def _shared_beam(inputs: Inputs, sources: Any) -> Beam | None:
         return Beam.of(moved.shape, None, moved.mask)
     if sources is None or isinstance(sources, Shots):
         return None
-    ready = inputs.recipe.prepared(replace(inputs.shot, image=np.asarray(sources, np.float64)))
-    checked_source(ready.image, ready.mask)
-    return Beam.of(ready.shape, ready.image, ready.mask)
+    beam = np.asarray(sources, np.float64)
+    ready = inputs.recipe.prepared(replace(inputs.shot, image=beam, source=beam))
+    checked_source(ready.source, ready.mask)
+    return Beam.of(ready.shape, ready.source, ready.mask)
 
 
 def _checked_variables(

@@ -5,11 +5,20 @@ from __future__ import annotations
 import math
 import re
 import types
+from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 from qtpy.QtCore import QEvent, QObject, QSignalBlocker, Qt, Signal
-from qtpy.QtWidgets import QCheckBox, QComboBox, QLineEdit, QSizePolicy, QWidget
+from qtpy.QtWidgets import (
+    QCheckBox,
+    QComboBox,
+    QFileDialog,
+    QLineEdit,
+    QSizePolicy,
+    QToolButton,
+    QWidget,
+)
 from superqt import QLabeledDoubleSlider, QLabeledSlider, QLargeIntSpinBox
 
 from napari_shadowinv._napari.widgets._qt import beside
@@ -261,6 +270,36 @@ class _Range(Editor):
         self.changed.emit()
 
 
+class _NumberOrFile(Editor):
+    """A number or the name of a file, as text, with a button to choose the file."""
+
+    def __init__(self, title: str) -> None:
+        text, button = QLineEdit(), QToolButton()
+        text.setPlaceholderText("a number, or a file")
+        text.setMinimumWidth(80)
+        button.setText("…")
+        button.setToolTip("Choose a file.")
+        super().__init__(beside((text, 1), (button, 0)))
+        self._text, self._title = text, title
+        self._text.editingFinished.connect(self.changed)
+        button.clicked.connect(lambda: self._choose())
+
+    def value(self) -> str | None:
+        """The text, for the model to understand or refuse."""
+        return self._text.text().strip() or None
+
+    def set_value(self, value: Any) -> None:
+        if isinstance(value, float):
+            value = f"{value:.10g}"
+        self._text.setText("" if value is None else str(value))
+        self.changed.emit()
+
+    def _choose(self) -> None:
+        path, _ = QFileDialog.getOpenFileName(self, self._title)
+        if path:
+            self.set_value(path)
+
+
 class _Optional(Editor):
     """Another editor behind a check box; None while it is not checked."""
 
@@ -321,6 +360,8 @@ def _plain_editor(kind: Any, field: FieldInfo) -> Editor:
         return _Quantity(unit_of_title(field.title or "")[1])
     if get_origin(kind) is tuple:
         return _Range()
+    if Path in get_args(kind):
+        return _NumberOrFile(field.title or "")
     raise TypeError(f"no editor for a field of type {kind}")
 
 
