@@ -67,7 +67,7 @@ def test_each_step_and_each_source_is_shown_once_with_all_that_it_takes():
 
 
 def test_the_order_of_steps_is_that_of_the_command():
-    (told,) = re.findall(r"in the order (rotate, .*?)\.", PAGE)
+    (told,) = re.findall(r"in the order (dark, .*?)\.", PAGE)
     assert told.split(", ") == list(STEPS)
 
 

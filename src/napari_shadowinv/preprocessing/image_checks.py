@@ -108,7 +108,7 @@ def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -
         yield (
             f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
             "zero, so the detector's dark level seems to be left in it: the field comes out too "
-            "weak, by about the same share; subtract it from image and source (step 'dark', "
+            "weak, by this share or more; subtract it from image and source (step 'dark', "
             "--dark)"
         )
     strays = np.zeros(image.shape, bool)

@@ -141,15 +141,17 @@ def _as_level(value: Any) -> Any:
     try:
         return float(value)
     except ValueError:
-        return Path(value)
+        return value
+
+
+def _as_plain(level: float | Path) -> float | str:
+    return str(level) if isinstance(level, Path) else level
 
 
 Level = Annotated[
     Annotated[float, Field(allow_inf_nan=False)] | Path,
     BeforeValidator(_as_level),
-    PlainSerializer(
-        lambda level: str(level) if isinstance(level, Path) else level, when_used="json"
-    ),
+    PlainSerializer(_as_plain, when_used="json"),
 ]
 """A number of counts, or a file with an image of them."""
 

@@ -276,6 +276,7 @@ def _shared_beam(inputs: Inputs, sources: Any) -> Beam | None:
         return None
     beam = np.asarray(sources, np.float64)
     ready = inputs.recipe.prepared(replace(inputs.shot, image=beam, source=beam))
+    assert ready.source is not None
     checked_source(ready.source, ready.mask)
     return Beam.of(ready.shape, ready.source, ready.mask)
 
