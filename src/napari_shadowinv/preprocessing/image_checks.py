@@ -66,8 +66,9 @@ _MIN_BLOCKS = 16
 _USABLE = 0.999  # share of a block's pixels
 _RING = 0.2  # of the side: there is rarely an object
 _MAX_SHIFT = 0.2  # of the side
-_MIN_SHIFT = 0.6  # coarse pixels
 _MATCH = 0.5  # of the mismatch that may be left after a shift
+_ABOVE_NOISE = 1.2  # of the median mismatch, so that a shift can be told
+_MIN_SIDES = 3  # of the image, that tell
 _MIN_OVERLAP = 0.4  # of the ring
 _MIN_CONTRAST = 0.01  # of the mean
 _NEGATIVE_CORRELATION = -0.4
@@ -349,17 +350,41 @@ class ReferencePair:
         shift = np.array([int(place) - side for place, side in zip(best, reach, strict=True)])
         if (np.abs(shift) == reach).any():
             return None
-        unmoved, remaining = float(near[reach[0], reach[1]]), float(near[best])
-        if not shift.any():
-            # Below a block: the differences lie along the gradient of the beam.
-            slopes = np.stack([np.gradient(beam, axis=axis)[ring] for axis in (0, 1)], axis=1)
-            difference = (shot - beam)[ring]
-            fraction, *_ = np.linalg.lstsq(slopes, -difference, rcond=None)
-            remaining = float(((difference + (slopes * fraction).sum(axis=1)) ** 2).mean())
-            shift = shift + fraction
-        if np.hypot(*shift) < _MIN_SHIFT or remaining > _MATCH * unmoved:
+        if not shift.any() or not self._fits_after(shift[0], shift[1]):
             return None
         return float(shift[0] * step), float(shift[1] * step)
+
+    def _fits_after(self, down: int, right: int) -> bool:
+        """Whether a shift by blocks makes most sides fit; an object displaces some of them."""
+        shot, beam, _ = self._blocks
+        height, width = shot.shape
+        rows = slice(max(down, 0), height + min(down, 0))
+        columns = slice(max(right, 0), width + min(right, 0))
+        behind = (
+            slice(rows.start - down, rows.stop - down),
+            slice(columns.start - right, columns.stop - right),
+        )
+        common = self._ring[rows, columns] & self._ring[behind]
+        moved = (shot[rows, columns] - beam[behind]) ** 2
+        unmoved = (shot - beam)[rows, columns] ** 2
+        pair = self._ring[:, 1:] & self._ring[:, :-1]
+        noise = float(np.median(np.diff(shot - beam, axis=1)[pair] ** 2)) / 2
+
+        def gain(part: BoolArray) -> float:
+            """Share that is left of the mismatch, apart from noise."""
+            before, after = (float(np.median(values[part])) for values in (unmoved, moved))
+            return (after - noise) / max(before - noise, 1e-300)
+
+        if common.sum() < _MIN_BLOCKS or np.median(unmoved[common]) < _ABOVE_NOISE * noise:
+            return False
+        if gain(common) > _MATCH:
+            return False
+        y, x = np.ogrid[rows, columns]
+        top, left = height * _RING, width * _RING
+        sides = (y < top, y >= height - top, x < left, x >= width - left)
+        parts = [common & side for side in sides]
+        better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
+        return len(better) >= _MIN_SIDES and sum(better) >= len(better) - 1
 
     @cached_property
     def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
