@@ -147,8 +147,8 @@ def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -
     elif pair.shift is not None:
         down, right = pair.shift
         yield (
-            "register: at its borders the image fits the source best after a shift by "
-            f"{down:+.0f} px in y and {right:+.0f} px in x: the shift would be taken for a field; "
+            f"register: at its borders the image lies {down:+.0f} px in y and {right:+.0f} px in x "
+            "from the source: the shift would be taken for a field; "
             "align source and image, or cut both to the same part of the beam (step 'crop')"
         )
 

@@ -1,0 +1,200 @@
+"""Mistakes are put into images whose field is known; the images without them stay silent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from napari_shadowinv import InversionOptions, invert, run, synthetic_image
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.preprocessing import (
+    Bin,
+    Crop,
+    Dark,
+    Radiograph,
+    Recipe,
+    ReferencePair,
+    image_warnings,
+)
+from napari_shadowinv.preprocessing.image_checks import (
+    dark_level,
+    saturated_share,
+    stray_pixels,
+)
+
+SHAPE = (160, 160)
+COUNTS = 300
+
+
+def beam() -> np.ndarray:
+    """A smooth beam with structure of 10 %, mean 1."""
+    y, x = np.indices(SHAPE) / SHAPE[0]
+    texture = gaussian_filter(np.random.default_rng(5).normal(size=SHAPE), 4)
+    smooth = np.exp(-((y - 0.45) ** 2 + (x - 0.55) ** 2) / 0.5)
+    structured = smooth * (1 + 0.1 * texture / texture.std())
+    return structured / structured.mean()
+
+
+def counted(peak: float) -> tuple[np.ndarray, np.ndarray]:
+    """Image and source in counts, with noise of counting."""
+    truth = toroid(SHAPE, paper_setup(), peak, 30e-6).displacement
+    rng = np.random.default_rng(1)
+    image = rng.poisson(COUNTS * synthetic_image(truth, beam())).astype(float)
+    return image, rng.poisson(COUNTS * beam()).astype(float)
+
+
+@pytest.fixture(scope="module")
+def shot() -> tuple[np.ndarray, np.ndarray]:
+    return counted(194.0)
+
+
+@pytest.fixture(scope="module")
+def faint() -> tuple[np.ndarray, np.ndarray]:
+    return counted(24.0)
+
+
+def named(image, source, mask=None) -> list[str]:
+    """The names of the warnings."""
+    return [text.partition(":")[0] for text in image_warnings(image, source, mask)]
+
+
+def test_image_warnings_are_silent_on_a_right_shot(shot):
+    image, source = shot
+    assert named(image, source) == []
+    assert named(image, None) == []
+    assert named(7.3 * image, 0.1 * source) == []
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_dark_level_is_the_offset_in_units_of_the_mean(shot, share):
+    image = shot[0]
+    offset = share * image.mean()
+    assert dark_level(image) == 0
+    assert dark_level(image + offset) == pytest.approx(share / (1 + share), rel=0.15)
+    assert named(image + offset, shot[1] + offset) == ["dark level"]
+
+
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0])
+def test_dark_level_needs_no_kind_of_noise_to_be_silent(power):
+    image = synthetic_image(toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement)
+    rng = np.random.default_rng(2)
+    assert dark_level(image + 0.05 * image**power * rng.normal(size=SHAPE)) == 0
+
+
+def test_dark_level_ignores_masked_pixels(shot):
+    image = shot[0] + 100.0
+    mask = np.ones(SHAPE, bool)
+    mask[:, :40] = False
+    garbled = np.where(mask, image, np.random.default_rng(0).normal(5000, 900, SHAPE))
+    assert dark_level(garbled, mask) == dark_level(np.where(mask, image, 0.0), mask) > 0.1
+
+
+def test_saturation_is_the_share_of_clipped_pixels(shot):
+    image, source = shot
+    limit = 1.5 * image.mean()
+    clipped = np.minimum(image, limit)
+    assert saturated_share(clipped) == np.mean(image >= limit)
+    assert saturated_share(image) == 0
+    assert named(clipped, source) == ["saturation"]
+
+
+def test_saturation_leaves_uniform_images_alone():
+    assert saturated_share(np.ones(SHAPE)) == 0
+
+
+def test_stray_pixels_are_those_put_in(shot):
+    image = shot[0].copy()
+    rows, columns = np.array([[20, 21], [70, 5], [140, 150], [10, 120]]).T
+    image[rows, columns] = 20 * COUNTS
+    image[30, 20] = 0
+    expected = {*zip(rows.tolist(), columns.tolist(), strict=True), (30, 20)}
+    assert {tuple(place) for place in np.argwhere(stray_pixels(image)).tolist()} == expected
+    assert not stray_pixels(shot[0]).any()
+    assert named(image, shot[1]) == ["hot pixels"]
+
+
+def test_stray_pixels_leave_a_focus_alone():
+    y, x = np.indices(SHAPE) - 80.0
+    focus = 1 + 100 / (1 + 8 * (y**2 + x**2))
+    assert not stray_pixels(focus).any()
+
+
+@pytest.mark.parametrize("shift", [(6, 0), (-6, 4), (0, 20)])
+def test_register_finds_the_shift_of_a_reference(faint, shift):
+    image, source = faint
+    down, right = shift
+    part = np.s_[24:136, 24:136]
+    moved = source[24 + down : 136 + down, 24 + right : 136 + right]
+    pair = ReferencePair(image[part], moved, np.ones((112, 112), bool))
+    assert pair.shift == (down, right)
+    assert named(image[part], moved) == ["register"]
+    assert named(image[part], source[part]) == []
+
+
+def test_negative_and_swapped_are_named(shot, faint):
+    image, source = faint
+    assert "negative" in named(image.max() - image, source)
+    assert named(shot[1], shot[0])[-1:] == ["swapped"]
+
+
+def test_invert_reports_what_the_checks_see(shot):
+    image, source = (plane[30:130, 30:130] for plane in shot)
+    dark = 0.5 * image.mean()
+    few = InversionOptions(n_sites=300)
+    warnings = invert(image + dark, source=source + dark, options=few).report.warnings
+    assert any(text.startswith("dark level: ") for text in warnings)
+    # An estimate of the source comes from the image itself: nothing is compared with it.
+    recipe = Recipe(source={"method": "gaussian"}, options=few)
+    alone = run(recipe, np.minimum(image, 1.5 * image.mean()))
+    names = [text.partition(":")[0] for text in alone.report.warnings]
+    assert "saturation" in names
+    assert not {"register", "swapped", "negative"} & set(names)
+
+
+# The step
+
+
+def test_dark_gives_the_field_without_an_offset(shot):
+    image, source = (plane[:64, :64] for plane in shot)
+    plain = run(Recipe(), image, source=source)
+    taken = run(Recipe(steps=(Dark(level=200.0),)), image + 200, source=source + 200)
+    np.testing.assert_array_equal(taken.displacement, plain.displacement)
+    assert taken.provenance.notes == ("dark level 200 subtracted",)
+
+
+def test_dark_frame_moves_with_the_image(shot, tmp_path):
+    image, source = shot
+    frame = np.random.default_rng(3).uniform(50, 250, SHAPE)
+    np.save(tmp_path / "dark.npy", frame)
+    dark = Dark(level=tmp_path / "dark.npy")
+    crop, merge = Crop(y=(10, 74), x=(20, 84)), Bin(factor=2)
+    plain = run(Recipe(steps=(crop, merge)), image, source=source)
+    for steps in ((dark, crop, merge), (crop, dark, merge), (crop, merge, dark)):
+        taken = run(Recipe(steps=steps), image + frame, source=source + frame)
+        np.testing.assert_allclose(taken.displacement, plain.displacement, atol=1e-6)
+    assert taken.provenance.dark.file == "dark.npy"
+
+
+def test_dark_is_a_number_or_a_file_in_every_notation():
+    for level in (12.5, "12.5"):
+        assert Dark(level=level).level == 12.5
+    recipe = Recipe(steps=(Dark(level="frames/dark.tif"),))
+    assert recipe.dark_file.name == "dark.tif"
+    assert Recipe.model_validate_json(recipe.model_dump_json()) == recipe
+
+
+@pytest.mark.parametrize(
+    ("level", "message"),
+    [(500.0, "not below the image's mean"), ("unread.tif", "has not been read")],
+)
+def test_dark_says_why_it_cannot_be_subtracted(level, message):
+    with pytest.raises(InputError, match=message):
+        Dark(level=level).applied(Radiograph(np.full((8, 8), 400.0)))
+
+
+def test_dark_frame_of_another_size_is_refused(tmp_path):
+    np.save(tmp_path / "dark.npy", np.ones((5, 6)))
+    with pytest.raises(InputError, match=r"\(5, 6\), image \(8, 8\): they must match"):
+        run(Recipe(steps=(Dark(level=tmp_path / "dark.npy"),)), np.full((8, 8), 400.0))
