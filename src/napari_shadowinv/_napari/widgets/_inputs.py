@@ -58,11 +58,11 @@ class SetupPicker(QWidget):
             "<qt>With a setup the results are in SI units; lengths can be entered as 1.3 mm or "
             "0.0013.</qt>"
         )
-        self.geometry = forms.wrapping_label()
+        self.geometry_label = forms.wrapping_label()
         self.doubts = forms.wrapping_label(style=forms.PROBLEM_STYLE)
         self.note = forms.wrapping_label()
         self.files = forms.TomlButtons("setup", self._to_save, self.load)
-        column(self, self.picker, self.geometry, self.doubts, self.note, self.files)
+        column(self, self.picker, self.geometry_label, self.doubts, self.note, self.files)
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
 
@@ -189,7 +189,7 @@ class SetupPicker(QWidget):
             shape = height, width
         line = "" if setup is None else geometry_text(setup, shape)
         doubts = () if setup is None else setup_warnings(setup, shape)
-        for label, text in ((self.geometry, line), (self.doubts, "\n".join(doubts))):
+        for label, text in ((self.geometry_label, line), (self.doubts, "\n".join(doubts))):
             label.setText(text)
             label.setVisible(bool(text))
 
