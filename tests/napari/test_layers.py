@@ -317,3 +317,30 @@ def test_layers_keep_their_order_when_some_are_deleted_between_results(
     qtbot.waitUntil(lambda: bool(complete), timeout=60_000)
     assert [layer.name for layer in window.layers if layer.name != "other"] == names
     assert window.layers.selection.active is window.layers["other"]
+
+
+def test_masked_pixels_are_blank_and_set_no_limits(solved: Inversion) -> None:
+    mask = np.ones(solved.image.shape, bool)
+    mask[15:25, 20:30] = False
+    displacement = solved.displacement.copy()
+    displacement[:, ~mask] = 100.0
+    masked = replace(solved, mask=mask, displacement=displacement)
+    for data, keywords, _ in inversion_layers(masked):
+        role = role_of(keywords)
+        if role in ("field", "field y", "field x", "potential", "residual", "reprojection"):
+            np.testing.assert_array_equal(np.isnan(data), ~mask)
+        if role == "field":
+            strongest = np.hypot(*solved.displacement)[mask].max()
+            assert keywords["contrast_limits"] == (0.0, pytest.approx(strongest))
+        if role == "arrows":
+            at = data[:, 0].astype(int)
+            assert mask[at[:, 0], at[:, 1]].all()
+    assert (masked.displacement[:, ~mask] == 100.0).all()
+
+
+def test_doubtful_result_has_the_doubt_in_its_names(solved: Inversion) -> None:
+    for warnings, converged, mark in (((), True, ""), (("edge",), True, " (doubtful)"),
+                                      (("edge",), False, " (failed)")):  # fmt: skip
+        report = replace(solved.report, warnings=warnings, converged=converged)
+        for _, keywords, _ in inversion_layers(replace(solved, report=report), name="a"):
+            assert keywords["name"].endswith(f" – a{mark}")

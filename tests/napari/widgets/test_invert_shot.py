@@ -19,6 +19,7 @@ from napari.utils import progress
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.layer_metadata import mark, result_of, role_of, unit_of
+from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._napari.widgets import _runner, invert_shot
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.physics.forward import synthetic_image
@@ -529,3 +530,89 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
     assert again.source.picker.model() == tool.source.picker.model()
     assert again.steps.steps() == tuple(step() for step in STEPS.values())
     assert again.steps.folded.text().startswith("Steps first: rotate, crop, remove hot pixels, bin")
+
+
+def test_doubts_stand_under_run_with_a_notification(
+    window: Any, tool: Any, run: Any, told: list[str]
+) -> None:
+    tool.options.set_values({**FEW, "max_iterations": 1})
+    run(tool)
+    assert "Failed" in tool.verdict.text()
+    (text,) = told
+    assert text.startswith("Failed: ")
+    assert "--" not in tool.verdict.text()
+    assert layer_of(window, "field").name.endswith("(failed)")
+    told.clear()
+    y, x = np.mgrid[:48, :60]
+    edge = synthetic_image(np.stack([0 * x, 0.03 * (x - 20.0)]))
+    window.layers["shot"].data = edge
+    tool.options.set_values(FEW)
+    run(tool)
+    report = result_of(layer_of(window, "field")).content.report
+    assert report.converged
+    assert report.warnings
+    assert "Doubtful" in tool.verdict.text()
+    assert told[-1].startswith("Doubtful: ")
+    assert layer_of(window, "field").name.endswith("(doubtful)")
+    assert "Iterations" in tool.report.texts()
+    assert not tool.report.details.isExpanded()
+
+
+def test_preview_shows_its_verdict_and_residual(
+    window: Any, tool: Any, qtbot: Any, told: list[str]
+) -> None:
+    tool.live.setChecked(True)
+    qtbot.waitUntil(lambda: "Preview: " in tool.verdict.text(), timeout=PATIENCE)
+    content = result_of(layer_of(window, "field", "preview")).content
+    assert f"{100 * content.report.image_residual:.3g} %" in tool.panel.status.text()
+    assert told == []
+
+
+def test_menu_brings_a_hidden_tab_to_the_front(
+    window: Any, tool: Any, open_widget: Any, qtbot: Any
+) -> None:
+    qtbot.waitUntil(lambda: tool._dock is not None, timeout=PATIENCE)
+    front = open_widget("Line profile")
+    qtbot.waitUntil(lambda: tool.visibleRegion().isEmpty(), timeout=PATIENCE)
+    dock = tool._dock
+    dock.setVisible(not dock.isVisible())  # as napari's menu does
+    qtbot.waitUntil(lambda: not tool.visibleRegion().isEmpty(), timeout=PATIENCE)
+    assert front.visibleRegion().isEmpty()
+    qtbot.wait(50)
+    dock.setVisible(not dock.isVisible())
+    qtbot.wait(50)
+    assert not dock.isVisible()
+
+
+def test_image_with_structure_is_taken_before_a_reference(window: Any, open_widget: Any) -> None:
+    y, x = np.mgrid[-1:1:96j, -1:1:96j]
+    beam = 400 * np.exp(-0.3 * (x**2 + y**2))
+    setup = paper_setup()
+    image = synthetic_image(toroid((96, 96), setup, 60.0, 20e-6).displacement, beam)
+    rng = np.random.default_rng(1)
+    window.add_image(rng.poisson(beam).astype(float), name="reference")
+    tool = open_widget("Invert shot")
+    assert tool.image.layer.name == "reference"
+    shot = window.add_image(rng.poisson(image).astype(float), name="shot")
+    assert tool.image.layer is shot
+    window.add_image(rng.poisson(beam).astype(float), name="later reference")
+    assert tool.image.layer is shot
+
+
+def test_camera_fits_after_units_change(
+    window: Any, tool: Any, run: Any, proton_setup: ProtonSetup
+) -> None:
+    run(tool)
+    tool.setup.show_setup(proton_setup.model_dump())
+    run(tool)
+    centre = np.array(window.layers["shot"].extent.world).mean(axis=0)
+    np.testing.assert_allclose(window.camera.center[-2:], centre[-2:], rtol=0.05)
+    zoom = window.camera.zoom
+    window.reset_view()
+    assert window.camera.zoom == pytest.approx(zoom)
+
+
+def test_window_texts_have_labels_in_place_of_flags() -> None:
+    text = "try a free boundary (--boundary free), or give the noise_level; see --max-shots"
+    told = window_text(text)
+    assert told == "try a free boundary, or give the 'Noise level'; see --max-shots"

@@ -134,6 +134,7 @@ class Docked(QWidget):
 
     def _come_to_front(self) -> None:
         if self._dock is not None and self._dock.parent().isVisible():
+            self._in_front = True
             self._dock.show()
             self._dock.raise_()
 
