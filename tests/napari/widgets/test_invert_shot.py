@@ -543,7 +543,7 @@ def test_doubts_stand_under_run_with_a_notification(
     assert "--" not in tool.verdict.text()
     assert layer_of(window, "field").name.endswith("(failed)")
     told.clear()
-    y, x = np.mgrid[:48, :60]
+    x = np.mgrid[:48, :60][1]
     edge = synthetic_image(np.stack([0 * x, 0.03 * (x - 20.0)]))
     window.layers["shot"].data = edge
     tool.options.set_values(FEW)

@@ -156,6 +156,12 @@ class ModelForm(QtWidgets.QWidget):
         needed = [name for name in self.editors if fields[name].is_required()]
         return all(self.editors[name].value() in (None, "") for name in needed)
 
+    @property
+    def _is_blank(self) -> bool:
+        fields = self._model_class.model_fields
+        has_required = any(fields[name].is_required() for name in self.editors)
+        return has_required and self.is_empty
+
     def values(self) -> dict[str, Any]:
         """What the form holds, as a TOML file does: what is not given is left out."""
         edited = {name: editor.value() for name, editor in self.editors.items()}
@@ -191,8 +197,8 @@ class ModelForm(QtWidgets.QWidget):
             self.model()
         except InputError as error:
             self._problem.setText(str(error))
-            # An empty form is no mistake yet.
-            self._problem.setVisible(bool(self.values().keys() - self._fixed.keys()))
+            # A form in which nothing has been typed is no mistake yet, whatever its defaults.
+            self._problem.setVisible(not self._is_blank)
         else:
             self._problem.setVisible(False)
         self.changed.emit()

@@ -67,7 +67,8 @@ def known_field(layer: Any | None, point: Any, setup: Any) -> KnownField:
             "choose one of the simulated objects"
         )
     result = about.result_of(layer)
-    if result is not None and about.role_of(layer) in _FIELDS:
+    is_masked = about.role_of(layer) == "potential" and bool(np.isnan(layer.data).any())
+    if result is not None and (about.role_of(layer) in _FIELDS or is_masked):
         displacement = np.asarray(about.displacement_of(layer))
         return KnownField(displacement, 1.0, result.setup, "The displacement of this result.")
     potential = shown_plane(layer, point) if layer.ndim == 3 else image_of(layer, "potential")

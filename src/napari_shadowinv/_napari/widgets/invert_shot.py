@@ -198,7 +198,7 @@ class InvertShot(InversionInputs, LivePanel):
         self.fit_view = FitView(self.viewer, self.panel)
         self._refined = ResultLayers(self.viewer, self)
         self.verdict, self.report = VerdictLine(), FoldedReport()
-        self._told: Result | None = None
+        self._reported: Result | None = None
         save = SaveButton(
             self,
             lambda: result_to_save(self.viewer, shown_result(self.viewer, self._result_layers())),
@@ -305,7 +305,7 @@ class InvertShot(InversionInputs, LivePanel):
             self._empty_report()
 
     def _empty_report(self) -> None:
-        self._told = None
+        self._reported = None
         self.verdict.empty()
         self.report.empty()
 
@@ -321,7 +321,7 @@ class InvertShot(InversionInputs, LivePanel):
         """Report on the inversion whose layer is selected, such as one from a file."""
         layer = self.viewer.layers.selection.active
         result = None if layer is None else result_of(layer)
-        if result is None or result is self._told or self.panel.runner.running:
+        if result is None or result is self._reported or self.panel.runner.running:
             return
         if isinstance(result.content, Fit):
             self._empty_report()
@@ -329,7 +329,7 @@ class InvertShot(InversionInputs, LivePanel):
         elif isinstance(result.content, Inversion):
             self.fit_view.empty()
             self._report(result.content, result.setup, [])
-            self._told = result
+            self._reported = result
             self.reveal(self.verdict)
 
     def _report(
@@ -354,7 +354,7 @@ class InvertShot(InversionInputs, LivePanel):
             self.panel.say(f"Image residual {image_residual_text(value.inversion)}")
             return
         self._report(value.inversion, value.inversion.setup, request.origins.rows())
-        self._told = result_of(value.described[0][1])
+        self._reported = result_of(value.described[0][1])
         if headline.level is not Level.SOUND:
             show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
         self.reveal(self.verdict)
