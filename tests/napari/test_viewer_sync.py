@@ -31,8 +31,8 @@ def test_only_the_image_that_is_seen_has_a_colour_bar(
     assert bars(viewer) == ["|d| (px) – b"]
     layers["|d| (px) – b"].visible = False
     assert bars(viewer) == ["|d| (px) – a"]
-    layers["potential (px²) – b"].visible = True
-    assert bars(viewer) == ["potential (px²) – b"]
+    layers["residual (% of mean) – b"].visible = True
+    assert bars(viewer) == ["residual (% of mean) – b"]
     layers.move(layers.index("|d| (px) – a"), len(layers))
     assert bars(viewer) == ["|d| (px) – a"]
     # What covers them is no image of this plugin's.
@@ -41,7 +41,7 @@ def test_only_the_image_that_is_seen_has_a_colour_bar(
     layers.remove("other")
     assert bars(viewer) == ["|d| (px) – a"]
     layers.remove("|d| (px) – a")
-    assert bars(viewer) == ["potential (px²) – b"]
+    assert bars(viewer) == ["residual (% of mean) – b"]
 
 
 def test_a_colour_bar_that_was_switched_off_stays_off(
@@ -50,7 +50,7 @@ def test_a_colour_bar_that_was_switched_off_stays_off(
     add_inversion(viewer, solved, name="a")
     viewer.layers["|d| (px) – a"].colorbar.visible = False
     viewer.layers["|d| (px) – a"].visible = False
-    viewer.layers["potential (px²) – a"].visible = True
+    viewer.layers["residual (% of mean) – a"].visible = True
     assert not any(one.colorbar.visible for one in viewer.layers if hasattr(one, "colorbar"))
 
 

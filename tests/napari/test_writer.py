@@ -60,7 +60,7 @@ def assert_same_layer(one: Any, two: Any) -> None:
     if hasattr(one, "features"):
         assert list(one.features) == list(two.features)
         np.testing.assert_array_equal(two.features, one.features)
-    facts = [{**mark_of(layer), "result": None} for layer in (one, two)]
+    facts = [{**mark_of(layer), "result": None, "source": None} for layer in (one, two)]
     assert facts[0] == facts[1]
 
 

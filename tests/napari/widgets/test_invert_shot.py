@@ -319,7 +319,7 @@ def test_a_run_replaces_the_last_result_of_its_shot(
     metadata = mark("shot", "", proton_setup)
     tool.image.layer = window.add_image(2 * shot, name="second", metadata=metadata)
     run(tool)
-    assert len(window.layers) == count + 1 + len(roles)
+    assert len(window.layers) == count + 1 + 4
     tool.keep_earlier.setChecked(True)
     run(tool)
     assert len(window.layers) == count + 1 + 2 * len(roles)
@@ -562,7 +562,8 @@ def test_preview_shows_its_verdict_and_residual(
     window: Any, tool: Any, qtbot: Any, told: list[str]
 ) -> None:
     tool.live.setChecked(True)
-    qtbot.waitUntil(lambda: "Preview: " in tool.verdict.text(), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: len(tool.previewed.layers) == 2 and settled(tool), timeout=PATIENCE)
+    assert "Preview: " in tool.verdict.text()
     content = result_of(layer_of(window, "field", "preview")).content
     assert f"{100 * content.report.image_residual:.3g} %" in tool.panel.status.text()
     assert told == []
