@@ -132,10 +132,12 @@ def _inputs_shown(viewer: Any, result: Result | None) -> set[str]:
     """Roles of what a viewer shows already as a shot and its source, because no step changed it."""
     content = None if result is None else result.content
     recipe = getattr(getattr(content, "provenance", None), "recipe", None)
-    image = getattr(content, "image", None)  # a fit has several
-    if image is None or recipe is None or recipe.steps:
+    if recipe is None or recipe.steps:
         return set()
-    shape = image.shape
+    planes: Any = getattr(content, "images", None)  # of a fit
+    if planes is None:
+        planes = getattr(content, "image", None)
+    shape = () if planes is None else tuple(planes.shape[-2:])
     inputs = {SHOT: "image", SOURCE: "source", None: "image"}
     return {
         inputs[role_of(shown)]

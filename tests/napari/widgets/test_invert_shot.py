@@ -322,7 +322,7 @@ def test_a_run_replaces_the_last_result_of_its_shot(
     assert len(window.layers) == count + 1 + 4
     tool.keep_earlier.setChecked(True)
     run(tool)
-    assert len(window.layers) == count + 1 + 2 * len(roles)
+    assert len(window.layers) == count + 1 + 2 * 4
     bars = [one.name for one in window.layers if getattr(one, "colorbar", None) is not None]
     shown = [one for one in window.layers if one.name in bars and one.colorbar.visible]
     assert [(role_of(one), one.visible) for one in shown] == [("field", True)]
