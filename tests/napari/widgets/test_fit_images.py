@@ -637,7 +637,7 @@ def test_refine_starts_from_the_last_inversion(
         lambda: any("refined" in one.name and role_of(one) == "arrows" for one in window.layers),
         timeout=PATIENCE,
     )
-    assert any("shot |∫B×dz|" in name for name in names), names
+    assert any(name.startswith("|∫B×dz| (mT·m) – shot") for name in names), names
     refined = layer_of(window, "field", "refined")
     assert refined.data.shape == shot.shape
     qtbot.waitUntil(lambda: not tool._refined.busy, timeout=PATIENCE)

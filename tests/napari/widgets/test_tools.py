@@ -156,7 +156,7 @@ def test_only_what_may_be_a_field_is_offered_and_it_says_what_it_is_taken_for(
 
     window.add_image(shot, name="counts")
     window.add_image(shot, name="beam", metadata=mark("source", "intensity"))
-    add_inversion(window, solved, proton_setup, name="solved")
+    add_inversion(window, solved, proton_setup, name="solved", all_layers=True)
     offered = [tool.potential.itemText(n) for n in range(tool.potential.count())]
     assert len(offered) == 5  # potential, three of the field, and the image of unknown origin
     assert "counts" in offered
