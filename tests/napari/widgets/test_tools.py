@@ -117,7 +117,7 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     assert tool.warning.isVisible()
     assert "Caustics" in tool.warning.text()
 
-    add_inversion(window, solved, proton_setup, name="solved")
+    add_inversion(window, solved, proton_setup, name="solved", all_layers=True)
     potential = next(one for one in window.layers if role_of(one) == "potential")
     assert unit_of(potential) != "px²"
     tool.object.set_kind("layer")
@@ -186,7 +186,7 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
         before = tool._last._last
         tool.panel.button.click()
         qtbot.waitUntil(lambda: tool._last._last is not before, timeout=PATIENCE)
-        name = f"{tool.potential.layer.name.partition(' (')[0]} image"
+        name = "solved image"
         qtbot.waitUntil(lambda: name in window.layers, timeout=PATIENCE)
         return window.layers[name].data
 
