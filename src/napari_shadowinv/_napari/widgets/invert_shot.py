@@ -349,8 +349,9 @@ class InvertShot(InversionInputs, LivePanel):
         if request.recipe.setup is not None:
             moved = place_together(self.viewer, image, request.recipe.setup, request.companions)
         if request.preview:
-            self.show_layers(image, value.described, preview=True, fit=moved)
             self.verdict.show_headline(headline, "Preview: ")
+            self._reported = result_of(value.described[0][1])
+            self.show_layers(image, value.described, preview=True, fit=moved)
             self.panel.say(f"Image residual {image_residual_text(value.inversion)}")
             return
         self._report(value.inversion, value.inversion.setup, request.origins.rows())
