@@ -12,6 +12,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import notifications
 from napari_shadowinv._napari.frame import Frame, frame_of
+from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.shots import loaded, radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -162,7 +163,7 @@ def _inverted(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLaye
     if picked.setup_origin:
         told["setup_origin"] = picked.setup_origin
     result = about.Result(inversion, picked.setup, told)
-    return results.main_layers(results.result_layers(result, picked.frame, picked.name))
+    return main_layers(results.result_layers(result, picked.frame, picked.name))
 
 
 def _repaired(picked: _Picked, should_stop: ShouldStop) -> list[results.FullLayerData]:

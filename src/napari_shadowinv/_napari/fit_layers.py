@@ -9,14 +9,9 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._napari.frame import Frame
+from napari_shadowinv._napari.kinds import KINDS, layer_name
 from napari_shadowinv._napari.layer_metadata import KEY, Result, mark, role_of
-from napari_shadowinv._napari.layers import (
-    KINDS,
-    FullLayerData,
-    dataset_layers,
-    layer_name,
-    symmetric_limits,
-)
+from napari_shadowinv._napari.layers import FullLayerData, dataset_layers, symmetric_limits
 from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import FIELDS

@@ -12,6 +12,7 @@ import numpy as np
 
 from napari_shadowinv._napari.fit_layers import fit_layers, verdict_in_words
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, matrix_of
+from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.layer_metadata import (
     SHOT,
     SOURCE,
@@ -20,7 +21,7 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
     slot_of,
 )
-from napari_shadowinv._napari.layers import FullLayerData, main_layers, result_layers
+from napari_shadowinv._napari.layers import FullLayerData, result_layers
 from napari_shadowinv._napari.packs import pack_frame, pack_layers, pack_result, warnings_of_pack
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from napari_shadowinv._napari.frame import Frame, frame_for
+from napari_shadowinv._napari.kinds import KINDS, MASKED_ROLES, Kind, layer_name, main_layers
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
     Result,
-    belongs_to_result,
     mark,
-    mark_of,
     role_of,
-    slot_of,
 )
 from napari_shadowinv._napari.sites import Cells, power_cells, site_features
 from napari_shadowinv._napari.viewer_sync import keep_in_step, show_scale_bar
@@ -50,76 +48,6 @@ _SHORTEST_ARROW = 0.05
 _MOST_SITES_SHOWN = 200_000
 _BRIGHTEST = 99.7  # percentile
 _ENOUGH_PIXELS = 100_000
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of layer; ``{unit}`` and ``{symbol}`` in a title depend on the setup."""
-
-    role: str
-    variable: str
-    title: str
-    unit: str = ""
-    colormap: str = ""
-    type: str = "image"
-    visible: bool = False
-    main: bool = False  # shown by default; all others by *More layers*
-    shown_of: Literal["shot", "stack", "both"] = "both"
-
-
-KINDS = (
-    Kind("image", "image", "image", "flux/px²", "gray"),
-    Kind("source", "source", "source", "flux/px²", "gray", shown_of="shot"),
-    Kind("reprojection", "reprojection", "re-projection", "flux/px²", "gray"),
-    Kind("residual", "residual", "residual (% of mean)", "%", "RdBu_r", main=True, shown_of="shot"),
-    Kind("residual", "residual", "residual", "flux/px²", "RdBu_r", main=True, shown_of="stack"),
-    Kind("potential", "potential", "potential ({unit})", colormap="viridis"),
-    Kind("field y", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
-    Kind("field x", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
-    Kind("field", "displacement", "{symbol} ({unit})", colormap="inferno", visible=True, main=True),
-    Kind(
-        "uncertainty",
-        "displacement_uncertainty",
-        "σ of {symbol} ({unit})",
-        colormap="magma",
-        main=True,
-        shown_of="shot",
-    ),
-    Kind("caustic", "caustic", "caustics", type="labels", main=True),
-    Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
-    Kind(
-        "arrows",
-        "displacement",
-        "displacement arrows",
-        "px",
-        type="vectors",
-        visible=True,
-        main=True,
-    ),
-    Kind("sites", "sites", "sites{share}", colormap="inferno", type="points", shown_of="shot"),
-    Kind("cells", "sites", "power cells", type="shapes", main=True, shown_of="shot"),
-)
-_MAIN_ROLES = {kind.role for kind in KINDS if kind.main}
-_MASKED_ROLES = {"reprojection", "residual", "potential", "field y", "field x", "field"}
-_MASKED_ROLES |= {"uncertainty"}
-
-
-def main_layers(
-    described: Sequence[FullLayerData], also: Collection[str] = ()
-) -> list[FullLayerData]:
-    """Select the layers shown by default, and those whose role and part are in `also`."""
-    return [
-        layer
-        for layer in described
-        if role_of(layer[1]) in _MAIN_ROLES
-        or mark_of(layer[1]).get("main", not belongs_to_result(layer[1]))
-        or slot_of(layer[1]) in also
-    ]
-
-
-def layer_name(title: str, name: str) -> str:
-    """Name a layer by its quantity and then its result: long names are cut in the middle."""
-    return f"{title} – {name}" if name else title
 
 
 def inversion_layers(
@@ -264,7 +192,7 @@ def dataset_layers(
         if not shown.has(kind):
             continue
         data, words, look = _CONTENTS[kind.type](shown, kind)
-        if kind.role in _MASKED_ROLES and shown.masked is not None:
+        if kind.role in MASKED_ROLES and shown.masked is not None:
             data = _where(shown.masked, np.nan, data)
         unit = words.get("unit", kind.unit)
         keywords = {

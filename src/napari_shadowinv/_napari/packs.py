@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from napari_shadowinv._napari.frame import Frame, frame_for
+from napari_shadowinv._napari.kinds import Kind
 from napari_shadowinv._napari.layer_metadata import CAME_WITH, Result, mark
-from napari_shadowinv._napari.layers import FullLayerData, Kind, Limits
+from napari_shadowinv._napari.layers import FullLayerData, Limits
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray

@@ -18,8 +18,8 @@ from napari_shadowinv._napari.fit_layers import (
     start_in_words,
     verdict_in_words,
 )
+from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.layer_metadata import Result, result_of
-from napari_shadowinv._napari.layers import main_layers
 from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import (

@@ -11,7 +11,7 @@ from napari.utils import progress as activity
 from qtpy import QtWidgets
 from qtpy.QtCore import QSize, Qt
 
-from napari_shadowinv._napari.layers import main_layers
+from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.notifications import MISTAKES, window_text
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, section, wrapping_label

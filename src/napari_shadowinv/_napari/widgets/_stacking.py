@@ -170,7 +170,7 @@ class StackRequest:
                 self._limits[role] = _widened(self._limits[role], np.asarray(data[index]))
 
     def _describe(self, first: int | None = None) -> None:
-        from napari_shadowinv._napari.layers import main_layers
+        from napari_shadowinv._napari.kinds import main_layers
         from napari_shadowinv._napari.stores import store_layers
 
         try:
