@@ -274,7 +274,7 @@ def test_every_field_tells_its_meaning() -> None:
         ({"energi": 3}, "unknown key 'energi', did you mean 'energy'"),
         ({"colour": 3}, "unknown key 'colour'; known keys are kind"),
         ({"species": "proten"}, "'species' is 'proten': species must be 'proton'"),
-        ({"energy": "high"}, "'energy' is 'high': .* must be a valid number"),
+        ({"energy": "high"}, "'energy' is 'high': expected a number in MeV"),
         ({"kind": "protons"}, "'kind' is 'protons', .* did you mean 'proton'"),
         ({"kind": ["proton"]}, "'kind' is .* must be 'proton' .* or 'optical'"),
         ({"kind": "electron"}, 'give kind = "proton" and species = "electron"'),

@@ -41,10 +41,10 @@ shadowinv invert shot.tif --hot-pixels 6 --source-from polynomial --source-degre
 [bold]setup.toml[/bold]
 kind = "proton"                  # any charged particles; or "optical"
 species = "proton"               # or "electron", "deuteron", "alpha", …
-energy = 14.7                    # MeV; for light: wavelength = 532e-9 (m)
+energy = 14.7                    # MeV; or with a unit: "700 keV"; for light: wavelength
 source_object_distance = 0.01    # m; inf for a collimated beam
 object_image_distance = 0.28     # m
-detector_pixel_size = 145e-6     # m; or pixel_size at the object
+detector_pixel_size = "145 µm"   # or pixel_size at the object
 
 [bold]options.toml[/bold] (all optional; see InversionOptions for more)
 n_sites = 100000

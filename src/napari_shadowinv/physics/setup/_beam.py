@@ -10,12 +10,20 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import ConfigDict, Field, model_serializer, model_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from napari_shadowinv._system.arrays import plain_array, unmasked
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.setup._quantities import number_in_unit, unit_in_title
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,8 @@ _LENGTHS = {
     "detector_pixel_size",
     "wavelength",
 }
+# Fields of any kind of setup that take a unit; pydantic allows no validator for "*" with `kind`.
+_QUANTITIES = sorted({*_LENGTHS, "energy"})
 
 
 class BeamSetup(CheckedModel):
@@ -120,6 +130,18 @@ class BeamSetup(CheckedModel):
         None,
         most=_MAX_PIXEL_M,
     )
+
+    @field_validator(*_QUANTITIES, mode="before", check_fields=False)
+    @classmethod
+    def _read_unit(cls, value: Any, info: ValidationInfo) -> Any:
+        """Turn a text such as "14.7 MeV" into the number in the field's unit."""
+        unit = unit_in_title(cls.model_fields[info.field_name or ""].title)
+        if not isinstance(value, str):
+            return value
+        try:
+            return float(value)
+        except ValueError:
+            return number_in_unit(value, unit)
 
     @model_validator(mode="after")
     def _one_pixel_size(self) -> BeamSetup:
