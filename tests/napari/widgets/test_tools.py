@@ -13,6 +13,7 @@ from qtpy.QtWidgets import QFileDialog
 from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import mark, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.widgets.line_profile import measure_peak
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import (
@@ -302,6 +303,35 @@ def test_a_profile_has_true_units_on_both_axes(profile: Any, qtbot: Any) -> None
     axes = profile.plot.figure.axes
     assert {axis.get_ylabel() for axis in axes} == {"nm", "T"}
     assert axes[-1].get_xlabel() == "distance (µm)"
+
+
+def test_measures_of_a_gaussian_are_those_of_its_formula() -> None:
+    distance = np.linspace(0.0, 100.0, 401)
+    measures = measure_peak(distance, -3.0 * np.exp(-((distance - 40) ** 2) / (2 * 5.0**2)))
+    assert measures is not None
+    assert (measures.peak, measures.position) == (-3.0, 40.0)
+    assert measures.width == pytest.approx(5 * np.sqrt(8 * np.log(2)), rel=1e-3)
+    assert measures.area == pytest.approx(-3 * 5 * np.sqrt(2 * np.pi), rel=1e-6)
+    assert "width (FWHM) 11.77 µm, area -37.6 T·µm" in measures.text("T", "µm")
+
+
+def test_width_beyond_the_line_is_told_as_such() -> None:
+    distance = np.linspace(0.0, 10.0, 11)
+    values = np.where(distance > 8, np.nan, 5.0 - 0.1 * distance)
+    measures = measure_peak(distance, values)
+    assert measures is not None
+    assert np.isnan(measures.width)
+    assert measures.area == pytest.approx(8 * 4.6)
+    assert "width (FWHM) beyond the line" in measures.text("T", "µm")
+    assert measure_peak(distance, np.full(11, np.nan)) is None
+
+
+def test_profile_shows_peak_width_and_area(profile: Any, window: Any, qtbot: Any) -> None:
+    profile.check(window.layers["field"], False)
+    profile.lines.layer.add_lines(np.array([[10.0, 5.0], [10.0, 45.0]]))
+    qtbot.waitUntil(lambda: "peak 75 nm at 80 µm" in profile.measures.text(), timeout=PATIENCE)
+    assert profile.measures.isVisibleTo(profile)
+    assert "area 4400 nm·µm" in profile.measures.text()
 
 
 def test_a_profile_is_averaged_over_its_width(profile: Any, window: Any, qtbot: Any) -> None:

@@ -97,6 +97,51 @@ def sampled(
     return np.where(count > 0, rows.sum(axis=0) / np.maximum(count, 1), np.nan)
 
 
+@dataclass(frozen=True)
+class PeakMeasures:
+    """Peak of a profile, its full width at half maximum, and the area under the profile."""
+
+    peak: float  # the value of largest magnitude, with its sign
+    position: float  # distance along the line
+    width: float  # NaN if the profile stays above half of the peak up to an end of the line
+    area: float
+
+    def text(self, unit: str, distance_unit: str) -> str:
+        """Return the measures in words, with their units."""
+        width = "beyond the line" if np.isnan(self.width) else f"{self.width:.4g} {distance_unit}"
+        return (
+            f"peak {f'{self.peak:.4g} {unit}'.strip()} at {self.position:.4g} {distance_unit}, "
+            f"width (FWHM) {width}, "
+            f"area {self.area:.4g} {'·'.join(filter(None, (unit, distance_unit)))}"
+        )
+
+
+def measure_peak(distance: FloatArray, values: FloatArray) -> PeakMeasures | None:
+    """Measure the peak of largest magnitude; None if the line misses the image.
+
+    Nothing is subtracted: half of the maximum counts from zero.
+    """
+    inside = np.isfinite(values)
+    if not inside.any():
+        return None
+    distance, values = distance[inside], values[inside]
+    top = int(np.abs(values).argmax())
+    peak = float(values[top])
+    relative = values / peak if peak else np.zeros_like(values)
+    edges = [_half_maximum(distance[top::step], relative[top::step]) for step in (-1, 1)]
+    area = float(np.trapezoid(values, distance))
+    return PeakMeasures(peak, float(distance[top]), edges[1] - edges[0], area)
+
+
+def _half_maximum(distance: FloatArray, relative: FloatArray) -> float:
+    """Distance at which a flank, which begins at its peak of 1, falls to a half; NaN if never."""
+    below = np.flatnonzero(relative < 0.5)
+    if not below.size or below[0] == 0:
+        return float("nan")
+    pair = slice(below[0] - 1, below[0] + 1)
+    return float(np.interp(-0.5, -relative[pair], distance[pair]))
+
+
 def table_text(distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> str:
     """Return profiles as comma-separated values, a column each, with units in the first row."""
     text = io.StringIO()
@@ -168,6 +213,11 @@ class LineProfile(qt.Docked):
                 "averaged.</qt>"
             )
         self.plot = ProfilePlot()
+        self.measures = forms.wrapping_label()
+        self.measures.setToolTip(
+            "<qt>Peak: the value of largest magnitude. Width: full width at half of the peak, "
+            "counted from zero. Area: integral along the line.</qt>"
+        )
         self.hint = forms.wrapping_label("Press ✎ and draw a line on the image.")
         self.problem = forms.wrapping_label(style=forms.PROBLEM_STYLE)
         self.export = QtWidgets.QPushButton("Export CSV…")
@@ -182,7 +232,7 @@ class LineProfile(qt.Docked):
         )
         whole = qt.column(self, *rows, margin=6)
         whole.addWidget(self.plot, 1)
-        for widget in (self.export, self.problem):
+        for widget in (self.measures, self.export, self.problem):
             whole.addWidget(widget)
         self.setMinimumWidth(WIDTH)
         self.setSizePolicy(
@@ -248,6 +298,17 @@ class LineProfile(qt.Docked):
             self.problem.setVisible(False)
         self.hint.setVisible(not self.profiles)
         self.plot.show_profiles(self._distance, self._unit, self.profiles)
+        self._show_measures()
+
+    def _show_measures(self) -> None:
+        lines = []
+        for profile in self.profiles:
+            peak = measure_peak(self._distance, profile.values)
+            if peak is not None:
+                name = f"{profile.name}: " if len(self.profiles) > 1 else ""
+                lines.append(f"{name}{peak.text(profile.unit, self._unit)}")
+        self.measures.setText("\n".join(lines))
+        self.measures.setVisible(bool(lines))
 
     def show_problem(self, text: str) -> None:
         """Show what is wrong, where it can be read until there is another profile."""
