@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import os
 import shutil
 import signal
@@ -18,10 +19,13 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
+from rich import progress
+from rich.console import Console
 from typer.testing import Result
 
 from command_line import flat, shadowinv
 from napari_shadowinv import InversionOptions, invert, read
+from napari_shadowinv.cli._batch import progress_columns
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.preprocessing import Provenance
 
@@ -302,6 +306,35 @@ def test_a_table_of_all_shots_is_exported_as_csv(night, folder):
     assert f"{float(store.image_residual[3]):.2%}" in flat(status)
     largest = np.hypot(*store.displacement.values[3]).max()
     assert float(rows[3]["displacement_peak (px)"]) == pytest.approx(largest, rel=1e-6)
+
+
+def test_status_of_all_shots_fits_80_columns(night, folder, monkeypatch):
+    name = "n.shadowinv.zarr"
+    np.save(night.path(2), 0 * night.images[2])
+    assert batch().exit_code == 1
+    monkeypatch.setenv("COLUMNS", "80")
+    status = shadowinv("status", name, "--all").output
+    lines = status.splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = [line for line in lines if " shot_" in line and "done" in line]
+    assert len(rows) == 5
+    assert all(line.rstrip().endswith("%") for line in rows)
+    reasons = status.split("Reasons and warnings")[1]
+    assert reasons.split("shot 2", 1)[1].split("\n")[0].strip().startswith("image has no positive pixel")
+
+
+def test_progress_of_a_batch_fits_80_columns():
+    text = io.StringIO()
+    console = Console(file=text, width=80, force_terminal=True, color_system=None)
+    bars = progress.Progress(*progress_columns(), console=console, expand=True)
+    words = {"rate": "12.3 shots/min", "left": "3 min left", "failed": "2 failed"}
+    last = "a_long_name_of_a_shot_of_the_night_0123.tif, 3.2 s"
+    bars.add_task("4 threads", total=500, completed=123, last=last, **words)
+    console.print(bars.get_renderable())
+    (line,) = text.getvalue().splitlines()
+    assert len(line) <= 80
+    for word in ("4 threads", "123/500", *words.values()):
+        assert word in line
 
 
 @pytest.mark.parametrize("text", ["6", "a", "1:2:3:4", ""])

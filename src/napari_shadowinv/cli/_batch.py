@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from rich import box, progress
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cli._tables import Rows, options_text, two_columns
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.stack import RunProgress
 
 EXIT_FAILED_SHOTS = 1
+_BAR_COLUMNS = 16
 _NAMED = 10  # failures that a table names
 _DETERMINED = "determined"  # the verdict on a fit that may be believed
 
@@ -148,22 +149,30 @@ def _check(out: Path, resume: bool, overwrite: bool) -> None:
         )
 
 
+def progress_columns() -> tuple[progress.ProgressColumn, ...]:
+    """Columns of the progress line; in a narrow terminal the last shot's name is cut."""
+    cut = Column(ratio=1, no_wrap=True, overflow="ellipsis")
+    kept = Column(no_wrap=True)
+    return (
+        progress.SpinnerColumn(),
+        progress.TextColumn("{task.description}", markup=False, table_column=kept),
+        progress.BarColumn(bar_width=_BAR_COLUMNS),
+        progress.MofNCompleteColumn(table_column=kept),
+        progress.TextColumn("{task.fields[rate]}", table_column=kept),
+        progress.TextColumn("{task.fields[left]}", table_column=kept),
+        progress.TextColumn("{task.fields[failed]}", style="red", table_column=kept),
+        progress.TextColumn("{task.fields[last]}", style="dim", markup=False, table_column=cut),
+    )
+
+
 @contextmanager
 def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], None]]:
     """A bar with rate and time left, and above it each shot that failed."""
     console = Console(stderr=True)
-    columns = (
-        progress.SpinnerColumn(),
-        progress.TextColumn("{task.description}", markup=False),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TextColumn("{task.fields[rate]}"),
-        progress.TextColumn("{task.fields[left]}"),
-        progress.TextColumn("{task.fields[failed]}", style="red"),
-        progress.TextColumn("{task.fields[last]}", style="dim", markup=False),
-    )
     hidden = quiet or not console.is_terminal
-    with progress.Progress(*columns, console=console, disable=hidden) as bars:
+    with progress.Progress(
+        *progress_columns(), console=console, disable=hidden, expand=True
+    ) as bars:
         task = bars.add_task("starting", total=None, rate="", left="", failed="", last="")
 
         def show(news: RunProgress) -> None:
@@ -332,7 +341,7 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
         return tables, is_damaged
     own = _ROW_COLUMNS if store.own_setups else _SHOT_COLUMNS
     columns = own if store.field is None else _FIT_COLUMNS
-    headings = "shot", "name", "status", "seconds", *columns, "how it went"
+    headings = "shot", "name", "status", "seconds", *columns
     shots = Table(box=box.SIMPLE)
     for heading in headings:
         # Wide enough for the words of a verdict.
@@ -345,10 +354,19 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
             STATUS_NAMES[status],
             f"{report['seconds']:.1f}" if "seconds" in report else "",
             *(show(report[key]) if key in report else "" for key, show in columns.values()),
-            plain(report.get("reason") or "; ".join(report.get("warnings", ()))),
             style="red" if status in (FAILED, DAMAGED) else "",
         )
-    return [*tables, shots], is_damaged
+    # In the table above they would be squeezed into a few letters a line.
+    notes = [(f"shot {index}", note) for index, note in _notes(store)]
+    tables += [shots, *([two_columns("Reasons and warnings", notes)] if notes else [])]
+    return tables, is_damaged
+
+
+def _notes(store: StackStore) -> Iterator[tuple[int, str]]:
+    """The reason of each failed shot, the warnings of the others."""
+    for index, report in enumerate(store.reports()):
+        reason = report.get("reason")
+        yield from ((index, text) for text in ([reason] if reason else report.get("warnings", ())))
 
 
 def _checksums_text(store: StackStore) -> str:

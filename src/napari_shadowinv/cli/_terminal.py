@@ -104,18 +104,20 @@ def progress_bars() -> Iterator[OnProgress | None]:
     """One bar for each stage, on a terminal only."""
     from rich import progress as bar
     from rich.console import Console
+    from rich.table import Column
 
     console = Console(stderr=True)
     if not console.is_terminal:
         yield None
         return
+    cut = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # so that a line stays one line
     columns = (
         bar.TextColumn("{task.description:<10}", markup=False),
-        bar.BarColumn(),
+        bar.BarColumn(bar_width=30),
         bar.TimeElapsedColumn(),
-        bar.TextColumn("{task.fields[message]}", style="dim", markup=False),
+        bar.TextColumn("{task.fields[message]}", style="dim", markup=False, table_column=cut),
     )
-    with bar.Progress(*columns, console=console) as bars:
+    with bar.Progress(*columns, console=console, expand=True) as bars:
         tasks: dict[str, TaskID] = {}
 
         def finish_all() -> None:

@@ -306,7 +306,7 @@ def test_a_profile_has_true_units_on_both_axes(profile: Any, qtbot: Any) -> None
 
 
 def test_measures_of_a_gaussian_are_those_of_its_formula() -> None:
-    distance = np.linspace(0.0, 100.0, 401)
+    distance = np.linspace(0.0, 100.0, 4001)
     measures = measure_peak(distance, -3.0 * np.exp(-((distance - 40) ** 2) / (2 * 5.0**2)))
     assert measures is not None
     assert (measures.peak, measures.position) == (-3.0, 40.0)
