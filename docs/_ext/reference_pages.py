@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from importlib import import_module
 from inspect import cleandoc, isclass, unwrap
@@ -26,6 +26,28 @@ from napari_shadowinv.preprocessing import Choice
 FOLDER = Path(__file__).parents[1] / "reference"
 
 _SHAPES: dict[Any, str] = {Path: "PATH", int: "INTEGER", float: "NUMBER", str: "TEXT"}
+
+TASKS: dict[str, tuple[str, ...]] = {
+    "Invert one image": ("invert", "InversionOptions", "Inversion", "Report", "plan_sites"),
+    "Apply a recipe to a file": ("read", "Radiograph", "Recipe", "run", "write"),
+    "Describe the experiment, for SI units": ("ProtonSetup", "OpticalSetup"),
+    "Estimate the error of a field": ("uncertainty", "Uncertainty"),
+    "Fit one or several images, also where rays cross": ("fit", "FitOptions", "Fit"),
+    "Invert many shots": ("run_stack", "invert_stack", "watch_stack", "stack_statistics"),
+    "Predict an image, or compare with linear theory": (
+        "synthetic_image",
+        "project",
+        "project_potential",
+        "poisson_invert",
+    ),
+    "Show a result in napari": ("add_inversion",),
+    "Follow progress, cancel, handle errors": (
+        "Progress",
+        "InversionCancelled",
+        "InputError",
+        "FileFormatError",
+    ),
+}
 
 MODULES = {
     "preprocessing": "Recipes, steps, filters and source estimates",
@@ -253,8 +275,9 @@ def api_page() -> str:
         "Arrays are `[y, x]`, vectors in axis order (y, x), a pixel's centre is at its integer "
         "index; lengths are object-plane pixels unless a name or a unit says otherwise.",
         "## napari_shadowinv",
-        summary("napari_shadowinv"),
     ]
+    for task, names in TASKS.items():
+        parts += [f"### {task}", summary("napari_shadowinv", names)]
     for name, title in MODULES.items():
         module = f"napari_shadowinv.{name}"
         parts += [f"## {module}", f"{title}.", summary(module)]
@@ -274,8 +297,9 @@ def public_names(module: str) -> list[str]:
     ]
 
 
-def summary(module: str) -> str:
-    lines = "\n".join(f"   {name}" for name in public_names(module))
+def summary(module: str, names: Sequence[str] | None = None) -> str:
+    """Table of the names of a module, of all that are public by default."""
+    lines = "\n".join(f"   {name}" for name in names or public_names(module))
     return (
         f"```{{eval-rst}}\n.. currentmodule:: {module}\n\n"
         f".. autosummary::\n   :toctree: api\n   :nosignatures:\n\n{lines}\n```"

@@ -320,7 +320,12 @@ def test_status_of_all_shots_fits_80_columns(night, folder, monkeypatch):
     assert len(rows) == 5
     assert all(line.rstrip().endswith("%") for line in rows)
     reasons = status.split("Reasons and warnings")[1]
-    assert reasons.split("shot 2", 1)[1].split("\n")[0].strip().startswith("image has no positive pixel")
+    assert (
+        reasons.split("shot 2", 1)[1]
+        .split("\n")[0]
+        .strip()
+        .startswith("image has no positive pixel")
+    )
 
 
 def test_progress_of_a_batch_fits_80_columns():
