@@ -144,6 +144,14 @@ def test_complete_help_of_a_command_shows_all_its_flags(command: str) -> None:
         assert kind not in text
 
 
+def test_program_alone_lists_its_commands() -> None:
+    result = shadowinv()
+    assert result.exit_code == 2
+    assert result.output == shadowinv("-h").output
+    for command in COMMANDS:
+        assert f"\n  {command} " in result.output
+
+
 def test_commands_are_completed_in_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
     environment = {"_SHADOWINV_COMPLETE": "complete_bash", "COMP_WORDS": "shadowinv inv"}
     result = CliRunner().invoke(

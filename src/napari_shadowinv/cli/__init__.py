@@ -22,7 +22,7 @@ from napari_shadowinv.cli import (
     _watch_command,
 )
 from napari_shadowinv.cli._help import HELP_NAMES, HelpfulCommand, HelpfulGroup
-from napari_shadowinv.cli._terminal import notify_errors
+from napari_shadowinv.cli._terminal import EXIT_MISTAKE, notify_errors
 from napari_shadowinv.errors import InputError
 
 __all__ = ["app"]
@@ -30,7 +30,7 @@ __all__ = ["app"]
 app = typer.Typer(
     name="shadowinv",
     help="Shadowgrams and proton radiographs to deflection potentials and fields.",
-    no_args_is_help=True,
+    invoke_without_command=True,
     context_settings={"help_option_names": list(HELP_NAMES)},
     cls=HelpfulGroup,
     pretty_exceptions_enable=False,
@@ -59,6 +59,7 @@ def _check_environment() -> None:
 
 @app.callback()
 def main(
+    ctx: typer.Context,
     version: Annotated[
         bool,
         typer.Option(
@@ -68,6 +69,9 @@ def main(
 ) -> None:
     """Shadowgrams and proton radiographs to deflection potentials and fields."""
     _check_environment()
+    if ctx.invoked_subcommand is None:
+        typer.echo(ctx.get_help())
+        raise typer.Exit(EXIT_MISTAKE)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that knows no ∫ or µ is no reason to fail after the work is done.
         if isinstance(stream, TextIOWrapper):
