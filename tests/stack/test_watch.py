@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -513,3 +514,87 @@ def test_ctrl_c_is_the_normal_end_unless_files_wait(
     assert end == (f"Ended: 1 done, 0 failed{left}; repeat the command to go on with {out}.")
     assert list(read(out).status.values) == [DONE]
     assert not list(tmp_path.glob(".*.lock"))
+
+
+def test_removed_store_is_named_and_not_made_again(folder, out):
+    put(folder, 0)
+    with Watched(folder, out) as watch:
+        watch.ended(1)
+        shutil.rmtree(out)
+        put(folder, 1)
+        watch.until(lambda: watch.error)
+    assert "was removed or moved while it was being written" in str(watch.error)
+    assert "disk space" not in str(watch.error)
+    assert not out.exists()
+
+
+def test_done_shot_whose_file_turns_bad_is_failed_and_empty(folder, out):
+    names = ("potential", "displacement", "caustic", "weights")
+    put(folder, 0, 1)
+    with Watched(folder, out, variables=names) as watch:
+        watch.ended(2)
+        (folder / "shot_1.npy").write_bytes(b"no image")
+        watch.ended(3)
+    assert list(watch.result.status.values) == [DONE, FAILED]
+    for name in ("potential", "displacement", "weights"):
+        assert np.isnan(watch.result[name][1]).all(), name
+        assert np.isfinite(watch.result[name][0]).all(), name
+    assert not watch.result.caustic[1].any()
+
+
+@pytest.mark.parametrize("command", ["batch", "watch"])
+def test_shot_not_converged_ends_with_exit_code_3(folder, out, tmp_path, command):
+    np.save(tmp_path / "reference.npy", SOURCE)
+    np.save(folder / "shot_0.npy", 0.9 * SOURCE + 0.1 * IMAGES[1])  # one step is enough
+    put(folder, 1)
+    place = folder if command == "watch" else f"{folder}/*.npy"
+    more = ["--pattern", "*.npy", "--settle", SETTLE, "--idle", 0.2]
+    more = more if command == "watch" else ["--scheduler", "threads"]
+    result = shadowinv(
+        command, place, "--source", tmp_path / "reference.npy", "--n-sites", 100,
+        "--max-iterations", 1, "--out", out, *more,
+    )  # fmt: skip
+    assert list(read(out).converged.values) == [True, False]
+    assert result.exit_code == 3, result.output
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only there the system reports a closed file")
+def test_file_opened_again_is_not_taken_until_closed(folder):
+    arrivals = _arrivals.Arrivals(folder.resolve(), "*.npy", settle=SETTLE)
+
+    def until(condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + 30
+        while not condition():
+            assert time.monotonic() < end
+            time.sleep(0.005)
+
+    with _arrivals.observing(arrivals, polling=False, on_note=print):
+        put(folder, 0)
+        until(lambda: arrivals.waiting == 1)
+        with (folder / "shot_0.npy").open("r+b") as file:
+            file.write(whole(1)[:100])
+            file.flush()
+            until(lambda: arrivals.waiting == 0)
+            assert arrivals.take(0.2) is None
+        until(lambda: arrivals.waiting == 1)
+        assert arrivals.take(0.2) == "shot_0.npy"
+
+
+def test_file_written_during_its_read_is_read_again(folder, out):
+    reads = []
+
+    def load_and_change(path: Path) -> np.ndarray:
+        image = np.load(path)
+        reads.append(path.name)
+        if len(reads) == 1:
+            path.write_bytes(whole(4))
+        return image
+
+    put(folder, 0)
+    with Watched(folder, out, reader=load_and_change, dtype="float64") as watch:
+        watch.ended(1)
+        watch.until(lambda: watch.told[-1].waiting == 0)
+    assert len(reads) > 1
+    assert len(watch.shots) == 1
+    expected = invert(IMAGES[4], plan=plan_sites(SOURCE, OPTIONS), options=OPTIONS)
+    np.testing.assert_array_equal(watch.result.displacement[0], expected.displacement)

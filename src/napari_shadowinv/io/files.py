@@ -23,6 +23,7 @@ from napari_shadowinv.errors import FileFormatError
 
 DEFLATE_RATIO = 1040  # the most that zlib can pack into one byte, a little rounded up
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_CUT_SHORT = re.compile(r"\d+ requested and \d+ written")  # numpy's words where there is no room
 
 
 def check_promise(path: Path, header: str, promised: int, held: int) -> None:
@@ -160,11 +161,11 @@ def _written(path: Path, temporary: Path, overwrite: bool) -> Iterator[Path]:
                 os.fsync(file.fileno())
             os.replace(temporary, path)
     except OSError as error:
-        if error.errno not in _NO_ROOM:
+        if error.errno not in _NO_ROOM and not _CUT_SHORT.fullmatch(str(error)):
             raise
+        reason = error.strerror or "No space left on device"
         raise FileFormatError(
-            f"{path} cannot be written ({error.strerror}): free some disk space, or choose "
-            "another folder"
+            f"{path} cannot be written ({reason}): free some disk space, or choose another folder"
         ) from error
     finally:
         # A second Ctrl-C must not leave the half of it behind.

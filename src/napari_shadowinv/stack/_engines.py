@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import threading
 import time
@@ -188,8 +189,22 @@ def engine_for(
     elif isinstance(scheduler, import_module("distributed").Client):
         yield _Cluster(scheduler)
     else:
-        with _connected(scheduler, should_stop) as client:
+        with _quiet_dask(), _connected(scheduler, should_stop) as client:
             yield _Cluster(client)
+
+
+@contextmanager
+def _quiet_dask() -> Iterator[None]:
+    """Keep dask's tracebacks of a lost connection from the terminal: `EngineError` reports it."""
+    loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def is_here(scheduler: Any) -> bool:
@@ -243,6 +258,13 @@ def _last_cause(error: BaseException) -> str:
 def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:
     """Connect in a thread: only so can the wait for a scheduler that is not there be ended."""
     distributed: Any = import_module("distributed")
+    if isinstance(scheduler, str) and scheduler.startswith("tls://"):
+        keys = distributed.Security().get_connection_args("client")
+        if keys.get("ssl_context") is None:
+            raise EngineError(
+                f"no scheduler can be reached at {scheduler} without keys: set "
+                "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, __CLIENT__CERT and __CLIENT__KEY"
+            )
     answer: Future[Any] = Future()
 
     def connect() -> None:

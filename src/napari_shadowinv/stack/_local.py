@@ -34,6 +34,7 @@ def local_client(count: int) -> Iterator[Any]:
         opened.enter_context(_forgotten(_TRIMMING, environment.get(_TRIMMING)))
         # Data spilled to disk when memory is short could be exchanged for code.
         own = str(opened.enter_context(temporary_folder("shadowinv")))
+        opened.enter_context(dask.config.set({"temporary-directory": own}))
         # A cluster that is half made cannot be closed.
         with interrupts_put_off(), _hidden_from_workers():
             cluster = distributed.LocalCluster(
