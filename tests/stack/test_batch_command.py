@@ -25,6 +25,7 @@ from typer.testing import Result
 
 from command_line import flat, shadowinv
 from napari_shadowinv import InversionOptions, invert, read
+from napari_shadowinv.cli import _batch
 from napari_shadowinv.cli._batch import progress_columns
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.preprocessing import Provenance
@@ -550,3 +551,15 @@ def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
     assert code == 130
     assert "Cancelled: nothing written" in told
     assert sorted(folder.rglob("*")) == before
+
+
+def test_status_counts_levels_and_lists_warnings_once(store):
+    reports = StackStore(store).reports()
+    assert {report["level"] for report in reports} <= {"sound", "doubtful", "failed"}
+    assert all("peak" in report["headline"] for report in reports)
+    doubtful = [report for report in reports if report["level"] == "doubtful"]
+    assert all(report["warnings"] for report in doubtful)
+    text = flat(shadowinv("status", store).output)
+    assert f"{len(doubtful)} doubtful" in text
+    kinds = {_batch.warning_kind(one) for report in doubtful for one in report["warnings"]}
+    assert text.count("warning ") == len(kinds)

@@ -475,7 +475,7 @@ def test_the_command_tells_a_line_for_each_shot(folder, out, tmp_path, monkeypat
     # What casts doubt on a shot is said once, whatever its numbers.
     warning, failure = result.stderr.splitlines()
     assert warning.startswith("warning: shot_0.npy: the field reaches the image's edge")
-    assert all(line.endswith("1 warning") for line in told)
+    assert all(line.endswith("doubtful, 1 warning") for line in told)
     assert failure.startswith("failed: shot_2.npy: ")
     assert lines[-1].startswith("Ended: 2 done, 1 failed; repeat the command to go on with")
     assert shadowinv(*command, "--quiet").stdout == ""

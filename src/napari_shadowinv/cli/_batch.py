@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -291,7 +293,31 @@ def _trouble_rows(store: StackStore) -> Rows:
     ]
     if rough:
         rows.append(("warning", f"{len(rough)} shots did not converge: {_listed(rough)}"))
-    return [*rows, *_verdict_rows(store)]
+    return [*rows, *_verdict_rows(store), *_level_rows(store)]
+
+
+def _level_rows(store: StackStore) -> Rows:
+    """Count the shots of each level of trust, and list each kind of warning with its shots."""
+    levels: Counter[str] = Counter()
+    warned: dict[str, tuple[str, list[str]]] = {}
+    for name, report in zip(store.names, store.reports(), strict=True):
+        if "level" not in report:
+            continue
+        levels[report["level"]] += 1
+        for warning in report.get("warnings", ()):
+            warned.setdefault(warning_kind(warning), (warning, []))[1].append(name)
+    if not levels:
+        return []
+    counts = ", ".join(f"{count} {level}" for level, count in levels.most_common())
+    return [
+        ("levels", counts),
+        *[("warning", f"{_listed(names)}: {warning}") for warning, names in warned.values()],
+    ]
+
+
+def warning_kind(warning: str) -> str:
+    """Return a warning without its numbers, which differ from shot to shot."""
+    return re.sub(r"[\d.,]+", "", warning)
 
 
 def _listed(names: Sequence[str]) -> str:

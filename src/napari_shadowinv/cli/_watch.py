@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_good, names_of
+from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_good, names_of, warning_kind
 from napari_shadowinv.cli._terminal import (
     cancelled_code,
     interrupted,
@@ -73,9 +72,8 @@ class _Lines:
         told, doubts = _told(news.result)
         told = f"  {told}  {outcome.seconds:.2f} s{waiting}{doubts}"
         self._print(self.out, f"{_shortened(name, _WIDTH - len(told))}{told}", _style(doubts))
-        for warning in getattr(news.result.report, "warnings", ()):
-            # The numbers in it differ from shot to shot.
-            kind = re.sub(r"[\d.,]+", "", warning)
+        for warning in _warnings_of(news.result):
+            kind = warning_kind(warning)
             if kind not in self.warned:
                 self.warned.add(kind)
                 self._print(self.err, f"warning: {news.name}: {warning}", "yellow")
@@ -94,9 +92,17 @@ def _shortened(name: str, room: int) -> str:
     return name if len(name) <= room else f"…{name[1 - room :]}"
 
 
+def _warnings_of(result: Inversion | Fit) -> tuple[str, ...]:
+    from napari_shadowinv.fitting import Fit, Verdict
+
+    if not isinstance(result, Fit):
+        return result.report.warnings
+    return () if result.verdict is Verdict.DETERMINED else (result.explanation,)
+
+
 def _told(result: Inversion | Fit) -> tuple[str, str]:
-    """The numbers of a shot, and what casts doubt on them."""
-    from napari_shadowinv.inversion import Inversion
+    """Return the numbers of a shot, and what casts doubt on them."""
+    from napari_shadowinv.inversion import Inversion, Level
     from napari_shadowinv.physics.units import shown_fields, with_error
 
     if not isinstance(result, Inversion):
@@ -107,10 +113,11 @@ def _told(result: Inversion | Fit) -> tuple[str, str]:
     error = None if errors is None else errors.of_peak
     peak = with_error(field.largest, error.share if error else 0.0)
     count = len(report.warnings)
-    warnings = f"  {count} warning{'s' if count > 1 else ''}" if count else ""
+    warnings = f", {count} warning{'s' if count > 1 else ''}" if count else ""
+    level = "" if result.headline.level is Level.SOUND else f"  {result.headline.level.value}"
     return (
         f"peak {field.symbol} {peak} {field.unit}  residual {100 * report.image_residual:.3g} %",
-        f"{'' if report.converged else '  NOT converged'}{warnings}",
+        f"{'' if report.converged else '  NOT converged'}{level}{warnings}",
     )
 
 

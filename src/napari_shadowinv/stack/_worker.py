@@ -178,8 +178,14 @@ class Work:
 
     def report(self, inversion: Inversion) -> dict[str, Any]:
         """Return what is told of a shot."""
-        told = {**dataclasses.asdict(inversion.report), "stages": inversion.report.seconds}
-        return told | numbers_of(inversion)
+        headline = inversion.headline
+        return {
+            **dataclasses.asdict(inversion.report),
+            "stages": inversion.report.seconds,
+            "level": headline.level.value,
+            "headline": headline.text,
+            **numbers_of(inversion),
+        }
 
 
 def _as_chosen(inversion: Inversion) -> Inversion:
