@@ -55,3 +55,14 @@ def test_one_shot_has_no_spread(night):
 def test_a_dataset_without_shots_is_refused(inversion):
     with pytest.raises(InputError, match="no fields of a series of shots"):
         stack_statistics(inversion.to_dataset())
+
+
+def test_peak_leaves_out_masked_pixels(night, out):
+    mask = np.ones(night.source.shape, bool)
+    mask[4:16, 6:20] = False  # the blob
+    written = night.run(out, mask=mask, shots=night.images[:2])
+    np.testing.assert_array_equal(written.mask, mask)
+    peaks = stack_statistics(written).displacement_peak.values
+    lengths = np.hypot(*written.displacement.values.transpose(1, 0, 2, 3).astype(float))
+    np.testing.assert_allclose(peaks, lengths[:, mask].max(axis=1), rtol=1e-12)
+    assert (peaks < lengths.max(axis=(1, 2))).all()

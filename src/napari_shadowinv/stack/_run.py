@@ -141,7 +141,7 @@ def run_stack(
     kept = stored_type(dtype)
     stack = describe_stack(
         shots,
-        variables=stored_variables(variables, recipe),
+        variables=stored_variables(variables, recipe, mask),
         source=source,
         mask=mask,
         recipe=recipe,
@@ -193,11 +193,15 @@ def stored_type(dtype: str) -> np.dtype[Any]:
 
 
 def stored_variables(
-    variables: Collection[str] | None, recipe: Recipe | None
+    variables: Collection[str] | None, recipe: Recipe | None, mask: ArrayLike | None
 ) -> Collection[str] | None:
     """Return what is stored of each shot; None for what is usual of a fit."""
     is_fit = recipe is not None and recipe.fit is not None
-    return STORED if variables is None and not is_fit else variables
+    if variables is not None or is_fit:
+        return variables
+    # Without it, fields under a mask would count as data.
+    has_mask = mask is not None or (recipe is not None and recipe.mask is not None)
+    return (*STORED, "mask") if has_mask else STORED
 
 
 class _Run:

@@ -32,7 +32,8 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
     xarray.Dataset
         Lazy. For each field ``name``, by component: ``name_mean`` and ``name_std`` (y, x), the
         standard deviation of one shot (divided by shots - 1; NaN for a single shot), and
-        ``name_peak`` (shot), the largest magnitude of each shot.
+        ``name_peak`` (shot), the largest magnitude of each shot, without masked pixels where the
+        stack has its ``mask``, as a store of masked shots does.
 
     Raises
     ------
@@ -68,14 +69,18 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
         if done.sizes["shot"] < 2:
             spread = spread * np.nan
         found[f"{name}_std"] = _labelled(spread, field, "standard deviation of shots")
-        found[f"{name}_peak"] = _labelled(_peak(field), field, "largest magnitude")
+        peak = _peak(field, stack.get("mask"))
+        found[f"{name}_peak"] = _labelled(peak, field, "largest magnitude")
     return xr.Dataset(found, attrs={**stack.attrs, "shots": stack.sizes["shot"]})
 
 
-def _peak(field: xarray.DataArray) -> xarray.DataArray:
+def _peak(field: xarray.DataArray, mask: xarray.DataArray | None) -> xarray.DataArray:
+    """Return the largest magnitude of each shot among the pixels that were used."""
     squared = field.astype(np.float64) ** 2
     if "component" in field.dims:
         squared = squared.sum("component", skipna=False)
+    if mask is not None:
+        squared = squared.where(mask, 0.0)
     largest: xarray.DataArray = squared.max(("y", "x"), skipna=False)
     return largest**0.5
 

@@ -120,7 +120,7 @@ def watch_stack(
     _check_numbers(settle=settle, idle=idle, shots=shots)
     describe = partial(
         describe_stack,
-        variables=stored_variables(variables, recipe),
+        variables=stored_variables(variables, recipe, mask),
         source=source,
         mask=mask,
         recipe=recipe,
