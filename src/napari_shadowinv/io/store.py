@@ -41,6 +41,7 @@ from napari_shadowinv.io.store_checksums import (
     check_seal,
     find_damage,
     note_shot,
+    read_labels,
 )
 from napari_shadowinv.io.store_setups import OWN_SETUPS, field_in_si, with_own_setups
 
@@ -195,7 +196,7 @@ class ShotWriter:
                     group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
                 else:
                     erase(self.path, group[name], index)
-            noted = note_shot(self.path, group, index, summary_of(attributes))
+            noted = note_shot(self.path, group, index, self.labels(index, attributes))
             text = json.dumps({**report, **noted})
             group["report"][index : index + 1] = np.array([text], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
@@ -211,6 +212,12 @@ class ShotWriter:
                 erase(self.path, group[name], index)
         except OSError as error:
             raise store_error(self.path, error) from error
+
+    def labels(self, index: int, attributes: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the name and other labels of a shot."""
+        numbers = tuple(summary_of(attributes))
+        labels = _labels_of_all(self.path, self.store_id, self.shots, numbers)
+        return labels[index] if labels else {}
 
     def arrays(self) -> dict[str, Any]:
         return _opened(self.path, self.store_id, self.shots)
@@ -240,6 +247,13 @@ def open_to_write(path: Path) -> dict[str, Any]:
         name: array.with_config({"write_empty_chunks": True})
         for name, array in zarr.open_group(path, mode="r+").arrays()
     }
+
+
+@lru_cache(maxsize=4)
+def _labels_of_all(
+    path: Path, store_id: str, shots: int, numbers: tuple[str, ...]
+) -> list[dict[str, Any]]:
+    return read_labels(_opened(path, store_id, shots), numbers, slice(shots))
 
 
 @lru_cache(maxsize=4)
@@ -302,13 +316,10 @@ class StackStore:
         damaged = self.damage.shots
         if not damaged:
             return self._values("status")
-        return np.array(
-            [
-                DAMAGED if index in damaged else int(self._values("status", index))
-                for index in range(len(self.names))
-            ],
-            np.int8,
-        )
+        statuses = np.full(len(self.names), DAMAGED, np.int8)
+        for index in set(range(len(statuses))) - damaged.keys():
+            statuses[index] = self._values("status", index)
+        return statuses
 
     def report(self, index: int) -> dict[str, Any]:
         """Return how a shot went; ``reason`` says why it failed, or how it is damaged."""

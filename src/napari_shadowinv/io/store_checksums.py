@@ -150,14 +150,10 @@ def has_checksums(array: Any) -> bool:
 
 
 def note_shot(
-    root: Path, arrays: Mapping[str, Any], index: int, numbers: Collection[str]
+    root: Path, arrays: Mapping[str, Any], index: int, labels: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what the report of a shot says of its chunks and labels, once these are written.
-
-    The `numbers` are the arrays that are copied from the reports.
-    """
+    """Return what the report of a shot says of its chunks and labels, once these are written."""
     chunks: dict[str, str | None] = {}
-    labels: dict[str, Any] = {}
     for name, array in arrays.items():
         if (array.metadata.dimension_names or (None,))[0] != "shot" or name in _RECORD:
             continue
@@ -166,9 +162,21 @@ def note_shot(
         if array.chunks[0] == 1:
             key = array.metadata.encode_chunk_key((index, *[0] * (array.ndim - 1)))
             chunks[name] = stored_checksum(root / name / key)
-        elif name not in numbers:
-            labels[name] = np.asarray(array[index]).item()
-    return {CHUNKS: chunks, LABELS: labels}
+    return {CHUNKS: chunks, LABELS: dict(labels)}
+
+
+def read_labels(
+    arrays: Mapping[str, Any], numbers: Collection[str], which: slice
+) -> list[dict[str, Any]]:
+    """Return the labels of some shots; the `numbers` are arrays that are copied from reports."""
+    columns = {
+        name: np.asarray(array[which]).tolist()
+        for name, array in arrays.items()
+        if (array.metadata.dimension_names or (None,))[0] == "shot"
+        and array.chunks[0] > 1
+        and name not in numbers
+    }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def stored_checksum(file: Path) -> str | None:

@@ -24,6 +24,7 @@ from napari_shadowinv.io.store import (
     store_error,
     summary_of,
 )
+from napari_shadowinv.io.store_checksums import read_labels
 from napari_shadowinv.io.store_layout import lengthen
 
 
@@ -35,6 +36,10 @@ class _OpenWriter(ShotWriter):
 
     def arrays(self) -> dict[str, Any]:
         return self.opened
+
+    def labels(self, index: int, attributes: Mapping[str, Any]) -> dict[str, Any]:
+        labels = read_labels(self.opened, summary_of(attributes), slice(index, index + 1))
+        return labels[0] if labels else {}
 
 
 class GrowingStore:
