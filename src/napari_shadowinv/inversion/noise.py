@@ -40,6 +40,7 @@ _MIN_TILES = 5
 _QUIET_SHARE = 0.3  # of the tiles, those with the least structure around them
 _MIN_RISE, _RISE_DEVIATIONS = 1.2, 0.8  # of V(2) over V(1): least, and in 1/√(tiles)
 _LOW_QUANTILE = 0.25  # of the quiet tiles: noise is correlated in nearly all of them
+_MAX_UNEVENNESS = 0.2  # of its logarithm between tiles: noise has 0.1, structure 0.3 and more
 _MIN_DEVIATION = 1e-4  # of the brightness; below are the smooth flanks of noiseless images
 _MAX_PLATEAU_RISE = 1.35  # of V at the largest lag over the one before
 _MIN_CORRELATION = 0.05
@@ -145,8 +146,9 @@ def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
     if count < _MIN_TILES:
         return 1.0, 1.0
     tiles, finest = tiles[quiet], finest[quiet]
-    lowest = np.quantile(_difference_variance(tiles, side, 2) / finest, _LOW_QUANTILE)
-    if lowest < max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(count)):
+    rise = _difference_variance(tiles, side, 2) / np.maximum(finest, 1e-300)
+    least = max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(count))
+    if np.quantile(rise, _LOW_QUANTILE) < least or np.log(rise).std() > _MAX_UNEVENNESS:
         return 1.0, 1.0
     variances = [_difference_variance(tiles, side, lag) for lag in lags]
     ratios = np.array([np.median(variance / finest) for variance in variances])
