@@ -459,7 +459,7 @@ def _report(
             fields.jacobian,
             n_sites,
             options,
-            is_beam_different=budget.beam_difference > 0,
+            beam_difference=budget.beam_difference,
         )
     return Report(
         converged=finest.converged,

@@ -38,9 +38,10 @@ _MIN_SIDE_PX = 92  # of an image with large tiles
 _MAX_TILES = 20  # along each axis
 _MIN_TILES = 5
 _QUIET_SHARE = 0.3  # of the tiles, those with the least structure around them
-_MIN_RISE, _RISE_DEVIATIONS = 1.2, 0.8  # of V(2) over V(1): least, and in 1/√(tiles)
+_RISE_LAG_PX = 3
+_MIN_RISE, _RISE_DEVIATIONS = 1.2, 0.8  # of V(3) over V(1): least, and in 1/√(tiles)
 _LOW_QUANTILE = 0.25  # of the quiet tiles: noise is correlated in nearly all of them
-_MAX_UNEVENNESS = 0.2  # of its logarithm between tiles: noise has 0.1, structure 0.3 and more
+_MAX_UNEVENNESS = 0.25  # of its logarithm between tiles: noise has 0.15, structure 0.4 and more
 _MIN_DEVIATION = 1e-4  # of the brightness; below are the smooth flanks of noiseless images
 _MAX_PLATEAU_RISE = 1.35  # of V at the largest lag over the one before
 _MIN_CORRELATION = 0.05
@@ -137,6 +138,12 @@ def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
     tiles, used = _tiles(excess, mask, side, lags[-1])
     finest = _difference_variance(tiles, side, 1)
     used &= finest > 0
+    is_rising = used & (_difference_variance(tiles, side, _RISE_LAG_PX) > _MIN_RISE * finest)
+    if is_rising.mean() < _QUIET_SHARE * (1 - _LOW_QUANTILE):
+        return 1.0, 1.0
+    tiles = _without_hot_pixels(tiles)
+    finest = _difference_variance(tiles, side, 1)
+    used &= finest > 0
     rise = np.where(
         used, _difference_variance(tiles, side, lags[-1]) / np.where(used, finest, 1.0), 1.0
     )
@@ -146,7 +153,7 @@ def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
     if count < _MIN_TILES:
         return 1.0, 1.0
     tiles, finest = tiles[quiet], finest[quiet]
-    rise = _difference_variance(tiles, side, 2) / np.maximum(finest, 1e-300)
+    rise = _difference_variance(tiles, side, _RISE_LAG_PX) / np.maximum(finest, 1e-300)
     least = max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(count))
     if np.quantile(rise, _LOW_QUANTILE) < least or np.log(rise).std() > _MAX_UNEVENNESS:
         return 1.0, 1.0
@@ -168,16 +175,21 @@ def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
 def _tiles(
     excess: FloatArray, mask: BoolArray, side: int, lag: int
 ) -> tuple[FloatArray, BoolArray]:
-    """Tiles on a grid, each with the pixels at a lag, without hot pixels; and which are usable."""
+    """Tiles on a grid, each with the pixels at a lag, and which are usable."""
     size = side + lag
     steps = [max(side, -(-(n - size) // _MAX_TILES)) for n in excess.shape]
     places = np.s_[:: steps[0], :: steps[1]]
     tiles = sliding_window_view(excess, (size, size))[places]
     used = sliding_window_view(mask, (size, size))[places].all(axis=(2, 3))
+    return tiles, np.asarray(used)
+
+
+def _without_hot_pixels(tiles: FloatArray) -> FloatArray:
+    """Clip each tile about its median."""
     middle = np.median(tiles[..., ::2, ::2], axis=(2, 3), keepdims=True)
     spread = np.median(np.abs(tiles[..., ::2, ::2] - middle), axis=(2, 3), keepdims=True)
     limit = _CLIP_DEVIATIONS * _NORMAL_MAD * spread
-    return np.clip(tiles, middle - limit, middle + limit), np.asarray(used)
+    return np.clip(tiles, middle - limit, middle + limit)
 
 
 def _difference_variance(tiles: FloatArray, side: int, lag: int) -> FloatArray:

@@ -88,7 +88,7 @@ _CONTRAST_BLUR = 0.025  # of the shorter side
 _MIN_EDGE_CONTRAST = 0.6  # of the strongest contrast of the same sign
 _MAX_OPPOSITE_CONTRAST = 0.35  # of the contrast at an edge, at the opposite edge
 _MIN_SIGN_CONTRAST = 0.03  # of the strongest contrast
-_CONTRAST_DEVIATIONS = 7.0
+_CONTRAST_DEVIATIONS, _BEAM_DEVIATIONS = 7.0, 4.0
 
 _MIN_HOLE_PX = 3  # side of the smallest masked square that matters
 _NEAR_MASK = 0.02  # of the shorter side
@@ -109,12 +109,12 @@ def doubts(
     n_sites: int,
     options: InversionOptions,
     *,
-    is_beam_different: bool = False,
+    beam_difference: float = 0.0,
 ) -> tuple[str, ...]:
     """Say in plain sentences why a converged answer must not be trusted; empty if nothing does.
 
-    Where image and source differ without an object, contrast at the edge is not taken for an
-    object that is cut off.
+    Contrast at the edge is an object that is cut off only if it is well above the relative
+    `beam_difference` of image and source outside the object.
     """
     square = np.einsum("cyx,cyx->yx", displacement, displacement)
     rms = float(np.sqrt(square[prepared.mask].mean()))
@@ -127,9 +127,7 @@ def doubts(
     found.append(_peak_at_mask(displacement, prepared.mask))
     if options.boundary == "closed":
         reaching = _cut_off(displacement, prepared.mask, noise, rms)
-        if not reaching and not is_beam_different:
-            reaching = _cut_by_edge(prepared, noise)
-        found.append(reaching)
+        found.append(reaching or _cut_by_edge(prepared, noise, beam_difference))
     return tuple(sentence for sentence in found if sentence)
 
 
@@ -328,7 +326,7 @@ def _is_strongest_at_edge(outwards: FloatArray, along: FloatArray, peak: float) 
     return bool(crossing and np.nanmax(np.abs(along)) > _AT_EDGE * peak)
 
 
-def _cut_by_edge(prepared: Prepared, noise: ImageNoise) -> str:
+def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) -> str:
     """The image's contrast is as strong at one edge as anywhere, and the opposite edge is calm."""
     mask = prepared.mask
     mean = prepared.source[mask].mean()
@@ -340,6 +338,7 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise) -> str:
     # At the edge half of the Gaussian repeats the edge's pixels.
     by_noise = noise.typical * np.sqrt(noise.clumping / (2 * np.pi)) / width
     strongest = float(np.abs(contrast).max())
+    least = max(_CONTRAST_DEVIATIONS * by_noise, _BEAM_DEVIATIONS * beam_difference)
     for values in (contrast, -contrast):
         largest = float(values.max())
         if largest < _MIN_SIGN_CONTRAST * strongest:
@@ -353,7 +352,7 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise) -> str:
         opposites = dict(zip(sides, ("bottom", "top", "right", "left"), strict=True))
         for side, at_edge in sides.items():
             if (
-                at_edge > max(_MIN_EDGE_CONTRAST * largest, _CONTRAST_DEVIATIONS * by_noise)
+                at_edge > max(_MIN_EDGE_CONTRAST * largest, least)
                 and sides[opposites[side]] < _MAX_OPPOSITE_CONTRAST * at_edge
             ):
                 return (
