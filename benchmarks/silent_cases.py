@@ -68,11 +68,11 @@ def traced(
         low, near = y + dy - top, x + dx - left
         for down, share_y in ((0, 1 - low), (1, low)):
             for right, share_x in ((0, 1 - near), (1, near)):
-                row, column = top + down, left + right
-                inside = ((row >= 0) & (row < side) & (column >= 0) & (column < side)).ravel()
-                places = (row * side + column).ravel()[inside]
-                light = (weights * (share_y * share_x).ravel())[inside]
-                counts += np.bincount(places, light, minlength=counts.size)
+                # The field ends inside the image: what a share of a ray would lose, it keeps.
+                row = np.clip(top + down, 0, side - 1)
+                column = np.clip(left + right, 0, side - 1)
+                light = weights * (share_y * share_x).ravel()
+                counts += np.bincount((row * side + column).ravel(), light, counts.size)
     return counts.reshape(side, side), displaced(rows, columns, side, strength)
 
 

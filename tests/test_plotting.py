@@ -127,6 +127,22 @@ def test_figure_shows_sites_warnings_and_failure(make_inversion: Make) -> None:
     assert "not converged" in " ".join(item.get_text() for item in bad.texts)
 
 
+def test_masked_pixels_are_blank_in_all_pictures(make_inversion: Make) -> None:
+    calm = make_inversion((30, 30))
+    mask = np.ones((30, 30), bool)
+    mask[4:9, 20:26] = False
+    figure = report_figure(Inversion(**{**vars(calm), "mask": mask}))
+    for panel in panels(figure)[:5]:
+        shown = panel.images[0].get_array()
+        np.testing.assert_array_equal(np.ma.getmaskarray(np.ma.masked_invalid(shown)), ~mask)
+
+
+def test_figure_has_the_headline_of_the_inversion(make_inversion: Make) -> None:
+    inversion = make_inversion((30, 30))
+    text = " ".join(item.get_text() for item in report_figure(inversion).texts)
+    assert inversion.headline.text in text
+
+
 def test_empty_field_is_no_error(make_inversion: Make) -> None:
     calm = make_inversion((20, 20))
     still = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.beam import beam_difference
-from napari_shadowinv.inversion.budget import ErrorEstimate
+from napari_shadowinv.inversion.budget import Budget, ErrorEstimate
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.physics import phantoms
@@ -244,6 +245,20 @@ def test_accuracy_decides_on_the_sites_and_is_kept(image):
         assert found.report.sites_reason
     assert counts == sorted(counts)
     assert image.size // 16 < counts[0] <= counts[2] <= image.size
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0])
+def test_sites_needed_follow_from_the_fall_of_the_error(monkeypatch, image, power):
+    """An error 4 times too large that falls as n⁻ᵖ needs 1.3 · 4^(1/p) times the sites."""
+    options = InversionOptions(accuracy=0.01)
+    prepared = prepare(image, None, options)
+    budget = Budget(plan_sites(np.ones(image.shape)), prepared, ImageNoise(prepared), options)
+    move = np.full((2, 9), np.sqrt(0.5))  # 1 px
+    monkeypatch.setattr(budget, "_move", lambda solution: move)
+    monkeypatch.setattr(budget, "_change", lambda solved: (np.full(9, 0.04**2), power))
+    monkeypatch.setattr(budget._noise, "displacements", lambda level: (0.0, 0.0))
+    levels = [SimpleNamespace(weights=np.zeros(n), residual=0.0) for n in (100, 400)]
+    assert budget.needed(levels) == pytest.approx(1.3 * 4 ** (1 / power))
 
 
 def test_noise_needs_fewer_sites():

@@ -330,3 +330,52 @@ def test_phantoms_get_no_doubts(scene: str):
     image = synthetic_image(field)
     assert signs(image) == []
     assert signs(np.random.default_rng(6).poisson(100 * image).astype(float)) == []
+
+
+def cropped(image, source, first):
+    """A shot and its reference from a column on."""
+    return invert(image[:, first:], source=source[:, first:]).report.warnings
+
+
+@pytest.mark.parametrize("amplitude", [150.0, -60.0])
+def test_an_object_that_a_crop_cuts_is_reported(amplitude):
+    side, width = 128, 10.0
+    blob = phantoms.gaussian_blob((side, side), amplitude, width, (60.0, 70.0))
+    image = np.random.default_rng(3).poisson(1000 * synthetic_image(blob.displacement))
+    source = np.full(image.shape, 1000.0)
+    assert not cropped(image, source, 20)
+    for widths in (2.0, 1.5):
+        warnings = cropped(image, source, round(70 - widths * width))
+        assert any("edge" in text for text in warnings), widths
+
+
+def test_a_jet_across_the_image_is_not_cut():
+    x = np.indices((96, 96))[1]
+    potential = 12 * np.exp(-((x - 47) ** 2) / (2 * 6.0**2))
+    displacement = -np.array(np.gradient(potential))
+    image = np.random.default_rng(5).poisson(500 * synthetic_image(displacement))
+    assert invert(image, source=np.full(image.shape, 500.0)).report.warnings == ()
+
+
+@pytest.mark.parametrize("at_peak", [True, False])
+def test_a_mask_at_the_peak_is_reported(at_peak):
+    blob = phantoms.gaussian_blob((96, 96), 60.0, 9.0)
+    image = synthetic_image(blob.displacement)
+    length = np.hypot(*blob.displacement)
+    row, column = np.unravel_index(length.argmax(), length.shape) if at_peak else (8, 80)
+    mask = np.ones(image.shape, bool)
+    mask[row - 5 : row + 5, column - 5 : column + 5] = False
+    warnings = invert(image, mask=mask).report.warnings
+    assert any("lies at masked pixels" in text for text in warnings) == at_peak
+
+
+def test_the_headline_and_errors_leave_masked_pixels_out():
+    blob = phantoms.gaussian_blob((96, 96), 60.0, 9.0)
+    image = synthetic_image(blob.displacement)
+    mask = np.ones(image.shape, bool)
+    mask[30:44, 40:56] = False
+    found = invert(image, mask=mask)
+    outside = np.hypot(*found.displacement)[mask].max()
+    assert found.errors.peak == outside
+    peak = float(found.headline.text.rsplit("|d| ", 1)[1].split(" ±")[0])
+    assert peak == pytest.approx(outside, rel=0.05)

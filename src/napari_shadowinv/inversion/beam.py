@@ -28,8 +28,9 @@ _MIN_USED_SHARE = 0.5  # of a cell's pixels
 _MIN_CELL_PX = 2
 _MAX_NOISE_RATIO = 2.0  # variance of a quiet tile about its plane, over that of noise
 _MAX_CURVATURE = 0.15  # of the spread of the tiles
+_MAX_DEVIATIONS = 4.0  # of a quiet tile from the others
 _MIN_CURVATURE = 1e-3  # of the brightness
-_MIN_QUIET_SHARE = 0.3  # of the frame's tiles
+_MIN_QUIET_SHARE = 0.2  # of the frame's tiles
 _SIGNIFICANCE = 5.0  # standard deviations
 _MIN_DIFFERENCE = 2e-3
 
@@ -108,4 +109,10 @@ def _is_quiet(ratio: FloatArray, means: FloatArray, variance: FloatArray) -> Boo
     square = (residual**2).sum(axis=(2, 3)) / (_CELLS**2 - 3)
     spread = 1.4826 * float(np.nanmedian(np.abs(means - 1)))
     allowed = max(_MAX_CURVATURE * spread, _MIN_CURVATURE) ** 2
-    return np.asarray(square <= _MAX_NOISE_RATIO * variance + allowed)
+    quiet = square <= _MAX_NOISE_RATIO * variance + allowed
+    if not quiet.any():
+        return np.asarray(quiet)
+    # A flank may look like a plane, but stands out from the beam's slow differences.
+    away = np.abs(means - np.median(means[quiet]))
+    spread = 1.4826 * float(np.median(away[quiet]))
+    return np.asarray(quiet & (away <= _MAX_DEVIATIONS * spread))

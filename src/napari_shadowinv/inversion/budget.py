@@ -41,7 +41,7 @@ _WHOLE = 3.0  # times the sites of the level before: a whole step
 _SAFETY = 1.3
 _SOLVED = 0.1  # largest residual of a level that tells anything
 _SHARE_OF_NOISE, _MUCH_NOISE = 0.2, 0.8
-_NOTABLE_BEAM = 0.1  # of the peak
+_MAX_BEAM_AT_PEAK, _MAX_BEAM_RMS = 0.1, 0.25  # without a warning, of the displacement
 
 _RESPONDING = 4500  # sites, at most, whose linear response is worked out
 _NOISE_SAMPLES, _BEAM_SAMPLES, _WAVES = 16, 8, 16
@@ -187,9 +187,10 @@ class Errors:
 
     def beam_warning(self) -> str:
         """Warn if image and source differ outside the object so that the peak is uncertain."""
-        if self.beam is None or self.beam_basis != "seen":
+        if self.beam is None or self.beam_basis != "seen" or not self.peak > 0:
             return ""
-        if not self.beam.at_peak > _NOTABLE_BEAM * self.peak:
+        at_peak, everywhere = self.beam.at_peak / self.peak, self.beam.rms / self.rms
+        if not (at_peak > _MAX_BEAM_AT_PEAK or everywhere > _MAX_BEAM_RMS):
             return ""
         return (
             f"image and source differ by {100 * self.beam_variation:.2g} % (r.m.s.) where there is "
