@@ -30,6 +30,7 @@ def field_from(path: Path, variable: str | None = None) -> Field:
     """Displacement from a result, or from an array of px or px²."""
     from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
     from napari_shadowinv.io import read_dataset, read_radiograph
+    from napari_shadowinv.io.dataset import require
     from napari_shadowinv.io.formats import kind_of
     from napari_shadowinv.io.hdf5 import read_hdf5
     from napari_shadowinv.io.images import read_npy
@@ -46,7 +47,9 @@ def field_from(path: Path, variable: str | None = None) -> Field:
         if is_pack(dataset.attrs):
             raise _no_field(path, "a film pack")
         source = dataset["source"].values if "source" in dataset else None
-        return Field(dataset["displacement"].values, source, setup_from_dataset(dataset))
+        require(dataset, ("displacement",))
+        displacement = _displacement(path, dataset["displacement"].values)
+        return Field(displacement, source, setup_from_dataset(dataset))
     if kind == "npy":
         return Field(_displacement(path, read_npy(path)))
     raise _no_field(path, f"a {kind.upper()} picture")

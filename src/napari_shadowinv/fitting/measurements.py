@@ -103,8 +103,6 @@ def measured(
         source, lit = unpack_planes(source, "source")
         exposed = join_masks(exposed, mask_of_each(lit, data))
     count, height, width = data.shape
-    needed = _BYTES_PER_PIXEL + count * _BYTES_PER_PIXEL_AND_IMAGE
-    check_memory((height, width), needed, f"a fit of {count} images")
     names = names or [f"image {k + 1}" for k in range(count)]
     if len(names) != count:
         raise InputError(f"received {count} images and {len(names)} names: expected one each")
@@ -238,6 +236,11 @@ def estimated_noise(image: FloatArray, used: BoolArray) -> float:
 
 
 def _checked_images(images: ArrayLike) -> FloatArray:
+    shapes = [np.shape(plane) for plane in images] if isinstance(images, list) else []
+    shape = (len(shapes), *max(shapes)) if shapes else np.shape(images)
+    count = shape[0] if len(shape) > 2 else 1
+    needed = _BYTES_PER_PIXEL + count * _BYTES_PER_PIXEL_AND_IMAGE
+    check_memory(shape[-2:], needed, "a fit")
     try:
         data = np.array(images, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.arrays import unpack_shot
 from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
@@ -40,7 +41,7 @@ from napari_shadowinv.inversion._drawing import noise_of
 from napari_shadowinv.inversion._invert import invert, plan_sites
 from napari_shadowinv.inversion._sampling import Resolving, Responding, Scatter, Seed
 from napari_shadowinv.inversion.labels import dataset_from_field, label
-from napari_shadowinv.inversion.normalise import prepare
+from napari_shadowinv.inversion.normalise import bytes_per_pixel, prepare
 from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.transport.sites import SitePlan
@@ -219,6 +220,7 @@ def uncertainty(
         raise InputError(f"method is {method!r}, expected 'linear' or 'resolve'")
     if plan is None:
         image, source, mask = unpack_shot(image, source, mask)
+    check_memory(np.shape(image), bytes_per_pixel(options), "an inversion")
     draw, described = noise_of(image, noise, gain, mask if plan is None else plan.mask)
     if plan is None:
         beam = prepare(image, source, options, mask).source

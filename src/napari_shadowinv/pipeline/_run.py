@@ -23,6 +23,7 @@ from napari_shadowinv._system.arrays import (
     unpack_mask,
 )
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -49,6 +50,7 @@ __all__ = ["PREVIEW_PIXELS", "PREVIEW_SITES", "Inputs", "gathered", "run", "run_
 
 PREVIEW_SITES = 5_000
 PREVIEW_PIXELS = 10_000
+_BYTES_PER_PIXEL = 24  # of an image and copies that steps make; an inversion needs more
 
 Shot = Radiograph | ArrayLike | str | Path
 
@@ -410,6 +412,7 @@ def plane_of(values: Any, name: str) -> FloatArray:
         )
     if array.dtype.kind not in "buif":
         raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
+    check_memory(array.shape, _BYTES_PER_PIXEL, "an image")
     return array.astype(np.float64)
 
 

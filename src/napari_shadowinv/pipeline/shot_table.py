@@ -66,7 +66,11 @@ class ShotRow(CheckedModel):
         default=None, title="Setup", description="TOML file with the experimental geometry."
     )
     energy: float | None = Field(
-        default=None, gt=0, title="Energy", description="Energy in MeV, in place of the setup's."
+        default=None,
+        gt=0,
+        le=1e5,
+        title="Energy",
+        description="Energy in MeV, in place of the setup's.",
     )
     strength: Annotated[tuple[float, ...], BeforeValidator(_strength)] | None = Field(
         default=None,

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import SETUPS_LABEL, variable_labels
 from napari_shadowinv.io.store import SUMMARY
 from napari_shadowinv.io.store_setups import with_places
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack import _spec
 from napari_shadowinv.stack._choosing import choose_sites
 from napari_shadowinv.stack._references import Reader, Shot, read_shot
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Recipe, Step
+    from napari_shadowinv.preprocessing import Step
 
 # One number for each shot, beside the arrays of an inversion.
 _NUMBERS = {name: kind for name, (kind, _) in SUMMARY.items() if name != "seconds"}
@@ -111,6 +113,7 @@ def invert_stack(
     >>> float(abs(stack.displacement.isel(shot=1)).max())
     0.0
     """
+    check_instance(recipe, Recipe, "recipe")
     if recipe is not None and recipe.fit is not None:
         raise InputError(
             "the recipe has a section fit, and invert_stack inverts: use run_stack to fit, or "

@@ -16,12 +16,14 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.locking import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
+from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
 from napari_shadowinv.io.store_layout import create_store, remove_unfinished
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._choosing import choose_sites
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
 from napari_shadowinv.stack._references import Reader, read_shot
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Recipe, Step
+    from napari_shadowinv.preprocessing import Step
 
 _POLL = 0.25  # seconds between two looks at the engine and at `should_stop`
 
@@ -196,6 +198,7 @@ def stored_variables(
     variables: Collection[str] | None, recipe: Recipe | None, mask: ArrayLike | None
 ) -> Collection[str] | None:
     """Return what is stored of each shot; None for what is usual of a fit."""
+    check_instance(recipe, Recipe, "recipe")
     is_fit = recipe is not None and recipe.fit is not None
     if variables is not None or is_fit:
         return variables
