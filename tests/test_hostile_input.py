@@ -45,7 +45,7 @@ from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io import read_toml
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import FitChoices
-from napari_shadowinv.pipeline.shot_table import ShotRow, rows_of
+from napari_shadowinv.pipeline.shot_table import ShotRow, is_table, rows_of
 from napari_shadowinv.preprocessing import STEPS
 
 SHOT = np.random.default_rng(0).poisson(300, (16, 20)).astype(float)
@@ -251,6 +251,13 @@ def test_hostile_row_of_a_table_is_refused(row: str, message: str) -> None:
 
     with pytest.raises(InputError, match=message):
         rows_of(Path("shots.csv"), ShotRow)
+
+
+def test_large_image_as_numbers_is_no_table() -> None:
+    np.savetxt("large.csv", np.random.default_rng(0).random((200, 250)), delimiter=",")
+    assert Path("large.csv").stat().st_size > 1_000_000
+
+    assert not is_table(Path("large.csv"))
 
 
 @pytest.mark.parametrize("dose", ["nan", "-3", "inf"])

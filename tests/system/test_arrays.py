@@ -191,6 +191,17 @@ def test_forward_models_take_axes_by_name() -> None:
     )
 
 
+def test_dataset_of_a_result_is_taken_as_it_is() -> None:
+    inversion = invert(SHOT, options=OPTIONS)
+    dataset = inversion.to_dataset(SETUP)
+
+    for turn in (dataset, dataset.transpose("x", ...)):
+        image = synthetic_image(turn.displacement, turn.source)
+        assert np.array_equal(image, synthetic_image(inversion.displacement, inversion.source))
+        again = run(Recipe(setup=SETUP, options=OPTIONS), turn.image)
+        assert again.image.shape == SHOT.shape
+
+
 def test_displacement_in_metres_is_refused() -> None:
     field = xr.DataArray(1e-6 * TRUTH, dims=("component", "y", "x"), attrs={"units": "m"})
 

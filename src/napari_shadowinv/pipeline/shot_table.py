@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from napari_shadowinv._system.safety import small_text
+from napari_shadowinv._system.safety import check_regular, small_text
 from napari_shadowinv._system.validation import CheckedModel, nearest, validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing, text_of
@@ -36,6 +36,8 @@ __all__ = [
     "write_table",
 ]
 
+_EXPECTED = "a table as comma-separated values"
+_LONGEST_HEADER = 100_000  # bytes
 _CONFIG = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -271,12 +273,19 @@ def is_table(path: Path) -> bool:
     """Tell whether a file is a table with names of columns, and no image as numbers."""
     if path.suffix.lower() not in SITES.suffixes:
         return False
-    lines = _lines(path)
+    check_regular(path, _EXPECTED)
+    with path.open("rb") as file:  # an image may be large
+        head = file.read(_LONGEST_HEADER).decode("utf-8-sig", errors="replace")
+    lines = _filled(head)
     return bool(lines) and not any(map(_is_number, _cells(path, lines[0])))
 
 
 def _lines(path: Path) -> list[str]:
-    text = small_text(path, "a table as comma-separated values", "utf-8-sig")
+    return _filled(small_text(path, _EXPECTED, "utf-8-sig"))
+
+
+def _filled(text: str) -> list[str]:
+    """Lines of a table that are neither empty nor a comment."""
     return [line for line in text.splitlines() if line.strip(" ,;\t") and line.strip()[0] != "#"]
 
 
