@@ -999,7 +999,7 @@ def test_rerun_reads_no_foreign_file(
 
 
 @pytest.mark.parametrize(
-    "entry", [{"mask": "{file}"}, {"source": {"kind": "measured", "file": "{file}"}}]
+    "entry", [{"mask": "{file}"}, {"source": {"method": "measured", "file": "{file}"}}]
 )
 def test_rerun_reads_no_file_of_a_recipe(
     folder: Path, refused: Callable[..., None], entry: dict[str, Any]

@@ -61,7 +61,11 @@ def test_it_is_made_again_and_described(truth: Truth, here: Path) -> None:
     told = flat(shadowinv("info", "pack.shadowinv").output)
     assert "film pack of shadowinv" in told
     assert "3 of 90 × 120 px" in told
-    again = shadowinv("rerun", "pack.shadowinv")
+    # A result may come from anybody: scans that lie elsewhere are asked for.
+    refused = shadowinv("rerun", "pack.shadowinv")
+    assert refused.exit_code == 2
+    assert "film_01.tif, which is in another folder" in flat(refused.stderr)
+    again = shadowinv("rerun", "pack.shadowinv", "--other-folders")
     assert again.exit_code == 0, again.output
     assert "the same result, bit for bit" in flat(again.output)
     one, other = read("pack.shadowinv"), read("pack_again.shadowinv")

@@ -120,6 +120,8 @@ def check_readable(dataset: xarray.Dataset, result: Path) -> None:
     try:
         version = json.loads(text)["version"]
     except (TypeError, ValueError, KeyError, RecursionError):
+        version = __version__
+    if version == __version__:
         raise InputError(
             f"{result} has a damaged provenance: make it again with a recipe (docs/recipes.md)"
         ) from None

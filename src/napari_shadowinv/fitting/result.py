@@ -24,6 +24,7 @@ from napari_shadowinv.inversion.labels import (
     belongs,
     dataset_from_field,
     label,
+    numbers_of,
 )
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
@@ -351,7 +352,7 @@ class Fit:
 
     @classmethod
     def _from_parts(cls, dataset: xarray.Dataset) -> Fit:
-        arrays = {name: np.ascontiguousarray(dataset[name].values) for name in _VARIABLES}
+        arrays = {name: numbers_of(dataset, name) for name in _VARIABLES}
         attributes = dataset.attrs
         content = json.loads(attributes["report"])
         if content.get("beam") is not None:
@@ -416,9 +417,7 @@ class Fit:
 
 def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArray) -> FittedField:
     potential, displacement, uncertainty, by_beam = (
-        np.ascontiguousarray(dataset[variable + ending].values)
-        if variable + ending in dataset
-        else None
+        numbers_of(dataset, variable + ending) if variable + ending in dataset else None
         for variable in (
             "potential",
             "displacement",
@@ -430,6 +429,10 @@ def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArr
         raise InputError(
             f"dataset has no potential or no displacement of the field {name!r}: expected the "
             "result of a fit"
+        )
+    if displacement.shape != (2, *potential.shape):
+        raise ValueError(
+            f"displacement has shape {displacement.shape}, potential {potential.shape}"
         )
     weights = float(smoothness[0]), float(smoothness[1])
     return FittedField(name, potential, displacement, uncertainty, weights, by_beam)

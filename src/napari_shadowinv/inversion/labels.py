@@ -22,7 +22,7 @@ import numpy as np
 
 from napari_shadowinv import __version__
 from napari_shadowinv._system.safety import refusing_junk
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
     import xarray
@@ -126,6 +126,14 @@ def fit_labels(
 def belongs(variable: object, field: str) -> bool:
     """Tell whether a variable makes sense for a field: ∫E dz of a magnetic one does not."""
     return _ASSUMES.get(str(variable), field) == field
+
+
+def numbers_of(dataset: xarray.Dataset, name: str) -> AnyArray:
+    """Return a variable of a result as an array; a `ValueError` if it holds no numbers."""
+    values = np.ascontiguousarray(dataset[name].values)
+    if values.dtype.kind not in "buif":
+        raise ValueError(f"{name} holds {values.dtype} values, expected numbers")
+    return values
 
 
 def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:

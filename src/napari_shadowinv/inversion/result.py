@@ -16,7 +16,13 @@ from napari_shadowinv._system.safety import refusing_junk
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.budget import Errors
-from napari_shadowinv.inversion.labels import FORMAT, VARIABLES, dataset_from_field, label
+from napari_shadowinv.inversion.labels import (
+    FORMAT,
+    VARIABLES,
+    dataset_from_field,
+    label,
+    numbers_of,
+)
 from napari_shadowinv.inversion.trust import image_residual
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.units import shown_fields
@@ -306,9 +312,7 @@ class Inversion:
 
     @classmethod
     def _from_parts(cls, dataset: xarray.Dataset) -> Inversion:
-        arrays: dict[str, Any] = {
-            name: np.ascontiguousarray(dataset[name].values) for name in VARIABLES
-        }
+        arrays: dict[str, Any] = {name: numbers_of(dataset, name) for name in VARIABLES}
         content = json.loads(dataset.attrs["report"])
         known = {field.name for field in dataclasses.fields(Report)} & content.keys()
         report = Report(**{name: _tuples(content[name]) for name in known})
