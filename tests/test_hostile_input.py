@@ -32,8 +32,10 @@ from napari_shadowinv import (
     invert,
     invert_stack,
     plan_sites,
+    poisson_invert,
     read,
     run,
+    synthetic_image,
     uncertainty,
     write,
 )
@@ -127,6 +129,16 @@ def test_model_inside_another_is_named_with_its_place() -> None:
 def test_wrong_kind_of_argument_is_named(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [invert, plan_sites, poisson_invert, synthetic_image],
+)
+@pytest.mark.parametrize("image", [[[1, 2], [3]], "x", None, SHOT.astype(str)])
+def test_what_is_no_image_is_refused(call: Callable[[Any], Any], image: Any) -> None:
+    with pytest.raises(InputError):
+        call(image)
 
 
 def test_options_may_be_a_mapping() -> None:

@@ -6,7 +6,7 @@
 - numbers as floats: `as_numbers`
 - two masks together: `join_masks`; size of a pixel by the coordinates: `coordinate_spacing`
 
-Everything else, lists and dask arrays included, passes through untouched.
+Everything else, dask arrays included, passes through untouched.
 """
 
 from __future__ import annotations
@@ -44,6 +44,13 @@ def unpack_array(
     """
     if _is_labelled(values):
         values = _in_order(values, name, dims, unit)
+    if isinstance(values, (list, tuple)):
+        try:
+            return np.asarray(values), None
+        except ValueError:
+            raise InputError(
+                f"{name} is a list whose parts have different lengths: expected an array"
+            ) from None
     if not isinstance(values, np.ma.MaskedArray):
         return values, None
     masked = np.ma.getmaskarray(values)
@@ -54,7 +61,9 @@ def plain_array(
     values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = ""
 ) -> ArrayLike:
     """Return the values in the order of `dims`; refuse masked ones, which have no meaning here."""
-    plain: ArrayLike = unpack_array(unmasked(values, name), name, dims, unit=unit)[0]
+    plain: AnyArray = np.asarray(unpack_array(unmasked(values, name), name, dims, unit=unit)[0])
+    if plain.dtype.kind not in "buif":
+        raise InputError(f"{name} has values of type {plain.dtype}, expected real numbers")
     return plain
 
 
