@@ -57,9 +57,7 @@ def unpack_array(
     return values.data, ~masked if masked.any() else None
 
 
-def plain_array(
-    values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = ""
-) -> ArrayLike:
+def plain_array(values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = "") -> AnyArray:
     """Return the values in the order of `dims`; refuse masked ones, which have no meaning here."""
     plain: AnyArray = np.asarray(unpack_array(unmasked(values, name), name, dims, unit=unit)[0])
     if plain.dtype.kind not in "buif":

@@ -170,11 +170,12 @@ def _checked_displacement(displacement: ArrayLike) -> FloatArray:
 def _checked_source(source: ArrayLike | None, shape: tuple[int, int]) -> FloatArray:
     if source is None:
         return np.ones(shape)
-    flux = np.ascontiguousarray(plain_array(source, "source"), dtype=np.float64)
-    if flux.shape != shape:
+    plain = plain_array(source, "source")
+    if plain.shape != shape:
         raise InputError(
-            f"source has shape {flux.shape}, displacement describes {shape}: they must match"
+            f"source has shape {plain.shape}, displacement describes {shape}: they must match"
         )
+    flux = np.ascontiguousarray(plain, dtype=np.float64)
     _refuse_non_finite("source", flux)
     if flux.min() < 0:
         raise InputError(

@@ -11,10 +11,13 @@ from numpy.typing import ArrayLike
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._system.arrays import SQUARE_PIXELS, plain_array
+from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
 __all__ = ["border_mean", "poisson_invert"]
+
+_BYTES_PER_PIXEL = 64  # image, source, ratio, transform and copies of them
 
 
 def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> FloatArray:
@@ -94,7 +97,9 @@ def _solve_neumann(laplacian: FloatArray) -> FloatArray:
 
 
 def _checked(name: str, values: ArrayLike) -> FloatArray:
-    array = np.asarray(plain_array(values, name), dtype=np.float64)
+    plain = plain_array(values, name)
+    check_memory(plain.shape, _BYTES_PER_PIXEL, "a linear inversion")
+    array = np.asarray(plain, dtype=np.float64)
     if array.ndim != 2 or array.size == 0:
         raise InputError(f"{name} has shape {array.shape}: expected (height, width)")
     bad = array.size - np.count_nonzero(np.isfinite(array))
