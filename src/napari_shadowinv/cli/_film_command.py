@@ -12,6 +12,7 @@ import typer
 from napari_shadowinv.cli import _flags, _outputs
 from napari_shadowinv.cli._tables import Rows, two_columns
 from napari_shadowinv.cli._terminal import interrupted, notify_errors, progress_bars, say
+from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
     import xarray
@@ -27,12 +28,13 @@ HELP = {
     "layers": "Folder for the fluence of each layer as an image, with a table of them for fit and "
     "batch.",
     "corners": "Table (.csv) for the corners that were found, to correct and give to the pack.",
+    "new": "Folder of scans for which to write a pack.toml to complete, instead of a run.",
     "out": "Result file. Default: the pack's name with .shadowinv, in the current folder.",
 }
 EPILOG = r"""
 [bold]Examples[/bold]
-shadowinv film pack.toml
-shadowinv film pack.toml --layers layers
+shadowinv film --new scans
+shadowinv film scans/pack.toml --layers layers
 shadowinv fit layers/layers.csv --gains free --source unknown
 
 [bold]pack.toml[/bold] (files are looked for beside it)
@@ -57,7 +59,7 @@ Known films: EBT3, HDV2, MDV3; materials: Al, Au, Cu, Fe, Kapton, Mylar, Ta, Ti 
 
 @notify_errors
 def film(
-    pack: Annotated[Path, typer.Argument(help=HELP["pack"], show_default=False)],
+    pack: Annotated[Path | None, typer.Argument(help=HELP["pack"], show_default=False)] = None,
     layers: Annotated[Path | None, typer.Option(help=HELP["layers"])] = None,
     layers_format: Annotated[
         LayersFormat, typer.Option(help="Format of the layers' images.")
@@ -65,6 +67,7 @@ def film(
     corners: Annotated[Path | None, typer.Option("--save-corners", help=HELP["corners"])] = None,
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
     report: _flags.Figure = None,
+    new: Annotated[Path | None, typer.Option("--new", help=HELP["new"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
@@ -79,6 +82,14 @@ def film(
     from napari_shadowinv.pipeline import read_pack, write_layers
     from napari_shadowinv.pipeline.film_files import LAYERS_TABLE
 
+    if new is not None:
+        _write_new(new, pack, overwrite)
+        return
+    if pack is None:
+        raise InputError(
+            "no pack is given: name the TOML file that describes it, or a folder of scans with "
+            "--new to write one"
+        )
     result, figure = _outputs.result_and_figure(pack, out, report)
     outputs: dict[Path, tuple[str, ...]] = {
         result: tuple(PACK_WRITERS),
@@ -106,6 +117,19 @@ def film(
         say(layer_table(dataset))
         rows = [*pack_rows(dataset), ("written", ", ".join(map(str, written)))]
         say(two_columns("Film pack", rows))
+
+
+def _write_new(folder: Path, pack: Path | None, overwrite: bool) -> None:
+    """Write a pack file for a folder of scans, and list what is missing in it."""
+    from napari_shadowinv.pipeline.new_pack import draft_pack, missing_entries, write_new_pack
+
+    if pack is not None:
+        raise InputError(f"--new writes a pack file and {pack} is one: give only one of them")
+    entries = draft_pack(folder)
+    rows = [("layers", str(len(entries["layers"])))]
+    rows += [("to complete", text) for text in missing_entries(entries)]
+    path = write_new_pack(folder, entries, overwrite=overwrite)
+    say(two_columns("New pack", [*rows, ("written", str(path))]))
 
 
 def _made(pack: Pack, quiet: bool) -> xarray.Dataset:

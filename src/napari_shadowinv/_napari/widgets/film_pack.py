@@ -27,6 +27,7 @@ from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._corners import CornerEditor
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled, with_button
 from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
+from napari_shadowinv._napari.widgets._new_pack import NewPackDialog
 from napari_shadowinv._napari.widgets._pack_work import PackAnswer, PackJob, edits_beside
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._plots import COLOURS, Plot
@@ -153,7 +154,9 @@ class FilmPack(ToolPanel):
             qt.beside((self.to_fit, 1), (self.write, 1), (self.save, 1)),
         )
         column.setAlignment(Qt.AlignmentFlag.AlignTop)
-        self.add(labelled("Pack", self.path), self._last.keep_earlier, self.panel, self.actions)
+        self.new = _button("New pack…", "Describe a pack from a folder of scans.")
+        pack_row = qt.beside((self.path, 1), (self.new, 0))
+        self.add(labelled("Pack", pack_row), self._last.keep_earlier, self.panel, self.actions)
         self.corners = CornerEditor(self.viewer, self)
 
     def _connect(self) -> None:
@@ -163,6 +166,7 @@ class FilmPack(ToolPanel):
             signal.connect(self._soon)
         self.packs.picked.connect(self._on_pack)
         for button, action in (
+            (self.new, self._new_pack),
             (self.show_corners, self._show_corners),
             (self.paint, self._paint),
             (self.run_again, self._run_again),
@@ -184,6 +188,16 @@ class FilmPack(ToolPanel):
         pack = read_pack(file)
         name = file.stem if file.stem != "pack" else file.parent.name
         return PackJob(pack, str(file), name, self._new_folder())
+
+    @qt.notify_errors
+    def _new_pack(self) -> None:
+        folder = QtWidgets.QFileDialog.getExistingDirectory(self, "Folder with the scans of a pack")
+        if not folder:
+            return
+        dialog = NewPackDialog(Path(folder), self)
+        if dialog.exec() and dialog.written is not None:
+            self.path.edit.setText(str(dialog.written))
+            self.panel.say(f"Wrote {dialog.written}. {dialog.missing_text()}")
 
     def forget(self) -> None:
         self.panel.say("")

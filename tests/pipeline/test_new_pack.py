@@ -1,0 +1,74 @@
+"""Facts about a pack file that is drafted from a folder of scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from command_line import flat, shadowinv
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.pipeline import read_pack
+from napari_shadowinv.pipeline.new_pack import NewPack, draft_pack, write_new_pack
+
+TABLE = "Dose,Red,Green,Blue\n1,30000,31000,29000\n10,20000,24000,26000\n100,8000,12000,20000\n"
+
+
+@pytest.fixture
+def scans(tmp_path: Path) -> Path:
+    for name in ("film_10.tif", "film_2.tif", "EBT3_film_11.tif", "HDV2.tif"):
+        (tmp_path / name).touch()
+    (tmp_path / "HDV2_table.csv").write_text(TABLE)
+    (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
+    (tmp_path / "notes.txt").touch()
+    return tmp_path
+
+
+def test_draft_has_the_scans_in_order(scans: Path) -> None:
+    entries = draft_pack(scans)
+    assert [layer["file"] for layer in entries["layers"]] == [
+        "EBT3_film_11.tif",
+        "film_2.tif",
+        "film_10.tif",
+    ]
+    assert [layer["film"] for layer in entries["layers"]] == ["EBT3", "HDV2", "HDV2"]
+    assert entries["films"] == {"HDV2": {"calibration": "HDV2_table.csv", "unexposed": "HDV2.tif"}}
+
+
+def test_draft_is_read_as_a_pack(scans: Path) -> None:
+    facts = NewPack(seen_from="detector", source_object_distance=0.01, object_image_distance=0.1)
+    entries = draft_pack(scans, facts)
+    entries["layers"][1]["filters"] = ["13 um Al", "25 um Fe"]
+    pack = read_pack(write_new_pack(scans, entries))
+    assert pack.seen_from == "detector"
+    assert pack.setup == {"source_object_distance": 0.01, "object_image_distance": 0.1}
+    assert [slab.material for slab in pack.layers[1].filters] == ["Al", "Fe"]
+    assert pack.films["HDV2"].calibration == scans / "HDV2_table.csv"
+    with pytest.raises(FileFormatError, match=r"pack.toml exists"):
+        write_new_pack(scans, entries)
+
+
+def test_other_folders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="has no scans of films"):
+        draft_pack(tmp_path)
+    with pytest.raises(FileFormatError, match="cannot be read as a folder"):
+        draft_pack(tmp_path / "missing")
+
+
+def test_one_distance_alone_is_refused(scans: Path) -> None:
+    with pytest.raises(InputError, match="only one of two distances"):
+        draft_pack(scans, NewPack(source_object_distance=0.01))
+
+
+def test_film_command_writes_a_new_pack(scans: Path) -> None:
+    ended = shadowinv("film", "--new", scans)
+    assert ended.exit_code == 0, ended.output
+    for words in ("calibration of EBT3", "filters: those in front", "seen_from", "pack.toml"):
+        assert words in flat(ended.output)
+    assert len(read_pack(scans / "pack.toml").layers) == 3
+    again = shadowinv("film", "--new", scans)
+    assert again.exit_code == 2
+    assert "exists" in flat(again.output)
+    nothing = shadowinv("film")
+    assert nothing.exit_code == 2
+    assert "no pack is given" in flat(nothing.output)
