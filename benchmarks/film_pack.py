@@ -2,10 +2,15 @@
 
     python benchmarks/film_pack.py [--seeds 3] [--protons 2e6]
     python benchmarks/film_pack.py --chain [--seeds 3] [--bin 3]
+    python benchmarks/film_pack.py --real pack.toml [--first 1] [--last 17]
 
 With --chain: how far the fields and the beam, by a fit of all layers, are from the truth, as the
 steps from the scans to the layers are added one by one; and of a pack whose films have slipped by
 up to 6 px, laid on each other by what they show, or by three holes read to 0.3 px.
+
+With --real: how the films of a real pack were moved and turned by their texture, against their
+edges, and where the slit near their upper right corner lies on the upright films before and after.
+Films that lie right show it at one place; where it is torn, too faint or masked, it is left out.
 
 The scans are those of tests/film/simulated_pack.py: rays counted where an exact formula puts them,
 on films that lie askew. For each film: the energy of its protons and its doses; the protons that
@@ -33,7 +38,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from napari_shadowinv import FitOptions, Recipe
-from napari_shadowinv.film import moved_corners, write_corners
+from napari_shadowinv.film import moved_corners, straightened, write_corners
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.setup import setup_from_dict
@@ -264,13 +269,68 @@ def fiducials(truth: Truth, seed: int) -> Path:
     return path
 
 
+def slit_of(film: FloatArray) -> tuple[float, float] | None:
+    """Lower end and place across (y, x) in px of the slit near the upper right corner."""
+    part = film[:60, -55:-20]
+    away = np.abs(part - ndimage.median_filter(part, (1, 15)))
+    profile = np.clip(away[12:28].mean(axis=0) - np.median(away[12:28].mean(axis=0)), 0, None)
+    best = int(np.argmax(profile))
+    near = slice(max(best - 3, 0), best + 4)
+    line = away[:, max(best - 1, 0) : best + 2].max(axis=1)
+    ended = np.flatnonzero(line[25:] < np.median(line[12:28]) / 2)
+    if not profile[near].any() or not ended.size or ended[0] == 0:
+        return None
+    across = np.average(np.arange(part.shape[1])[near], weights=profile[near])
+    return float(25 + ended[0]), float(film.shape[1] - 55 + across)
+
+
+def print_real(pack: Path, first: int, last: int) -> None:
+    """Print moves by texture against edges, and the places of slits by edges and as laid."""
+    described = read_pack(pack)
+    layers = tuple(
+        layer if first <= number <= last else layer.model_copy(update={"exclude": True})
+        for number, layer in enumerate(described.layers, 1)
+    )
+    dataset = run_film(described.model_copy(update={"layers": layers}))
+    shape = dataset.sizes["y"], dataset.sizes["x"]
+    print("| film | type | shift y, x (px) | turn (°) | by | slit by edges | slit as laid |")
+    print(f"|{'---|' * 7}")
+    places: dict[str, list[float]] = {}
+    for number in range(first, last + 1):
+        film = dataset.isel(layer=number - 1)
+        corners, shift = film["corners"].values, film["shift"].values
+        turn = float(film["turn"])
+        pixels = tifffile.imread(described.layers[number - 1].file)
+        laid = moved_corners(corners, shift, turn, 1.0)
+        slits = [
+            slit_of(straightened(pixels, where, shape=shape).mean(axis=-1))
+            for where in (corners, laid)
+        ]
+        cells = ["–" if slit is None else f"{slit[0]:.0f}, {slit[1]:.1f}" for slit in slits]
+        by = "texture" if bool(film["by_images"]) else "edges"
+        print(
+            f"| {number} | {film['film'].item()} | {shift[0]:+.1f}, {shift[1]:+.1f} | "
+            f"{np.rad2deg(turn):+.2f} | {by} | {' | '.join(cells)} |"
+        )
+        if by == "edges" and slits[1] is not None:
+            places.setdefault(film["film"].item(), []).append(slits[1][1])
+    for kind, across in places.items():
+        print(f"\n{kind} laid by edges: slits within {np.ptp(across):.1f} px across.")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--protons", type=float, default=2e6, help="in a pixel of the object")
     parser.add_argument("--bin", type=int, default=3, help="pixels that are summed for the fit")
     parser.add_argument("--chain", action="store_true", help="fit fields, which takes long")
+    parser.add_argument("--real", type=Path, help="pack.toml of real films with a slit")
+    parser.add_argument("--first", type=int, default=1, help="film of the real pack")
+    parser.add_argument("--last", type=int, default=17, help="film of the real pack")
     given = parser.parse_args()
+    if given.real is not None:
+        print_real(given.real, given.first, given.last)
+        return
     with tempfile.TemporaryDirectory() as folder:
         if given.chain:
             print("| seed | steps | B (%) | E (%) | beam (%) | told ± (%) | χ² | verdict | s |")

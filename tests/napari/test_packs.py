@@ -140,3 +140,11 @@ def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_dataset: Any)
         np.testing.assert_array_equal(usable_of(layer), usable)
         np.testing.assert_array_equal(layer.data, np.where(usable, lost["fluence"].values[k], 0))
         np.testing.assert_allclose(layer.scale, 1e6 * setup.object_pixel_size)
+
+
+def test_layers_that_are_no_measurement_are_marked(pack_dataset: Any) -> None:
+    assert list(packs.spectrum_in(pack_dataset).is_measured) == [True, True, False]
+    faint = pack_dataset.copy(deep=True)
+    faint["fluence_error"].values[0] = faint["fluence"].values[0]
+    faint["usable"].values[1] = False
+    assert not packs.spectrum_in(faint).is_measured.any()

@@ -460,3 +460,20 @@ def test_a_film_that_is_too_dark_is_told(truth: Truth, changed) -> None:
 def test_other_packs_are_told(truth: Truth, changed, old: str, new: str, message: str) -> None:
     with pytest.raises((InputError, FileFormatError), match=re.escape(message)):
         run_film(read_pack(changed((old, new))))
+
+
+def test_real_films_are_not_moved_by_lines_of_equal_dose(shared_data: Path) -> None:
+    folder = shared_data / "rcf"
+    film = {
+        "calibration": folder / "EBT3_2_calibration.csv",
+        "unexposed": folder / "EBT3.tif",
+    }
+    layers = [
+        {"film": "EBT3", "filters": "750 um Fe", "file": folder / f"RCF_18{letter}.tif"}
+        for letter in "OPQ"
+    ]
+    found = run_film(Pack.model_validate({"layers": layers, "films": {"EBT3": film}}))
+    # Edges and the slit that is cut into all of them agree within 2 px.
+    assert np.ptp(found["shift"].values, axis=0).max() < 2
+    assert np.ptp(found["turn"].values) < np.deg2rad(0.3)
+    assert (found["shift_error"].values > 2).all()

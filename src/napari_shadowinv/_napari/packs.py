@@ -43,6 +43,7 @@ LEFT_OUT, BY_HAND = 1, 2
 """Labels of unusable pixels: as `run_film` found them, and as somebody painted them."""
 
 _LABEL_COLOURS = ["transparent", "#5dff5d", "#00c8ff"]
+_MIN_SIGNIFICANCE = 2.0  # fluence over its error
 _SHORT = 1e-9  # s
 _DARK_AND_BRIGHT = (0.1, 99.7)  # percentiles
 _NEARLY_DARK = 0.3
@@ -54,6 +55,10 @@ class Spectrum(NamedTuple):
     energies: FloatArray  # MeV
     fluence: FloatArray  # protons per m² and MeV
     error: FloatArray  # median standard deviation of its pixels, which largely share it
+    bands: FloatArray  # shape (n, 2), MeV
+    is_measured: BoolArray
+    """False for a layer without usable pixels, one whose fluence is below twice its error, and the
+    last one, whose fluence depends on the assumed spectrum beyond it."""
 
 
 def pack_layers(
@@ -193,11 +198,12 @@ def spectrum_in(dataset: xarray.Dataset, region: BoolArray | None = None) -> Spe
         planes = zip(dataset[name].values, inside, strict=True)
         return np.array([what(one[used]) if used.any() else np.nan for one, used in planes], float)
 
-    return Spectrum(
-        dataset["energy"].values,
-        of_each("fluence", partial(np.mean, dtype=np.float64)),
-        of_each("fluence_error", np.median),
-    )
+    fluence = of_each("fluence", partial(np.mean, dtype=np.float64))
+    error = of_each("fluence_error", np.median)
+    is_measured = fluence > _MIN_SIGNIFICANCE * error  # not where they are NaN
+    is_measured[-1] = False
+    bands = np.stack([dataset["energy_low"].values, dataset["energy_high"].values], axis=1)
+    return Spectrum(dataset["energy"].values, fluence, error, bands, is_measured)
 
 
 def painted_by_hand(labels: AnyArray, dataset: xarray.Dataset) -> BoolArray:

@@ -88,6 +88,8 @@ def test_a_run_shows_the_fluences_of_the_films(
     used = pack_dataset["usable"].values
     means = [plane[one].astype(float).mean() for plane, one in zip(fluence.data, used, strict=True)]
     np.testing.assert_allclose(tool.plot.shown.fluence, means)
+    hatched = [patch for patch in tool.plot.figure.axes[0].patches if patch.get_hatch()]
+    assert len(hatched) == 1
     # The same pack again takes the place of its result.
     tool.panel.button.click()
     wait(tool)

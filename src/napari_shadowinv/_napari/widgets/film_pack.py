@@ -74,6 +74,9 @@ class SpectrumPlot(Plot):
             markersize=4,
             capsize=2,
         )
+        for (low, high), is_measured in zip(spectrum.bands, spectrum.is_measured, strict=True):
+            if not is_measured:
+                axis.axvspan(low, high, facecolor="none", edgecolor=self.ink, hatch="///", lw=0)
         axis.set_yscale("log", nonpositive="clip")
         seen = spectrum.fluence[spectrum.fluence > 0]
         if seen.size:
@@ -124,7 +127,9 @@ class FilmPack(ToolPanel):
         self.plot = SpectrumPlot()
         self.plot.setToolTip(
             "<qt>Mean fluence of each film. Bars are the standard deviation of a pixel (median): "
-            "errors of calibration are shared by all pixels and do not average out.</qt>"
+            "errors of calibration are shared by all pixels and do not average out. Hatched layers "
+            "are no measurement: they have no usable pixels or a fluence below twice its error, or "
+            "are the last one, which sees all protons beyond it, too.</qt>"
         )
         self.show_corners = _button(
             "Show corners", "Show the scan of the film in view, with corners to drag."
