@@ -162,7 +162,9 @@ def test_the_film_pack_has_the_numbers_of_its_page(shared_data, tmp_path, monkey
     assert np.abs(found["shift"].values).max() == pytest.approx(8.3, abs=0.1)
     assert f"{float(found['peak'][-1]):.1f} MeV" in page
     nominal = np.genfromtxt("RCF_Stack_Design.csv", delimiter=",", skip_header=2, max_rows=1)[1:]
-    assert np.abs(found["energy"].values / nominal - 1).max() < 0.05
+    # The last film sees all protons beyond its peak, too.
+    assert np.abs(found["energy"].values / nominal - 1)[:-1].max() < 0.05
+    assert found["peak"].values[-1] == pytest.approx(nominal[-1], rel=0.01)
 
 
 def assert_same_but_for_rounding(printed: str, shown: str) -> None:
