@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 from napari_shadowinv._napari.layer_metadata import belongs_to_result, mark_of, role_of, slot_of
 
-if TYPE_CHECKING:
-    from napari_shadowinv._napari.layers import FullLayerData
+_LayerData = tuple[Any, dict[str, Any], str]
 
 
 @dataclass(frozen=True)
@@ -64,9 +63,7 @@ MASKED_ROLES = {"reprojection", "residual", "potential", "field y", "field x", "
 MASKED_ROLES |= {"uncertainty"}
 
 
-def main_layers(
-    described: Sequence[FullLayerData], also: Collection[str] = ()
-) -> list[FullLayerData]:
+def main_layers(described: Sequence[_LayerData], also: Collection[str] = ()) -> list[_LayerData]:
     """Select the layers shown by default, and those whose role and part are in `also`."""
     return [
         layer
