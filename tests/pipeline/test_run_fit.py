@@ -171,3 +171,17 @@ def test_an_inversion_is_not_made_as_a_fit() -> None:
     made: dict[str, Any] = {"provenance": '{"version": "1", "recipe": {}, "image": {}}'}
     assert FitProvenance.of(made) is None
     assert FitProvenance.of({}) is None
+
+
+def test_fit_warns_of_broken_pixels_in_an_image(images: list[FloatArray], tmp_path: Path) -> None:
+    second = images[1].copy()
+    second[20, 30] = 40.0
+    shots = [
+        FitShot(image, setup) for image, setup in zip((images[0], second), SETUPS, strict=True)
+    ]
+    result = run_fit(Recipe(fit=FitChoices(noise=0.02, options=HASTY)), shots)
+    (text,) = result.warnings
+    assert text.startswith("image 2: hot pixels: 1 pixel of the image differs")
+    path = tmp_path / "fit.shadowinv"
+    write(path, result)
+    assert Fit.from_dataset(read(path)).warnings == result.warnings

@@ -259,6 +259,16 @@ class Fit:
             text = f"{report.total:.2%} of the displacement in total (r.m.s.); {text}"
         return [("error bars", text), ("beam", report.beam.text)]
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons to doubt the images, each with the name of its image."""
+        images = () if self.provenance is None else self.provenance.images
+        return tuple(
+            f"{each.image.file or f'image {number}'}: {text}"
+            for number, each in enumerate(images, 1)
+            for text in each.warnings
+        )
+
     def peak_text(self, field: FittedField, shown: ShownField) -> str:
         """Return the largest magnitude of a field with its total error, in the unit shown."""
         share = field.error_of_peak

@@ -456,7 +456,8 @@ def _provenance(
             gain=one.gain,
             psf=one.psf,
             noise=one.noise,
-            notes=(*shot.warnings, *shot.notes),
+            notes=shot.notes,
+            warnings=shot.warnings,
         )
         for one, inputs, shot in zip(given, gathering, ready, strict=True)
     )

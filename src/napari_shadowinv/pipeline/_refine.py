@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from napari_shadowinv import __version__
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.fitting import Fit, fit
@@ -69,10 +67,11 @@ def run_refinement(
 
 
 def _options(inversion: Inversion, options: FitOptions) -> FitOptions:
-    """The options, with the beam's variation of the inversion if its beam was assumed uniform."""
-    if options.beam_variation is not None or np.ptp(inversion.source) > 0:
+    """The options, with the beam's variation in the error budget of the inversion."""
+    errors = inversion.errors
+    if options.beam_variation is not None or errors is None or errors.beam is None:
         return options
-    return options.model_copy(update={"beam_variation": inversion.options.beam_variation})
+    return options.model_copy(update={"beam_variation": errors.beam_variation})
 
 
 def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0.0) -> FitChoices:

@@ -32,6 +32,8 @@ class FitOrigin(CheckedModel):
         As given for this image; None where the recipe counts.
     notes : tuple of str
         What the steps found and did.
+    warnings : tuple of str
+        Reasons to doubt the image, its source or its setup.
     """
 
     model_config = _CONFIG
@@ -45,6 +47,7 @@ class FitOrigin(CheckedModel):
     psf: float | None = None
     noise: Noise | None = None
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 class FitProvenance(CheckedModel):

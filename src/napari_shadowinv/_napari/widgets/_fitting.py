@@ -111,7 +111,9 @@ class FitView(QWidget):
         if found.verdict is not Verdict.DETERMINED:
             text = verdict_in_words(found)
             show_warning(text[:1].upper() + text[1:])
-        self.report.show_rows([*job.given, *fit_rows(found, job.names)])
+        texts = {text for name, text in job.given if name == "Warning"}
+        doubts = [("Warning", window_text(text)) for text in found.warnings if text not in texts]
+        self.report.show_rows([*doubts, *job.given, *fit_rows(found, job.names)])
         self._others.show([])
         self._job, self._result = job, answer.result
         self._fill_answers(found)
@@ -130,7 +132,8 @@ class FitView(QWidget):
             self.empty()
             self._result = result
             self._tell(result.content)
-            self.report.show_rows(fit_rows(result.content))
+            doubts = [("Warning", window_text(text)) for text in result.content.warnings]
+            self.report.show_rows([*doubts, *fit_rows(result.content)])
 
     def _tell(self, found: Fit) -> None:
         good = found.verdict is Verdict.DETERMINED
