@@ -532,7 +532,7 @@ def test_a_margin_wider_than_the_image_is_refused_before_it_is_made():
 def test_the_headline_puts_warnings_before_the_peak(image):
     inversion = invert(image)
     assert inversion.headline.level == "sound"
-    assert f"{peak(inversion.displacement):.4f}" in inversion.headline.text
+    assert f"{peak(inversion.displacement):.2f}" in inversion.headline.text
     doubtful = inversion.with_warnings(["the beam is wrong"]).headline
     assert doubtful.level == "doubtful"
     assert doubtful.text == f"the beam is wrong; {inversion.headline.text}"

@@ -59,9 +59,9 @@ def beam_difference(prepared: Prepared, noise: ImageNoise) -> float:
     ratio, variance = _cell_ratios(prepared, noise, cell, rows, columns)
     means, by_noise = ratio.mean(axis=(2, 3)), variance.mean(axis=(2, 3))
     is_used = np.isfinite(means)
-    if not is_used.any():
+    middle = float(np.median(means[is_used])) if is_used.any() else 0.0
+    if not middle > 0:
         return 0.0
-    middle = float(np.median(means[is_used]))
     means, by_noise = means / middle, by_noise / middle**2
     quiet = ~is_used | _is_quiet(ratio / middle, means, by_noise)
     # An object fades into tiles that seem quiet beside it.
