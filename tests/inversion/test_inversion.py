@@ -336,7 +336,7 @@ def test_one_thread_leaves_all_other_threads_at_rest(image):
 
 def test_the_report_tells_how_it_went(image):
     noisy = image - 0.3 * (np.random.default_rng(2).random(SHAPE) < 0.01)
-    noisy[5, 5] = -1.0
+    noisy[5, 5:12] = -1.0  # 0.15 % of the pixels
     inversion = invert(noisy, options=InversionOptions(negative="clip"))
     report = inversion.report
     assert report.clipped_pixels == (noisy < 0).sum()
@@ -346,6 +346,11 @@ def test_the_report_tells_how_it_went(image):
     assert report.iterations == sum(steps for _, steps, _ in report.levels)
     assert set(report.seconds) == {"prepare", "sites", "transport", "read-out", "errors"}
     assert any("negative" in warning for warning in report.warnings)
+    noisy[5, 5:12] = 1.0
+    noisy[5, 5] = -1.0
+    few = invert(noisy, options=InversionOptions(negative="clip")).report
+    assert few.clipped_pixels > 0
+    assert not any("negative" in warning for warning in few.warnings)
 
 
 def test_an_inversion_that_does_not_converge_says_so(image):

@@ -25,6 +25,7 @@ _MARGIN_SHARE = 0.05  # of the image's shorter side
 _BYTES_PER_SITE = 2000  # measured peak of a whole inversion, rounded up
 _BYTES_PER_PIXEL, _BYTES_PER_PIXEL_FREE = 180, 320  # measured peak of a large image
 _NOTABLE_FLUX_CHANGE = 0.05
+_NOTABLE_RAISED = 1e-3  # share of the pixels
 _NOTABLE_MASK = 0.2  # of the pixels
 _DIMMEST, _BRIGHTEST = 1e-301, 1e301  # sums of a whole image stay within double precision
 _ALIKE = 1e-6  # of the mean: what rounding to 32 bits leaves of a difference
@@ -173,10 +174,10 @@ def _warnings(
             "right after another exposure, and wrong if a dark level was left in one of them "
             "(--dark), if one is a negative, or if light was lost in the object or past the edge"
         )
-    if clipped:
+    if clipped > _NOTABLE_RAISED * size:
         warnings.append(f"negative pixels set to zero: {clipped} ({clipped / size:.2%})")
     dark = floored - clipped
-    if dark > 0:
+    if dark > _NOTABLE_RAISED * size:
         warnings.append(
             f"dark pixels raised to the floor: {dark} ({dark / size:.2%}); "
             "the field inside dark areas is not reliable"
