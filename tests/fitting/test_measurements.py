@@ -10,11 +10,11 @@ from scipy import constants
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting.blur import point_spread
 from napari_shadowinv.fitting.measurements import (
     Measured,
     estimated_noise,
     measured,
-    point_spread,
     strengths_of,
 )
 from napari_shadowinv.options import FitOptions
