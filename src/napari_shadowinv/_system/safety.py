@@ -35,6 +35,10 @@ P = ParamSpec("P")
 Content = TypeVar("Content")
 
 
+class _DamagedContentError(InputError):
+    """Content that its reader cannot use; a reader of files names the file instead."""
+
+
 def refusing_damage(
     read: Callable[Concatenate[Path, P], Content],
 ) -> Callable[Concatenate[str | Path, P], Content]:
@@ -44,6 +48,8 @@ def refusing_damage(
     def guarded(path: str | Path, *args: P.args, **kwargs: P.kwargs) -> Content:
         try:
             return read(Path(path), *args, **kwargs)
+        except _DamagedContentError as error:
+            raise _damage(path, error.__cause__ or error) from error
         except (FileFormatError, InputError, InversionCancelled):
             raise
         except (ImportError, NameError):  # a mistake in a program, which no file can cause
@@ -58,13 +64,20 @@ def refusing_damage(
                 raise FileFormatError(
                     f"{path} cannot be read ({error.strerror}): check its permissions and the disk"
                 ) from error
-            found = " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
-            raise FileFormatError(
-                f"{path} is damaged or truncated ({found}): expected a complete file; "
-                "copy or export it again"
-            ) from error
+            raise _damage(path, error) from error
 
     return cast("Callable[Concatenate[str | Path, P], Content]", guarded)
+
+
+def _damage(path: str | Path, cause: BaseException) -> FileFormatError:
+    return FileFormatError(
+        f"{path} is damaged or truncated ({_reason(cause)}): expected a complete file; copy or "
+        "export it again"
+    )
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
 
 
 @contextmanager
@@ -75,9 +88,9 @@ def refusing_junk(name: str) -> Iterator[None]:
     except (InputError, ImportError, NameError, MemoryError):
         raise
     except Exception as error:
-        reason = " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
-        raise InputError(
-            f"{name} is damaged or was changed ({reason}): expected it as this package writes it"
+        raise _DamagedContentError(
+            f"{name} is damaged or was changed ({_reason(error)}): expected it as this package "
+            "writes it"
         ) from error
 
 
