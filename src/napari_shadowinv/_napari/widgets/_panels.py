@@ -215,7 +215,7 @@ def _error_rows(inversion: Inversion) -> list[tuple[str, str]]:
     errors = inversion.errors
     if errors is None:
         return []
-    (field,) = shown_fields([inversion.displacement], inversion.setup)
+    (field,) = shown_fields([inversion.displacement], inversion.setup, mask=inversion.mask)
     told = [(name.capitalize(), text) for name, text in inversion.error_rows]
     return [("Field", field.peak_text(errors.of_peak)), *told]
 
