@@ -173,7 +173,7 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray
     content = result.content
     looks = {slot_of(keywords): _look(keywords, kind) for _, keywords, kind in layers}
     name = next((mark_of(keywords).get("name") for _, keywords, _ in layers), None)
-    kept = {_LOOKS: json.dumps(looks), **({_NAME: name} if name else {})}
+    kept = {_LOOKS: json.dumps(looks), **({} if name is None else {_NAME: name})}
     if isinstance(content, xr.Dataset):
         return content.assign_attrs(kept)
     told = {**result.attributes, **kept}
