@@ -109,12 +109,14 @@ def add_inversion(
 
     Examples
     --------
+    The names say that nothing deflects the rays of a blank image:
+
     >>> from napari.components import ViewerModel
     >>> from napari_shadowinv import invert
     >>> viewer = ViewerModel()
     >>> layers = add_inversion(viewer, invert(np.ones((20, 20))), name="blank")
     >>> [layer.name for layer in layers if layer.visible]
-    ['|d| (px) – blank', 'displacement arrows – blank']
+    ['|d| (px) – blank (doubtful)', 'displacement arrows – blank (doubtful)']
     """
     described = inversion_layers(inversion, setup, name=name, **keywords)
     return add_layers(viewer, described if all_layers else main_layers(described))
@@ -157,8 +159,15 @@ def result_layers(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     )
     diagram = power_cells(content) if cells else None
-    titled = f"{name} {doubt_of_inversion(content)}".strip()
-    described = dataset_layers(dataset, result.setup, frame, titled, facts, cells=diagram)
+    described = dataset_layers(
+        dataset,
+        result.setup,
+        frame,
+        name,
+        facts,
+        cells=diagram,
+        doubt=doubt_of_inversion(content),
+    )
     for _, keywords, _ in described:
         if role_of(keywords) == "image":
             # With its beam and mask it can be inverted again.
@@ -184,8 +193,12 @@ def dataset_layers(
     shot: int | None = None,
     cells: Cells | None = None,
     deflector: str | None = None,
+    doubt: str = "",
 ) -> list[FullLayerData]:
-    """Describe the layers of a result, or of a stack in the units and contrast of one `shot`."""
+    """Describe the layers of a result, or of a stack in the units and contrast of one `shot`.
+
+    All names end with `doubt`.
+    """
     shown = _Shown(dataset, setup, shot, cells, deflector)
     layers = []
     for kind in KINDS:
@@ -196,7 +209,7 @@ def dataset_layers(
             data = _where(shown.masked, np.nan, data)
         unit = words.get("unit", kind.unit)
         keywords = {
-            "name": layer_name(kind.title.format(**words), name),
+            "name": f"{layer_name(kind.title.format(**words), name)} {doubt}".rstrip(),
             "metadata": mark(kind.role, unit, setup, **facts),
             "visible": kind.visible,
             **frame.keywords(stacked=shot is not None),
