@@ -249,9 +249,7 @@ class InvertShot(InversionInputs, LivePanel):
             result_frame(layer, recipe),
             self.origins(layer, layer.name),
             preview,
-            ", ".join(
-                filter(None, (mark_of(layer).get("name", layer.name), self.source.short_name))
-            ),
+            self._result_name(layer),
         )
 
     def _result_name(self, layer: Any) -> str:
