@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from napari_shadowinv import (
 from napari_shadowinv._napari.widgets._fields import parsed, shown
 from napari_shadowinv._napari.widgets._forecast import BlobRecipe, ForwardJob, ToroidRecipe
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
+from napari_shadowinv._napari.widgets._panels import report_rows
 from napari_shadowinv._napari.widgets._stacking import StackJob
 from napari_shadowinv._napari.widgets.estimate_source import SourceRequest
 from napari_shadowinv._napari.widgets.invert_shot import cost_of
@@ -205,6 +207,17 @@ def test_seconds_of_all_stages_are_told(shot: Array) -> None:
     assert set(report.seconds) == {"source", "prepare", "sites", "transport", "read-out", "errors"}
     assert report.seconds["sites"] > 0
     assert not report.warnings
+
+
+def test_report_leaves_masked_pixels_out_of_the_peak(shot: Array) -> None:
+    inversion = invert(shot, options=FEW)
+    mask = np.ones(shot.shape, bool)
+    mask[36:44, 8:16] = False
+    displacement = np.where(mask, inversion.displacement, 100.0)
+    masked = replace(inversion, mask=mask, displacement=displacement)
+    text = dict(report_rows(masked))["Field"]
+    largest = np.hypot(*inversion.displacement)[mask].max()
+    assert float(text.removeprefix("peak |d| ").split()[0]) == pytest.approx(largest, rel=0.01)
 
 
 def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
