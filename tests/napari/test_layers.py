@@ -345,3 +345,7 @@ def test_doubtful_result_has_the_doubt_in_its_names(solved: Inversion) -> None:
         report = replace(solved.report, warnings=warnings, converged=converged)
         for _, keywords, _ in inversion_layers(replace(solved, report=report), name="a"):
             assert keywords["name"].endswith(f" – a{mark}")
+        names = [
+            keywords["name"] for _, keywords, _ in inversion_layers(replace(solved, report=report))
+        ]
+        assert f"|d| (px){mark}" in names
