@@ -170,7 +170,6 @@ class StackRequest:
                 self._limits[role] = _widened(self._limits[role], np.asarray(data[index]))
 
     def _describe(self, first: int | None = None) -> None:
-        from napari_shadowinv._napari.kinds import main_layers
         from napari_shadowinv._napari.stores import store_layers
 
         try:
@@ -185,8 +184,7 @@ class StackRequest:
                 limits = keywords["contrast_limits"]
                 self._limits[str(role_of(keywords))] = limits
                 self._given.add(limits)
-        shown = main_layers(layers)
-        self.described.extend((data, keywords | more, kind) for data, keywords, kind in shown)
+        self.described.extend((data, keywords | more, kind) for data, keywords, kind in layers)
 
 
 def _is_image(layer: Any) -> bool:

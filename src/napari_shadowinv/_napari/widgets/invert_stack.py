@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdit, QSpinBox
 
+from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.layer_metadata import may_be_shot, role_of
 from napari_shadowinv._napari.stores import follow_shots
 from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled
@@ -372,7 +373,8 @@ class InvertStack(InversionInputs, ToolPanel):
             self.results = ResultLayers(self.viewer, self)
             self.results.complete.connect(self._on_layers)
         self._look_at = not again and request.image is None
-        self.results.show(request.described, select=not again)
+        described = main_layers(request.described, also=self.results.slots)
+        self.results.show(described, select=not again)
 
     def _on_layers(self) -> None:
         # Files lie where their setup puts them, which may be far from what is in view.
