@@ -37,8 +37,8 @@ def _lasting() -> None:
 
 @pytest.fixture(scope="session")
 def shot() -> np.ndarray[Any, Any]:
-    """An off-centre blob in an even beam, in counts."""
-    blob = gaussian_blob((48, 60), 20.0, 8.0, (20.0, 33.0))
+    """An off-centre blob in an even beam, in counts, that no edge cuts."""
+    blob = gaussian_blob((48, 60), 15.0, 6.0, (22.0, 33.0))
     return 300 * synthetic_image(blob.displacement)
 
 
