@@ -64,7 +64,7 @@ def of_role(viewer: Any, role: str) -> Any:
 
 
 def scratch_of(tool: Any) -> list[Path]:
-    return list(Path(tool._scratch.name).rglob("*"))
+    return list(tool._scratch.rglob("*"))
 
 
 def test_a_run_shows_the_fluences_of_the_films(
