@@ -79,6 +79,6 @@ def test_add_to_running_lays_the_result_on_the_selected_shot(
     shot = running.add_image(data, **{**keywords, "translate": (10.0, 20.0)})
     runpy.run_path(str(EXAMPLES / "napari_add_to_running.py"))
     (field,) = [layer for layer in running.layers if role_of(layer) == "field"]
-    assert field.name.startswith("my shot ")
+    assert field.name.endswith(" – my shot")
     np.testing.assert_array_equal(field.extent.world, shot.extent.world)
     assert setup_of(field) == proton_setup

@@ -201,6 +201,7 @@ def test_a_feature_of_image_and_result_is_at_one_place(
     shot: Array,
     proton_setup: ProtonSetup,
     steps: tuple[Step, ...],
+    qtbot: Any,
 ) -> None:
     bright = shot.copy()
     bright[24:28, 36:40] = 5 * shot.mean()
@@ -209,6 +210,8 @@ def test_a_feature_of_image_and_result_is_at_one_place(
     tool.setup.show_setup(proton_setup.model_dump())
     tool.steps.show_steps(steps)
     run(tool)
+    tool.more_layers.click()
+    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     (seen,) = (layer for layer in viewer.layers if role_of(layer) == "image")
     spot = np.argwhere(np.asarray(seen.data) > 0.9 * seen.data.max()).mean(axis=0)
     expected = image.data_to_world((25.5, 37.5))
@@ -238,7 +241,7 @@ def test_a_result_of_larger_pixels_is_in_the_units_of_these(
     mine, other = (
         next(one for one in layers if role_of(one) == "field") for layers in (viewer.layers, fresh)
     )
-    assert mine.name.removeprefix("shot ") == other.name
+    assert mine.name.replace(" – shot", "") == other.name
     np.testing.assert_allclose(mine.data, other.data)
 
 

@@ -175,7 +175,7 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     window: Any, open_widget: Any, qtbot: Any, told: list[str], solved: Inversion,
     proton_setup: ProtonSetup,
 ) -> None:  # fmt: skip
-    add_inversion(window, solved, proton_setup, name="solved")
+    add_inversion(window, solved, proton_setup, name="solved", all_layers=True)
     tool = open_widget("Forward model")
     shown = [tool.deflector.itemData(index) for index in range(tool.deflector.count())]
     assert tuple(shown[1:]) == get_args(Deflector)
