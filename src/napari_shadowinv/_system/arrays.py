@@ -5,6 +5,7 @@
 - image, source and mask of one shot: `unpack_shot`; several planes: `unpack_planes`
 - numbers as floats: `as_numbers`
 - two masks together: `join_masks`; size of a pixel by the coordinates: `coordinate_spacing`
+- places of values in their order: `order_by_value`
 
 Everything else, dask arrays included, passes through untouched.
 """
@@ -202,3 +203,18 @@ def _spacing(array: Any, dim: str, name: str) -> float | None:
         )
     metres = _METRES.get(str(coordinate.attrs.get("units", "")).strip())
     return None if metres is None else abs(mean) * metres
+
+
+def order_by_value(values: FloatArray) -> AnyArray:
+    """Return the places of finite values from the lowest to the highest, in single precision.
+
+    Equal values stay in their sequence. NumPy counts integers of 16 bits instead of comparing
+    them, so sorting by the two halves of the numbers is several times as fast as `argsort`.
+    """
+    heights = values - values.min()
+    heights /= heights.max() or 1.0
+    # The bits of numbers that are not negative are in the order of the numbers.
+    bits = heights.astype(np.float32).view(np.uint32)
+    order = np.argsort(bits.astype(np.uint16), kind="stable")
+    highs = (bits >> 16).astype(np.uint16)
+    return np.asarray(order[np.argsort(highs[order], kind="stable")])

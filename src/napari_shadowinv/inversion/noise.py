@@ -19,6 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 from scipy.optimize import nnls
 
+from napari_shadowinv._system.arrays import order_by_value
 from napari_shadowinv._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -210,7 +211,7 @@ def _terms(bright: FloatArray, differences: FloatArray) -> FloatArray:
     """Fit what detectors have: noise of reading, of counting, and of uneven response."""
     step = -(-len(bright) // _SAMPLES)
     bright, differences = bright[::step], differences[::step]
-    order = np.argsort(bright, kind="stable")
+    order = order_by_value(bright)
     parts = np.array_split(order, min(_BINS, max(1, len(order) // 20)))
     found = [(float(bright[part].mean()), _clipped(differences[part]) ** 2) for part in parts]
     places, variances = np.array(found).T

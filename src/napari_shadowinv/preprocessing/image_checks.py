@@ -25,6 +25,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
 from scipy.optimize import nnls
 
+from napari_shadowinv._system.arrays import order_by_value
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 
 __all__ = [
@@ -178,7 +179,7 @@ def dark_level(image: FloatArray, mask: BoolArray | None = None) -> float:
     mean = brightness.mean()
     if not mean > 0:
         return 0.0
-    order = np.argsort(brightness, kind="stable")
+    order = order_by_value(brightness)
     order = order[: int((1 - _BRIGHTEST_LEFT_OUT) * order.size)]
     bins = np.array_split(order, _DARK_BINS)
     levels = np.array([brightness[part].mean() for part in bins]) / mean
