@@ -252,7 +252,7 @@ class Budget:
         if error < _MUCH_NOISE * noise:
             response = self._response(solved)
             moves, finer = self._noisy_moves(response, solved[-1].level.spacing)
-            by_noise = _with_finer((moves**2).sum(axis=2).mean(axis=1), finer)
+            by_noise = _with_finer(_mean_square(moves), finer)
             noise = math.sqrt(float((by_noise * response.shares).sum()))
         if error < _SHARE_OF_NOISE * noise:
             self.reason = f"{told}, below a fifth of what the noise does ({_percent(noise, rms)})"
@@ -271,19 +271,21 @@ class Budget:
         along = displacement[:, row, column] / max(length[row, column], 1e-300)
         response = self._response(solved)
         near = _near(peak, response.places, response.spacing)
+        close = np.flatnonzero(near)
+        nothing_finer = np.zeros(len(near))
 
-        def estimate(moves: FloatArray, finer: FloatArray | float = 0.0) -> ErrorEstimate:
-            squares = _with_finer((moves**2).sum(axis=2).mean(axis=1), finer)
-            at_peak = ((moves * along).sum(axis=2) ** 2).mean(axis=1)
-            at_peak = _with_finer(at_peak, finer / 2)
-            return _roots((squares * response.shares).sum(), (at_peak * near).sum())
+        def estimate(moves: FloatArray, finer: FloatArray = nothing_finer) -> ErrorEstimate:
+            squares = _with_finer(_mean_square(moves), finer)
+            at_peak = ((moves[close] @ along) ** 2).mean(axis=1)
+            at_peak = _with_finer(at_peak, finer[close] / 2)
+            return _roots((squares * response.shares).sum(), (at_peak * near[close]).sum())
 
         discretisation = ErrorEstimate(math.nan, math.nan)
         if len(solved) > 1:
             squares, _ = self._change(solved)
             spacing = max(solved[-2].level.spacing, _stride(mask.shape))
-            close = _near(peak, self._places.T, spacing)
-            discretisation = _roots(squares.mean(), (squares * close).sum() / 2)
+            weights = _near(peak, self._places.T, spacing)
+            discretisation = _roots(squares.mean(), (squares * weights).sum() / 2)
         by_percent = estimate(_TESTED_VARIATION * response.to(self._beams(response)))
         times = variation / _TESTED_VARIATION
         return Errors(
@@ -406,7 +408,12 @@ def _times(value: float | ErrorEstimate, factor: float) -> Any:
     return factor * value
 
 
-def _with_finer(squares: FloatArray, finer: FloatArray | float) -> FloatArray:
+def _mean_square(moves: FloatArray) -> FloatArray:
+    """Mean square length over the samples, (t, k, 2), at each triangle."""
+    return np.asarray(np.einsum("tkc,tkc->t", moves, moves) / moves.shape[1])
+
+
+def _with_finer(squares: FloatArray, finer: FloatArray) -> FloatArray:
     """Add the mean squares of finer waves, which are negative where noise lacks waves."""
     return np.asarray(np.maximum(squares + finer, _LEAST_NOISE * squares))
 

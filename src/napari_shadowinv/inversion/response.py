@@ -56,7 +56,7 @@ class LinearResponse:
         """Return each triangle's displacement (t, k, 2), px, by fluxes that cells gain (k, n)."""
         potential = -0.5 * self._factors.solve(changes.T)
         corners, slopes = self._slopes
-        return np.asarray(-np.einsum("tik,tic->tkc", potential[corners], slopes))
+        return np.asarray(-np.swapaxes(potential[corners], 1, 2) @ slopes)
 
     def finer(self, variance: FloatArray, spacing: float, grain: float = 0.0) -> FloatArray:
         """Return each triangle's mean square displacement, px², by waves too fine for this level.
