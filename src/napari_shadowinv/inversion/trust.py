@@ -233,9 +233,11 @@ def mark_caustics(
     -------
     ndarray of bool, shape (H, W)
     """
+    below = (jacobian < threshold) & mask
+    if not below.any():
+        return np.asarray(below)
     spacing_px = max(1.0, math.sqrt(jacobian.size / n_sites))
     averaged = ndimage.gaussian_filter(jacobian, spacing_px, mode="nearest")
-    below = (jacobian < threshold) & mask
     regions, _ = ndimage.label(below, structure=np.ones((3, 3)))
     caustics = np.unique(regions[below & (averaged < threshold)])
     marked: BoolArray = np.isin(regions, caustics) & below
