@@ -70,7 +70,7 @@ def test_the_commands_work_as_shown(folder, night):
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines()[0] == "Watching shots for *.tif; Ctrl-C ends it."
     others = [command for command in COMMANDS if not re.search("batch|watch", command)]
-    assert len(others) == 5
+    assert len(others) == 7
     for command in others:
         result = runner.invoke(app, command.split()[1:])
         assert result.exit_code == 0, result.output
