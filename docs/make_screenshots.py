@@ -27,6 +27,7 @@ from qtpy.QtCore import QSettings
 from qtpy.QtWidgets import QApplication
 
 import napari
+from napari._qt.dialogs.qt_notification import NapariQtNotification
 from napari_shadowinv import InversionOptions, add_inversion, invert
 from napari_shadowinv._napari.layer_metadata import mark, setup_of
 from napari_shadowinv.io import read_radiograph
@@ -87,6 +88,9 @@ def photograph(viewer: napari.Viewer, name: str, *, close: bool = True) -> None:
     # It may go on turning when a file has been opened.
     viewer.window._qt_window._activity_dialog.maybe_hide_progress_indicator()
     settle(3.0)
+    for notification in viewer.window._qt_window.findChildren(NapariQtNotification):
+        notification.close()  # it covers the scale bar
+    settle(0.2)
     pixels = viewer.window.screenshot(canvas_only=False, flash=False)
     path = HERE / name
     picture = Image.fromarray(pixels[..., :3])
@@ -230,13 +234,15 @@ def fit_window() -> None:
     """Two films of one toroid: the widget, its verdict and the field."""
     viewer = new_window("two energies", height=840)
     setup = paper_setup()
-    truth = toroid((80, 80), setup, 90.0, 20e-6).displacement
+    truth = toroid((96, 96), setup, 90.0, 16e-6).displacement
     for seed, energy in enumerate((14.7, 30.0)):
         film = setup.model_copy(update={"energy": energy})
         counts = np.random.default_rng(seed).poisson(1000 * project(truth, setup, film))
         name, metadata = f"{energy:g} MeV", mark("shot", "counts", film)
         viewer.add_image(counts.astype(float), name=name, metadata=metadata)
     widget = open_widget(viewer, "Fit several images")
+    widget.source.picker.set_kind("unknown")
+    widget.noise.restore("poisson")
     press_run(widget)
     print(widget.view.verdict.text())
     photograph(viewer, "napari-fit.png")

@@ -10,6 +10,9 @@ from typing import Any
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import mark_of, role_of
 
+# Beyond this length a name would be cut off beside the colour bar of a narrow window.
+_NAME_SIZE_PT, _LINE_PT = 10, 460
+
 _watched: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
@@ -98,6 +101,7 @@ def _show_bar(layer: Any, on: bool) -> None:
     layer.colorbar.visible = on
     # Beside the bar, as napari lays out what shares a corner.
     layer.name_overlay.position = layer.colorbar.position
+    layer.name_overlay.font_size = min(_NAME_SIZE_PT, _LINE_PT / len(layer.name or " "))
     layer.name_overlay.visible = on
 
 
