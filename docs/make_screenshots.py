@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 from make_film_pictures import pack_of_page
+from napari._qt.dialogs.qt_notification import NapariQtNotification
 from PIL import Image
 from qtpy.QtCore import QSettings
 from qtpy.QtWidgets import QApplication
 
 import napari
-from napari._qt.dialogs.qt_notification import NapariQtNotification
 from napari_shadowinv import InversionOptions, add_inversion, invert
 from napari_shadowinv._napari.layer_metadata import mark, setup_of
 from napari_shadowinv.io import read_radiograph
