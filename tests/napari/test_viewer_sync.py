@@ -54,6 +54,17 @@ def test_a_colour_bar_that_was_switched_off_stays_off(
     assert not any(one.colorbar.visible for one in viewer.layers if hasattr(one, "colorbar"))
 
 
+def test_a_long_name_is_smaller_beside_the_colour_bar(
+    viewer: ViewerModel, solved: Inversion
+) -> None:
+    add_inversion(viewer, solved, name="a")
+    add_inversion(viewer, solved, name=80 * "b")
+    short, long = (viewer.layers[f"|d| (px) – {name}"] for name in ("a", 80 * "b"))
+    long.visible = False
+    sizes = [layer.name_overlay.font_size for layer in (short, long)]
+    assert sizes[1] * len(long.name) < 1.01 * sizes[0] * 46
+
+
 def test_an_image_of_the_same_size_lies_on_the_result(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, told: list[str],
     tmp_path: Path,
