@@ -18,6 +18,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,18 @@ import numpy as np
 MAX_SECONDS, MAX_BYTES = 20.0, 2_000_000_000
 # Numba and the threads of BLAS reserve addresses that they do not use.
 _RESERVED_BYTES = 4_000_000_000
+
+# Commands import them when they need them.
+_IMPORTED = (
+    "cli",
+    "film",
+    "fitting",
+    "inversion",
+    "pipeline",
+    "plotting",
+    "preprocessing",
+    "stack",
+)
 
 Case = Callable[[], object]
 
@@ -276,7 +289,8 @@ def main() -> int:
     failures: dict[str, list[str]] = {}
     print("| input | cases | refused | accepted | failures |")
     print("|---|---|---|---|---|")
-    import napari_shadowinv.cli  # noqa: F401 - imported once, before the forks
+    for name in _IMPORTED:  # once, before the forks
+        import_module(f"napari_shadowinv.{name}")
 
     for kind in parser.parse_args().only:
         outcomes = [outcome(case) for case in KINDS[kind]()]
