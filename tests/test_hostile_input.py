@@ -242,6 +242,12 @@ def test_loop_of_links_is_refused_in_one_sentence(here: Path) -> None:
         assert "Too many levels of symbolic links" in flat(ended.stderr)
 
 
+def test_name_too_long_for_a_shot_is_refused() -> None:
+    with pytest.raises(FileFormatError, match="cannot be opened") as caught:
+        invert_stack("a" * 300)
+    assert "Errno" not in str(caught.value)
+
+
 def test_path_with_a_null_character_is_refused() -> None:
     for check in (lambda path: check_regular(path, "a file"), resolved_path):
         with pytest.raises(FileFormatError, match="null character"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import inspect
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -98,9 +99,10 @@ def find_shots(
 
 def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shots:
     path = Path(text)
-    if path.is_dir():
+    # Path.is_dir raises an error if a name is too long.
+    if os.path.isdir(path):
         raise InputError(f"{text} is a folder: specify the files, such as '{text}/*.tif'")
-    if _MAGIC.search(text) and not path.exists():
+    if _MAGIC.search(text) and not os.path.exists(path):
         found = in_counting_order(map(Path, glob.glob(text, recursive=True)))
         if not found:
             raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
@@ -182,7 +183,7 @@ def _table_of(shots: Any) -> Path | Sequence[ShotRow] | None:
     if isinstance(shots, Sequence) and shots and all(isinstance(one, ShotRow) for one in shots):
         return shots
     alone = shots[0] if isinstance(shots, (list, tuple)) and len(shots) == 1 else shots
-    if not isinstance(alone, (str, Path)) or not Path(alone).is_file():
+    if not isinstance(alone, (str, Path)) or not os.path.isfile(alone):
         return None
     return Path(alone) if is_table(Path(alone)) else None
 
