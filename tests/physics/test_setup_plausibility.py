@@ -101,6 +101,12 @@ def test_setup_warnings_are_silent_on_real_setups(values):
     assert setup_warnings(setup_from_dict(values), SHAPE) == ()
 
 
+@pytest.mark.parametrize("shape", [(100, 3000), (3000, 100)])
+def test_setup_warnings_go_by_the_longer_side(shape):
+    (text,) = setup_warnings(setup_from_dict(FILM), shape)
+    assert "field of view of 1.5 cm is wider than the 1 cm" in text
+
+
 def test_geometry_text_shows_field_of_view_and_magnification():
     paper = ProtonSetup.example()
     assert geometry_text(paper, (100, 200)).startswith("300 × 150 µm at the object, M = 16.4, ")
