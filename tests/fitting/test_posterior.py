@@ -9,6 +9,7 @@ import pytest
 from scipy.fft import idctn
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.beam_error import draw_variations
 from napari_shadowinv.fitting.descent import descend
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.posterior import Posterior
@@ -218,3 +219,17 @@ def test_open_beams_are_those_that_several_energies_cannot_exclude() -> None:
 
     assert spread([1.0, 1.0]) > 0.02
     assert spread([1.0, 0.5]) < 0.01
+
+
+def test_draw_variations_have_unit_rms_inside_and_the_length() -> None:
+    scene, length = weak_scene((48, 64), (1.0, 1.0)), 8.0
+    scene = replace(scene, pad=20, beams=np.ones((2, 88, 104)))
+    fields = draw_variations(scene, length, 40, np.random.default_rng(1))
+    assert fields.shape == (40, 88, 104)
+    inside = fields[:, 20:-20, 20:-20]
+    np.testing.assert_allclose(inside.mean(axis=(1, 2)), 0, atol=1e-12)
+    np.testing.assert_allclose(inside.std(axis=(1, 2)), 1)
+    # Waves with normal components of deviation 1/length have slopes of that r.m.s.
+    for axis in (1, 2):
+        slope = np.sqrt((np.gradient(inside, axis=axis) ** 2).mean())
+        assert slope == pytest.approx(1 / length, rel=0.1)
