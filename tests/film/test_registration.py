@@ -91,6 +91,12 @@ def test_moved_corners_cut_the_film_where_it_shows_the_same() -> None:
     np.testing.assert_allclose(cut[inner], film((0, 0))[inner], atol=0.02)
 
 
+def test_moved_corners_measure_shifts_in_pixels_of_the_scale() -> None:
+    corners = np.array([(0, 0), (0, 200), (150, 200), (150, 0)], dtype=float)
+    moved = moved_corners(corners, (2.0, -1.0), 0.0, 3.0)
+    np.testing.assert_allclose(moved - corners, np.tile([6.0, -3.0], (4, 1)))
+
+
 @pytest.mark.parametrize(
     ("way", "message"),
     [

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from napari_shadowinv.cli._tables import inversion_rows
 from napari_shadowinv.inversion import Inversion, Report, invert
-from napari_shadowinv.inversion.trust import image_residual
+from napari_shadowinv.inversion.edges import inner_sides, turned_back
+from napari_shadowinv.inversion.trust import image_residual, mark_caustics
 from napari_shadowinv.io import read
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics import phantoms
@@ -211,7 +212,40 @@ def test_a_field_of_twice_the_noise_is_found(seed):
     assert signs(noisy(synthetic_image(weak), share, seed)) == []
 
 
+# Edges
+
+
+def test_inner_sides_of_a_field_from_the_middle_point_outwards():
+    middle = np.indices((60, 80)) - np.array([29.5, 39.5])[:, None, None]
+    sides = inner_sides(middle, np.ones((60, 80), bool))
+    assert sides is not None
+    assert sides.depth == 3
+    for side, distance in zip(sides.outwards, (26.5, 26.5, 36.5, 36.5), strict=True):
+        np.testing.assert_allclose(side, distance)
+    assert turned_back(sides) == pytest.approx(31.5)
+    shifted = inner_sides(np.ones((2, 60, 80)), np.ones((60, 80), bool))
+    assert shifted is not None
+    assert turned_back(shifted) == 0
+
+
+def test_inner_sides_need_pixels_along_all_sides():
+    mask = np.ones((60, 80), bool)
+    mask[:20] = False
+    assert inner_sides(np.ones((2, 60, 80)), mask) is None
+
+
 # Deep folds
+
+
+def test_mark_caustics_takes_regions_as_wide_as_the_sites():
+    """Sites are 4 px apart: a single pixel below the limit is noise, twelve in a row are not."""
+    jacobian, mask = np.ones((40, 40)), np.ones((40, 40), bool)
+    jacobian[10, 30] = -0.5
+    jacobian[20:32, 6:18] = -0.5
+    mask[20:24] = False
+    expected = np.zeros((40, 40), bool)
+    expected[24:32, 6:18] = True
+    np.testing.assert_array_equal(mark_caustics(jacobian, mask, 100, 0.2), expected)
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import struct
 from pathlib import Path
 
+import google_crc32c
 import numpy as np
 import pytest
 import zarr
@@ -83,6 +85,14 @@ def test_swapped_numbers_of_shots_are_refused(store):
     swap(store / "image_residual" / "c" / "0", store / "noise_error" / "c" / "0")
     with pytest.raises(FileFormatError, match="does not belong to shots 0 to 5"):
         read(store)
+
+
+def test_coordinate_with_a_valid_checksum_of_its_own_is_damage(store):
+    file = store / "y" / "c" / "0"
+    flip(file, 0)
+    raw = file.read_bytes()[:-4]
+    file.write_bytes(raw + struct.pack("<I", google_crc32c.value(raw)))
+    assert StackStore(store).damage.files == ("y/c/0 is not the file that was written",)
 
 
 def test_flipped_bit_in_a_field_is_refused_on_reading(store):
