@@ -187,9 +187,10 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
         before = tool._last._last
         tool.panel.button.click()
         qtbot.waitUntil(lambda: tool._last._last is not before, timeout=PATIENCE)
-        name = "solved image"
-        qtbot.waitUntil(lambda: name in window.layers, timeout=PATIENCE)
-        return window.layers[name].data
+        qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
+        (layer,) = tool.results.layers
+        assert layer.name.startswith("solved image")
+        return layer.data
 
     expected = project(solved.displacement, proton_setup, slow)
     np.testing.assert_allclose(image(), expected)
