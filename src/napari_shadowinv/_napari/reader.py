@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.notifications import notify_errors, show_caution
 from napari_shadowinv._system.safety import refusing_damage
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, STORE
 
 if TYPE_CHECKING:
@@ -93,10 +93,7 @@ def _read_file(path: Path) -> list[FullLayerData]:
         for text in content.warnings:
             show_caution(f"{path.name}: {text}")
         return radiograph_layers(content)
-    try:
-        layers = layers_of_dataset(content, path.stem)
-    except InputError as error:  # of a dataset, which does not know its file
-        raise FileFormatError(f"{path}: {error}") from error
+    layers = layers_of_dataset(content, path.stem)
     _show_in_window(layers)
     result = result_of(layers[0][1])
     for text in () if result is None else doubts_of(result):
