@@ -26,6 +26,7 @@ from napari_shadowinv import (
     synthetic_image,
     uncertainty,
 )
+from napari_shadowinv._system.arrays import order_by_value
 from napari_shadowinv.fitting.measurements import measured
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import FitShot
@@ -266,3 +267,14 @@ def test_uneven_coordinates_are_refused() -> None:
 
     with pytest.raises(InputError, match="not evenly spaced"):
         invert(image, options=OPTIONS)
+
+
+@pytest.mark.parametrize("scale", [1e-290, 1.0, 1e290])
+def test_order_by_value_sorts_at_any_scale(scale: float) -> None:
+    values = scale * np.random.default_rng(3).integers(-5, 50, 3000)
+    order = order_by_value(values)
+    assert np.array_equal(order, np.argsort(values, kind="stable"))
+
+
+def test_order_by_value_keeps_equal_values_in_sequence() -> None:
+    assert np.array_equal(order_by_value(np.full(7, 2.0)), np.arange(7))
