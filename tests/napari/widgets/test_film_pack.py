@@ -90,6 +90,8 @@ def test_a_run_shows_the_fluences_of_the_films(
     np.testing.assert_allclose(tool.plot.shown.fluence, means)
     hatched = [patch for patch in tool.plot.figure.axes[0].patches if patch.get_hatch()]
     assert len(hatched) == 1
+    left, right = hatched[0].get_x(), hatched[0].get_x() + hatched[0].get_width()
+    assert left <= tool.plot.shown.energies[-1] <= right
     # The same pack again takes the place of its result.
     tool.panel.button.click()
     wait(tool)

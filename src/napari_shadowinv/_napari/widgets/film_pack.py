@@ -74,9 +74,12 @@ class SpectrumPlot(Plot):
             markersize=4,
             capsize=2,
         )
-        for (low, high), is_measured in zip(spectrum.bands, spectrum.is_measured, strict=True):
+        layers = zip(spectrum.bands, spectrum.energies, spectrum.is_measured, strict=True)
+        for band, energy, is_measured in layers:
             if not is_measured:
-                axis.axvspan(low, high, facecolor="none", edgecolor=self.ink, hatch="///", lw=0)
+                # The last film shows protons from beyond its band, too.
+                low, high = min(*band, energy), max(*band, energy)
+                axis.axvspan(low, high, facecolor="none", edgecolor=self.ink, hatch="////", lw=0)
         axis.set_yscale("log", nonpositive="clip")
         seen = spectrum.fluence[spectrum.fluence > 0]
         if seen.size:
