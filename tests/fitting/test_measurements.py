@@ -129,6 +129,8 @@ def nearly_all_masked() -> FloatArray:
         ({"fiducials": np.ones((2, 4))}, r"fiducials have shape \(2, 4\): expected rows of y, x"),
         ({"fiducials": [[45, 5, 0, 0, 1]]}, "fiducials lie outside the image or have no positive"),
         ({"fiducials": [[5, 5, 0, 0, 0]]}, "fiducials lie outside the image or have no positive"),
+        ({"fiducials": [[5, 5, 0, -1e300, 1]]}, "displaced by more than the image's 51 px"),
+        ({"fiducials": [[5, 5, 0, 0, 1e-300]]}, "σ below 1e-06 px"),
         ({"images": images(1), "strengths": [1], "source": "unknown"}, "one image and an unknown"),
     ],
 )

@@ -35,6 +35,7 @@ __all__ = [
     "strengths_of",
 ]
 
+_MIN_SIGMA_PX = 1e-6  # of a fiducial; the square of less overflows
 _BLOCK = 8  # px; sides are filled up to a multiple of it, for pixels four times as wide
 _SMALLEST_SIDE = 32
 _BYTES_PER_PIXEL, _BYTES_PER_PIXEL_AND_IMAGE = 2000, 600  # measured peak
@@ -473,5 +474,10 @@ def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fi
     places, known, errors = table[:, :2], table[:, 2:4], table[:, 4]
     if ((places < -0.5) | (places > np.array(size) - 0.5)).any() or not (errors > 0).all():
         raise InputError("fiducials lie outside the image or have no positive σ: check their rows")
+    if np.abs(known).max(initial=0.0) > max(size) or errors.min(initial=1.0) < _MIN_SIGMA_PX:
+        raise InputError(
+            f"fiducials are displaced by more than the image's {max(size)} px, or have a σ below "
+            f"{_MIN_SIGMA_PX:g} px: check their rows"
+        )
     # A pixel's centre is at its index; the rays count from the image's corner.
     return Fiducials(places + 0.5, known, errors)
