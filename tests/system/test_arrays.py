@@ -26,7 +26,7 @@ from napari_shadowinv import (
     synthetic_image,
     uncertainty,
 )
-from napari_shadowinv._system.arrays import order_by_value
+from napari_shadowinv._system.arrays import coordinate_spacing, order_by_value
 from napari_shadowinv.fitting.measurements import measured
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import FitShot
@@ -278,3 +278,12 @@ def test_order_by_value_sorts_at_any_scale(scale: float) -> None:
 
 def test_order_by_value_keeps_equal_values_in_sequence() -> None:
     assert np.array_equal(order_by_value(np.full(7, 2.0)), np.arange(7))
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("micron", 1e-6), ("um", 1e-6), ("nm", 1e-9)],
+)
+def test_coordinate_spacing_is_in_metres(unit: str, metres: float) -> None:
+    spacing = coordinate_spacing(_placed(2.0, 2.0, unit), "image")
+    assert spacing == pytest.approx(2 * metres)
