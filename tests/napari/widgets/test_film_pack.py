@@ -224,14 +224,15 @@ def test_cancelling_leaves_nothing(
 ) -> None:
     written: list[list[Path]] = []
 
-    def endless(pack: Any, *, on_progress: Any, should_stop: Any) -> Any:
+    def work_slowly(pack: Any, *, on_progress: Any, should_stop: Any) -> Any:
         written.append(scratch_of(tool))
-        while not should_stop():
+        for _ in range(PATIENCE // 10):
+            if should_stop():
+                raise InversionCancelled
             time.sleep(0.01)
-        raise InversionCancelled
 
     tool = evaluated
-    monkeypatch.setattr(_pack_work, "run_film", endless)
+    monkeypatch.setattr(_pack_work, "run_film", work_slowly)
     of_role(viewer, "unusable").data[0, 30:40, 30:40] = BY_HAND
     before = list(viewer.layers)
     tool.run_again.click()
