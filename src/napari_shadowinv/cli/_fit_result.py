@@ -227,8 +227,8 @@ def _field_text(fit: Fit, field: FittedField) -> str:
 
     (pixels,) = shown_fields([field.displacement], None)
     row, column = pixels.peak
-    told = f"{fit.peak_text(field, pixels)}, at y = {row}, x = {column} px"
+    peak = f"{fit.peak_text(field, pixels)}, at y = {row}, x = {column} px"
     if not fit.setups:
-        return told
+        return peak
     (shown,) = shown_fields([field.displacement], fit.setups[0], FIELDS[field.name])
-    return f"{fit.peak_text(field, shown)}; {told}"
+    return f"{fit.peak_text(field, shown)}; {peak}"

@@ -9,11 +9,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.beam_error import ASSUMED_VARIATION, draw_variations
+from napari_shadowinv.fitting.beam_error import draw_variations
 from napari_shadowinv.fitting.descent import finer
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import Measured
 from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.inversion.budget import ASSUMED_VARIATION
 from napari_shadowinv.options import FitOptions
 
 __all__ = ["BeamShifts", "errors_by_noise", "largest_share", "shifts_by_beam"]

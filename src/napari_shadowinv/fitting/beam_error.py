@@ -9,10 +9,7 @@ import numpy as np
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.forward import Scene
 
-__all__ = ["ASSUMED_VARIATION", "BeamError", "draw_variations"]
-
-ASSUMED_VARIATION = 0.05
-"""R.m.s. non-uniformity of a beam that was assumed, not measured."""
+__all__ = ["BeamError", "draw_variations"]
 
 _WAVES = 60
 

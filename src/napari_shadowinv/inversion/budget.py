@@ -33,7 +33,7 @@ from napari_shadowinv.transport.objective import Solution
 from napari_shadowinv.transport.sites import RATIO, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
-__all__ = ["Budget", "ErrorEstimate", "Errors"]
+__all__ = ["ASSUMED_VARIATION", "Budget", "ErrorEstimate", "Errors"]
 
 _PLACES = 48  # along the longer side, where levels are compared
 _USUAL_RATE, _RATES = 0.35, (0.25, 0.7)  # of the change between levels to the one before
@@ -48,7 +48,9 @@ _NOISE_SAMPLES, _BEAM_SAMPLES, _WAVES = 16, 8, 16
 _NEAR = 2.5  # site spacings
 _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
 
-_ASSUMED_VARIATION, _TESTED_VARIATION = 0.05, 0.01  # of a beam, r.m.s.
+ASSUMED_VARIATION = 0.05
+"""Relative r.m.s. difference between the true beam and a source that was not recorded."""
+_TESTED_VARIATION = 0.01  # of a beam, r.m.s.
 _BEAM_TEXTS = {
     "assumed": "beam assumed, {:.2g} %",
     "stated": "beam stated, {:.2g} %",
@@ -102,7 +104,7 @@ class Errors:
     solver: ErrorEstimate
     beam: ErrorEstimate | None = None
     beam_sensitivity: ErrorEstimate | None = None
-    beam_variation: float = _ASSUMED_VARIATION
+    beam_variation: float = ASSUMED_VARIATION
     beam_basis: str = "assumed"
     noise_correlation: float = 0.0
 
@@ -310,7 +312,7 @@ class Budget:
     def _beam_variation(self) -> tuple[float, str]:
         """Relative difference of beam and source, and where it is from."""
         stated = self.options.beam_variation
-        expected = 0.0 if self._plan.measured else _ASSUMED_VARIATION
+        expected = 0.0 if self._plan.measured else ASSUMED_VARIATION
         seen = self.beam_difference
         if seen > (expected if stated is None else stated):
             return seen, "seen"

@@ -20,7 +20,7 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, compare, fit, point_spread
-from napari_shadowinv.fitting.beam_error import ASSUMED_VARIATION
+from napari_shadowinv.inversion.budget import ASSUMED_VARIATION
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.options import FIELDS, FitChoices, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import default_deflector

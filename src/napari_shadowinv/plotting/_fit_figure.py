@@ -167,8 +167,8 @@ def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
 def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
     """The verdict and why, each line with its colour."""
     colour = GOOD_COLOUR if fit.verdict is Verdict.DETERMINED else ALARM_COLOUR
-    told = "; ".join([f"{fit.verdict.upper()}: {fit.explanation}", *fit.warnings])
-    lines = [(line, colour) for line in textwrap.wrap(told, letters)]
+    summary = "; ".join([f"{fit.verdict.upper()}: {fit.explanation}", *fit.warnings])
+    lines = [(line, colour) for line in textwrap.wrap(summary, letters)]
     if not fit.report.converged:
         lines.append((f"⚠ not converged in {fit.report.iterations} steps", ALARM_COLOUR))
     return lines
