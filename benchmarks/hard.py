@@ -133,7 +133,11 @@ def main() -> None:
         units.append(unit())
         times = seconds / np.mean(units[-2:])
         report = inversion.report
-        said = [text.split("; ", 1)[1] for text in report.warnings if "not converged" in text]
+        said = [
+            caution.text.split("; ", 1)[1]
+            for caution in report.warnings
+            if caution.code == "not-converged"
+        ]
         print(
             f"| {case.name} | {'yes' if report.converged else 'no'} | {report.iterations} "
             f"| {report.residual:.2g} | {times:.1f} | {' '.join(said)} |",

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv import InversionOptions, invert
+from napari_shadowinv.cautions import Caution
 
 FloatArray = NDArray[np.float64]
 
@@ -185,7 +186,7 @@ class Outcome:
 
     error: float
     total: float
-    warnings: tuple[str, ...]
+    warnings: tuple[Caution, ...]
 
     @property
     def is_silent(self) -> bool:
@@ -214,9 +215,9 @@ def main() -> None:
     for seed, (name, make) in enumerate(CASES.items()):
         outcome = run_trial(make(np.random.default_rng(seed), choices.side))
         silent += outcome.is_silent
-        words = "; ".join(" ".join(text.split()[:7]) for text in outcome.warnings)
+        codes = ", ".join(caution.code for caution in outcome.warnings)
         mark = "SILENT " if outcome.is_silent else ""
-        print(f"| {name} | {outcome.error:.1%} | {outcome.total:.1%} | {mark}{words} |", flush=True)
+        print(f"| {name} | {outcome.error:.1%} | {outcome.total:.1%} | {mark}{codes} |", flush=True)
     print(f"\n{silent} of {len(CASES)} cases are wrong in silence\n")
     print("| right input | warned | of | error above 3 totals |\n|---|---|---|---|")
     for name, make in RIGHT.items():
@@ -224,8 +225,8 @@ def main() -> None:
         outcomes = [run_trial(make(rng, choices.side)) for rng in rngs]
         warned = sum(bool(outcome.warnings) for outcome in outcomes)
         beyond = sum(outcome.error > MAX_TOTALS * outcome.total for outcome in outcomes)
-        kinds = sorted({" ".join(w.split()[:4]) for o in outcomes for w in o.warnings})
-        print(f"| {name} | {warned} {'; '.join(kinds)} | {choices.right} | {beyond} |", flush=True)
+        codes = sorted({caution.code for each in outcomes for caution in each.warnings})
+        print(f"| {name} | {warned} {', '.join(codes)} | {choices.right} | {beyond} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -111,14 +111,14 @@ def wrong_shots(image: FloatArray, source: FloatArray, counts: int) -> Iterator[
     yield "hot pixels", (hot, source)
 
 
-NAMES = {
-    "dark level 10 %": "dark level",
-    "dark level 20 %": "dark level",
-    "dark level 200 counts": "dark level",
+CODES = {
+    "dark level 10 %": "dark-level",
+    "dark level 20 %": "dark-level",
+    "dark level 200 counts": "dark-level",
     "reference shifted by 5 px": "register",
     "reference shifted by 25 px": "register",
 }
-"""How the warning begins, where it is not by the mistake's name."""
+"""Caution of each mistake that is not named like it."""
 
 
 def noticed_shots(seeds: int) -> dict[str, list[bool]]:
@@ -135,11 +135,9 @@ def noticed_shots(seeds: int) -> dict[str, list[bool]]:
                     shot = rng.poisson(counts * folded).astype(float)
                     source = rng.poisson(counts * clean).astype(float)
                     for mistake, (image, reference) in wrong_shots(shot, source, counts):
-                        texts = image_warnings(image, reference)
-                        name = NAMES.get(mistake, mistake)
-                        named.setdefault(mistake, []).append(
-                            any(text.startswith(name) for text in texts)
-                        )
+                        codes = {caution.code for caution in image_warnings(image, reference)}
+                        code = CODES.get(mistake, mistake)
+                        named.setdefault(mistake, []).append(code in codes)
     return named
 
 
@@ -221,13 +219,12 @@ def main() -> None:
     examples: dict[str, str] = {}
     for label, (image, source) in right_shots(seeds):
         began = time.process_time()
-        texts = image_warnings(image, source)
+        cautions = image_warnings(image, source)
         seconds += time.process_time() - began
         total += 1
-        for text in texts:
-            kind = text.partition(":")[0]
-            alarms[kind] += 1
-            examples.setdefault(kind, label)
+        for caution in cautions:
+            alarms[caution.code] += 1
+            examples.setdefault(caution.code, label)
     false = sum(alarms.values())
     print(
         f"\nFalse alarms: {false} on {total} right shots ({100 * false / total:.1f} %), "

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.fitting import Basin, Fit, FitOptions, FitReport, FittedField, Verdict
 from napari_shadowinv.inversion import Inversion, Report
 from napari_shadowinv.inversion.budget import ErrorEstimate, Errors
@@ -72,7 +73,7 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         "clipped_pixels": 1,
         "levels": ((4, 10, 0.1), (17, 21, 1 / 3000)),
         "seconds": {"prepare": 0.1, "sites": 0.2, "transport": 1.0, "read-out": 0.1},
-        "warnings": ("1 negative pixel was set to zero",),
+        "warnings": (Caution("negative-pixels", "1 negative pixel was set to zero"),),
         "sites_reason": "as given",
         "errors": Errors(
             peak=float(np.hypot(*blob.displacement).max()),

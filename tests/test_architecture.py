@@ -23,7 +23,7 @@ SOURCE = Path(__file__).parents[1] / "src"
 PACKAGE = "napari_shadowinv"
 # From the ground up: a room imports only rooms of the lines above its own.
 ROOMS = (
-    ("errors", "_typing"),
+    ("errors", "_typing", "cautions"),
     ("_system",),
     ("options",),
     ("geometry",),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut, Verdict
 from napari_shadowinv.inversion import Inversion
@@ -58,7 +59,9 @@ def assert_nothing_overlaps(figure: Figure) -> None:
 def test_no_panel_touches_another_or_leaves_the_page(
     make_inversion: Make, shape: tuple[int, int], with_setup: bool, proton_setup: ProtonSetup
 ) -> None:
-    inversion = make_inversion(shape, converged=False, warnings=("a long warning " * 20,))
+    inversion = make_inversion(
+        shape, converged=False, warnings=(Caution("flux", "a long warning " * 20),)
+    )
     figure = report_figure(inversion, proton_setup if with_setup else None, title="Shot 42")
     assert len(panels(figure)) == 6
     assert_nothing_overlaps(figure)

@@ -1,5 +1,6 @@
 from ._napari.layers import add_inversion
 from ._system.progress import Progress
+from .cautions import Caution
 from .errors import FileFormatError, InputError, InversionCancelled
 from .fitting import Fit, FitOptions, fit
 from .inversion import Inversion, Report, invert, plan_sites
@@ -17,6 +18,7 @@ from .stack import invert_stack, run_stack, stack_statistics, watch_stack
 __version__: str
 
 __all__ = [
+    "Caution",
     "FileFormatError",
     "Fit",
     "FitOptions",

@@ -212,7 +212,7 @@ def test_the_total_holds_the_error_by_another_beam(source):
         errors.append(rms(found.displacement - blob.displacement))
         totals.append(found.errors.total.rms)
         if variation >= 0.05 and source == "recorded":
-            assert any("image and source differ by" in text for text in found.report.warnings)
+            assert "beam" in {caution.code for caution in found.report.warnings}
     ratio = np.array(errors) / totals
     assert (ratio < 2.5).all()
     if source == "recorded":
@@ -321,7 +321,7 @@ def test_an_accuracy_out_of_reach_is_told():
     image = synthetic_image(pair().displacement)
     report = invert(image, options=InversionOptions(accuracy=1e-6)).report
     assert report.n_sites == image.size
-    assert any("the accuracy of 0.0001 % is not reached" in text for text in report.warnings)
+    assert "the accuracy of 0.0001 % is not reached" in str(report.warnings)
 
 
 def test_nothing_is_told_of_an_answer_that_is_none(image):
@@ -443,7 +443,7 @@ def test_the_first_shots_decide_for_a_stack(tmp_path):
     reasons = {json.loads(str(text))["sites_reason"] for text in store.report.values}
     assert reasons == {"as many as the first shots needed for the accuracy"}
     missed = "the accuracy of 3 % is not reached: with the sites of the first shots"
-    warned = ["".join(json.loads(str(text))["warnings"]) for text in store.report.values]
+    warned = [str(json.loads(str(text))["warnings"]) for text in store.report.values]
     assert [missed in text for text in warned] == 4 * [False] + [True]
     lazy = invert_stack(np.stack([easy, hard]), options=options)
     assert lazy.sizes["site"] == alone[1]

@@ -172,7 +172,7 @@ def test_the_linear_response_to_little_noise_is_that_of_solving_again(clean, pla
 def test_noise_too_strong_for_a_linear_response_is_told(clean, plan):
     found = uncertainty(clean, 5, plan=plan, noise=1.5, options=OPTIONS)
     assert found.nonlinearity > 0.3
-    assert any("method='resolve'" in warning for warning in found.warnings)
+    assert "method='resolve'" in found.warnings[0].text
 
 
 def test_each_sample_is_zero_in_the_mean_over_the_border(counts, plan):
@@ -203,7 +203,7 @@ def test_samples_that_do_not_converge_are_counted(clean):
     options = InversionOptions(max_iterations=1, negative="clip")
     found = uncertainty(clean, 2, noise=0.5, options=options)
     assert found.converged == (False, False)
-    assert found.warnings[0].startswith("2 of 2 samples that were solved did not converge")
+    assert found.warnings[0].text.startswith("2 of 2 samples that were solved did not converge")
 
 
 def test_progress_comes_from_the_callers_thread_and_counts_the_samples(counts):

@@ -33,8 +33,7 @@ RAYS = 12
 ONSET = np.exp(1.5) / 2
 """Strength of an outward Gaussian field, in units of its radius, at which caustics begin."""
 
-MISFIT, NOTHING = "the picture does not fit", "no deflection found"
-FOLDS, CUT_OFF = "rays cross", "the field reaches the image's edge"
+MISFIT, NOTHING, FOLDS, CUT_OFF = "misfit", "no-deflection", "folds", "closed-edge"
 
 
 def traced(field: Field, beyond: int = 0) -> Array:
@@ -87,13 +86,18 @@ def jet(y: Array, x: Array) -> tuple[Array, Array]:
     return 0 * y, 3 * u / 6 * np.exp(0.5 - (u / 6) ** 2 / 2)
 
 
+def codes_of(inversion):
+    """Codes of all warnings."""
+    return {caution.code for caution in inversion.report.warnings}
+
+
 def signs(image: Array, **options: object) -> list[str]:
-    """The warnings of this module that an image gets, without their numbers."""
+    """Codes of the warnings of this module that an image gets."""
     choices = {"negative": "clip", **options}
     report = invert(image, options=InversionOptions.model_validate(choices)).report
     assert report.converged
     known = (MISFIT, NOTHING, FOLDS, CUT_OFF)
-    return [sign for sign in known for text in report.warnings if text.startswith(sign)]
+    return [caution.code for caution in report.warnings if caution.code in known]
 
 
 def noisy(image: Array, share: float, seed: int = 1) -> Array:
@@ -157,15 +161,15 @@ def test_a_pattern_as_fine_as_the_pixels_does_not_fit(pattern, contrast):
     found = invert(np.where(odd == 1, float(contrast), 1.0))
     assert found.report.converged
     assert found.report.image_residual > 0.15
-    assert found.report.warnings[0].startswith(MISFIT)
-    assert NOTHING not in " ".join(found.report.warnings)
+    assert found.report.warnings[0].code == MISFIT
+    assert NOTHING not in codes_of(found)
 
 
 def test_too_few_sites_do_not_fit_and_the_advice_is_more():
     image = traced(gaussian(0.6))
     found = invert(image, options=InversionOptions(n_sites=100)).report
-    assert found.warnings[0].startswith(MISFIT)
-    assert "use more sites" in found.warnings[0]
+    assert found.warnings[0].code == MISFIT
+    assert "use more sites" in found.warnings[0].text
     assert signs(image, n_sites=5000) == []
 
 
@@ -197,7 +201,7 @@ def test_noise_of_the_source_counts_too():
     y, x = np.indices((SIDE, SIDE))
     beam = 0.3 + np.exp(-((y - 40) ** 2 + (x - 60) ** 2) / 2 / 30**2)
     image, source = rng.poisson(100 * beam), rng.poisson(100 * beam)
-    assert invert(image, source=source).report.warnings[0].startswith(NOTHING)
+    assert invert(image, source=source).report.warnings[0].code == NOTHING
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -279,7 +283,7 @@ def test_deep_folds_are_wrong_and_get_a_warning(strength, shape, share):
     found = invert(noisy(traced(field), share), options=InversionOptions(negative="clip"))
     true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
     assert np.linalg.norm(found.displacement - true) > 0.07 * np.linalg.norm(true)
-    assert found.report.warnings[0].startswith(FOLDS)
+    assert found.report.warnings[0].code == FOLDS
 
 
 def test_hot_pixels_are_no_folds():
@@ -306,7 +310,7 @@ def test_a_field_that_goes_on_beyond_the_edge_gets_a_warning(field, share):
     found = invert(image, options=InversionOptions(negative="clip"))
     true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
     assert np.linalg.norm(found.displacement - true) > 0.3 * np.linalg.norm(true)
-    assert any(text.startswith(CUT_OFF) for text in found.report.warnings)
+    assert CUT_OFF in codes_of(found)
 
 
 def test_an_object_that_the_edge_cuts_in_half_gets_a_warning():
@@ -330,7 +334,7 @@ def test_where_flux_may_cross_the_edge_or_the_edge_is_masked_nothing_is_said():
     assert signs(image, boundary="free") == []
     mask = np.zeros(image.shape, dtype=bool)
     mask[10:-10, 10:-10] = True
-    assert not any(text.startswith(CUT_OFF) for text in invert(image, mask=mask).report.warnings)
+    assert CUT_OFF not in codes_of(invert(image, mask=mask))
 
 
 # Good images
@@ -368,7 +372,7 @@ def test_phantoms_get_no_doubts(scene: str):
 
 def cropped(image, source, first):
     """A shot and its reference from a column on."""
-    return invert(image[:, first:], source=source[:, first:]).report.warnings
+    return codes_of(invert(image[:, first:], source=source[:, first:]))
 
 
 @pytest.mark.parametrize("amplitude", [150.0, -60.0])
@@ -380,7 +384,7 @@ def test_an_object_that_a_crop_cuts_is_reported(amplitude):
     assert not cropped(image, source, 20)
     for widths in (2.0, 1.5):
         warnings = cropped(image, source, round(70 - widths * width))
-        assert any("edge" in text for text in warnings), widths
+        assert {"cut-object", "closed-edge"} & warnings, widths
 
 
 def test_a_jet_across_the_image_is_not_cut():
@@ -399,8 +403,7 @@ def test_a_mask_at_the_peak_is_reported(at_peak):
     row, column = np.unravel_index(length.argmax(), length.shape) if at_peak else (8, 80)
     mask = np.ones(image.shape, bool)
     mask[row - 5 : row + 5, column - 5 : column + 5] = False
-    warnings = invert(image, mask=mask).report.warnings
-    assert any("lies at masked pixels" in text for text in warnings) == at_peak
+    assert ("masked-peak" in codes_of(invert(image, mask=mask))) == at_peak
 
 
 def test_the_headline_and_errors_leave_masked_pixels_out():

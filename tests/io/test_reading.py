@@ -299,7 +299,7 @@ def test_real_film_scan(shared_data: Path) -> None:
     assert red.image.shape == (548, 1022)
     assert red.metadata["bits"] == 16
     np.testing.assert_array_equal(red.image, tifffile.imread(path)[..., 0])
-    assert "wrong sign unless it is converted to dose first" in red.warnings[0]
+    assert "wrong sign unless it is converted to dose first" in red.warnings[0].text
 
 
 def test_every_real_film_is_told_and_no_linear_image(shared_data: Path) -> None:

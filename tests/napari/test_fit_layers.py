@@ -24,6 +24,7 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layer_state import missing_layers
 from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.fitting import Fit, FitOptions, Verdict, fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
@@ -136,7 +137,7 @@ def test_a_verdict_cannot_be_missed(
 def test_warnings_of_a_saved_inversion_are_told(
     viewer: ViewerModel, solved: Inversion, tmp_path: Path, told: list[str]
 ) -> None:
-    report = replace(solved.report, warnings=("it did not converge",))
+    report = replace(solved.report, warnings=(Caution("not-converged", "it did not converge"),))
     opened(viewer, write(tmp_path / "shot.shadowinv", replace(solved, report=report)))
     assert told == ["shot.shadowinv: it did not converge"]
 

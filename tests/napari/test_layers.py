@@ -15,6 +15,7 @@ from napari_shadowinv._napari.frame import frame_for, place
 from napari_shadowinv._napari.layer_metadata import result_of, role_of, setup_of, unit_of
 from napari_shadowinv._napari.layers import inversion_layers, thinned_arrows
 from napari_shadowinv._napari.sites import power_cells
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion import Inversion
 
 
@@ -339,9 +340,12 @@ def test_masked_pixels_are_blank_and_set_no_limits(solved: Inversion) -> None:
     assert (masked.displacement[:, ~mask] == 100.0).all()
 
 
+EDGE = (Caution("closed-edge", "the field reaches the edge"),)
+
+
 def test_doubtful_result_has_the_doubt_in_its_names(solved: Inversion) -> None:
-    for warnings, converged, mark in (((), True, ""), (("edge",), True, " (doubtful)"),
-                                      (("edge",), False, " (failed)")):  # fmt: skip
+    marks = {((), True): "", (EDGE, True): " (doubtful)", (EDGE, False): " (failed)"}
+    for (warnings, converged), mark in marks.items():
         report = replace(solved.report, warnings=warnings, converged=converged)
         for _, keywords, _ in inversion_layers(replace(solved, report=report), name="a"):
             assert keywords["name"].endswith(f" – a{mark}")

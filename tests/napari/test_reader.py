@@ -388,8 +388,8 @@ def test_a_scan_of_film_is_told_and_so_is_its_result(viewer: ViewerModel, tmp_pa
     ((_, own, _),) = read_paths([str(tmp_path / "film.tif"), str(tmp_path / "film2.tif")])
     (told,) = [record for record in notification_manager.records if "film.tif" in record.message]
     (warning,) = mark_of(own)["warnings"]
-    assert "wrong sign" in warning
-    assert warning in told.message
+    assert "wrong sign" in warning.text
+    assert warning.text in told.message
     (read_by_napari,) = viewer.open(tmp_path / "film.tif", plugin="napari")
     assert warnings_of(read_by_napari) == (warning,)
     assert warnings_of(viewer.add_image(film)) == ()

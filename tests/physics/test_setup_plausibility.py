@@ -59,9 +59,9 @@ WRONG = {
 
 @pytest.mark.parametrize(("values", "words"), WRONG.values(), ids=WRONG)
 def test_setup_warnings_name_a_wrong_unit(values, words):
-    texts = setup_warnings(setup_from_dict(values), SHAPE)
-    assert any(words in text for text in texts)
-    assert all(text.startswith("setup: ") for text in texts)
+    cautions = setup_warnings(setup_from_dict(values), SHAPE)
+    assert any(words in caution.text for caution in cautions)
+    assert {caution.code for caution in cautions} == {"setup"}
 
 
 @pytest.mark.parametrize(
@@ -103,8 +103,8 @@ def test_setup_warnings_are_silent_on_real_setups(values):
 
 @pytest.mark.parametrize("shape", [(100, 3000), (3000, 100)])
 def test_setup_warnings_go_by_the_longer_side(shape):
-    (text,) = setup_warnings(setup_from_dict(FILM), shape)
-    assert "field of view of 1.5 cm is wider than the 1 cm" in text
+    (caution,) = setup_warnings(setup_from_dict(FILM), shape)
+    assert "field of view of 1.5 cm is wider than the 1 cm" in caution.text
 
 
 def test_geometry_text_shows_field_of_view_and_magnification():
@@ -118,7 +118,7 @@ def test_deflection_warnings_begin_at_three_tenths_of_a_radian():
     setup = ProtonSetup.example()
     pixels = setup.displacement(np.array([[[0.29]], [[0.0]]]))
     assert deflection_warnings(setup, pixels) == ()
-    assert "small angles" in deflection_warnings(setup, 1.1 * pixels)[0]
+    assert "small angles" in deflection_warnings(setup, 1.1 * pixels)[0].text
 
 
 def test_deflection_warnings_doubt_fields_of_kilotesla_metres():
@@ -126,4 +126,4 @@ def test_deflection_warnings_doubt_fields_of_kilotesla_metres():
         energy=9e4, source_object_distance=0.01, object_image_distance=0.28, pixel_size=5e-6
     )
     pixels = setup.displacement(np.array([[[0.2]], [[0.0]]]))
-    assert "T m, far more" in deflection_warnings(setup, pixels)[0]
+    assert "T m, far more" in deflection_warnings(setup, pixels)[0].text

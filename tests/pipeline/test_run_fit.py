@@ -180,8 +180,9 @@ def test_fit_warns_of_broken_pixels_in_an_image(images: list[FloatArray], tmp_pa
         FitShot(image, setup) for image, setup in zip((images[0], second), SETUPS, strict=True)
     ]
     result = run_fit(Recipe(fit=FitChoices(noise=0.02, options=HASTY)), shots)
-    (text,) = result.warnings
-    assert text.startswith("image 2: hot pixels: 1 pixel of the image differs")
+    (caution,) = result.warnings
+    assert caution.code == "hot-pixels"
+    assert caution.text.startswith("image 2: hot pixels: 1 pixel of the image differs")
     path = tmp_path / "fit.shadowinv"
     write(path, result)
     assert Fit.from_dataset(read(path)).warnings == result.warnings

@@ -25,7 +25,6 @@ from typer.testing import Result
 
 from command_line import flat, shadowinv
 from napari_shadowinv import InversionOptions, invert, read
-from napari_shadowinv.cli import _batch
 from napari_shadowinv.cli._batch import progress_columns
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.preprocessing import Provenance
@@ -561,5 +560,5 @@ def test_status_counts_levels_and_lists_warnings_once(store):
     assert all(report["warnings"] for report in doubtful)
     text = flat(shadowinv("status", store).output)
     assert f"{len(doubtful)} doubtful" in text
-    kinds = {_batch.warning_kind(one) for report in doubtful for one in report["warnings"]}
-    assert text.count("warning ") == len(kinds)
+    codes = {caution["code"] for report in doubtful for caution in report["warnings"]}
+    assert text.count("warning ") == len(codes)

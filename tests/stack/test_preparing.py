@@ -241,7 +241,7 @@ def test_doubts_of_a_source_are_in_the_report_of_each_shot(night, out):
             scheduler="synchronous",
         )
         for index in (0, 1):
-            told = "; ".join(StackStore(out).report(index)["warnings"])
+            told = str(StackStore(out).report(index)["warnings"])
             assert words in told
             assert ("'isotropic'" in told) == ("'isotropic'" in words)
     written = read_stack(out)["source"][1]

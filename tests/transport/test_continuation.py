@@ -183,7 +183,7 @@ def test_an_unsolved_image_leaves_the_solution_of_a_blurred_one(stages):
 def test_the_report_of_an_unsolved_image_names_the_blur():
     report = invert(one_pixel(), options=InversionOptions(n_sites=2000, max_iterations=30)).report
     assert not report.converged
-    assert re.search(r"not converged.*only the image blurred by \S+ px", report.warnings[0])
+    assert re.search(r"not converged.*only the image blurred by \S+ px", report.warnings[0].text)
 
 
 def test_a_solution_short_of_the_tolerance_is_better_than_that_of_a_blurred_image():

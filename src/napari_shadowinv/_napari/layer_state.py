@@ -23,6 +23,7 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import FullLayerData, result_layers
 from napari_shadowinv._napari.packs import pack_frame, pack_layers, pack_result, warnings_of_pack
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
 
@@ -149,9 +150,9 @@ def _inputs_shown(viewer: Any, result: Result | None) -> set[str]:
     }
 
 
-def doubts_of(result: Result) -> tuple[str, ...]:
-    """Return why a result may be wrong, in sentences; nothing where there is no reason."""
-    from napari_shadowinv.fitting import Fit, Verdict
+def doubts_of(result: Result) -> tuple[Caution, ...]:
+    """Return the reasons to doubt a result."""
+    from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
 
     content = result.content
@@ -159,8 +160,8 @@ def doubts_of(result: Result) -> tuple[str, ...]:
         return warnings_of_pack(content)  # type: ignore[arg-type]
     if isinstance(content, Inversion):
         return content.report.warnings
-    if isinstance(content, Fit) and content.verdict is not Verdict.DETERMINED:
-        return (verdict_in_words(content),)
+    if isinstance(content, Fit) and content.verdict_caution:
+        return (replace(content.verdict_caution, text=verdict_in_words(content)),)
     return ()
 
 

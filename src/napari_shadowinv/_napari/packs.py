@@ -22,6 +22,7 @@ from napari_shadowinv._napari.layers import FullLayerData, Limits
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.film import Pack
 from napari_shadowinv.physics.setup import setup_from_dict
 
@@ -165,9 +166,9 @@ def pack_of(dataset: xarray.Dataset) -> Pack:
     return validated(Pack, json.loads(dataset.attrs["pack"]), "the result's pack")
 
 
-def warnings_of_pack(dataset: xarray.Dataset) -> tuple[str, ...]:
-    """Return what one should know before trusting the dataset of a pack."""
-    return tuple(json.loads(dataset.attrs.get("warnings", "[]")))
+def warnings_of_pack(dataset: xarray.Dataset) -> tuple[Caution, ...]:
+    """Return the reasons to doubt the dataset of a pack."""
+    return tuple(map(Caution.from_json, json.loads(dataset.attrs.get("warnings", "[]"))))
 
 
 def scales_of(dataset: xarray.Dataset) -> FloatArray:

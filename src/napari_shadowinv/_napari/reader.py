@@ -90,14 +90,14 @@ def _read_file(path: Path) -> list[FullLayerData]:
 
     content = read(path)
     if isinstance(content, Radiograph):
-        for text in content.warnings:
-            show_caution(f"{path.name}: {text}")
+        for caution in content.warnings:
+            show_caution(f"{path.name}: {caution.text}")
         return radiograph_layers(content)
     layers = layers_of_dataset(content, path.stem)
     _show_in_window(layers)
     result = result_of(layers[0][1])
-    for text in () if result is None else doubts_of(result):
-        show_caution(f"{path.name}: {text}")
+    for caution in () if result is None else doubts_of(result):
+        show_caution(f"{path.name}: {caution.text}")
     return layers
 
 

@@ -158,8 +158,8 @@ def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
     """Describe a run of shots as one lazy stack; only the first that can be read is read now."""
     # A shot that cannot be read, or of another shape, is dark and gives a warning when shown.
     first, at = _first_readable(paths)
-    for text in first.warnings:
-        show_caution(f"{paths[at].name}: {text}")
+    for caution in first.warnings:
+        show_caution(f"{paths[at].name}: {caution.text}")
     height, width = first.image.shape
     plane_of = partial(_plane_of, shape=(height, width))
     stack = lazy_stack(plane_of, paths, (height, width), ready=first.image, at=at)

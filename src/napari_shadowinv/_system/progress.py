@@ -19,7 +19,6 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
-OnWarning = Callable[[str], None]
 ShouldStop = Callable[[], bool]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._tables import Rows, options_text, two_columns
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
@@ -304,8 +304,9 @@ def _level_rows(store: StackStore) -> Rows:
         if "level" not in report:
             continue
         levels[report["level"]] += 1
-        for warning in report.get("warnings", ()):
-            warned.setdefault(warning_kind(warning), (warning, []))[1].append(name)
+        for caution in map(Caution.from_json, report.get("warnings", ())):
+            key = caution.text if caution.code == "other" else caution.code
+            warned.setdefault(key, (caution.text, []))[1].append(name)
     if not levels:
         return []
     counts = ", ".join(f"{count} {level}" for level, count in levels.most_common())
@@ -313,11 +314,6 @@ def _level_rows(store: StackStore) -> Rows:
         ("levels", counts),
         *[("warning", f"{_listed(names)}: {warning}") for warning, names in warned.values()],
     ]
-
-
-def warning_kind(warning: str) -> str:
-    """Return a warning without its numbers, which differ from shot to shot."""
-    return re.sub(r"[\d.,]+", "", warning)
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -391,8 +387,11 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
 def _notes(store: StackStore) -> Iterator[tuple[int, str]]:
     """The reason of each failed shot, the warnings of the others."""
     for index, report in enumerate(store.reports()):
-        reason = report.get("reason")
-        yield from ((index, text) for text in ([reason] if reason else report.get("warnings", ())))
+        if reason := report.get("reason"):
+            yield index, reason
+            continue
+        cautions = map(Caution.from_json, report.get("warnings", ()))
+        yield from ((index, caution.text) for caution in cautions)
 
 
 def _checksums_text(store: StackStore) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import _flags, _outputs
 from napari_shadowinv.cli._tables import Rows, two_columns
 from napari_shadowinv.cli._terminal import interrupted, notify_errors, progress_bars, say
@@ -214,4 +215,5 @@ def pack_rows(dataset: xarray.Dataset) -> Rows:
         rows.append(("pixel", f"{1e6 * dataset.attrs['scan_pixel_size']:.4g} µm on the film"))
     if "seen_from" in dataset.attrs:
         rows.append(("seen from", dataset.attrs["seen_from"]))
-    return rows + [("warning", text) for text in json.loads(dataset.attrs["warnings"])]
+    cautions = map(Caution.from_json, json.loads(dataset.attrs["warnings"]))
+    return rows + [("warning", caution.text) for caution in cautions]

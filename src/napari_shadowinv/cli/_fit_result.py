@@ -184,7 +184,7 @@ def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
     rows = [
         ("verdict", str(fit.verdict)),
         ("because" if determined else "warning", fit.explanation),
-        *[("warning", text) for text in fit.warnings],
+        *[("warning", caution.text) for caution in fit.warnings],
         *[(f"image {k + 1}", _image_text(fit, k, names)) for k in range(len(fit.images))],
         ("size", size_text(fit.images[0])),
         ("setup", setup_text(fit.setups[0] if fit.setups else None)),

@@ -89,7 +89,7 @@ def _picture_rows(path: Path, found: Format) -> _tables.Rows:
     if array.ndim == 3:
         advice = "convert a scan of film to dose, or choose with --channel"
         rows.append(("channels", f"{array.shape[-1]}: {advice}"))
-    return [*rows, *_array_rows(array), *[("warning", text) for text in warnings]]
+    return [*rows, *_array_rows(array), *[("warning", caution.text) for caution in warnings]]
 
 
 def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _tables.Rows:
@@ -114,7 +114,7 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _tables.Rows:
     rows.append(("setup", _tables.setup_text(shot.setup, shot, shot.shape)))
     rows += [("note", text) for text in shot.notes]
     doubts = () if shot.setup is None else setup_warnings(shot.setup, shot.shape)
-    return [*rows, *[("warning", text) for text in (*shot.warnings, *doubts)]]
+    return [*rows, *[("warning", caution.text) for caution in (*shot.warnings, *doubts)]]
 
 
 def _array_rows(array: AnyArray) -> _tables.Rows:

@@ -142,7 +142,7 @@ def closing_rows(report: Report, written: Iterable[Path] = ()) -> Rows:
     stages = ", ".join(f"{stage} {value:.2f}" for stage, value in report.seconds.items())
     return [
         ("time", f"{sum(report.seconds.values()):.2f} s ({stages})"),
-        *[("warning", warning) for warning in report.warnings],
+        *[("warning", caution.text) for caution in report.warnings],
         *[("written", str(path)) for path in written],
     ]
 

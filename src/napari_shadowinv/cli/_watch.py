@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_good, names_of, warning_kind
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_good, names_of
 from napari_shadowinv.cli._terminal import (
     cancelled_code,
     interrupted,
@@ -73,10 +74,9 @@ class _Lines:
         told = f"  {told}  {outcome.seconds:.2f} s{waiting}{doubts}"
         self._print(self.out, f"{_shortened(name, _WIDTH - len(told))}{told}", _style(doubts))
         for warning in _warnings_of(news.result):
-            kind = warning_kind(warning)
-            if kind not in self.warned:
-                self.warned.add(kind)
-                self._print(self.err, f"warning: {news.name}: {warning}", "yellow")
+            if warning.code not in self.warned:
+                self.warned.add(warning.code)
+                self._print(self.err, f"warning: {news.name}: {warning.text}", "yellow")
 
     def _print(self, console: Console, text: str, style: str = "") -> None:
         console.print(plain(text, style), soft_wrap=True, highlight=False)
@@ -92,12 +92,12 @@ def _shortened(name: str, room: int) -> str:
     return name if len(name) <= room else f"…{name[1 - room :]}"
 
 
-def _warnings_of(result: Inversion | Fit) -> tuple[str, ...]:
-    from napari_shadowinv.fitting import Fit, Verdict
+def _warnings_of(result: Inversion | Fit) -> tuple[Caution, ...]:
+    from napari_shadowinv.fitting import Fit
 
     if not isinstance(result, Fit):
         return result.report.warnings
-    return () if result.verdict is Verdict.DETERMINED else (result.explanation,)
+    return () if result.verdict_caution is None else (result.verdict_caution,)
 
 
 def _told(result: Inversion | Fit) -> tuple[str, str]:

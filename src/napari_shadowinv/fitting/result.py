@@ -12,6 +12,7 @@ import numpy as np
 
 from napari_shadowinv._system.safety import refusing_junk
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.verdict import Verdict
@@ -260,14 +261,21 @@ class Fit:
         return [("error bars", text), ("beam", report.beam.text)]
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[Caution, ...]:
         """Reasons to doubt the images, each with the name of its image."""
         images = () if self.provenance is None else self.provenance.images
         return tuple(
-            f"{each.image.file or f'image {number}'}: {text}"
+            caution.about(each.image.file or f"image {number}")
             for number, each in enumerate(images, 1)
-            for text in each.warnings
+            for caution in each.warnings
         )
+
+    @property
+    def verdict_caution(self) -> Caution | None:
+        """The verdict as a reason to doubt the fields; None if they are determined."""
+        if self.verdict is Verdict.DETERMINED:
+            return None
+        return Caution("verdict", self.explanation)
 
     def peak_text(self, field: FittedField, shown: ShownField) -> str:
         """Return the largest magnitude of a field with its total error, in the unit shown."""

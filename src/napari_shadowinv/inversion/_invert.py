@@ -17,6 +17,7 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import normalise
 from napari_shadowinv.inversion.budget import Budget
@@ -279,10 +280,12 @@ def invert(
     told = _report(prepared.in_units(), noise, solutions, fields, seconds, budget)
     finest = adaptive and len(answer.weights) == levels.counts[-1]
     if finest and errors is not None and told.warnings == prepared.warnings:
-        missed = errors.missed(options.accuracy, "with the most sites placed unless more are given")
+        missed = errors.accuracy_caution(
+            options.accuracy, "with the most sites placed unless more are given"
+        )
         told = replace(told, warnings=(*told.warnings, *filter(None, [missed])))
     if errors is not None:
-        told = replace(told, warnings=(*filter(None, [errors.beam_warning()]), *told.warnings))
+        told = replace(told, warnings=(*filter(None, [errors.beam_caution()]), *told.warnings))
     with _timed("prepare", seconds):
         beam = prepared.source if plan.measured else None
         signs = image_warnings(prepared.image, beam, prepared.mask)
@@ -445,10 +448,11 @@ def _report(
     budget: Budget,
 ) -> Report:
     finest, options = solutions[-1], budget.options
-    found: tuple[str, ...] = (
+    text = (
         f"not converged: flux residual {finest.residual:.2g} per cell, tolerance "
-        f"{options.tolerance:.2g}; {finest.reason}",
+        f"{options.tolerance:.2g}; {finest.reason}"
     )
+    found: tuple[Caution, ...] = (Caution("not-converged", text),)
     if finest.converged:
         moves, n_sites = fields.displacement, len(finest.weights)
         found = doubts(

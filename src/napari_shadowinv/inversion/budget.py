@@ -22,6 +22,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.beam import beam_difference
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared
@@ -137,15 +138,16 @@ class Errors:
             parts[_BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)] = self.beam
         return {name: error for name, error in parts.items() if not math.isnan(error.rms)}
 
-    def missed(self, accuracy: float, why: str) -> str:
-        """Say so, and why, if discretisation misses an accuracy and shows beside the noise."""
+    def accuracy_caution(self, accuracy: float, why: str) -> Caution | None:
+        """Warn if the discretisation error exceeds the accuracy and is not hidden by noise."""
         error = self.discretisation.rms
         if not error > max(accuracy * self.rms, _SHARE_OF_NOISE * self.noise.rms):
-            return ""
-        return (
+            return None
+        return Caution(
+            "accuracy",
             f"the accuracy of {100 * accuracy:.2g} % is not reached: {why}, the discretisation "
             f"error is about {_percent(error, self.rms)} of the displacement; give a larger number "
-            "of sites"
+            "of sites",
         )
 
     def scaled(self, factor: float) -> Errors:
@@ -187,18 +189,19 @@ class Errors:
             )
         return rows
 
-    def beam_warning(self) -> str:
+    def beam_caution(self) -> Caution | None:
         """Warn if image and source differ outside the object so that the peak is uncertain."""
         if self.beam is None or self.beam_basis != "seen" or not self.peak > 0:
-            return ""
+            return None
         at_peak, everywhere = self.beam.at_peak / self.peak, self.beam.rms / self.rms
         if not (at_peak > _MAX_BEAM_AT_PEAK or everywhere > _MAX_BEAM_RMS):
-            return ""
-        return (
+            return None
+        return Caution(
+            "beam",
             f"image and source differ by {100 * self.beam_variation:.2g} % (r.m.s.) where there is "
             f"no object: the field may be off by {_percent(self.beam.rms, self.rms)}, its peak by "
             f"{_percent(self.beam.at_peak, self.peak)}; use a source of the same exposure, or fit "
-            "the beam"
+            "the beam",
         )
 
     @classmethod

@@ -20,7 +20,7 @@ import json
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from operator import add
 from threading import Event
@@ -35,6 +35,7 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.linear_surface import WIDTH
 from napari_shadowinv.inversion._drawing import noise_of
@@ -88,7 +89,7 @@ class Uncertainty:
     iterations, residuals, converged : tuple of int, of float, of bool
         Of each sample that was solved, which of linear ones are the first few: solver steps,
         largest relative flux error of a cell, tolerance met.
-    warnings : tuple of str
+    warnings : tuple of Caution
         Reasons to doubt the deviations.
     """
 
@@ -105,7 +106,7 @@ class Uncertainty:
     iterations: tuple[int, ...]
     residuals: tuple[float, ...]
     converged: tuple[bool, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Caution, ...]
 
     def to_dataset(
         self, setup: Setup | None = None, *, attributes: Mapping[str, str] | None = None
@@ -125,8 +126,10 @@ class Uncertainty:
             a JSON text in the attribute ``uncertainty``.
         """
         samples: tuple[str, ...] = ("n", "noise", "method", "nonlinearity", "tolerance")
-        samples += ("iterations", "residuals", "converged", "warnings")
-        history = json.dumps({name: getattr(self, name) for name in samples})
+        samples += ("iterations", "residuals", "converged")
+        values = {name: getattr(self, name) for name in samples}
+        values["warnings"] = [asdict(caution) for caution in self.warnings]
+        history = json.dumps(values)
         dataset = self.inversion.to_dataset(
             setup, attributes={"uncertainty": history, **(attributes or {})}
         )
@@ -276,18 +279,18 @@ def uncertainty(
     mean, std = here + scatter.mean, scatter.std
     warnings = inversion.report.warnings
     if off > _LINEAR_ENOUGH:
-        warnings = (
+        text = (
             f"the response to noise is not linear: samples that were solved differ by "
-            f"{off:.0%} of what the noise changes; use method='resolve'",
-            *warnings,
+            f"{off:.0%} of what the noise changes; use method='resolve'"
         )
+        warnings = (Caution("samples", text), *warnings)
     iterations, residuals, converged = zip(*went, strict=True)
     if failed := converged.count(False):
-        warnings = (
+        text = (
             f"{failed} of {len(converged)} samples that were solved did not converge: the "
-            "deviations are unreliable where the samples scatter most",
-            *warnings,
+            "deviations are unreliable where the samples scatter most"
         )
+        warnings = (Caution("samples", text), *warnings)
     return Uncertainty(
         inversion=inversion,
         potential_mean=mean[0],

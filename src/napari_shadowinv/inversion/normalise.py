@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 
@@ -44,7 +45,7 @@ class Prepared:
     clipped_pixels: int
     floored_pixels: int  # the clipped ones included
     flux_scale: float  # what the image was divided by
-    warnings: tuple[str, ...]
+    warnings: tuple[Caution, ...]
 
     def in_units(self) -> Prepared:
         """Return the same with image and source in units of `unit`, too."""
@@ -165,30 +166,34 @@ def masked_source(source: FloatArray, mask: BoolArray, options: InversionOptions
 
 def _warnings(
     ratio: float, clipped: int, floored: int, usable: BoolArray, options: InversionOptions
-) -> tuple[str, ...]:
-    warnings = []
+) -> tuple[Caution, ...]:
+    cautions = []
     size = int(usable.sum())
     if abs(ratio - 1) > _NOTABLE_FLUX_CHANGE:
-        warnings.append(
+        text = (
             f"the image's flux is {ratio:.3g} times the source's; it was scaled to match, which is "
             "right after another exposure, and wrong if a dark level was left in one of them "
             "(--dark), if one is a negative, or if light was lost in the object or past the edge"
         )
+        cautions.append(Caution("flux", text))
     if clipped > _NOTABLE_RAISED * size:
-        warnings.append(f"negative pixels set to zero: {clipped} ({clipped / size:.2%})")
+        text = f"negative pixels set to zero: {clipped} ({clipped / size:.2%})"
+        cautions.append(Caution("negative-pixels", text))
     dark = floored - clipped
     if dark > _NOTABLE_RAISED * size:
-        warnings.append(
+        text = (
             f"dark pixels raised to the floor: {dark} ({dark / size:.2%}); "
             "the field inside dark areas is not reliable"
         )
+        cautions.append(Caution("dark-pixels", text))
     excluded = 1 - float(usable.mean())
     if excluded >= _NOTABLE_MASK:
-        warnings.append(
+        text = (
             f"the mask excludes {excluded:.1%} of the pixels: the field there is only a smooth "
             "continuation. To hide the object from a source estimate, use a source mask instead"
         )
-    return tuple(warnings)
+        cautions.append(Caution("mask", text))
+    return tuple(cautions)
 
 
 def checked_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:

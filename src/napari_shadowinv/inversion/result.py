@@ -14,6 +14,7 @@ import numpy as np
 
 from napari_shadowinv._system.safety import refusing_junk
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.labels import (
@@ -86,7 +87,7 @@ class Report:
         Sites, solver steps and final residual of each level, coarse to fine.
     seconds : dict of str to float
         Time of each stage: prepare, sites, transport, read-out, errors.
-    warnings : tuple of str
+    warnings : tuple of Caution
         Reasons to doubt the result.
     flux_scale : float
         Factor by which the image was divided to match the source.
@@ -113,7 +114,7 @@ class Report:
     clipped_pixels: int
     levels: tuple[tuple[int, int, float], ...]
     seconds: dict[str, float]
-    warnings: tuple[str, ...]
+    warnings: tuple[Caution, ...]
     flux_scale: float = 1.0
     flux_left: dict[str, float] = field(default_factory=dict)
     flux_entered: dict[str, float] = field(default_factory=dict)
@@ -226,23 +227,24 @@ class Inversion:
         """
         error = None if self.errors is None else self.errors.of_peak
         (field,) = shown_fields([self.displacement], setup, mask=self.mask)
-        warnings = list(self.report.warnings)
-        level = Level.DOUBTFUL if warnings else Level.SOUND
+        cautions = self.report.warnings
+        texts = [caution.text for caution in cautions]
+        level = Level.DOUBTFUL if cautions else Level.SOUND
         if not self.report.converged:
             level = Level.FAILED
-            if not any("not converged" in text for text in warnings):
-                warnings.insert(0, "not converged: do not trust the field")
-        return Headline(level, "; ".join([*warnings, field.peak_text(error)]))
+            if all(caution.code != "not-converged" for caution in cautions):
+                texts.insert(0, "not converged: do not trust the field")
+        return Headline(level, "; ".join([*texts, field.peak_text(error)]))
 
-    def with_warnings(self, texts: Iterable[str]) -> Inversion:
+    def with_warnings(self, cautions: Iterable[Caution]) -> Inversion:
         """Return the same inversion with more warnings in its report.
 
         Parameters
         ----------
-        texts : iterable of str
+        cautions : iterable of Caution
             To be appended.
         """
-        warnings = (*self.report.warnings, *texts)
+        warnings = (*self.report.warnings, *cautions)
         return replace(self, report=replace(self.report, warnings=warnings))
 
     def to_dataset(
@@ -316,6 +318,7 @@ class Inversion:
         content = json.loads(dataset.attrs["report"])
         known = {field.name for field in dataclasses.fields(Report)} & content.keys()
         report = Report(**{name: _tuples(content[name]) for name in known})
+        report = replace(report, warnings=tuple(map(Caution.from_json, report.warnings)))
         if content.get("errors"):
             report = replace(report, errors=Errors.of(content["errors"]))
         if math.isnan(report.image_residual):  # a file of an older version

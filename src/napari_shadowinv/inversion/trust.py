@@ -52,6 +52,7 @@ import numpy as np
 from scipy import ndimage
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.edges import TURNED_BACK, inner_sides, turned_back
 
 if TYPE_CHECKING:
@@ -110,8 +111,8 @@ def doubts(
     options: InversionOptions,
     *,
     beam_difference: float = 0.0,
-) -> tuple[str, ...]:
-    """Say in plain sentences why a converged answer must not be trusted; empty if nothing does.
+) -> tuple[Caution, ...]:
+    """Return the reasons to doubt a converged answer; empty if there are none.
 
     Contrast at the edge is an object that is cut off only if it is well above the relative
     `beam_difference` of image and source outside the object.
@@ -122,13 +123,17 @@ def doubts(
     # Where the finest structure is a pattern, it is no measure of noise.
     nothing = "" if misfit else _nothing_found(noise, rms)
     if nothing:
-        return (nothing,)
-    found = [misfit, _deep_folds(jacobian, prepared.mask)]
-    found.append(_peak_at_mask(displacement, prepared.mask))
+        return (Caution("no-deflection", nothing),)
+    texts = {
+        "misfit": misfit,
+        "folds": _deep_folds(jacobian, prepared.mask),
+        "masked-peak": _peak_at_mask(displacement, prepared.mask),
+    }
     if options.boundary == "closed":
-        reaching = _cut_off(displacement, prepared.mask, noise, rms)
-        found.append(reaching or _cut_by_edge(prepared, noise, beam_difference))
-    return tuple(sentence for sentence in found if sentence)
+        texts["closed-edge"] = _cut_off(displacement, prepared.mask, noise, rms)
+        if not texts["closed-edge"]:
+            texts["cut-object"] = _cut_by_edge(prepared, noise, beam_difference)
+    return tuple(Caution(code, text) for code, text in texts.items() if text)
 
 
 def is_coarse(prepared: Prepared, reprojection: FloatArray, noise: ImageNoise) -> bool:

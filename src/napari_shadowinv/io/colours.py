@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 
 CHANNELS = ("red", "green", "blue", "mean")
@@ -43,7 +44,7 @@ def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> Fl
     return np.ascontiguousarray(colours[..., index], dtype=np.float64)
 
 
-def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[str, ...]:
+def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[Caution, ...]:
     """Warn of a picture in colour, or with a bright rim: it may be a film, dark with dose."""
     grey = to_grey(array, "mean", "")
     is_colour = array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, ""))
@@ -56,10 +57,11 @@ def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[str, ...]
         )
     else:
         return ()
-    return (
+    text = (
         f"{sign}: film darkens with dose, so a scan gives a field of the wrong sign unless it is "
-        "converted to dose first (napari_shadowinv.film)",
+        "converted to dose first (napari_shadowinv.film)"
     )
+    return (Caution("film-scan", text),)
 
 
 def _is_lit_around(image: FloatArray) -> bool:

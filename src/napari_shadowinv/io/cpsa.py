@@ -35,6 +35,7 @@ import numpy as np
 
 from napari_shadowinv._system.safety import check_regular, check_size, refusing_damage
 from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film.tracks import Tracks
 from napari_shadowinv.io.files import check_promise
@@ -83,12 +84,12 @@ def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[
     bin_ = chosen.pop("bin", None)
     counts, _, bin_ = tracks.selected(**chosen).image(bin_)
     if not chosen:
-        warnings = (
-            *warnings,
+        text = (
             f"all {counts.sum()} tracks are counted, whatever their diameter, contrast and "
             "eccentricity, and not all need be of the beam: choose ranges with variable, such as "
-            "'diameter=4:12 contrast=:40'",
+            "'diameter=4:12 contrast=:40'"
         )
+        warnings = (*warnings, Caution("tracks", text))
     metadata: dict[str, Any] = {
         "bits": 32,
         "geometry": {"detector_pixel_size": bin_ * 1e-6},
@@ -154,7 +155,7 @@ def _chosen(text: str) -> dict[str, Any]:
     return chosen
 
 
-def _read(path: Path) -> tuple[Tracks, tuple[str, ...]]:
+def _read(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
     """Tracks of a scan, and what is odd about it."""
     check_regular(path, "a CR-39 scan, .cpsa")
     check_size(path, _IN_MEMORY * path.stat().st_size)
@@ -226,12 +227,13 @@ def _frames(path: Path, data: bytes, shape: tuple[int, int]) -> AnyArray:
 
 def _pitch_warnings(
     shape: tuple[int, int], extent: FloatArray, frame_size: FloatArray
-) -> tuple[str, ...]:
+) -> tuple[Caution, ...]:
     """Warn of frames with gaps between them, or that overlap."""
     ratios = extent / (np.array(shape) * frame_size)
     if (np.abs(ratios - 1) <= _SAME_PITCH).all():
         return ()
-    return (
+    text = (
         f"the scanned area is {ratios[0]:.3g} times as wide and {ratios[1]:.3g} times as high as "
-        "its frames put side by side: they overlap or leave gaps, which show in the image",
+        "its frames put side by side: they overlap or leave gaps, which show in the image"
     )
+    return (Caution("tracks", text),)

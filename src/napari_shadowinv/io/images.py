@@ -17,6 +17,7 @@ import numpy as np
 
 from napari_shadowinv._system.safety import check_regular, check_size, refusing_damage
 from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.colours import film_warnings, to_grey
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
@@ -96,7 +97,7 @@ def tiff_pages(path: Path) -> int:
 @refusing_damage
 def read_tiff_page(
     path: Path, number: int, *, channel: str | int | None = None
-) -> tuple[FloatArray, tuple[str, ...]]:
+) -> tuple[FloatArray, tuple[Caution, ...]]:
     """Read page `number`, from 0, of a TIFF that holds many, with warnings as of a `Radiograph`."""
     check_regular(path, "a TIFF")
     with _opened(path) as tiff:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from napari_shadowinv import __version__
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import (
     Pack,
@@ -301,10 +302,13 @@ def _by_film(
     return values
 
 
-def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) -> list[str]:
+def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) -> list[Caution]:
     found = [
-        f"{film.name} is darker than its calibration reaches over {one.too_dark:.0%} of it: left "
-        "out"
+        Caution(
+            "film-range",
+            f"{film.name} is darker than its calibration reaches over {one.too_dark:.0%} of it: "
+            "left out",
+        )
         for film, one in zip(films, doses, strict=True)
         if one.too_dark > _DARK
     ]
@@ -316,26 +320,30 @@ def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) 
             why = "have no fiducials"
         elif pack.align == "edges":
             why = "are not compared with each other"
-        found.append(
+        text = (
             f"films {', '.join(map(str, loose))} {why}: laid by their edges, to some "
             f"{poses.errors[at_edges].max():.0f} px"
         )
+        found.append(Caution("film-alignment", text))
     if any(film.fiducials for film in films) and not np.isfinite(poses.closure):
-        found.append(
+        text = (
             "each film has one fiducial, so that nothing tells a mark that was read wrongly: give "
             "two or more that go through all films"
         )
+        found.append(Caution("film-alignment", text))
     furthest = float(np.abs(poses.shifts).max())
     if furthest > 0 and poses.by_images.any():
-        found.append(
+        text = (
             f"films were moved by up to {furthest:.1f} px by what they show, which fields "
             "displace, too: a fit of E beside B by these layers can be wrong without a sign of it"
         )
+        found.append(Caution("film-alignment", text))
     if pack.setup is not None and pack.seen_from is None:
-        found.append(
+        text = (
             "the pack does not say from which side its films are seen, and the source was assumed: "
             "if they are seen from the detector, B has the wrong sign; give seen_from"
         )
+        found.append(Caution("film-side", text))
     return found
 
 
@@ -347,7 +355,7 @@ def _dataset(
     pixel: float | None,
     planes: dict[str, Any],
     by_film: ByLayer,
-    warnings: list[str],
+    warnings: list[Caution],
 ) -> xarray.Dataset:
     import xarray as xr
 
@@ -373,7 +381,7 @@ def _dataset(
         "package_version": __version__,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "pack": pack.model_dump_json(exclude_defaults=True),
-        "warnings": json.dumps(warnings),
+        "warnings": json.dumps([asdict(caution) for caution in warnings]),
         "seen_from": _SEEN_FROM[pack.seen_from],
     }
     if pixel is not None:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv import __version__
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, compare, fit, point_spread
 from napari_shadowinv.inversion.budget import ASSUMED_VARIATION
@@ -404,9 +405,9 @@ def _with_estimate(
 ) -> Radiograph:
     recorded = inputs.shot.shape
     placed = estimate.placed(shot.setup, recorded, inputs.recipe.matrix(recorded))
-    doubts: list[str] = []
+    doubts: list[Caution] = []
     source = estimated_source(placed, shot, should_stop, doubts.append)
-    return replace(shot, source=source).noted(*doubts)
+    return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
 
 
 def usual_fields(setups: Sequence[Setup] | None) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.inversion.compilation import ensure_compiled
@@ -185,7 +186,7 @@ def run_prepared(
     seconds: dict[str, float] = {}
     clock = time.perf_counter() if began is None else began
     report("prepare", 0, None)
-    doubts: list[str] = []
+    doubts: list[Caution] = []
     # Before an estimate is made, and before sites are spread: a mistake is told at once.
     if shot.source is None:
         prepare(shot.image, None, options, shot.mask)
@@ -231,7 +232,7 @@ def _source(
     report: Reporter,
     should_stop: ShouldStop | None,
     cache: Cache,
-    doubts: list[str],
+    doubts: list[Caution],
     *,
     preview: bool,
 ) -> FloatArray:

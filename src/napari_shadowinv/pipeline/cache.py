@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from napari_shadowinv._system.progress import OnProgress, OnWarning, ShouldStop
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution, OnCaution
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Estimate
@@ -27,7 +28,7 @@ class Cache:
     )
     _solved: tuple[SitePlan, Inversion] | None = field(default=None, repr=False)
     _estimated: (
-        tuple[tuple[Estimate, bool], FloatArray, BoolArray | None, FloatArray, list[str]] | None
+        tuple[tuple[Estimate, bool], FloatArray, BoolArray | None, FloatArray, list[Caution]] | None
     ) = field(default=None, repr=False)
 
     def plan(
@@ -75,11 +76,12 @@ class Cache:
         mask: BoolArray | None,
         most_pixels: int | None = None,
         should_stop: ShouldStop | None = None,
-        on_warning: OnWarning | None = None,
+        on_caution: OnCaution | None = None,
     ) -> FloatArray:
         """Return an estimated source; with `most_pixels`, quickly, from merged pixels."""
         key = (estimate, most_pixels is not None)
-        source, doubts = None, []
+        source: FloatArray | None = None
+        doubts: list[Caution] = []
         if self._estimated is not None:
             last_key, last_image, last_mask, last_source, last_doubts = self._estimated
             same = same_array(image, last_image) and same_array(mask, last_mask)
@@ -93,9 +95,9 @@ class Cache:
                     estimate, image, mask, most_pixels, should_stop, doubts.append
                 )
             self._estimated = key, image, mask, source, doubts
-        if on_warning is not None:
+        if on_caution is not None:
             for doubt in doubts:
-                on_warning(doubt)
+                on_caution(doubt)
         return source
 
 
@@ -105,13 +107,13 @@ def quick_source(
     mask: BoolArray | None,
     most_pixels: int,
     should_stop: ShouldStop | None = None,
-    on_warning: OnWarning | None = None,
+    on_caution: OnCaution | None = None,
 ) -> FloatArray:
     """Estimate a source from an image whose pixels are merged until there are few enough."""
     # Linear between the middles of the merged pixels; its flux is that of the image.
     factor = int(np.ceil(np.sqrt(image.size / most_pixels)))
     if factor == 1 or min(image.shape) < 8 * factor:
-        return estimate.source(image, mask, should_stop, on_warning)
+        return estimate.source(image, mask, should_stop, on_caution)
     from scipy.ndimage import map_coordinates
     from skimage.transform import downscale_local_mean
 
@@ -123,7 +125,7 @@ def quick_source(
     known = share > 0
     coarse = np.where(known, sums / np.where(known, share, 1.0), 0.0)
     coarser = estimate.coarser(factor)
-    beam = coarser.source(coarse, None if known.all() else known, should_stop, on_warning)
+    beam = coarser.source(coarse, None if known.all() else known, should_stop, on_caution)
     middle = (factor - 1) / 2
     places = np.meshgrid(*((np.arange(n) - middle) / factor for n in image.shape), indexing="ij")
     fine = map_coordinates(beam, places, order=1, mode="nearest")

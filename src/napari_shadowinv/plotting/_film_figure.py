@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Grid, Panel, Scale
 
@@ -67,8 +68,8 @@ def pack_figure(dataset: xarray.Dataset, *, title: str | None = None) -> Figure:
 def _header(dataset: xarray.Dataset, letters: int) -> list[tuple[str, str]]:
     low, high = dataset["energy"].values[[0, -1]]
     lines = [(f"{dataset.sizes['layer']} films, {low:.3g} to {high:.3g} MeV", QUIET_COLOUR)]
-    for warning in json.loads(dataset.attrs["warnings"]):
-        lines += [(line, ALARM_COLOUR) for line in textwrap.wrap(warning, letters)]
+    for caution in map(Caution.from_json, json.loads(dataset.attrs["warnings"])):
+        lines += [(line, ALARM_COLOUR) for line in textwrap.wrap(caution.text, letters)]
     return lines
 
 

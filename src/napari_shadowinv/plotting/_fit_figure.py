@@ -167,7 +167,7 @@ def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
 def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
     """The verdict and why, each line with its colour."""
     colour = GOOD_COLOUR if fit.verdict is Verdict.DETERMINED else ALARM_COLOUR
-    summary = "; ".join([f"{fit.verdict.upper()}: {fit.explanation}", *fit.warnings])
+    summary = "; ".join([f"{fit.verdict.upper()}: {fit.explanation}", *map(str, fit.warnings)])
     lines = [(line, colour) for line in textwrap.wrap(summary, letters)]
     if not fit.report.converged:
         lines.append((f"⚠ not converged in {fit.report.iterations} steps", ALARM_COLOUR))

@@ -35,8 +35,9 @@ import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
+from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import OnCaution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.filling import FILL_WIDTH, filled, interpolated_source
@@ -75,9 +76,9 @@ class Estimate(Choice):
         image: FloatArray,
         mask: BoolArray | None,
         should_stop: ShouldStop | None = None,
-        on_warning: OnWarning | None = None,
+        on_caution: OnCaution | None = None,
     ) -> FloatArray:
-        """Estimate the source; `on_warning` receives a sentence where it has to be doubted.
+        """Estimate the source; `on_caution` receives a `Caution` if it is doubtful.
 
         An `InputError` if the image cannot be used, or there is no mask where one is needed.
         """
@@ -86,14 +87,14 @@ class Estimate(Choice):
                 f"got the estimate '{self.title}' without a mask: it fills in the masked pixels; "
                 "choose a mask that covers the object"
             )
-        return self._source(image, mask, should_stop, on_warning)
+        return self._source(image, mask, should_stop, on_caution)
 
     def _source(
         self,
         image: FloatArray,
         mask: BoolArray | None,
         should_stop: ShouldStop | None,
-        on_warning: OnWarning | None,
+        on_caution: OnCaution | None,
     ) -> FloatArray:
         return self.function(image, mask=mask, should_stop=should_stop, **self.values())
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ConfigDict, ValidationError
+from pydantic import BeforeValidator, ConfigDict, ValidationError
 
 from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.options import Noise
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.recipe import Origin, Provenance, Recipe
@@ -32,7 +33,7 @@ class FitOrigin(CheckedModel):
         As given for this image; None where the recipe counts.
     notes : tuple of str
         What the steps found and did.
-    warnings : tuple of str
+    warnings : tuple of Caution
         Reasons to doubt the image, its source or its setup.
     """
 
@@ -47,7 +48,7 @@ class FitOrigin(CheckedModel):
     psf: float | None = None
     noise: Noise | None = None
     notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Annotated[Caution, BeforeValidator(Caution.from_json)], ...] = ()
 
 
 class FitProvenance(CheckedModel):

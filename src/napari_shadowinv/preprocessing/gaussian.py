@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import warnings
-from functools import partial
 from typing import Literal
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.progress import OnWarning, Reporter, ShouldStop
+from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.estimates import Estimate, uniform_source
 
@@ -35,9 +34,9 @@ class GaussianEstimate(Estimate):
         image: FloatArray,
         mask: BoolArray | None,
         should_stop: ShouldStop | None,
-        on_warning: OnWarning | None,
+        on_caution: OnCaution | None,
     ) -> FloatArray:
-        return gaussian_source(image, mask=mask, should_stop=should_stop, on_warning=on_warning)
+        return gaussian_source(image, mask=mask, should_stop=should_stop, on_caution=on_caution)
 
 
 def gaussian_source(
@@ -45,7 +44,7 @@ def gaussian_source(
     *,
     mask: ArrayLike | None = None,
     should_stop: ShouldStop | None = None,
-    on_warning: OnWarning | None = None,
+    on_caution: OnCaution | None = None,
 ) -> FloatArray:
     """Elliptical Gaussian plus a constant, fitted to the image.
 
@@ -55,8 +54,8 @@ def gaussian_source(
     ----------
     image : array_like, shape (H, W)
     mask, should_stop : optional
-    on_warning : callable, optional
-        Receives a sentence where the fit has to be doubted. Default: `warnings.warn`.
+    on_caution : callable, optional
+        Receives a `Caution` if the fit is doubtful. Default: `warnings.warn` with its text.
 
     Returns
     -------
@@ -80,18 +79,20 @@ def gaussian_source(
     rows, columns = (np.arange(n) / side for n in values.shape)
     beam = _gaussian(parameters, rows[:, None], columns)
     rise = float(beam.max() / sample.max())
-    tell = on_warning or partial(warnings.warn, stacklevel=2)
+    report_caution = on_caution or warn_of
     if rise > pixels.MOST_EXTRAPOLATION:
-        tell(
+        text = (
             "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
             "uniform: mask less, or choose another estimate"
         )
+        report_caution(Caution("source", text))
         return uniform_source(image, mask=mask)
     if rise > _NOTABLE_EXTRAPOLATION:
-        tell(
+        text = (
             f"the Gaussian beam rises to {rise:.2g} times the fitted data under the mask: "
             "compare it with another estimate, or mask less"
         )
+        report_caution(Caution("source", text))
     return pixels.with_flux_of(mean * beam, values, usable)
 
 

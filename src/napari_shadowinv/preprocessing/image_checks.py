@@ -27,6 +27,7 @@ from scipy.optimize import nnls
 
 from napari_shadowinv._system.arrays import order_by_value
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 
 __all__ = [
     "ReferencePair",
@@ -79,8 +80,8 @@ _SWAPPED = 0.75  # see `is_swapped`
 
 def image_warnings(
     image: FloatArray, source: FloatArray | None = None, mask: BoolArray | None = None
-) -> tuple[str, ...]:
-    """Return a sentence for everything in an image and its reference that looks wrong.
+) -> tuple[Caution, ...]:
+    """Return a caution for everything in an image and its reference that looks wrong.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def image_warnings(
 
     Returns
     -------
-    tuple of str
+    tuple of Caution
         Empty if nothing looks wrong.
     """
     usable = np.ones(image.shape, bool) if mask is None else mask
@@ -105,13 +106,14 @@ def image_warnings(
     return tuple(_warnings(image, source, usable))
 
 
-def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -> Iterator[str]:
+def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -> Iterator[Caution]:
     if dark := max(dark_level(image, usable), 0 if source is None else dark_level(source, usable)):
-        yield (
+        yield Caution(
+            "dark-level",
             f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
             "zero, so the detector's dark level seems to be left in it: the field comes out too "
             "weak, by this share or more; subtract it from image and source (step 'dark', "
-            "--dark)"
+            "--dark)",
         )
     strays = np.zeros(image.shape, bool)
     for name, plane in (("image", image), ("source", source)):
@@ -120,37 +122,42 @@ def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -
         stray = stray_pixels(plane, usable)
         strays |= stray
         if (share := saturated_share(plane, usable & ~stray)) > 0:
-            yield (
+            yield Caution(
+                "saturation",
                 f"saturation: {share:.2%} of the {name}'s pixels are at its maximum: bright lines "
                 "are cut off there, and the field around them is too weak; mask these pixels, or "
-                "record with less exposure"
+                "record with less exposure",
             )
         if count := int(stray.sum()):
-            yield (
+            yield Caution(
+                "hot-pixels",
                 f"hot pixels: {count} pixel{'s' * (count > 1)} of the {name} differ"
                 f"{'s' * (count == 1)} from all neighbours by far more than the noise, and each "
-                "bends the field around it; replace them (step 'hot-pixels', --hot-pixels)"
+                "bends the field around it; replace them (step 'hot-pixels', --hot-pixels)",
             )
     if source is None:
         return
     pair = ReferencePair(image, source, usable & ~strays)
     if pair.is_negative:
-        yield (
+        yield Caution(
+            "negative",
             "negative: the image is dark where it should be bright, as in a negative or a scan of "
             "film: the field would have the wrong sign and size; invert its brightness, or "
-            "convert the film to dose"
+            "convert the film to dose",
         )
     elif pair.is_swapped:
-        yield (
+        yield Caution(
+            "swapped",
             "swapped: the source has far more structure than the image, so the two seem to be "
-            "swapped: the field would have the wrong sign; swap the files"
+            "swapped: the field would have the wrong sign; swap the files",
         )
     elif pair.shift is not None:
         down, right = pair.shift
-        yield (
+        yield Caution(
+            "register",
             f"register: at its borders the image lies {down:+.0f} px in y and {right:+.0f} px in x "
             "from the source: the shift would be taken for a field; "
-            "align source and image, or cut both to the same part of the beam (step 'crop')"
+            "align source and image, or cut both to the same part of the beam (step 'crop')",
         )
 
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, PrivateAttr
 
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import Setup, binned_setup
 from napari_shadowinv.preprocessing.estimates import Estimate
@@ -94,7 +95,7 @@ def _without_setup() -> InputError:
 
 def uniform_warnings(
     shape: tuple[int, int], setup: Setup | None, *, centre: tuple[float, float] | None = None
-) -> tuple[str, ...]:
+) -> tuple[Caution, ...]:
     """Say if a point source would light an image too unevenly to be taken as uniform.
 
     Parameters
@@ -108,7 +109,7 @@ def uniform_warnings(
 
     Returns
     -------
-    tuple of str
+    tuple of Caution
         Empty where the fluence of an isotropic point source varies by 1 % at most.
     """
     if setup is None or setup.collimated:
@@ -121,11 +122,12 @@ def uniform_warnings(
     fall = 1 - lowest / highest
     if fall <= _NOTABLE_FALL:
         return ()
-    return (
+    text = (
         f"the source is assumed uniform, but a point source {setup.source_object_distance:.3g} m "
         f"from the object lights this image unevenly, by {fall:.1%} between brightest and "
-        "dimmest pixel: if yours emits isotropically, choose the source 'isotropic'",
+        "dimmest pixel: if yours emits isotropically, choose the source 'isotropic'"
     )
+    return (Caution("source", text),)
 
 
 def isotropic_source(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class Radiograph:
         The undisturbed beam.
     mask, source_mask : ndarray of bool, shape (H, W), or None
         True where a pixel can be used; where the object is not, and the source can be estimated.
-    warnings : tuple of str
+    warnings : tuple of Caution
         What the user should know before trusting what the file says.
     dark : ndarray, shape (H, W), or None
         Image of the detector without light, for a step `Dark` with a file.
@@ -46,7 +47,7 @@ class Radiograph:
     source: FloatArray | None = None
     mask: BoolArray | None = None
     source_mask: BoolArray | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Caution, ...] = ()
     dark: FloatArray | None = None
 
     @property

@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import base64
-import warnings
 import zlib
 from collections.abc import Callable, Mapping
 from functools import reduce
@@ -21,6 +20,7 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution, warn_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
@@ -31,7 +31,8 @@ from napari_shadowinv.preprocessing.radiograph import Radiograph
 from napari_shadowinv.preprocessing.steps import Choice, Dark, Step, choices_of
 
 if TYPE_CHECKING:
-    from napari_shadowinv._system.progress import OnWarning, ShouldStop
+    from napari_shadowinv._system.progress import ShouldStop
+    from napari_shadowinv.cautions import OnCaution
 
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
@@ -239,7 +240,7 @@ def estimated_source(
     estimate: Estimate,
     shot: Radiograph,
     should_stop: ShouldStop | None = None,
-    on_warning: OnWarning | None = None,
+    on_caution: OnCaution | None = None,
     *,
     by: Callable[..., FloatArray] | None = None,
 ) -> FloatArray:
@@ -248,7 +249,7 @@ def estimated_source(
     Parameters
     ----------
     estimate : Estimate
-        How, placed for the shot; its `source` takes `should_stop` and `on_warning`.
+        How, placed for the shot; its `source` takes `should_stop` and `on_caution`.
     shot : Radiograph
     by : callable, optional
         Called in place of `Estimate.source`, such as one that remembers.
@@ -258,8 +259,8 @@ def estimated_source(
     # An estimate shall see no negative pixels, and 0 where they are masked.
     beam = np.maximum(shot.image if shot.mask is None else np.where(shot.mask, shot.image, 0), 0)
     estimated = estimate.source if by is None else by
-    source = estimated(beam, usable, should_stop=should_stop, on_warning=on_warning)
-    _check_fall(source, beam, shot.mask, shot.source_mask, on_warning)
+    source = estimated(beam, usable, should_stop=should_stop, on_caution=on_caution)
+    _check_fall(source, beam, shot.mask, shot.source_mask, on_caution)
     return source
 
 
@@ -268,18 +269,19 @@ def _check_fall(
     image: FloatArray,
     mask: BoolArray | None,
     bare: BoolArray | None,
-    warn: OnWarning | None,
+    on_caution: OnCaution | None,
 ) -> None:
-    """Tell of a source that is much darker behind the source mask than anywhere around it."""
+    """Report a source that is much darker behind the source mask than anywhere around it."""
     if bare is None:
         return
     seen, object_ = (bare, ~bare) if mask is None else (bare & mask, ~bare & mask)
     if object_.any() and source[object_].min() < image[seen].min() / _MOST_FALL:
-        (warnings.warn if warn is None else warn)(
+        text = (
             f"the estimated source falls to {source[object_].min():.3g} under the source mask, "
             f"while the image is at least {image[seen].min():.3g} elsewhere: compare it with "
             "another estimate"
         )
+        (on_caution or warn_of)(Caution("source", text))
 
 
 class Origin(CheckedModel):

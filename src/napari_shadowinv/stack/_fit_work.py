@@ -12,7 +12,7 @@ import numpy as np
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, Verdict
+from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion.labels import dataset_from_field
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.setup import Setup
@@ -96,7 +96,7 @@ class FitWork:
 
     def report(self, fit: Fit) -> dict[str, Any]:
         """Return what is told of a shot."""
-        report = dataclasses.asdict(fit.report)
+        report, doubt = dataclasses.asdict(fit.report), fit.verdict_caution
         told = {
             "verdict": str(fit.verdict),
             "explanation": fit.explanation,
@@ -109,7 +109,7 @@ class FitWork:
             "iterations": fit.report.iterations,
             "objective": fit.report.objective,
             "stages": report["seconds"],
-            "warnings": [] if fit.verdict is Verdict.DETERMINED else [fit.explanation],
+            "warnings": [] if doubt is None else [dataclasses.asdict(doubt)],
         }
         if np.isfinite(fit.report.uncertainty):
             told["uncertainty"] = fit.report.uncertainty

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import unpack_array
 from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.images import read_tiff_page
@@ -46,7 +47,7 @@ def read_shot(
     page: int | None = None,
     channel: str | int | None = None,
     variable: str | None = None,
-    warnings: list[str] | None = None,
+    warnings: list[Caution] | None = None,
 ) -> FloatArray:
     """Read the image of a shot; this is the reader where none is given.
 
@@ -56,8 +57,8 @@ def read_shot(
         As for `napari_shadowinv.io.read_radiograph`, whose errors this raises.
     page : int, optional
         Of a TIFF with many pages, from 0.
-    warnings : list of str, optional
-        What the user should know before trusting the image is put in here.
+    warnings : list of Caution, optional
+        Receives the reasons to doubt the image.
 
     Returns
     -------
@@ -73,18 +74,20 @@ def read_shot(
     return shot.image
 
 
-def doubts_of_file(shot: Radiograph) -> list[str]:
-    """What the user should know before trusting the image of a file in a stack."""
+def doubts_of_file(shot: Radiograph) -> list[Caution]:
+    """Reasons to doubt the image of a file in a stack."""
     ignored = [name for name in ("source", "mask") if getattr(shot, name) is not None]
     told = f"the file contains its own {' and '.join(ignored)}, which a stack ignores: pass one"
-    return [*shot.warnings, *([f"{told} for the whole stack"] if ignored else [])]
+    if not ignored:
+        return list(shot.warnings)
+    return [*shot.warnings, Caution("file", f"{told} for the whole stack")]
 
 
 def _read(reader: Reader, path: Path, **chosen: int) -> tuple[AnyArray, dict[str, Any]]:
     """Image of a file, and warnings if the reader can tell some."""
     if "warnings" not in inspect.signature(reader).parameters:
         return _plain(reader(path, **chosen)), {}
-    warnings: list[str] = []
+    warnings: list[Caution] = []
     image = _plain(reader(path, **chosen, warnings=warnings))
     return image, {"warnings": warnings} if warnings else {}
 

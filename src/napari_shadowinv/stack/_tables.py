@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.files import sha256
@@ -90,10 +91,11 @@ class RowShot(ObjectShot):
         (shot,), origin = super().load()
         warnings = doubts_of_file(shot.image)
         if self.unused:
-            warnings.append(
+            text = (
                 f"the table has {', '.join(self.unused)}, which an inversion does not use: fit the "
                 "image to use it"
             )
+            warnings.append(Caution("file", text))
         told = {**origin["files"]["file 1"], **origin, "warnings": warnings}
         return dataclasses.replace(shot, setup=self.setup), told
 

@@ -190,13 +190,14 @@ class Work:
 
 def _as_chosen(inversion: Inversion) -> Inversion:
     """Tell of a shot that the first ones have decided on its sites, and whether these suffice."""
-    missed, errors = "", inversion.errors
+    caution, errors = None, inversion.errors
     if errors is not None:
-        missed = errors.missed(inversion.options.accuracy, "with the sites of the first shots")
+        why = "with the sites of the first shots"
+        caution = errors.accuracy_caution(inversion.options.accuracy, why)
     report = replace(
         inversion.report,
         sites_reason="as many as the first shots needed for the accuracy",
-        warnings=(*inversion.report.warnings, *filter(None, [missed])),
+        warnings=(*inversion.report.warnings, *filter(None, [caution])),
     )
     return replace(inversion, report=report)
 
@@ -362,13 +363,14 @@ def write_shot(
 ) -> ShotOutcome:
     """Write what came of a shot."""
     made = tried.result
+    cautions = [dataclasses.asdict(caution) for caution in tried.origin.get("warnings", ())]
     if made is None:
         failed = {"reason": tried.failure, "seconds": tried.seconds}
-        writer.fail(index, {**tried.origin, **failed})
+        writer.fail(index, {**tried.origin, **failed, "warnings": cautions})
         return ShotOutcome(index, FAILED, tried.seconds, tried.failure)
     told = work.report(made)
-    warnings = [*told["warnings"], *tried.origin.get("warnings", ())]
-    report = {**told, "seconds": tried.seconds, **tried.origin, "warnings": warnings}
+    warnings = {"warnings": [*told["warnings"], *cautions]}
+    report = {**told, "seconds": tried.seconds, **tried.origin, **warnings}
     writer.write(index, work.arrays(made), report)
     spent = time.perf_counter() - tried.began
     return ShotOutcome(index, DONE, spent, converged=made.report.converged)

@@ -31,6 +31,7 @@ from napari_shadowinv._napari.layer_metadata import (
     unit_of,
 )
 from napari_shadowinv._napari.widgets import _fitting
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import app
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitOptions, Verdict, compilation, fit
@@ -407,7 +408,9 @@ def test_what_other_widgets_change_is_followed(window: Any, tool: Any, qtbot: An
 
 
 def test_doubts_of_the_reader_are_told(window: Any, tool: Any) -> None:
-    window.layers[1].metadata = mark("shot", "", SETUPS[1], warnings=["it may be film"])
+    window.layers[1].metadata = mark(
+        "shot", "", SETUPS[1], warnings=[Caution("film-scan", "it may be film")]
+    )
     assert ("Warning", "'6.0 MeV': it may be film") in tool.request().given
 
 

@@ -22,6 +22,7 @@ from napari_shadowinv._napari.layer_metadata import mark, result_of, role_of, un
 from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._napari.widgets import _runner, invert_shot
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.preprocessing import (
@@ -217,12 +218,12 @@ def test_what_a_file_brings_is_used_and_told(window: Any, tool: Any, shot: Array
     mask = np.zeros(shot.shape, np.uint8)
     mask[:, :5] = 1
     window.add_labels(mask, metadata=mark("mask", "", path="a.txt"))
-    metadata = mark("shot", "", path="a.txt", warnings=["it may be film"])
+    metadata = mark("shot", "", path="a.txt", warnings=[Caution("film-scan", "it may be film")])
     tool.masks.painted_is_unusable.setChecked(False)
     tool.image.layer = window.add_image(shot, name="other", metadata=metadata)
     inversion = computed(tool)
     assert (inversion.mask == (mask == 0)).all()
-    assert inversion.report.warnings[-1] == "it may be film"
+    assert inversion.report.warnings[-1].text == "it may be film"
 
 
 def test_a_saved_result_tells_how_it_was_made(

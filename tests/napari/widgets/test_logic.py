@@ -225,7 +225,7 @@ def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
 
     def warnings(source: Estimate, image: Array = shot, **more: Any) -> str:
         recipe = Recipe(source=source, options=FEW, setup=near)
-        return "; ".join(run(recipe, image, **more).report.warnings)
+        return str(run(recipe, image, **more).report.warnings)
 
     assert "choose the source 'isotropic'" in warnings(UniformEstimate())
     assert "isotropic" not in warnings(IsotropicEstimate())

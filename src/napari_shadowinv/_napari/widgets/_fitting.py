@@ -112,7 +112,11 @@ class FitView(QWidget):
             text = verdict_in_words(found)
             show_warning(text[:1].upper() + text[1:])
         texts = {text for name, text in job.given if name == "Warning"}
-        doubts = [("Warning", window_text(text)) for text in found.warnings if text not in texts]
+        doubts = [
+            ("Warning", window_text(caution.text))
+            for caution in found.warnings
+            if caution.text not in texts
+        ]
         self.report.show_rows([*doubts, *job.given, *fit_rows(found, job.names)])
         self._others.show([])
         self._job, self._result = job, answer.result
@@ -132,7 +136,7 @@ class FitView(QWidget):
             self.empty()
             self._result = result
             self._tell(result.content)
-            doubts = [("Warning", window_text(text)) for text in result.content.warnings]
+            doubts = [("Warning", window_text(caution.text)) for caution in result.content.warnings]
             self.report.show_rows([*doubts, *fit_rows(result.content)])
 
     def _tell(self, found: Fit) -> None:

@@ -188,7 +188,7 @@ class SetupPicker(QWidget):
             height, width = self._layer.data.shape[-2:]
             shape = height, width
         line = "" if setup is None else geometry_text(setup, shape)
-        doubts = () if setup is None else setup_warnings(setup, shape)
+        doubts = [] if setup is None else [each.text for each in setup_warnings(setup, shape)]
         for label, text in ((self.geometry_label, line), (self.doubts, "\n".join(doubts))):
             label.setText(text)
             label.setVisible(bool(text))

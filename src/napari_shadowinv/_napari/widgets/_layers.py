@@ -15,6 +15,7 @@ from napari_shadowinv._napari.widgets._fields import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import labelled, with_button
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_alive
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.colours import film_warnings
 from napari_shadowinv.io.formats import SCAN_SUFFIXES
@@ -86,7 +87,7 @@ def _grey(layer: Any | None, role: str) -> Any:
     return _data_of(layer)
 
 
-def warnings_of(layer: Any) -> tuple[str, ...]:
+def warnings_of(layer: Any) -> tuple[Caution, ...]:
     """What the reader of a grey image said against it, or that it looks like scanned film."""
     known = about.mark_of(layer)
     path = str(layer.source.path or "").lower()

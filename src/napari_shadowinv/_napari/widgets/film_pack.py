@@ -388,7 +388,7 @@ def _rows(dataset: xarray.Dataset) -> list[tuple[str, str]]:
         rows.append(("Seen from", dataset.attrs["seen_from"]))
     if empty.any():
         rows.append(("Left out", "film " + ", ".join(map(str, dataset["layer"].values[empty]))))
-    return rows + [("Warning", text) for text in packs.warnings_of_pack(dataset)]
+    return rows + [("Warning", caution.text) for caution in packs.warnings_of_pack(dataset)]
 
 
 def _title(role: str) -> str:

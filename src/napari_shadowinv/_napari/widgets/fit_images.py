@@ -60,9 +60,9 @@ def _warnings_of(rows: list[ImageRow]) -> list[tuple[str, str]]:
     """What the readers of the images said against them, a line each."""
     unique = {id(row.layer): row.layer for row in rows}.values()
     return [
-        ("Warning", f"'{layer.name}': {text}")
+        ("Warning", f"'{layer.name}': {caution.text}")
         for layer in unique
-        for text in layers.warnings_of(layer)
+        for caution in layers.warnings_of(layer)
     ]
 
 

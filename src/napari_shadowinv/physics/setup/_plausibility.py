@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.physics.setup._beam import BeamSetup, length_text, length_unit
 
 __all__ = ["deflection_warnings", "field_of_view_text", "geometry_text", "setup_warnings"]
@@ -61,7 +62,7 @@ def field_of_view_text(setup: BeamSetup, shape: tuple[int, int]) -> str:
     return f"{sides} {unit}"
 
 
-def setup_warnings(setup: BeamSetup, shape: tuple[int, int] | None = None) -> tuple[str, ...]:
+def setup_warnings(setup: BeamSetup, shape: tuple[int, int] | None = None) -> tuple[Caution, ...]:
     """Return a sentence for everything about a setup that no common experiment has.
 
     Parameters
@@ -72,22 +73,22 @@ def setup_warnings(setup: BeamSetup, shape: tuple[int, int] | None = None) -> tu
 
     Returns
     -------
-    tuple of str
+    tuple of Caution
         Empty if nothing is doubtful.
 
     Examples
     --------
     >>> from napari_shadowinv.physics.setup import ProtonSetup
     >>> lengths = {"source_object_distance": 0.28, "object_image_distance": 0.01}
-    >>> (text,) = setup_warnings(ProtonSetup(energy=14.7, pixel_size=1e-6, **lengths))
-    >>> text[:34]
+    >>> (caution,) = setup_warnings(ProtonSetup(energy=14.7, pixel_size=1e-6, **lengths))
+    >>> caution.text[:34]
     'setup: the magnification is 1.04: '
     """
     doubts = [*_pixel_doubts(setup), *_distance_doubts(setup, shape), *setup.probe_doubts()]
-    return tuple(f"setup: {doubt}" for doubt in doubts)
+    return tuple(Caution("setup", f"setup: {doubt}") for doubt in doubts)
 
 
-def deflection_warnings(setup: BeamSetup, displacement: FloatArray) -> tuple[str, ...]:
+def deflection_warnings(setup: BeamSetup, displacement: FloatArray) -> tuple[Caution, ...]:
     """Return a sentence if a displacement is larger than such an experiment can make.
 
     Parameters
@@ -99,19 +100,21 @@ def deflection_warnings(setup: BeamSetup, displacement: FloatArray) -> tuple[str
     largest = float(np.nanmax(np.hypot(*displacement), initial=0.0))
     angle = float(setup.deflection_angle(largest))
     if angle > _MAX_DEFLECTION_RAD:
-        return (
+        text = (
             f"setup: the largest deflection is {angle:.3g} rad, and small angles (below "
             f"{_MAX_DEFLECTION_RAD:g}) are assumed: the field in SI units is not reliable; check "
-            "the distances, the pixel size and their units",
+            "the distances, the pixel size and their units"
         )
+        return (Caution("setup", text),)
     main = setup.main_field.name
     if main == "path_integrated_b":
         field = float(np.abs(setup.field_in_si(main, np.array([largest, 0.0]))).max())
         if field > _MAX_FIELD_T_M:
-            return (
+            text = (
                 f"setup: the path-integrated field reaches {field:.3g} T m, far more than any "
-                "laboratory plasma has: check the energy (MeV), the distances and the pixel size",
+                "laboratory plasma has: check the energy (MeV), the distances and the pixel size"
             )
+            return (Caution("setup", text),)
     return ()
 
 
