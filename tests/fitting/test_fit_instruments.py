@@ -241,8 +241,11 @@ def test_each_step_is_told_with_its_stage_and_objective() -> None:
     image = noisy([counted(bump(0.4, 7, (23, 29)), SIZE)], NOISE)
     options = FitOptions(samples=2, steps=10, spacing=0.25, threads=1)
     fit(image, noise=NOISE, options=options, on_progress=told.append)
-    messages = " ".join(one.message for one in told)
     for stage in ("from near", "transport", "smoothness", "full size", "samples"):
-        assert f"{stage}, objective" in messages
+        objectives = [news.objective for news in told if news.message == stage]
+        assert objectives
+        assert all(isinstance(value, float) for value in objectives)
+    descent = next(news for news in told if news.message == "smoothness")
+    assert descent.text == f"smoothness, objective {descent.objective:.6g}"
     steps = [one.step for one in told]
     assert steps == sorted(steps)

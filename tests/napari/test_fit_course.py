@@ -41,7 +41,7 @@ def test_the_bar_never_goes_back_and_names_the_stages(options: FitOptions, stage
     words = [news.message.partition(",")[0] for news in heard]
     assert list(dict.fromkeys(words)) == [f"stage {k + 1} of {stages}" for k in range(stages)]
     assert "starts (transport)" in heard[0].message
-    assert not any("nan" in news.message for news in heard)
+    assert not any("nan" in news.text for news in heard)
 
 
 def test_other_progress_is_passed_on() -> None:

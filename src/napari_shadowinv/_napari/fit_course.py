@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 
 from napari_shadowinv._system.progress import Progress
@@ -32,7 +31,6 @@ _WORDS |= {
     "samples": _ERROR_BARS,
     "evidence": _ERROR_BARS,
 }
-_STEP = re.compile(r"^(?P<stage>.*), objective (?P<value>\S+)$")
 _PARTS = 1000  # of the bar
 
 
@@ -116,10 +114,9 @@ class Course:
 
     def heard(self, news: Progress) -> Progress:
         """Return where the fit is now: a share of the whole, and the stage in words."""
-        step = _STEP.match(news.message)
-        if news.stage != "fit" or step is None:
+        if news.stage != "fit" or news.objective is None:
             return news
-        name, value = step["stage"], float(step["value"])
+        name, value = news.message, news.objective
         self.history.append((name, value))
         stage = _WORDS.get(name, "starts")
         if stage not in self._weights:
@@ -131,9 +128,7 @@ class Course:
         words = f"stage {list(self._weights).index(stage) + 1} of {len(self._weights)}, {stage}"
         if stage == "starts":
             words += f" ({name})"
-        if math.isfinite(value):
-            words += f", objective {value:.6g}"
-        return Progress(news.stage, int(_PARTS * self._done), _PARTS, words)
+        return Progress(news.stage, int(_PARTS * self._done), _PARTS, words, value)
 
     def _share(self) -> float:
         stages = list(self._weights)

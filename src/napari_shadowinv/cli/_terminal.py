@@ -130,7 +130,7 @@ def progress_bars() -> Iterator[OnProgress | None]:
                 finish_all()
                 tasks[news.stage] = bars.add_task(news.stage, total=None, message="")
             task = tasks[news.stage]
-            bars.update(task, total=news.total, completed=news.step, message=news.message)
+            bars.update(task, total=news.total, completed=news.step, message=news.text)
 
         yield show
         finish_all()

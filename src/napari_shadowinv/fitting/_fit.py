@@ -128,7 +128,7 @@ def fit(
     names : sequence of str, optional
         What messages call the images. Default: their numbers.
     on_progress, should_stop : callable, optional
-        Receives a `Progress` after each step, with the objective in its message; ends the work
+        Receives a `Progress` after each step, with its objective; ends the work
         when it returns true.
 
     Returns
@@ -178,7 +178,7 @@ def fit(
     def tell(stage: str, objective: float) -> None:
         nonlocal steps
         steps += 1
-        report("fit", steps, None, f"{stage}, objective {objective:.6g}")
+        report("fit", steps, None, stage, objective)
 
     with _timed("starts", seconds):
         found = search(scene, starts(given, start, tell, should_stop), tell)

@@ -114,7 +114,7 @@ def leave_one_out(
     def tell(stage: str, objective: float) -> None:
         nonlocal steps
         steps += 1
-        report("leave one out", steps, None, f"{stage}, objective {objective:.6g}")
+        report("leave one out", steps, None, stage, objective)
 
     work = _Work(given, options, tell)
     begun = work.begun(should_stop)

@@ -7,6 +7,7 @@ depend on it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -114,7 +115,7 @@ def run_windows(
         def tell(progress: Progress) -> None:
             if on_progress is not None:
                 stage = f"window {number} of {len(groups)}"  # noqa: B023
-                on_progress(Progress(stage, progress.step, progress.total, progress.message))
+                on_progress(replace(progress, stage=stage))
 
         part = inputs.only(group)
         found = fit(

@@ -158,7 +158,7 @@ class RunPanel(QtWidgets.QWidget):
         self.bar.setRange(0, news.total or 1)
         self.bar.setValue(news.step if news.total else 0)
         stage = _STAGES.get(news.stage, news.stage)
-        text = f"{stage}: {news.message}" if news.message else f"{stage}…"
+        text = f"{stage}: {news.text}" if news.text else f"{stage}…"
         seconds = time.monotonic() - self._start
         self.say(f"{text} ({seconds:.0f} s)" if seconds >= _SHOW_SECONDS_FROM else text)
 
