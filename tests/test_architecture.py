@@ -23,7 +23,7 @@ SOURCE = Path(__file__).parents[1] / "src"
 PACKAGE = "napari_shadowinv"
 # From the ground up: a room imports only rooms of the lines above its own.
 ROOMS = (
-    ("errors", "_typing", "cautions"),
+    ("errors", "_typing", "cautions", "facts"),
     ("_system",),
     ("options",),
     ("geometry",),
@@ -43,7 +43,7 @@ HEIGHT = {room: height for height, rooms in enumerate(ROOMS) for room in rooms}
 CORE = {room for room in HEIGHT if HEIGHT[room] < HEIGHT["io"]}
 NEVER_IN_CORE = {"dask", "distributed", "matplotlib", "napari", "qtpy", "superqt", "typer"}
 NOT_AT_ONCE_IN_CORE = {"xarray"}
-MOST_LINES = 500
+MOST_LINES = 800
 
 
 def module_of(path: Path) -> str:

@@ -178,7 +178,7 @@ def result_layers(
 
 def doubt_of_inversion(inversion: Inversion) -> str:
     """Return the mark in the names of layers that must not be trusted blindly, or nothing."""
-    from napari_shadowinv.inversion import Level
+    from napari_shadowinv.facts import Level
 
     level = inversion.headline.level
     return "" if level is Level.SOUND else f"({level.value})"

@@ -102,7 +102,8 @@ def _warnings_of(result: Inversion | Fit) -> tuple[Caution, ...]:
 
 def _told(result: Inversion | Fit) -> tuple[str, str]:
     """Return the numbers of a shot, and what casts doubt on them."""
-    from napari_shadowinv.inversion import Inversion, Level
+    from napari_shadowinv.facts import Level
+    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.units import shown_fields, with_error
 
     if not isinstance(result, Inversion):

@@ -2,7 +2,7 @@
 
 - invert an image: `invert`
 - prepare the sites once for many images with one source: `plan_sites`; how many: `count_sites`
-- results: `Inversion`, with a `Report` and a `Headline`
+- results: `Inversion`, with a `Report`
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
 from ._invert import count_sites, invert, plan_sites
-from .result import Headline, Inversion, Level, Report
+from .result import Inversion, Report
 
-__all__ = ["Headline", "Inversion", "Level", "Report", "count_sites", "invert", "plan_sites"]
+__all__ = ["Inversion", "Report", "count_sites", "invert", "plan_sites"]

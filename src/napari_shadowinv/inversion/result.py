@@ -1,4 +1,4 @@
-"""The result of an inversion: `Inversion`, with a `Report` and a `Headline`."""
+"""The result of an inversion: `Inversion`, with a `Report`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from napari_shadowinv._system.safety import refusing_junk
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact, Headline, Level, caution_facts, time_fact
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.labels import (
     FORMAT,
@@ -26,7 +26,7 @@ from napari_shadowinv.inversion.labels import (
 )
 from napari_shadowinv.inversion.trust import image_residual
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.units import shown_fields
+from napari_shadowinv.physics.units import peak_facts, shown_fields
 from napari_shadowinv.preprocessing import Provenance
 
 if TYPE_CHECKING:
@@ -34,31 +34,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Headline", "Inversion", "Level", "Report"]
-
-
-class Level(StrEnum):
-    """How far a result can be trusted."""
-
-    SOUND = "sound"
-    DOUBTFUL = "doubtful"
-    FAILED = "failed"
-
-
-@dataclass(frozen=True)
-class Headline:
-    """A result in one line.
-
-    Attributes
-    ----------
-    level : Level
-        Sound without warnings, doubtful with warnings, failed if the solver did not converge.
-    text : str
-        The warnings, then the peak of the main field with its error.
-    """
-
-    level: Level
-    text: str
+__all__ = ["Inversion", "Report"]
 
 
 @dataclass(frozen=True)
@@ -235,6 +211,74 @@ class Inversion:
             if all(caution.code != "not-converged" for caution in cautions):
                 texts.insert(0, "not converged: do not trust the field")
         return Headline(level, "; ".join([*texts, field.peak_text(error)]))
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """The result in words, as every face shows it below the headline."""
+        return self.facts_in(self.setup)
+
+    def facts_in(self, setup: Setup | None) -> tuple[Fact, ...]:
+        """Return the facts in the units of a setup.
+
+        Parameters
+        ----------
+        setup : Setup or None
+            Gives the main field in SI units; None the displacement in px.
+        """
+        report = self.report
+        flows = {
+            "flux_left": ("Flux left", report.flux_left),
+            "flux_entered": ("Flux entered", report.flux_entered),
+        }
+        convergence = Level.SOUND if report.converged else Level.FAILED
+        return (
+            *caution_facts(report.warnings),
+            *peak_facts(
+                self.displacement,
+                setup,
+                mask=self.mask,
+                error=None if self.errors is None else self.errors.of_peak,
+            ),
+            Fact(
+                "image_residual",
+                "Image residual",
+                f"{100 * report.image_residual:.3g} % of the mean (r.m.s.)",
+            ),
+            *(Fact(name, name.capitalize(), text) for name, text in self.error_rows),
+            Fact("caustics", "Caustics", f"{self.caustic.mean():.2%} of the pixels"),
+            *(
+                Fact(key, title, ", ".join(f"{side} {share:.2%}" for side, share in flow.items()))
+                for key, (title, flow) in flows.items()
+                if flow
+            ),
+            Fact(
+                "flux_residual",
+                "Flux residual",
+                f"{report.residual:.2g} of a cell, tolerance {report.tolerance:.2g}: "
+                f"{'converged' if report.converged else 'NOT converged'}",
+                convergence,
+            ),
+            Fact(
+                "sites",
+                "Sites",
+                f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; "),
+                is_detail=True,
+            ),
+            Fact(
+                "iterations",
+                "Iterations",
+                f"{report.iterations} on {len(report.levels)} levels",
+                is_detail=True,
+            ),
+            Fact(
+                "floor",
+                "Floor",
+                f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
+                f"{report.clipped_pixels} clipped",
+                is_detail=True,
+            ),
+            time_fact(report.seconds),
+        )
 
     def with_warnings(self, cautions: Iterable[Caution]) -> Inversion:
         """Return the same inversion with more warnings in its report.

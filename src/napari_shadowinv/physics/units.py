@@ -1,6 +1,7 @@
 """Fields and potentials in units whose numbers are handy to read.
 
 - the field that an experimenter asks for: `shown_fields`; the potential: `shown_potential`
+- their strongest points in words: `peak_facts`
 - the grey limits of an image: `intensity_limits`
 - a number with its error: `with_error`, `PeakError`
 - the prefix for a number: `prefix_for`; the units that take one: `PREFIXED_UNITS`
@@ -16,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.facts import Fact
 from napari_shadowinv.physics.setup import SETUPS, Setup
 
 __all__ = [
@@ -23,6 +25,7 @@ __all__ = [
     "PeakError",
     "ShownField",
     "intensity_limits",
+    "peak_facts",
     "prefix_for",
     "shown_fields",
     "shown_potential",
@@ -138,6 +141,39 @@ def shown_fields(
         ShownField(field * factor, main.title, main.symbol, unit, main.components, main.arrows)
         for field in fields
     ]
+
+
+def peak_facts(
+    displacement: FloatArray,
+    setup: Setup | None,
+    deflector: str | None = None,
+    *,
+    mask: BoolArray | None = None,
+    error: PeakError | None = None,
+) -> list[Fact]:
+    """Return the strongest point of a field as facts.
+
+    Parameters
+    ----------
+    displacement : ndarray, shape (2, H, W)
+        In px.
+    setup : Setup or None
+        Adds the main field in SI units.
+    deflector : str, optional
+        See `shown_fields`.
+    mask : ndarray of bool, shape (H, W), optional
+        Pixels that count.
+    error : PeakError, optional
+        Standard error of the peak.
+    """
+    (pixels,) = shown_fields([displacement], None, mask=mask)
+    row, column = pixels.peak
+    text = f"{pixels.peak_text(error)}, at y = {row}, x = {column} px"
+    facts = [Fact("displacement", "Displacement", text)]
+    if setup is not None:
+        (field,) = shown_fields([displacement], setup, deflector, mask=mask)
+        facts.insert(0, Fact("field", "Field", field.peak_text(error)))
+    return facts
 
 
 def shown_potential(potential: FloatArray, setup: Setup | None) -> tuple[FloatArray, str]:

@@ -18,7 +18,7 @@ from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, section, wrap
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv._system.progress import Progress
-from napari_shadowinv.inversion import Headline, Level
+from napari_shadowinv.facts import Headline, Level
 from napari_shadowinv.physics.units import shown_fields
 
 if TYPE_CHECKING:

@@ -50,8 +50,9 @@ from napari_shadowinv._napari.widgets._saving import (
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Level
 from napari_shadowinv.fitting import Fit
-from napari_shadowinv.inversion import Inversion, Level
+from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.pipeline._run import PREVIEW_SITES, run
