@@ -161,7 +161,7 @@ def explanation_of(
         )
     return (
         f"{found}: the object may have changed between images, or energy, source or point spread "
-        "is not as given"
+        "is wrong"
     )
 
 
