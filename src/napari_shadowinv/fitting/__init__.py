@@ -1,4 +1,4 @@
-"""The forward model fitted to images: what rays through potentials would make of them.
+"""The forward model fitted to images, by tracing rays through potentials.
 
 - fit fields, and the beam, to one or several images of one object: `fit`, with `FitOptions`
 - the answer: `Fit`, with a `Verdict` on whether it may be believed

@@ -1,4 +1,4 @@
-"""Masks that hide the structure by which a field is told: `hidden_contrast`."""
+"""Masks that hide the structure that determines a field: `hidden_contrast`."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ def hidden_contrast(contrast: FloatArray, used: BoolArray) -> float:
     float
         The largest of all images; 0 without holes.
     """
-    seen = used.any(axis=0)
+    used_anywhere = used.any(axis=0)
     # Holes begin where pixels are missing inside the image, not at its edge.
-    depth = ndimage.distance_transform_edt(np.pad(~seen, 1))[1:-1, 1:-1]
-    labels, _ = ndimage.label(~seen)
+    depth = ndimage.distance_transform_edt(np.pad(~used_anywhere, 1))[1:-1, 1:-1]
+    labels, _ = ndimage.label(~used_anywhere)
     wide = np.unique(labels[depth >= _MIN_HOLE_RADIUS_PX])
     hole = np.isin(labels, wide[wide > 0])
     if not hole.any():
         return 0.0
-    rim = ndimage.binary_dilation(hole, iterations=_RIM_PX) & seen
+    rim = ndimage.binary_dilation(hole, iterations=_RIM_PX) & used_anywhere
     shares = []
     for image in contrast:
         strength = np.abs(ndimage.gaussian_filter(image, _SMOOTHED_PX))
-        strongest = float(np.quantile(strength[seen], _STRONGEST))
+        strongest = float(np.quantile(strength[used_anywhere], _STRONGEST))
         around = float(np.quantile(strength[rim], 0.9)) if rim.any() else 0.0
         shares.append(around / max(strongest, 1e-12))
     return max(shares)

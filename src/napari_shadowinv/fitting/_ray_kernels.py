@@ -1,7 +1,7 @@
-"""Kernels of `RayModel`: rays of a cell between knots, where they land, and what follows there.
+"""Kernels of `RayModel`: rays of a cell between knots, their landing points, and the derivatives.
 
 A cell's side is two pixels of the beam. Its rays start at the middles of n × m equal parts. Each
-row of them is traced at once; what a row shares (a spline's values along y) is worked out once.
+row of them is traced at once; the spline's values along y, which a row shares, are evaluated once.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _slopes_of_row(
 
 @njit(**_PART)
 def _share(place: float, steepness: float) -> tuple[float, float]:
-    """What the next pixel gets of a ray between two pixels' middles, and how fast that grows."""
+    """Share of a ray between two pixels' centres that goes to the next pixel, and its slope."""
     t = min(max((place - 0.5) * steepness + 0.5, 0.0), 1.0)
     nearer = min(t, 1 - t)
     part = 2 * nearer * nearer
@@ -117,11 +117,11 @@ def _flux_of_row(
     upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
     lower = KNOT**2 / (n * m) - upper
     i, j = KNOT * row, KNOT * column
-    left = upper * beam[i, j] + lower * beam[i + 1, j]
-    right = upper * beam[i, j + 1] + lower * beam[i + 1, j + 1]
+    at_left = upper * beam[i, j] + lower * beam[i + 1, j]
+    at_right = upper * beam[i, j + 1] + lower * beam[i + 1, j + 1]
     for b in range(m):
         first = _first_pixels_share(b, m)
-        out[b] = first * left + (1 - first) * right
+        out[b] = first * at_left + (1 - first) * at_right
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
@@ -174,7 +174,7 @@ def _add_moments(
     x: float,
     moments: FloatArray,
 ) -> None:
-    """What a row of rays adds to the derivatives of a frame."""
+    """Add the contribution of a row of rays to the derivatives of a frame."""
     for b in range(m):
         in_v, in_u = to_y[b], to_x[b]
         landed_y = y - slopes[0, b]
@@ -191,19 +191,19 @@ def _add_moments(
 def _add_to_beam(
     bright: FloatArray, row: int, column: int, a: int, n: int, m: int, of_beam: FloatArray
 ) -> None:
-    """What a row of rays adds to the derivatives of the beam in its cell's four pixels."""
+    """Add the contribution of a row of rays to the beam's derivatives in its cell's four pixels."""
     upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
     lower = KNOT**2 / (n * m) - upper
-    left = right = 0.0
+    pull_left = pull_right = 0.0
     for b in range(m):
         share = _first_pixels_share(b, m)
-        left += share * bright[b]
-        right += (1 - share) * bright[b]
+        pull_left += share * bright[b]
+        pull_right += (1 - share) * bright[b]
     i, j = KNOT * row, KNOT * column
-    of_beam[i, j] += upper * left
-    of_beam[i, j + 1] += upper * right
-    of_beam[i + 1, j] += lower * left
-    of_beam[i + 1, j + 1] += lower * right
+    of_beam[i, j] += upper * pull_left
+    of_beam[i, j + 1] += upper * pull_right
+    of_beam[i + 1, j] += lower * pull_left
+    of_beam[i + 1, j + 1] += lower * pull_right
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
@@ -250,8 +250,8 @@ def gather(
                         below, across = pull[i1, j], pull[i1, j1]
                         twist = across - beside - below + above
                         if beam_is_free:
-                            left = above + down * (below - above)
-                            bright[b] = left + right * (beside - above + down * twist)
+                            at_left = above + down * (below - above)
+                            bright[b] = at_left + right * (beside - above + down * twist)
                         to_y[b] = flux[b] * shares[2, b] * (below - above + right * twist)
                         to_x[b] = flux[b] * shares[3, b] * (beside - above + down * twist)
                     if frame_is_free:
@@ -294,16 +294,16 @@ def boxes(
     for row in range(start, stop):
         for column in range(columns):
             n, m = counts[0, row, column], counts[1, row, column]
-            top, left, bottom, right = size[0], size[1], 0, 0
+            first_row, first_column, last_row, last_column = size[0], size[1], 0, 0
             for a in range(n):
                 y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
                 _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
                 _land(slopes, m, y, x, frame, steepness, size, pixels, shares)
                 for b in range(m):
                     i, j = int(pixels[0, b]), int(pixels[1, b])
-                    top, bottom = min(top, i), max(bottom, i + 2)
-                    left, right = min(left, j), max(right, j + 2)
-            found[row, column] = top, left, bottom, right
+                    first_row, last_row = min(first_row, i), max(last_row, i + 2)
+                    first_column, last_column = min(first_column, j), max(last_column, j + 2)
+            found[row, column] = first_row, first_column, last_row, last_column
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
@@ -339,9 +339,9 @@ def collect(
     for row in range(start, stop):
         for column in range(columns):
             n, m = counts[0, row, column], counts[1, row, column]
-            top, left, bottom, right = boxes[row, column]
-            wide = right - left
-            block = np.zeros((max(bottom - top, 0) * max(wide, 0), 26))
+            first_row, first_column, last_row, last_column = boxes[row, column]
+            wide = last_column - first_column
+            block = np.zeros((max(last_row - first_row, 0) * max(wide, 0), 26))
             if not block.size:
                 continue
             for a in range(n):
@@ -358,9 +358,9 @@ def collect(
                     first[:] = upper * part, upper * (1 - part), lower * part, lower * (1 - part)
                     for q in range(4):
                         i, j = int(pixels[0, b]) + q // 2, int(pixels[1, b]) + q % 2
-                        if not (top <= i < bottom and left <= j < right):
+                        if not (first_row <= i < last_row and first_column <= j < last_column):
                             continue
-                        line = block[(i - top) * wide + j - left]
+                        line = block[(i - first_row) * wide + j - first_column]
                         in_v = shares[0, b] if q // 2 else 1 - shares[0, b]
                         in_u = shares[1, b] if q % 2 else 1 - shares[1, b]
                         to_v = flux[b] * in_u * (shares[2, b] if q // 2 else -shares[2, b])
@@ -386,7 +386,7 @@ def collect(
                             line[25] += to_u * landed_x
             entry = begins[row, column]
             for p in range(len(block)):
-                pixel = (top + p // wide) * width + left + p % wide
+                pixel = (first_row + p // wide) * width + first_column + p % wide
                 for s in range(26):
                     if s < 16:
                         unknown = (row + s // 4) * potential.shape[1] + column + s % 4

@@ -47,16 +47,16 @@ class LeaveOneOut:
     mask : ndarray of bool, shape (L, H, W)
         The pixels that were used.
     predicted, residual : ndarray, shape (L, H, W)
-        What the others predict, and data minus that; the residual is 0 where masked.
+        Prediction by the other images, and data minus prediction, 0 where masked.
     gains : ndarray, shape (L,)
         How much brighter each image is than the source that was given; fitted to the prediction.
     chi2 : ndarray, shape (L,)
         Mean of (residual / σ)² over each image.
     alone : ndarray, shape (L,)
-        The same if the image has a field of its own: what noise, source and point spread leave.
+        The same if the image is fitted alone: due to noise, source, point spread.
     limit : ndarray, shape (L,)
-        The largest χ² that one static field would give: 1.15 times that of a field of its own, and
-        what the others leave open.
+        The largest χ² that one static field would give: 1.15 times `alone`, plus the uncertainty
+        of the prediction.
     rms : ndarray, shape (L,)
         R.m.s. residual, relative to the image's mean.
     explanation : str
@@ -86,7 +86,7 @@ class LeaveOneOut:
         return LeaveOneOut(**arrays, explanation=self.explanation)
 
     def to_dataset(self) -> xarray.Dataset:
-        """Return everything as one labelled dataset; that of a fit takes its variables, too."""
+        """Return everything as one labelled dataset, whose variables can join those of a fit."""
         import xarray as xr
 
         variables: dict[str, Any] = {
@@ -104,7 +104,7 @@ class LeaveOneOut:
         InputError
             If one of them is missing.
         """
-        missing = [one for one, *_ in _VARIABLES.values() if one not in dataset]
+        missing = [variable for variable, *_ in _VARIABLES.values() if variable not in dataset]
         if missing or _SENTENCE not in dataset.attrs:
             raise InputError(
                 f"dataset has no {', '.join(missing) or _SENTENCE}: expected the result of "
@@ -137,11 +137,11 @@ def explanation_of(
     Parameters
     ----------
     chi2, limit : ndarray, shape (L,)
-        χ² of each image as the others predict it, and what it may be.
+        χ² of the prediction of each image, and its upper limit.
     setups : sequence of Setup or None
         Their energies name the images.
     names : sequence of str or None
-        What the images are called otherwise. Default: their numbers.
+        Names of the images in messages. Default: their numbers.
     """
     wrong = np.flatnonzero(chi2 > limit)
     if not len(wrong):
@@ -149,19 +149,23 @@ def explanation_of(
             f"one static field explains all {len(chi2)} images: each is predicted by the others "
             f"(χ² {chi2.min():.2f} to {chi2.max():.2f})"
         )
-    told = ", ".join(f"{value:.1f}" if value < _LARGE else f"{value:.0f}" for value in chi2[wrong])
-    those = f"image{'s' * (len(wrong) > 1)} {_called(wrong, setups, names)}"
+    values = ", ".join(
+        f"{value:.1f}" if value < _LARGE else f"{value:.0f}" for value in chi2[wrong]
+    )
+    images = f"image{'s' * (len(wrong) > 1)} {_called(wrong, setups, names)}"
     if len(wrong) < len(chi2) / 2:
         verb = "are" if len(wrong) > 1 else "is"
-        found = f"the {those} {verb} not explained by one static field with the others (χ² {told})"
+        disagreement = (
+            f"the {images} {verb} not explained by one static field with the others (χ² {values})"
+        )
     else:
-        found = (
+        disagreement = (
             f"no static field explains more than {max(len(chi2) - len(wrong), 1)} of "
-            f"{len(chi2)} images: the {those} differ (χ² {told})"
+            f"{len(chi2)} images: the {images} differ (χ² {values})"
         )
     return (
-        f"{found}: the object may have changed between images, or energy, source or point spread "
-        "is wrong"
+        f"{disagreement}: the object may have changed between images, or an energy, the source or "
+        "the point spread is wrong"
     )
 
 

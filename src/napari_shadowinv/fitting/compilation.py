@@ -34,7 +34,7 @@ _SIZE = (8, 8)
 def ensure_compiled(
     on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
 ) -> None:
-    """Compile what traces rays, and what a start from transport needs, unless it was done."""
+    """Compile the kernels of ray tracing and of starts from transport unless that was done."""
     if not is_compiled():
         _compile_rays(Reporter(on_progress, should_stop))
     of_transport.ensure_compiled(on_progress, should_stop)
@@ -52,18 +52,18 @@ def _is_kept(kernel: Any) -> bool:
     source = Path(kernel.py_func.__code__.co_filename)
     version = f"py{sys.version_info.major}{sys.version_info.minor}"
     name = f"{source.stem}.{kernel.py_func.__name__}-*.{version}*.nbi"
-    made = (index.stat().st_mtime for index in Path(kernel.stats.cache_path).glob(name))
-    return max(made, default=0.0) >= source.stat().st_mtime
+    build_times = (index.stat().st_mtime for index in Path(kernel.stats.cache_path).glob(name))
+    return max(build_times, default=0.0) >= source.stat().st_mtime
 
 
 def _compile_rays(report: Reporter) -> None:
     rays = RayModel(_SIZE, threads=1)
     potential, beam = np.zeros(rays.shape), rays.around(np.ones(_SIZE))
     counts = rays.ray_counts(potential)
-    seen = np.ones(rays.seen)
+    weights = np.ones(rays.seen)
     works: tuple[Callable[[], object], ...] = (
         lambda: rays.image(potential, counts, beam),
-        lambda: rays.gradient(potential, counts, beam, seen),
+        lambda: rays.gradient(potential, counts, beam, weights),
         lambda: rays.jacobian(potential, counts, beam),
     )
     for step, work in enumerate(works):

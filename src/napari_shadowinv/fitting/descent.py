@@ -35,7 +35,7 @@ _MOST_PIXELS = 2_000_000  # of all images
 class Preconditioner:
     """Scales in which the Hessian is about the identity: Sᵀ H S ≈ 1.
 
-    Diagonal in the cosines of the potentials, but for what fields have in common.
+    Diagonal in the cosines of the potentials, except for the coupling of two fields.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -43,18 +43,18 @@ class Preconditioner:
         data = np.zeros((*squares.shape, *[scene.strengths.shape[1]] * 2))
         for strengths, weights, psf in zip(scene.strengths, scene.weights, scene.psf, strict=True):
             width = psf if isinstance(psf, float) else 0.0
-            seen = np.exp(-squares * (scene.blur**2 + width**2))
+            transfer = np.exp(-squares * (scene.blur**2 + width**2))
             # An image's change by a weak potential is its Laplacian.
-            each = weights.mean() * (KNOT * squares) ** 2 * seen
+            each = weights.mean() * (KNOT * squares) ** 2 * transfer
             data += each[..., None, None] * np.outer(strengths, strengths)
         of_data = np.moveaxis(np.diagonal(data, axis1=2, axis2=3), -1, 0)
         rough = prior.of_rough.sum(axis=1)
         self._kept = np.divide(of_data, of_data + rough, out=np.ones_like(rough), where=rough > 0)
-        held = np.moveaxis(prior.of_potentials(), 0, -1)
-        matrix = data + held[..., None] * np.eye(held.shape[-1])
+        of_prior = np.moveaxis(prior.of_potentials(), 0, -1)
+        matrix = data + of_prior[..., None] * np.eye(of_prior.shape[-1])
         self._potentials = np.linalg.inv(np.linalg.cholesky(matrix))
         self._log_ratio = 0.5 * float(np.linalg.slogdet(matrix)[1].sum())
-        self._log_ratio -= 0.5 * float(np.log(held).sum())
+        self._log_ratio -= 0.5 * float(np.log(of_prior).sum())
         pixels = scene.weights.sum(axis=(1, 2))
         used = prior.beam_weights > 0
         self._beam = np.where(used, 1 / np.sqrt(prior.beam_weights + pixels.sum() / 4), 0.0)
@@ -91,9 +91,9 @@ class Preconditioner:
         )
 
     def log_size(self) -> float:
-        """Return log |det S| plus half the logarithm of what the prior's determinant is, about."""
-        others = np.concatenate([part.ravel() for part in (self._beam, self._gains, self._frames)])
-        return -self._log_ratio + float(np.log(others[others > 0]).sum())
+        """Return log |det S| plus about half the log-determinant of the prior."""
+        scales = np.concatenate([part.ravel() for part in (self._beam, self._gains, self._frames)])
+        return -self._log_ratio + float(np.log(scales[scales > 0]).sum())
 
 
 def descend(
@@ -109,11 +109,11 @@ def descend(
     Parameters
     ----------
     scene, start
-        What to explain, and from where.
+        The images and the starting point.
     iterations : int
         Most steps.
     least_gain : float
-        Ends where five steps lower the objective by less; 1 is what chance makes of it.
+        Ends where five steps lower the objective by less; chance changes it by about 1.
     after_step : callable, optional
         Receives the objective after each step.
 
@@ -130,8 +130,8 @@ def descend(
         counts, base = scene.ray_counts(unknowns), unknowns
 
         def objective(flat: FloatArray) -> tuple[float, FloatArray]:
-            there = base.plus(scales.times(base.like(flat)))  # noqa: B023
-            value, slope = scene.value_and_gradient(there, counts)  # noqa: B023
+            shifted = base.plus(scales.times(base.like(flat)))  # noqa: B023
+            value, slope = scene.value_and_gradient(shifted, counts)  # noqa: B023
             return value, scales.turned(slope).flat()
 
         flat, value, taken = minimise(
@@ -158,12 +158,12 @@ def settle(
 ) -> tuple[Unknowns, float, int, bool]:
     """Minimise a scene's objective from nearby: Gauss-Newton steps, and a descent if they fail.
 
-    They find what is only just determined, too, where a descent would end early.
+    They also converge in directions that are barely determined, where a descent would end early.
 
     Parameters
     ----------
     scene, start
-        What to explain, and from where.
+        The images and the starting point.
     steps : int
         Most steps.
     least_gain : float
@@ -200,22 +200,22 @@ def settle(
         step = solve(times, down, tolerance=_NEWTON, iterations=_MOST_SOLVING)
         change = scales.times(now.like(step))
         for share in _SHARES_OF_STEP:
-            there = now.plus(now.like(share * change.flat()))
-            counts_there = scene.ray_counts(there)
-            value_there, slope_there = scene.value_and_gradient(there, counts_there)
-            if value_there < value:
+            trial = now.plus(now.like(share * change.flat()))
+            trial_counts = scene.ray_counts(trial)
+            trial_value, trial_slope = scene.value_and_gradient(trial, trial_counts)
+            if trial_value < value:
                 break
         else:
             break
         taken, shortened = taken + 1, shortened + (share < 1)
-        gain = value - value_there
-        now, counts, value, slope = there, counts_there, value_there, slope_there
+        gain = value - trial_value
+        now, counts, value, slope = trial, trial_counts, trial_value, trial_slope
         if gain < least_gain:
             return now, value, taken, True
-    left = steps - taken
-    if left > 0:
+    remaining_steps = steps - taken
+    if remaining_steps > 0:
         now, value, more = descend(
-            scene, now, iterations=left, least_gain=least_gain, after_step=after_step
+            scene, now, iterations=remaining_steps, least_gain=least_gain, after_step=after_step
         )
         taken += more
     return now, value, taken, taken < steps
@@ -258,7 +258,7 @@ def coarser(scene: Scene, factor: int) -> Scene:
 
 
 def smoothness_in_pixels(factor: int) -> FloatArray:
-    """Return what λ and κ are multiplied by in larger pixels."""
+    """Return the factors of λ and κ in larger pixels."""
     return np.array([float(factor) ** (6 - 2 * power) for power in POWERS])
 
 

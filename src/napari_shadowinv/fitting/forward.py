@@ -56,7 +56,7 @@ class Scene:
     spacing : float
         See `RayModel`.
     bin : int
-        Side of a pixel in those of the recorded images.
+        Side of a pixel in recorded pixels.
     threads : int or None
         Number of threads. Default: all cores. It does not affect the result.
     """
@@ -102,7 +102,7 @@ class Scene:
 
     @cached_property
     def prior(self) -> Prior:
-        """What is held against unknowns."""
+        """The prior of the unknowns."""
         return Prior(
             rays=self.rays,
             strengths=self.strengths[0],
@@ -142,8 +142,8 @@ class Scene:
     def beam(self, unknowns: Unknowns) -> FloatArray:
         """Return the beam of each image within it, without gain, shape (L, H, W)."""
         height, width = self.rays.size
-        whole = self.beams * self._beam_shape(unknowns)
-        return np.asarray(whole[:, self.pad : self.pad + height, self.pad : self.pad + width])
+        beams = self.beams * self._beam_shape(unknowns)
+        return np.asarray(beams[:, self.pad : self.pad + height, self.pad : self.pad + width])
 
     def chi2(self, unknowns: Unknowns, counts: list[IntArray]) -> FloatArray:
         """Return the mean of ((f - I) / σ)² over each image's used pixels, shape (L,)."""
@@ -158,11 +158,11 @@ class Scene:
         of_shape = np.zeros(self.beams.shape[1:])
         for shot in self._shots(unknowns, counts):
             k, root = shot[0], np.sqrt(self.weights[shot[0]])
-            made = np.exp(unknowns.gains[k]) * self._bare(*shot)
-            residual = blurred(root * (made - self.images[k]), self.blur)
+            model = np.exp(unknowns.gains[k]) * self._bare(*shot)
+            residual = blurred(root * (model - self.images[k]), self.blur)
             value += float(np.einsum("yx,yx", residual, residual)) / 2
             pull = root * blurred(residual, self.blur)
-            slope.gains[k] += np.einsum("yx,yx", pull, made)
+            slope.gains[k] += np.einsum("yx,yx", pull, model)
             self._add_pulls(slope, of_shape, unknowns, shot, pull)
         slope.beam[:] += self._of_modes(of_shape * self._beam_shape(unknowns))
         return value, self._only_free(slope)
@@ -287,7 +287,7 @@ class Linear:
     Attributes
     ----------
     scene, unknowns
-        What it is of, and around what.
+        The scene and the unknowns around which it is linear.
     jacobians : list of csr_array
         As `RayModel.jacobian` returns them, for each image.
     bare : list of ndarray

@@ -1,4 +1,4 @@
-"""What is given to a fit, checked and brought into one unit: `measured`.
+"""The inputs of a fit, checked and in common units: `measured`.
 
 - standard deviation of an image's noise: `estimated_noise`
 - displacement by each field in each image, from the setups: `strengths_of`
@@ -58,11 +58,11 @@ _ALIGNED = {
 
 @dataclass(frozen=True)
 class Measured:
-    """Images in units of their beams, and what is known about them.
+    """Images in units of their beams, with their instrument.
 
-    `scene` has the sides of blocks; the images are its first `size` pixels. `units` (L,) is what
-    one unit is in each recorded image, `gains` (L,) how much brighter it is than its source, or
-    about where that is unknown; `counted` tells whether the noise is that of counts. The beam is
+    `scene` has the sides of blocks; the images are its first `size` pixels. `units` (L,) are
+    the recorded values of one unit, `gains` (L,) the brightness of each image relative to its
+    source, approximate where it is unknown; `counted` is true for Poisson noise. The beam is
     `assumed` if no source was given, and `common` if its source is the same for all images.
     """
 
@@ -96,7 +96,7 @@ def measured(
     options: FitOptions,
     names: Sequence[str] | None = None,
 ) -> Measured:
-    """Check what is given to a fit; see `fit` for what it may be."""
+    """Check the inputs of a fit; see `fit` for their forms."""
     images, exposed = unpack_planes(images, "images")
     data = _checked_images(images)
     exposed = mask_of_each(exposed, data)
@@ -184,7 +184,7 @@ def strengths_of(
     count : int
         Number of images.
     names : sequence of str, optional
-        What messages call them. Default: their numbers.
+        Names in messages. Default: their numbers.
 
     Raises
     ------
@@ -215,11 +215,11 @@ def strengths_of(
                 f"object, the first of {first.object_pixel_size * 1e6:.6g} µm: bring all images "
                 "to the same pixels first"
             )
-    one = np.ones((2, 4, 4))
+    block = np.ones((2, 4, 4))
     return np.array(
         [
             [
-                transferred_displacement(one, first, setup, deflector=FIELDS[field])[0, 0, 0]  # type: ignore[arg-type]
+                transferred_displacement(block, first, setup, deflector=FIELDS[field])[0, 0, 0]  # type: ignore[arg-type]
                 for field in fields
             ]
             for setup in setups
@@ -230,10 +230,10 @@ def strengths_of(
 def estimated_noise(image: FloatArray, used: BoolArray) -> float:
     """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
     differences = image[1:, 1:] - image[1:, :-1] - image[:-1, 1:] + image[:-1, :-1]
-    known = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
-    if not known.any():
+    both_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
+    if not both_used.any():
         return 0.0
-    return float(_NORMAL_MAD * np.median(np.abs(differences[known])) / 2)
+    return float(_NORMAL_MAD * np.median(np.abs(differences[both_used])) / 2)
 
 
 def _checked_images(images: ArrayLike) -> FloatArray:
@@ -344,11 +344,11 @@ def _refuse_what_is_given_twice(
                 f"the source is {names[k]} itself, so that nothing would have deflected: give "
                 "an image of the beam without the object"
             )
-        for other in range(k):
-            both = use & used[other]
-            if _are_alike(image[both], data[other][both]):
+        for earlier in range(k):
+            both = use & used[earlier]
+            if _are_alike(image[both], data[earlier][both]):
                 raise InputError(
-                    f"{names[other]} and {names[k]} are the same: give each image once"
+                    f"{names[earlier]} and {names[k]} are the same: give each image once"
                 )
 
 
@@ -356,8 +356,11 @@ def _are_alike(first: FloatArray, second: FloatArray) -> bool:
     """Whether two images are the same but for a factor and rounding to 32 bits, and not flat."""
     if not first.size or first.mean() <= 0 or second.mean() <= 0:
         return False
-    ones, others = first / first.mean(), second / second.mean()
-    return bool(np.abs(ones - others).max() <= _ALIKE and np.ptp(ones) > 2 * _ALIKE)
+    first_relative, second_relative = first / first.mean(), second / second.mean()
+    return bool(
+        np.abs(first_relative - second_relative).max() <= _ALIKE
+        and np.ptp(first_relative) > 2 * _ALIKE
+    )
 
 
 def _checked_gains(gains: ArrayLike | str, count: int) -> tuple[bool, FloatArray]:
@@ -445,7 +448,7 @@ def _is(value: object, kind: str) -> bool:
 
 
 def _smoothed(image: FloatArray, used: BoolArray) -> FloatArray:
-    """Means over the used pixels around each, at least a part of that of all."""
+    """Means over the used pixels around each, at least a fraction of the overall mean."""
     sums = uniform_filter(np.where(used, image, 0.0), _SMOOTHED)
     means = np.divide(
         sums, uniform_filter(used.astype(np.float64), _SMOOTHED), out=sums * 0, where=used
@@ -471,13 +474,16 @@ def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fi
         raise InputError(
             f"fiducials have shape {table.shape}: expected rows of y, x, dy, dx, σ in px"
         )
-    places, known, errors = table[:, :2], table[:, 2:4], table[:, 4]
+    places, displacements, errors = table[:, :2], table[:, 2:4], table[:, 4]
     if ((places < -0.5) | (places > np.array(size) - 0.5)).any() or not (errors > 0).all():
         raise InputError("fiducials lie outside the image or have no positive σ: check their rows")
-    if np.abs(known).max(initial=0.0) > max(size) or errors.min(initial=1.0) < _MIN_SIGMA_PX:
+    if (
+        np.abs(displacements).max(initial=0.0) > max(size)
+        or errors.min(initial=1.0) < _MIN_SIGMA_PX
+    ):
         raise InputError(
             f"fiducials are displaced by more than the image's {max(size)} px, or have a σ below "
             f"{_MIN_SIGMA_PX:g} px: check their rows"
         )
     # A pixel's centre is at its index; the rays count from the image's corner.
-    return Fiducials(places + 0.5, known, errors)
+    return Fiducials(places + 0.5, displacements, errors)

@@ -68,13 +68,13 @@ def minimise(
         slope = product(direction, gradient)
         if not slope < 0:
             break
-        found = _step_along(objective, point, direction, value, slope, step)
-        if found is None:
+        step_taken = _step_along(objective, point, direction, value, slope, step)
+        if step_taken is None:
             if not pairs:
                 break
             pairs.clear()
             continue
-        share, value, after = found
+        share, value, after = step_taken
         moved, turned = share * direction, after - gradient
         if (curvature := product(moved, turned)) > 0:
             pairs.append((moved, turned, curvature))
@@ -117,11 +117,11 @@ def _step_along(
     shortest, longest = 0.0, np.inf
     best = None
     for _ in range(_TRIALS):
-        there, gradient = objective(point + step * direction)
-        if not there <= value + _DECREASE * step * slope:
+        trial_value, gradient = objective(point + step * direction)
+        if not trial_value <= value + _DECREASE * step * slope:
             longest = step
         else:
-            best = step, there, gradient
+            best = step, trial_value, gradient
             if product(gradient, direction) >= _SLOPE * slope:
                 return best
             shortest = step
@@ -146,13 +146,13 @@ def solve(
     right : ndarray, shape (n,)
         The right side.
     tolerance : float
-        Length of the residual relative to that of the right side.
+        Length of the residual relative to the right side.
     iterations : int
         Most steps.
     after_step : callable, optional
         Receives the number of steps.
     """
-    found = np.zeros_like(right)
+    solution = np.zeros_like(right)
     residual, direction = right.copy(), right.copy()
     square = first = product(residual, residual)
     for k in range(iterations):
@@ -160,10 +160,10 @@ def solve(
             break
         image = times(direction)
         share = square / product(direction, image)
-        found += share * direction
+        solution += share * direction
         residual -= share * image
         square, before = product(residual, residual), square
         direction = residual + square / before * direction
         if after_step is not None:
             after_step(k + 1)
-    return found
+    return solution

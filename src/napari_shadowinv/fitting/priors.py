@@ -1,4 +1,4 @@
-"""What is known of potentials, beam, gains and frames before an image is looked at: `Prior`.
+"""The prior of potentials, beam, gains and frames: `Prior`.
 
     ½ Σ_m (λ_m |∇⁴φ_m|² + κ_m |∇⁶φ_m|²) + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²)
     + ½ Σ (θ_ij / s_ij)² + ½ Σ |d(x_k) - d_k|² / σ_k²
@@ -30,7 +30,7 @@ _STRETCH_SPREAD = 0.05  # of turns, magnifications and shears
 
 @dataclass(frozen=True)
 class Prior:
-    """What is held against unknowns, in pixels of one size.
+    """Gaussian prior of the unknowns, in pixels of one size.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Prior:
     fiducials : Fiducials or None
         Displacements known at points.
     bin : int
-        Side of a pixel in those of the recorded images.
+        Side of a pixel in recorded pixels.
     shift_spread : float
         Standard deviation of an image's shift, px of the recorded image.
     """
@@ -74,8 +74,8 @@ class Prior:
             return value, slope
         weights = 1 / self.fiducials.errors[:, None] ** 2
         goal = weights * self.fiducials.displacements
-        found = self._displacements_there(unknowns.potentials)
-        value += float(np.sum(goal * (self.fiducials.displacements / 2 - found)))
+        displacements = self._displacements_there(unknowns.potentials)
+        value += float(np.sum(goal * (self.fiducials.displacements / 2 - displacements)))
         self._add_there(slope.potentials, -goal)
         return value, slope
 
@@ -121,13 +121,13 @@ class Prior:
         )
 
     def root_of_smoothness(self, field: int, values: FloatArray) -> FloatArray:
-        """Return the root of what is held against rough coefficients, times values per cosine."""
+        """Return values per cosine times the root of the roughness penalty."""
         waves = np.sqrt(self.of_rough[field].sum(axis=0)) * values
         return np.asarray(idctn(waves, norm="ortho"))
 
     @cached_property
     def of_rough(self) -> FloatArray:
-        """What each of λ and κ holds against each field's cosines, shape (M, 2, …)."""
+        """Penalty of each field's cosines by λ and by κ, shape (M, 2, …)."""
         powers = np.stack([self.wave_numbers**power for power in POWERS])
         return KNOT**2 * self.smoothness[:, :, None, None] * powers
 
@@ -138,7 +138,7 @@ class Prior:
         return np.asarray(waves[0][:, None] ** 2 + waves[1] ** 2)
 
     def of_potentials(self) -> FloatArray:
-        """Return what is held against each field's cosines, about; shape (M, …)."""
+        """Return the approximate penalty of each field's cosines, shape (M, …)."""
         squares = self.wave_numbers
         lowest = (np.pi / (max(self.rays.shape) * KNOT)) ** 2 + (0.2 / self.decay) ** 2
         # A fifth of the coefficients or so lies in the pad.

@@ -40,11 +40,11 @@ class Pulls(NamedTuple):
 
 @dataclass(frozen=True)
 class RayModel:
-    """What a beam behind a potential looks like.
+    """Image of a beam behind a potential, by ray tracing.
 
     A potential is an array of coefficients with `shape`, in px², of cubic B-splines with a knot
-    every 2 px. A beam is the flux of each pixel, also of those of the strip: `around` continues one
-    from the image. A frame tells where the detector sees what lands at (y, x): at
+    every 2 px. A beam is the flux of each pixel, including the strip: `around` continues one
+    from the image. A frame maps the landing point (y, x) to the detector:
     (f0 + f1 y + f2 x, f3 + f4 y + f5 x), in px from the image's middle.
 
     Attributes
@@ -54,7 +54,7 @@ class RayModel:
     pad : int
         Width in px, even, of the strip around the image from which rays may enter.
     beyond : int
-        Width in px of the strip around the image where what lands is wanted, too.
+        Width in px of a strip around the image that is evaluated, too.
     spacing : float
         Largest distance in px between the landing points of neighbouring rays.
     threads : int or None
@@ -76,7 +76,7 @@ class RayModel:
 
     @property
     def cells(self) -> tuple[int, int]:
-        """Cells between knots along y and x, those of the strip among them."""
+        """Cells between knots along y and x, including the strip."""
         height, width = self.size
         return math.ceil(height / KNOT) + self.pad, math.ceil(width / KNOT) + self.pad
 
@@ -88,7 +88,7 @@ class RayModel:
 
     @property
     def seen(self) -> tuple[int, int]:
-        """Shape of an image, with what lies beyond."""
+        """Shape of an image with the strip."""
         return self.size[0] + 2 * self.beyond, self.size[1] + 2 * self.beyond
 
     def around(self, image: FloatArray) -> FloatArray:
@@ -117,8 +117,8 @@ class RayModel:
         # The curvature within a cell is a mean of that at its four corners.
         most = np.maximum(stretch[:, 1:], stretch[:, :-1])
         most = np.maximum(most[:, :, 1:], most[:, :, :-1])
-        wanted = np.rint(np.maximum(most, 0.5) * self._at_rest).astype(np.int64)
-        return np.asarray(np.minimum(wanted, MOST_RAYS))
+        ray_counts = np.rint(np.maximum(most, 0.5) * self._at_rest).astype(np.int64)
+        return np.asarray(np.minimum(ray_counts, MOST_RAYS))
 
     def image(
         self,
@@ -168,13 +168,15 @@ class RayModel:
         pull : ndarray
             Weight of each pixel, with the shape `seen`.
         of_beam, of_frame : bool, default True
-            Whether those of the beam and of the frame are wanted; else they are zero.
+            Whether to compute the derivatives by the beam and by the frame; else they are zero.
         """
-        found = Pulls(np.zeros((_BANDS, *self.shape)), np.zeros(beam.shape), np.zeros((_BANDS, 6)))
-        rest = found.potential, found.beam, of_beam, found.frame, of_frame
-        self._in_bands(kernels.gather, potential, counts, beam, frame, np.pad(pull, _GUARD), *rest)
-        about_middle = self._about_middle(found.frame.sum(axis=0))
-        return Pulls(found.potential.sum(axis=0), found.beam, about_middle)
+        pulls = Pulls(np.zeros((_BANDS, *self.shape)), np.zeros(beam.shape), np.zeros((_BANDS, 6)))
+        outputs = pulls.potential, pulls.beam, of_beam, pulls.frame, of_frame
+        self._in_bands(
+            kernels.gather, potential, counts, beam, frame, np.pad(pull, _GUARD), *outputs
+        )
+        about_middle = self._about_middle(pulls.frame.sum(axis=0))
+        return Pulls(pulls.potential.sum(axis=0), pulls.beam, about_middle)
 
     def jacobian(
         self,
@@ -199,9 +201,9 @@ class RayModel:
             A row for each pixel; columns for the coefficients, the beam's pixels and the frame.
         """
         size = self.seen[0] + 2 * _GUARD, self.seen[1] + 2 * _GUARD
-        given = potential, counts, beam, frame
+        model = potential, counts, beam, frame
         reached = np.empty((*self.cells, 4), np.int64)
-        self._in_ranges(kernels.boxes, len(reached), *given, size, reached)
+        self._in_ranges(kernels.boxes, len(reached), *model, size, reached)
         # The guard belongs to no pixel.
         first = np.maximum(reached[..., :2], _GUARD)
         behind = np.minimum(reached[..., 2:], np.array(self.seen) + _GUARD)
@@ -211,8 +213,16 @@ class RayModel:
         ends = np.cumsum(entries).reshape(entries.shape)
         places = np.empty((2, ends[-1, -1]), np.int32)
         values = np.empty(ends[-1, -1])
-        rest = reached, ends - entries, size[1], self._middle, (of_beam, of_frame), places, values
-        self._in_ranges(kernels.collect, len(reached), *given, size, *rest)
+        outputs = (
+            reached,
+            ends - entries,
+            size[1],
+            self._middle,
+            (of_beam, of_frame),
+            places,
+            values,
+        )
+        self._in_ranges(kernels.collect, len(reached), *model, size, *outputs)
         shape = (size[0] * size[1], potential.size + beam.size + 6)
         inner = np.arange(shape[0]).reshape(size)[_GUARD:-_GUARD, _GUARD:-_GUARD].ravel()
         return csr_array(coo_array((values, tuple(places)), shape=shape))[inner]
@@ -261,12 +271,12 @@ class RayModel:
         frame: FloatArray | None,
         *rest: Any,
     ) -> None:
-        seen = self._to_pixels(at_rest() if frame is None else frame)
+        frame_px = self._to_pixels(at_rest() if frame is None else frame)
         threads = available_threads(self.threads)
         if (counts[0] * counts[1]).sum() < _WORTH_A_THREAD:
             threads = 1
         steepness = self._at_rest / KNOT / _SHARED
-        fixed = (potential, counts, beam, _tables(), seen, self.pad, steepness)
+        fixed = (potential, counts, beam, _tables(), frame_px, self.pad, steepness)
         in_ranges(kernel, ranges, threads, *fixed, *rest, smallest=1)
 
     @property
@@ -291,11 +301,11 @@ class RayModel:
 
     def _about_middle(self, pulls: FloatArray) -> FloatArray:
         y, x = self._middle
-        found = pulls.copy()
+        about_middle = pulls.copy()
         for k in (0, 3):
-            found[k + 1] -= y * pulls[k]
-            found[k + 2] -= x * pulls[k]
-        return found
+            about_middle[k + 1] -= y * pulls[k]
+            about_middle[k + 2] -= x * pulls[k]
+        return about_middle
 
 
 def at_rest() -> FloatArray:
@@ -313,9 +323,9 @@ def _tables() -> FloatArray:
 
 
 def _at_pixels(coefficients: FloatArray, table: FloatArray, pad: int, count: int) -> FloatArray:
-    """Splines along the first axis at the pixels' centres; `table` is that of a cell's pixels."""
+    """Splines along the first axis at the pixels' centres; `table` has the values in a cell."""
     cells = len(coefficients) - 3
-    found = np.empty((KNOT * cells, coefficients.shape[1]))
+    values = np.empty((KNOT * cells, coefficients.shape[1]))
     for k in range(KNOT):
-        found[k::KNOT] = sum(table[i, k] * coefficients[i : i + cells] for i in range(4))
-    return found[pad : pad + count]
+        values[k::KNOT] = sum(table[i, k] * coefficients[i : i + cells] for i in range(4))
+    return values[pad : pad + count]

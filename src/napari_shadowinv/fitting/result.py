@@ -155,13 +155,13 @@ class FitReport:
     uncertainty : float
         R.m.s. standard deviation of the displacement as a share of it; NaN if not known.
     log_evidence : float
-        Logarithm of the evidence, up to what all choices of fields have in common; NaN if it was
-        not asked for.
+        Logarithm of the evidence, up to a constant that is the same for all choices of fields; NaN
+        if it was not requested.
     pattern : float
         How far the smoothed residual of an image stands out of white noise, in standard
         deviations; the largest of all images, NaN if not known. See `pattern_strength`.
     beam : BeamError or None
-        What a beam that differs from its source does to the displacement, if it was worked out.
+        Change of the displacement by a beam that differs from its source, if computed.
     noise_correlation : float
         Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise. The
         error bars take it into account.
@@ -202,7 +202,7 @@ class Fit:
     gains : ndarray, shape (L,)
         How much brighter each image is than the source that was given.
     frames : ndarray, shape (L, 6)
-        Where each detector sees what lands at (y, x), px from the image's middle: at
+        Position on each detector of the landing point (y, x), px from the image's middle:
         (f0 + f1 y + f2 x, f3 + f4 y + f5 x).
     reprojection, residual : ndarray, shape (L, H, W)
         The images as explained, and data minus that; the residual is 0 where masked.
@@ -296,7 +296,7 @@ class Fit:
         Parameters
         ----------
         setups : tuple of Setup, optional
-            The first adds fields in SI units, and coordinates in metres. Default: those of the fit.
+            The first adds fields in SI units, and coordinates in metres. Default: the fit's.
         attributes : mapping of str to str, optional
             Further attributes.
 
@@ -304,13 +304,13 @@ class Fit:
         -------
         xarray.Dataset
             Dimensions image, y, x and component ("y", "x"). Variables of each field end with its
-            name, as in ``displacement_B``; those of the only field do not. Options, report,
+            name, as in ``displacement_B``, unless there is only one field. Options, report,
             verdict and setups are in the attributes; `from_dataset` finds all of the fit in it.
         """
         import xarray as xr
 
-        known = self.setups if setups is None else setups
-        setup = known[0] if known else None
+        used_setups = self.setups if setups is None else setups
+        setup = used_setups[0] if used_setups else None
         history = {
             "format": FIT_FORMAT,
             "options": self.options.model_dump_json(),
@@ -319,28 +319,30 @@ class Fit:
             "explanation": self.explanation,
             "folded": self.folded,
             "fields": json.dumps([field.name for field in self.fields]),
-            "setups": json.dumps([one.model_dump(mode="json") for one in known]),
+            "setups": json.dumps([each.model_dump(mode="json") for each in used_setups]),
         }
         if self.provenance is not None:
             history["provenance"] = self.provenance.model_dump_json(exclude_none=True)
         merged = xr.Dataset()
         for field in self.fields:
-            one = dataset_from_field(field.displacement, field.potential, setup)
-            one = one.drop_vars([name for name in one.data_vars if not belongs(name, field.name)])
+            part = dataset_from_field(field.displacement, field.potential, setup)
+            part = part.drop_vars(
+                [name for name in part.data_vars if not belongs(name, field.name)]
+            )
             if field.uncertainty is not None:
                 vectors, *words = UNCERTAINTY
-                one["displacement_uncertainty"] = vectors, field.uncertainty, label(*words)
+                part["displacement_uncertainty"] = vectors, field.uncertainty, label(*words)
             if field.beam_uncertainty is not None:
                 vectors, *words = BEAM_UNCERTAINTY
-                one["displacement_beam_uncertainty"] = (
+                part["displacement_beam_uncertainty"] = (
                     vectors,
                     field.beam_uncertainty,
                     label(*words),
                 )
-            attrs = one.attrs
+            attrs = part.attrs
             if len(self.fields) > 1:
-                one = one.rename({name: f"{name}_{field.name}" for name in one.data_vars})
-            merged = merged.assign_coords(one.coords).assign(one.data_vars)
+                part = part.rename({name: f"{name}_{field.name}" for name in part.data_vars})
+            merged = merged.assign_coords(part.coords).assign(part.data_vars)
             merged.attrs.update(attrs)
         merged.attrs.update(history | dict(attributes or {}))
         merged["field"] = ("field", [field.name for field in self.fields])
@@ -352,7 +354,7 @@ class Fit:
 
     @classmethod
     def from_dataset(cls, dataset: xarray.Dataset) -> Fit:
-        """Rebuild a fit from what `to_dataset` returned.
+        """Rebuild a fit from its dataset.
 
         Raises
         ------
@@ -375,7 +377,7 @@ class Fit:
         content = json.loads(attributes["report"])
         if content.get("beam") is not None:
             content["beam"] = BeamError(**content["beam"])
-        known = {field.name for field in dataclasses.fields(FitReport)}
+        fit_fields = {field.name for field in dataclasses.fields(FitReport)}
         names = [str(name) for name in dataset["field"].values]
         fields = [
             _field(dataset, name, f"_{name}" if len(names) > 1 else "", smoothness)
@@ -404,11 +406,11 @@ class Fit:
             folded=float(attributes["folded"]),
             verdict=Verdict(attributes["verdict"]),
             explanation=str(attributes["explanation"]),
-            report=FitReport(**{name: content[name] for name in known & content.keys()}),
+            report=FitReport(**{name: content[name] for name in fit_fields & content.keys()}),
             options=FitOptions.model_validate_json(attributes["options"]),
             setups=tuple(
-                setup_from_dict(one, "the dataset's setups")
-                for one in json.loads(attributes["setups"])
+                setup_from_dict(values, "the dataset's setups")
+                for values in json.loads(attributes["setups"])
             ),
             provenance=FitProvenance.of(attributes),
         )

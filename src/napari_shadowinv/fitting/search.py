@@ -91,7 +91,7 @@ def _splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
 
 
 def search(scene: Scene, starts: Sequence[Start], tell: Tell) -> list[Found]:
-    """Descend from each start to pixels of two; return what differs, best first.
+    """Descend from each start to pixels of two; return the distinct minima, best first.
 
     Of the starts that have come to the same stage before the last, those go on that are best.
     """
@@ -104,27 +104,27 @@ def search(scene: Scene, starts: Sequence[Start], tell: Tell) -> list[Found]:
     ends = []
     for start in starts:
         *before, last = start.stages
-        found = _begun(coarser(rough, start.stages[0][0]), start)
+        end = _begun(coarser(rough, start.stages[0][0]), start)
         first = replace(rough, beam_spread=_HELD_BEAM) if start.beam_held else rough
         for stage in before:
-            found = _descended(first, found, stage, tell)
+            end = _descended(first, end, stage, tell)
         if before:
-            halfway.setdefault(before[-1], []).append(found)
+            halfway.setdefault(before[-1], []).append(end)
         else:
-            ends.append(_descended(rough, found, last, tell))
+            ends.append(_descended(rough, end, last, tell))
     for rivals in halfway.values():
-        for found in _different(rivals)[:_CONTINUED]:
-            ends.append(_descended(rough, found, starts[0].stages[-1], tell))
+        for end in _different(rivals)[:_CONTINUED]:
+            ends.append(_descended(rough, end, starts[0].stages[-1], tell))
     return _different(ends)
 
 
 def _different(found: list[Found]) -> list[Found]:
     """Those that differ and are not hopeless, best first."""
-    kept: list[Found] = []
-    for one in sorted(found, key=lambda each: each.value):
-        if all(other.distance(one) > _SAME_FIELD for other in kept):
-            kept.append(one)
-    return [one for one in kept if one.value < _HOPELESS * kept[0].value]
+    distinct: list[Found] = []
+    for candidate in sorted(found, key=lambda each: each.value):
+        if all(better.distance(candidate) > _SAME_FIELD for better in distinct):
+            distinct.append(candidate)
+    return [candidate for candidate in distinct if candidate.value < _HOPELESS * distinct[0].value]
 
 
 def _begun(scene: Scene, start: Start) -> Found:
@@ -156,26 +156,26 @@ def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
 
 
 def with_likely_smoothness(
-    scene: Scene, found: Found, rng: np.random.Generator, tell: Tell
+    scene: Scene, end: Found, rng: np.random.Generator, tell: Tell
 ) -> tuple[Scene, Found]:
     """Find λ and κ, unless they are given, and the unknowns that belong to them."""
-    given = bool(scene.smoothness.any())
-    if not given:
+    is_fixed = bool(scene.smoothness.any())
+    if not is_fixed:
         scene = replace(scene, smoothness=np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)))
-    found = settled(scene, found, tell)
-    if given:
-        return scene, found
+    end = settled(scene, end, tell)
+    if is_fixed:
+        return scene, end
     for _ in range(_ROUNDS):
         middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
-        value = found.value
-        posterior = Posterior(middle, found.unknowns, rng, lambda: tell("smoothness", value))  # noqa: B023
+        value = end.value
+        posterior = Posterior(middle, end.unknowns, rng, lambda: tell("smoothness", value))  # noqa: B023
         likely, change = posterior.likely_smoothness()
         if change < _SETTLED:
             break
         scene = replace(scene, smoothness=likely / smoothness_in_pixels(MIDDLE))
-        found = settled(scene, found, tell)
+        end = settled(scene, end, tell)
     scene = replace(scene, smoothness=HELD * likely / smoothness_in_pixels(MIDDLE))
-    return scene, settled(scene, found, tell, least_gain=_LAST_GAIN)
+    return scene, settled(scene, end, tell, least_gain=_LAST_GAIN)
 
 
 def settled(
@@ -203,7 +203,7 @@ def refined(
 ) -> tuple[Scene, Unknowns, float, int, bool]:
     """Descend with the pixels as recorded, with rays as dense as the data need.
 
-    Tells the number of steps, and whether they ended before the most that were allowed.
+    Also returns the number of steps, and whether it converged within the allowed number.
     """
     unknowns, steps = finer(found.unknowns), 0
     denser = list(_SPACINGS) if options.spacing is None else [options.spacing]

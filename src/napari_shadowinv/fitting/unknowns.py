@@ -1,4 +1,4 @@
-"""What a fit looks for, and displacements known beforehand: `Unknowns`, `Fiducials`."""
+"""The unknowns of a fit, and displacements known beforehand: `Unknowns`, `Fiducials`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Fiducials", "Unknowns"]
 
 
 class Unknowns(NamedTuple):
-    """What a fit looks for; also its derivatives and changes.
+    """The unknowns of a fit, or derivatives by them, or changes of them.
 
     `potentials` (M, …) are B-spline coefficients of the fields' potentials, `beam` (n, n) cosine
     coefficients of the beam's logarithm, `gains` (L,) logarithms, `frames` (L, 6) as a `RayModel`
@@ -41,7 +41,7 @@ class Unknowns(NamedTuple):
         return self._replace(gains=self.gains[chosen], frames=self.frames[chosen])
 
     def with_those(self, numbers: Sequence[int], found: Unknowns) -> Unknowns:
-        """Return what was found in some of the images, and of the others what is known here."""
+        """Return the unknowns with those of some images replaced."""
         gains, frames = self.gains.copy(), self.frames.copy()
         gains[list(numbers)], frames[list(numbers)] = found.gains, found.frames
         return found._replace(gains=gains, frames=frames)

@@ -35,11 +35,11 @@ class FitWindows:
     Attributes
     ----------
     numbers : tuple of tuple of int
-        The images of each group, by their places as given.
+        Indices of the images of each group.
     fits : tuple of Fit
-        What explains each group, in pixels of its own first image.
+        The fit of each group, in pixels of its first image.
     strengths : ndarray, shape (W, M)
-        Displacement of each group's first image by each field, relative to that of the first.
+        Displacement of each group's first image by each field, relative to the first image of all.
     """
 
     numbers: tuple[tuple[int, ...], ...]
@@ -55,16 +55,16 @@ class FitWindows:
     @property
     def displacement(self) -> FloatArray:
         """Displacement in px by each field in the first of all images, shape (W, M, 2, H, W)."""
-        found = [[field.displacement for field in fit.fields] for fit in self.fits]
-        return np.array(found) / self.strengths[:, :, None, None, None]
+        displacements = [[field.displacement for field in fit.fields] for fit in self.fits]
+        return np.array(displacements) / self.strengths[:, :, None, None, None]
 
     @property
     def energies(self) -> FloatArray | None:
         """Mean energy of each group in MeV, shape (W,); None if not known."""
-        found = [[getattr(setup, "energy", None) for setup in fit.setups] for fit in self.fits]
-        if any(not one or None in one for one in found):
+        energies = [[getattr(setup, "energy", None) for setup in fit.setups] for fit in self.fits]
+        if any(not group or None in group for group in energies):
             return None
-        return np.array([np.mean(np.array(one, dtype=float)) for one in found])
+        return np.array([np.mean(np.array(group, dtype=float)) for group in energies])
 
     @property
     def times_of_flight(self) -> FloatArray | None:
@@ -86,7 +86,7 @@ class FitWindows:
         xarray.Dataset
             Dimensions window, component, y and x, and member for the images of a group. Fields are
             those that displace the first of all images; variables of each end with its name, as in
-            ``displacement_B``, those of the only field do not. Coordinates along the windows are
+            ``displacement_B``, unless there is only one field. Coordinates along the windows are
             the mean energy and the time of flight, where they are known, and the mean strength.
         """
         import xarray as xr
@@ -94,11 +94,11 @@ class FitWindows:
         names = [field.name for field in self.fits[0].fields]
         merged = xr.Dataset()
         for m, name in enumerate(names):
-            one = xr.concat([self._of(w, m) for w in range(len(self.fits))], dim="window")
+            part = xr.concat([self._of(w, m) for w in range(len(self.fits))], dim="window")
             if len(names) > 1:
-                one = one.rename({variable: f"{variable}_{name}" for variable in one.data_vars})
-            merged = merged.assign_coords(one.coords).assign(one.data_vars)
-            merged.attrs.update(one.attrs)
+                part = part.rename({variable: f"{variable}_{name}" for variable in part.data_vars})
+            merged = merged.assign_coords(part.coords).assign(part.data_vars)
+            merged.attrs.update(part.attrs)
         members = ("window", "member")
         merged["image_number"] = members, np.array(self.numbers) + 1, label("1", "Image")
         chi2 = np.array([fit.chi2 for fit in self.fits])
@@ -109,42 +109,42 @@ class FitWindows:
 
     def added_to(self, dataset: xarray.Dataset) -> xarray.Dataset:
         """Return the dataset of a fit with these, their names beginning with ``window_``."""
-        own = self.to_dataset()
-        names = {*own.data_vars, "energy", "time_of_flight", "strength"} & {*own.variables}
-        renamed = own.rename({name: f"{PREFIX}{name}" for name in names})
+        windows = self.to_dataset()
+        names = {*windows.data_vars, "energy", "time_of_flight", "strength"} & {*windows.variables}
+        renamed = windows.rename({name: f"{PREFIX}{name}" for name in names})
         return dataset.assign_coords(renamed.coords).assign(renamed.data_vars)
 
     def _of(self, window: int, field: int) -> xarray.Dataset:
         """A field of a group."""
-        found, strength = self.fits[window].fields[field], self.strengths[window, field]
-        one = dataset_from_field(
-            found.displacement / strength, found.potential / strength, self.setup
+        fitted, strength = self.fits[window].fields[field], self.strengths[window, field]
+        part = dataset_from_field(
+            fitted.displacement / strength, fitted.potential / strength, self.setup
         )
-        one = one.drop_vars([name for name in one.data_vars if not belongs(name, found.name)])
-        if found.uncertainty is not None:
+        part = part.drop_vars([name for name in part.data_vars if not belongs(name, fitted.name)])
+        if fitted.uncertainty is not None:
             vectors, *words = UNCERTAINTY
-            one["displacement_uncertainty"] = (
+            part["displacement_uncertainty"] = (
                 vectors,
-                found.uncertainty / abs(strength),
+                fitted.uncertainty / abs(strength),
                 label(*words),
             )
-        for variable in one.data_vars.values():
+        for variable in part.data_vars.values():
             if PIXEL in variable.attrs["units"]:
                 variable.attrs["long_name"] += ", in the image displaced most"
-        return one
+        return part
 
     def _coordinates(self) -> Mapping[str, Any]:
         means = [
             (fit.strengths[:, 0] * strength).mean()
             for fit, strength in zip(self.fits, self.strengths[:, 0], strict=True)
         ]
-        known: dict[str, tuple[Sequence[float] | FloatArray | None, str, str]] = {
+        coordinates: dict[str, tuple[Sequence[float] | FloatArray | None, str, str]] = {
             "strength": (means, "1", "Mean displacement relative to the first image"),
             "energy": (self.energies, "MeV", "Mean energy"),
             "time_of_flight": (self.times_of_flight, "s", "Time of flight from source to object"),
         }
         return {
             name: ("window", np.array(values), label(unit, text))
-            for name, (values, unit, text) in known.items()
+            for name, (values, unit, text) in coordinates.items()
             if values is not None
         }
