@@ -26,7 +26,7 @@ def printed(script: str, **environment: str) -> str:
 
 
 def test_a_fit_tells_that_it_compiles_and_can_be_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[Any] = []
+    progress: list[Any] = []
     images = np.ones((2, 32, 32))
     keywords: dict[str, Any] = {
         "strengths": [1, 0.5],
@@ -34,18 +34,18 @@ def test_a_fit_tells_that_it_compiles_and_can_be_cancelled(monkeypatch: pytest.M
         "options": FitOptions(samples=0, steps=1),
     }
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
-    fit(images, **keywords, on_progress=told.append)
-    assert [news.stage for news in told[:4]] == ["compile"] * 3 + ["fit"]
-    assert [news.step for news in told[:3]] == [0, 1, 2]
-    assert "once, for" in told[0].message
-    told.clear()
+    fit(images, **keywords, on_progress=progress.append)
+    assert [news.stage for news in progress[:4]] == ["compile"] * 3 + ["fit"]
+    assert [news.step for news in progress[:3]] == [0, 1, 2]
+    assert "once, for" in progress[0].message
+    progress.clear()
     with pytest.raises(InversionCancelled):
-        ensure_compiled(told.append, should_stop=lambda: len(told) == 2)
-    assert len(told) == 2
+        ensure_compiled(progress.append, should_stop=lambda: len(progress) == 2)
+    assert len(progress) == 2
     monkeypatch.undo()
     assert is_compiled()
-    fit(images, **keywords, on_progress=told.append)
-    assert told[2].stage == "fit"
+    fit(images, **keywords, on_progress=progress.append)
+    assert progress[2].stage == "fit"
 
 
 def test_code_of_other_kernels_is_no_reason_not_to_compile(tmp_path: Path) -> None:
@@ -100,10 +100,11 @@ print([kernel.py_func.__name__ for kernel in kernels if len(kernel.signatures) >
 
 def test_parts_of_kernels_are_compiled_into_them_only() -> None:
     """A part with machine code of its own would sum in another order in the first process."""
-    compiled = {name: one for name, one in vars(_ray_kernels).items() if hasattr(one, "py_func")}
-    parts = {name: one for name, one in compiled.items() if name.startswith("_")}
+    attributes = vars(_ray_kernels).items()
+    compiled = {name: kernel for name, kernel in attributes if hasattr(kernel, "py_func")}
+    parts = {name: kernel for name, kernel in compiled.items() if name.startswith("_")}
     assert len(parts) > 4
-    assert all(one.targetoptions.get("inline") == "always" for one in parts.values())
+    assert all(part.targetoptions.get("inline") == "always" for part in parts.values())
     kernels = compiled.keys() - parts.keys()
     assert kernels == {"boxes", "collect", "deposit", "gather"}
     # None of them calls another.

@@ -75,11 +75,11 @@ def test_finer_pixels_make_the_same_image(scene: Scene) -> None:
     coarse = replace(coarser(scene, 2), spacing=0.1)
     fine = replace(scene, spacing=0.2)
     unknowns = bump(coarse, 2.0)
-    made = coarse.model(unknowns, coarse.ray_counts(unknowns))
+    model = coarse.model(unknowns, coarse.ray_counts(unknowns))
     twice = finer(unknowns)
     binned_image = binned(fine.model(twice, fine.ray_counts(twice)), 2) / 4
-    assert made.max() > 2
-    np.testing.assert_allclose(made, binned_image, atol=0.03)
+    assert model.max() > 2
+    np.testing.assert_allclose(model, binned_image, atol=0.03)
 
 
 def test_finer_pixels_double_the_displacement(scene: Scene) -> None:
@@ -104,9 +104,9 @@ def test_larger_pixels_keep_the_information_of_an_image(scene: Scene, factor: in
     weights = rng.uniform(380, 420, scene.weights.shape)
     brighter = replace(scene, images=np.full_like(scene.images, 1.07), weights=weights)
     coarse = coarser(brighter, factor)
-    for one in (brighter, coarse):
-        nothing = one.nothing()
-        misfit = one.chi2(nothing, one.ray_counts(nothing)) * one.weights[0].size
+    for each in (brighter, coarse):
+        nothing = each.nothing()
+        misfit = each.chi2(nothing, each.ray_counts(nothing)) * each.weights[0].size
         np.testing.assert_allclose(misfit, 0.07**2 * 400 * weights[0].size, rtol=0.01)
     assert coarse.images.shape == (2, SIZE[0] // factor, SIZE[1] // factor)
     assert coarse.bin == factor
@@ -122,10 +122,9 @@ def test_larger_pixels_hold_as_much_against_a_potential(scene: Scene, factor: in
         (none, 30.0, np.inf),
         (none, 30.0, 3.0),
     ):
-        one = replace(scene, smoothness=smoothness, tie=tie, decay=decay)
-        fine, coarse = (
-            each.prior.value_and_slope(bump(each, 1.0))[0] for each in (one, coarser(one, factor))
-        )
+        smooth = replace(scene, smoothness=smoothness, tie=tie, decay=decay)
+        scenes = smooth, coarser(smooth, factor)
+        fine, coarse = (each.prior.value_and_slope(bump(each, 1.0))[0] for each in scenes)
         assert fine > 0
         assert coarse == pytest.approx(fine, rel=0.15 * factor), (smoothness, tie, decay)
 
@@ -156,8 +155,8 @@ def test_point_spreads_are_narrower_in_larger_pixels(scene: Scene) -> None:
 
 
 def test_fiducials_are_scaled_with_the_pixels(scene: Scene) -> None:
-    known = Fiducials(np.array([[8.0, 12.0]]), np.array([[1.0, -2.0]]), np.array([0.5]))
-    coarse = coarser(replace(scene, fiducials=known), 4)
+    marks = Fiducials(np.array([[8.0, 12.0]]), np.array([[1.0, -2.0]]), np.array([0.5]))
+    coarse = coarser(replace(scene, fiducials=marks), 4)
     assert coarse.fiducials is not None
     np.testing.assert_array_equal(coarse.fiducials.places, [[2, 3]])
     np.testing.assert_array_equal(coarse.fiducials.displacements, [[0.25, -0.5]])
@@ -170,44 +169,44 @@ def test_pixels_as_they_are_are_the_scene_itself(scene: Scene) -> None:
 
 def test_descending_finds_the_field_that_made_the_images(scene: Scene) -> None:
     truth = bump(scene, 0.6)
-    made = scene.model(truth, scene.ray_counts(truth))
-    told: list[float] = []
-    given = replace(scene, images=made, smoothness=np.array([[1.0, 0.0]]))
-    found, value, steps = descend(
-        given, scene.nothing(), iterations=200, least_gain=0.05, after_step=told.append
+    images = scene.model(truth, scene.ray_counts(truth))
+    values: list[float] = []
+    target = replace(scene, images=images, smoothness=np.array([[1.0, 0.0]]))
+    end, value, steps = descend(
+        target, scene.nothing(), iterations=200, least_gain=0.05, after_step=values.append
     )
     expected = scene.rays.displacement(truth.potentials[0])
-    error = scene.rays.displacement(found.potentials[0]) - expected
+    error = scene.rays.displacement(end.potentials[0]) - expected
     assert np.linalg.norm(error) < 0.05 * np.linalg.norm(expected)
-    assert len(told) == steps
-    assert told[-1] == pytest.approx(value)
-    at_start, _ = given.value_and_gradient(scene.nothing(), given.ray_counts(scene.nothing()))
+    assert len(values) == steps
+    assert values[-1] == pytest.approx(value)
+    at_start, _ = target.value_and_gradient(scene.nothing(), target.ray_counts(scene.nothing()))
     assert value < 0.01 * at_start
 
 
 def test_descending_takes_no_more_steps_than_allowed(scene: Scene) -> None:
     truth = bump(scene, 1.0)
-    given = replace(scene, images=scene.model(truth, scene.ray_counts(truth)))
-    assert descend(given, scene.nothing(), iterations=4, least_gain=0)[2] <= 4
+    target = replace(scene, images=scene.model(truth, scene.ray_counts(truth)))
+    assert descend(target, scene.nothing(), iterations=4, least_gain=0)[2] <= 4
 
 
 def test_settling_reaches_where_a_long_descent_ends(scene: Scene) -> None:
     truth = bump(scene, 1.5)
-    made = scene.model(truth, scene.ray_counts(truth))
-    noisy = made + np.random.default_rng(6).normal(0, 0.05, made.shape)
-    seen = replace(scene, images=noisy)
+    images = scene.model(truth, scene.ray_counts(truth))
+    noisy = images + np.random.default_rng(6).normal(0, 0.05, images.shape)
+    target = replace(scene, images=noisy)
     near = truth._replace(potentials=0.99 * truth.potentials)
-    before, _ = seen.value_and_gradient(near, seen.ray_counts(near))
-    found, value, steps, ended = settle(seen, near, steps=8, least_gain=0.1)
+    before, _ = target.value_and_gradient(near, target.ray_counts(near))
+    end, value, steps, ended = settle(target, near, steps=8, least_gain=0.1)
     assert ended
     assert steps < 8
-    again, _ = seen.value_and_gradient(found, seen.ray_counts(found))
+    again, _ = target.value_and_gradient(end, target.ray_counts(end))
     assert value == again < before - 300
-    longer, less, _ = descend(seen, near, iterations=400, least_gain=1e-3)
+    longer, less, _ = descend(target, near, iterations=400, least_gain=1e-3)
     assert value - less < 0.5
     np.testing.assert_allclose(
-        seen.rays.displacement(found.potentials[0]),
-        seen.rays.displacement(longer.potentials[0]),
+        target.rays.displacement(end.potentials[0]),
+        target.rays.displacement(longer.potentials[0]),
         atol=0.03,
     )
 
@@ -215,11 +214,11 @@ def test_settling_reaches_where_a_long_descent_ends(scene: Scene) -> None:
 def test_settling_goes_on_by_descent_where_its_own_steps_fail(scene: Scene) -> None:
     """From a fold on the wrong side, steps of a linear model overshoot."""
     truth = bump(scene, 2.0)
-    made = scene.model(truth, scene.ray_counts(truth))
+    images = scene.model(truth, scene.ray_counts(truth))
     far = truth._replace(potentials=-2 * truth.potentials)
-    seen = replace(scene, images=made)
-    before, _ = seen.value_and_gradient(far, seen.ray_counts(far))
-    _, value, steps, ended = settle(seen, far, steps=60, least_gain=1.0)
+    target = replace(scene, images=images)
+    before, _ = target.value_and_gradient(far, target.ray_counts(far))
+    _, value, steps, ended = settle(target, far, steps=60, least_gain=1.0)
     assert value < before / 3
     assert steps <= 60
     assert ended == (steps < 60)

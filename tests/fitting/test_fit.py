@@ -62,10 +62,10 @@ def test_the_error_bars_are_as_large_as_the_error(found: Fit) -> None:
     (field,) = found.fields
     assert field.uncertainty is not None
     error = field.displacement - on_pixels(RING_AND_SPOT, SIZE)
-    told = np.sqrt((field.uncertainty**2).mean())
-    assert 1 / 3 < told / np.sqrt((error**2).mean()) < 3
+    deviation = np.sqrt((field.uncertainty**2).mean())
+    assert 1 / 3 < deviation / np.sqrt((error**2).mean()) < 3
     size = np.sqrt((field.displacement**2).mean())
-    assert found.report.uncertainty == pytest.approx(told / size)
+    assert found.report.uncertainty == pytest.approx(deviation / size)
 
 
 def test_the_parts_of_a_result_belong_together(found: Fit, folded_shots: list[FloatArray]) -> None:
@@ -80,9 +80,9 @@ def test_the_parts_of_a_result_belong_together(found: Fit, folded_shots: list[Fl
     border = np.ones(field.potential.shape, bool)
     border[1:-1, 1:-1] = False
     assert field.potential[border].mean() == pytest.approx(0, abs=1e-9)
-    best, *others = found.basins
+    best, *solutions = found.basins
     assert best.distance == 0
-    assert all(best.objective <= other.objective for other in others)
+    assert all(best.objective <= solution.objective for solution in solutions)
     np.testing.assert_allclose(found.strengths, [[1], [0.6]])
     assert found.report.seconds.keys() >= {"starts", "smoothness", "full size", "samples"}
 
@@ -92,8 +92,8 @@ def test_strong_rays_first_or_weak_ones_makes_no_difference(
 ) -> None:
     """The field is that of the first image."""
     turned = fit(noisy(folded_shots, NOISE)[::-1], strengths=[0.6, 1], noise=NOISE, options=PLAIN)
-    one, other = found.fields[0].displacement, turned.fields[0].displacement / 0.6
-    assert distance(other, one) < 0.04
+    forwards, backwards = found.fields[0].displacement, turned.fields[0].displacement / 0.6
+    assert distance(backwards, forwards) < 0.04
 
 
 def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
@@ -218,17 +218,17 @@ def test_an_unknown_beam_does_not_hide_a_strong_field() -> None:
     strengths = [1, 2.23]
     images = [counted(lambda y, x: s * ring(y, x), size, beam=beam) for s in strengths]  # noqa: B023
     counts = [np.random.default_rng(k).poisson(400 * image) for k, image in enumerate(images)]
-    found = fit(counts, strengths=strengths, source="unknown", noise="poisson", options=PLAIN)
-    assert found.verdict is Verdict.DETERMINED
-    assert distance(found.fields[0].displacement, on_pixels(ring, size)) < 0.02
+    result = fit(counts, strengths=strengths, source="unknown", noise="poisson", options=PLAIN)
+    assert result.verdict is Verdict.DETERMINED
+    assert distance(result.fields[0].displacement, on_pixels(ring, size)) < 0.02
 
 
 def test_nothing_is_taken_twice() -> None:
-    one, other = noisy([counted(WEAK, SIZE), counted(WEAK, SIZE)], 0.02)
+    first, second = noisy([counted(WEAK, SIZE), counted(WEAK, SIZE)], 0.02)
     with pytest.raises(InputError, match="image 1 and image 3 are the same"):
-        fit([one, other, 3 * one], strengths=[1, 0.9, 0.8], options=PLAIN)
+        fit([first, second, 3 * first], strengths=[1, 0.9, 0.8], options=PLAIN)
     with pytest.raises(InputError, match="the source is image 2 itself"):
-        fit([one, other], strengths=[1, 0.9], source=other, options=PLAIN)
+        fit([first, second], strengths=[1, 0.9], source=second, options=PLAIN)
 
 
 def test_a_field_that_is_not_there_does_not_make_the_images_likelier() -> None:
@@ -242,9 +242,9 @@ def test_a_field_that_is_not_there_does_not_make_the_images_likelier() -> None:
     weaker = [setups[0].momentum / setup.momentum for setup in setups]
     images = [counted(lambda y, x: s * WEAK(y, x), SIZE) for s in weaker]  # noqa: B023
     options = FitOptions(samples=0, spacing=0.25)
-    found = compare(noisy(images, NOISE), setups=setups, noise=NOISE, options=options)
-    assert [len(each.fields) for each in found] == [1, 2, 1]
-    assert found[0].fields[0].name == "B"
-    evidence = [each.report.log_evidence for each in found]
+    fits = compare(noisy(images, NOISE), setups=setups, noise=NOISE, options=options)
+    assert [len(each.fields) for each in fits] == [1, 2, 1]
+    assert fits[0].fields[0].name == "B"
+    evidence = [each.report.log_evidence for each in fits]
     assert abs(evidence[1] - evidence[0]) < 10
     assert evidence[2] < evidence[0] - 100

@@ -29,10 +29,10 @@ def shots() -> list[FloatArray]:
     return [shot(0), shot(1)]
 
 
-def fitted(images: Any, align: Any = "none", threads: int = 1, **given: Any) -> Fit:
+def fitted(images: Any, align: Any = "none", threads: int = 1, **keywords: Any) -> Fit:
     options = FitOptions(samples=0, steps=30, spacing=0.25, threads=threads, align=align)
-    given = {"strengths": STRENGTHS, "noise": NOISE} | given
-    return fit(images, options=options, **given)
+    keywords = {"strengths": STRENGTHS, "noise": NOISE} | keywords
+    return fit(images, options=options, **keywords)
 
 
 def error(result: Fit) -> float:
@@ -57,15 +57,15 @@ def test_a_blur_that_was_not_told_is_noticed() -> None:
     ring = bump(1.9, 8, (40, 40))
     for blur in (0.0, 2.0):
         image = noisy([counted(ring, size, blur=blur)], 0.02)[0]
-        given = {"strengths": None, "noise": 0.02, "source": np.ones(size)}
-        blind = fitted(image, psf=0.0, **given)
-        told = fitted(image, psf=blur, **given) if blur else blind
+        keywords = {"strengths": None, "noise": 0.02, "source": np.ones(size)}
+        blind = fitted(image, psf=0.0, **keywords)
+        aware = fitted(image, psf=blur, **keywords) if blur else blind
         assert blind.chi2.max() < 1.1
         assert (blind.verdict is Verdict.MISFIT) == (blur > 0)
         assert ("give the point spread" in blind.explanation) == (blur > 0)
-        assert told.verdict is Verdict.DETERMINED
+        assert aware.verdict is Verdict.DETERMINED
         truth = on_pixels(ring, size)
-        assert distance(told.fields[0].displacement, truth) < 0.03
+        assert distance(aware.fields[0].displacement, truth) < 0.03
 
 
 def test_one_folded_image_does_not_pass_for_an_answer() -> None:
@@ -73,10 +73,10 @@ def test_one_folded_image_does_not_pass_for_an_answer() -> None:
     size = (80, 80)
     ring = bump(4.0, 8, (40, 40))
     image = noisy([counted(ring, size, blur=1.5)], 0.05)[0]
-    given = {"strengths": None, "noise": 0.05, "source": np.ones(size)}
-    found = fitted(image, psf=1.5, **given)
-    assert found.chi2.max() < 1.1
-    assert found.verdict is Verdict.AMBIGUOUS
+    keywords = {"strengths": None, "noise": 0.05, "source": np.ones(size)}
+    result = fitted(image, psf=1.5, **keywords)
+    assert result.chi2.max() < 1.1
+    assert result.verdict is Verdict.AMBIGUOUS
 
 
 def test_dead_pixels_are_left_out(shots: list[FloatArray]) -> None:
@@ -107,9 +107,9 @@ def test_a_shifted_image_is_brought_back(
 def test_an_image_is_shifted_no_further_than_it_may_be(shots: list[FloatArray]) -> None:
     images = noisy([shots[0], shot(1, frame=(1.2, 1, 0, -2.0, 0, 1))], NOISE)
     options = FitOptions(samples=0, steps=30, spacing=0.25, align="shift", align_spread=1e-3)
-    found = fit(images, strengths=STRENGTHS, noise=NOISE, options=options)
-    assert np.abs(found.frames[1][[0, 3]]).max() < 0.5
-    assert found.verdict == Verdict.MISFIT
+    result = fit(images, strengths=STRENGTHS, noise=NOISE, options=options)
+    assert np.abs(result.frames[1][[0, 3]]).max() < 0.5
+    assert result.verdict == Verdict.MISFIT
 
 
 def test_a_turned_and_magnified_image_is_brought_back() -> None:
@@ -135,8 +135,8 @@ def test_unknown_gains_are_found(shots: list[FloatArray]) -> None:
     assert result.gains[1] / result.gains[0] == pytest.approx(1.2, rel=0.005)
     assert error(result) < 0.04
     np.testing.assert_allclose(result.source, result.gains[:, None, None] * np.ones(SIZE))
-    told = fitted(images, gains=[1, 1.2], source=source)
-    assert error(told) < 0.04
+    aware = fitted(images, gains=[1, 1.2], source=source)
+    assert error(aware) < 0.04
 
 
 def test_counts_are_weighted_by_what_is_expected(shots: list[FloatArray]) -> None:
@@ -156,10 +156,10 @@ def test_answers_to_few_counts_are_compared_by_what_is_expected() -> None:
     counts = np.random.default_rng(5).poisson(30 * counted(strong, size))
     options = FitOptions(samples=0, steps=20, spacing=0.25, smoothness=200, ambiguous=True)
     source = np.full(size, 30)
-    found = fit(counts, source=source, noise="poisson", options=options)
-    noise = np.sqrt(np.maximum(found.reprojection[0], 1))
-    told = fit(counts, source=source, noise=noise, options=options)
-    assert found.basins[0].objective == pytest.approx(told.basins[0].objective, rel=0.03)
+    result = fit(counts, source=source, noise="poisson", options=options)
+    noise = np.sqrt(np.maximum(result.reprojection[0], 1))
+    by_deviation = fit(counts, source=source, noise=noise, options=options)
+    assert result.basins[0].objective == pytest.approx(by_deviation.basins[0].objective, rel=0.03)
 
 
 def test_sides_may_be_odd_and_unlike() -> None:
@@ -173,13 +173,13 @@ def test_units_of_the_images_do_not_matter(shots: list[FloatArray]) -> None:
     """Not even by rounding, if one is a power of two of the other."""
     images = noisy(shots, NOISE)
     options = FitOptions(samples=0, steps=5, spacing=0.25, threads=1)
-    one, other = (
+    first, second = (
         fit(unit * images, strengths=STRENGTHS, noise=unit * NOISE, options=options)
         for unit in (1, 1024)
     )
-    np.testing.assert_array_equal(one.fields[0].displacement, other.fields[0].displacement)
-    np.testing.assert_array_equal(one.chi2, other.chi2)
-    np.testing.assert_array_equal(1024 * one.reprojection, other.reprojection)
+    np.testing.assert_array_equal(first.fields[0].displacement, second.fields[0].displacement)
+    np.testing.assert_array_equal(first.chi2, second.chi2)
+    np.testing.assert_array_equal(1024 * first.reprojection, second.reprojection)
 
 
 def test_noise_that_nobody_tells_is_found_in_the_images(shots: list[FloatArray]) -> None:
@@ -197,15 +197,15 @@ def test_fiducials_hold_the_field_where_noise_does_not() -> None:
     truth = on_pixels(weak, SIZE)
     rows, columns = np.meshgrid([7, 15, 23, 31, 39], [13, 21, 29, 37, 45], indexing="ij")
     places = rows.ravel(), columns.ravel()
-    known = truth[:, *places] + np.random.default_rng(6).normal(0, 0.03, (2, 25))
-    fiducials = np.column_stack([*places, *known, np.full(25, 0.03)])
-    found = [
+    displaced = truth[:, *places] + np.random.default_rng(6).normal(0, 0.03, (2, 25))
+    fiducials = np.column_stack([*places, *displaced, np.full(25, 0.03)])
+    fields = [
         fitted(image, strengths=None, noise=0.3, fiducials=table).fields[0].displacement
         for table in (None, fiducials)
     ]
-    missed = [np.sqrt(((one[:, *places] - known) ** 2).mean()) for one in found]
+    missed = [np.sqrt(((field[:, *places] - displaced) ** 2).mean()) for field in fields]
     assert missed[1] < 0.06 < missed[0]
-    assert distance(found[1], truth) < 0.5 * distance(found[0], truth)
+    assert distance(fields[1], truth) < 0.5 * distance(fields[0], truth)
 
 
 def test_neither_threads_nor_a_second_time_change_a_bit(shots: list[FloatArray]) -> None:
@@ -224,28 +224,28 @@ def test_neither_threads_nor_a_second_time_change_a_bit(shots: list[FloatArray])
 
 @pytest.mark.parametrize("after", [1, 20])
 def test_a_fit_ends_at_once_when_asked(shots: list[FloatArray], after: int) -> None:
-    asked = 0
+    calls = 0
 
     def should_stop() -> bool:
-        nonlocal asked
-        asked += 1
-        return asked >= after
+        nonlocal calls
+        calls += 1
+        return calls >= after
 
     with pytest.raises(InversionCancelled):
         fit(noisy(shots, NOISE), strengths=STRENGTHS, noise=NOISE, should_stop=should_stop)
-    assert asked == after
+    assert calls == after
 
 
 def test_each_step_is_told_with_its_stage_and_objective() -> None:
-    told: list[Progress] = []
+    reports: list[Progress] = []
     image = noisy([counted(bump(0.4, 7, (23, 29)), SIZE)], NOISE)
     options = FitOptions(samples=2, steps=10, spacing=0.25, threads=1)
-    fit(image, noise=NOISE, options=options, on_progress=told.append)
+    fit(image, noise=NOISE, options=options, on_progress=reports.append)
     for stage in ("from near", "transport", "smoothness", "full size", "samples"):
-        objectives = [news.objective for news in told if news.message == stage]
+        objectives = [news.objective for news in reports if news.message == stage]
         assert objectives
         assert all(isinstance(value, float) for value in objectives)
-    descent = next(news for news in told if news.message == "smoothness")
+    descent = next(news for news in reports if news.message == "smoothness")
     assert descent.text == f"smoothness, objective {descent.objective:.6g}"
-    steps = [one.step for one in told]
+    steps = [news.step for news in reports]
     assert steps == sorted(steps)

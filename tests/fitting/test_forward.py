@@ -132,8 +132,8 @@ def test_masked_pixels_do_not_matter(scene: Scene) -> None:
     counts = scene.ray_counts(unknowns)
     spoilt = replace(scene, images=np.where(scene.weights > 0, scene.images, 1e6))
     value, slope = scene.value_and_gradient(unknowns, counts)
-    other, slope_there = spoilt.value_and_gradient(unknowns, counts)
-    assert other == value
+    spoilt_value, slope_there = spoilt.value_and_gradient(unknowns, counts)
+    assert spoilt_value == value
     np.testing.assert_array_equal(slope_there.flat(), slope.flat())
 
 
@@ -147,8 +147,8 @@ def test_pushed_is_the_change_of_residuals(scene: Scene) -> None:
         scene.model(unknowns.plus(unknowns.like(s * change.flat())), counts) for s in (step, -step)
     )
     expected = np.sqrt(scene.weights) * (ahead - behind) / (2 * step)
-    found = scene.linear(unknowns, counts).pushed(change)
-    assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
+    pushed = scene.linear(unknowns, counts).pushed(change)
+    assert np.abs(pushed - expected).max() < 1e-4 * np.abs(expected).max()
 
 
 def test_pulled_is_the_transpose_of_pushed(scene: Scene) -> None:
@@ -166,11 +166,12 @@ def test_pulled_is_the_transpose_of_pushed(scene: Scene) -> None:
 def test_the_hessian_is_symmetric_and_positive(scene: Scene) -> None:
     unknowns = some(scene)
     counts = scene.ray_counts(unknowns)
-    one, other = random_like(unknowns, 5), random_like(unknowns, 6)
-    of_one, of_other = (scene.linear(unknowns, counts).hessian_times(way) for way in (one, other))
-    size = np.sqrt(along(one, of_one) * along(other, of_other))
-    assert abs(along(other, of_one) - along(one, of_other)) < 1e-12 * size
-    assert along(one, of_one) > 0
+    first, second = random_like(unknowns, 5), random_like(unknowns, 6)
+    linear = scene.linear(unknowns, counts)
+    of_one, of_other = (linear.hessian_times(way) for way in (first, second))
+    size = np.sqrt(along(first, of_one) * along(second, of_other))
+    assert abs(along(second, of_one) - along(first, of_other)) < 1e-12 * size
+    assert along(first, of_one) > 0
 
 
 def test_the_hessian_is_the_change_of_the_gradient_where_images_are_explained(
@@ -189,8 +190,8 @@ def test_the_hessian_is_the_change_of_the_gradient_where_images_are_explained(
         for s in (step, -step)
     )
     expected = (ahead.flat() - behind.flat()) / (2 * step)
-    found = explained.linear(unknowns, counts).hessian_times(change).flat()
-    assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
+    product = explained.linear(unknowns, counts).hessian_times(change).flat()
+    assert np.abs(product - expected).max() < 1e-4 * np.abs(expected).max()
 
 
 def test_an_image_is_made_by_the_sum_of_the_fields_at_its_strengths(scene: Scene) -> None:
@@ -204,8 +205,8 @@ def test_an_image_is_made_by_the_sum_of_the_fields_at_its_strengths(scene: Scene
 def test_nothing_in_the_way_leaves_the_beams(scene: Scene) -> None:
     plain = replace(scene, psf=[0.0, 0.0])
     nothing = plain.nothing()
-    made = plain.model(nothing, plain.ray_counts(nothing))
-    np.testing.assert_allclose(made, plain.beam(nothing), rtol=3e-3)
+    images = plain.model(nothing, plain.ray_counts(nothing))
+    np.testing.assert_allclose(images, plain.beam(nothing), rtol=3e-3)
     inside = slice(PAD, -PAD)
     np.testing.assert_array_equal(plain.beam(nothing), plain.beams[:, inside, inside])
     np.testing.assert_array_equal(nothing.frames, [at_rest()] * 2)
@@ -216,9 +217,9 @@ def test_gains_and_beam_multiply_the_image(scene: Scene) -> None:
     counts = scene.ray_counts(unknowns)
     plain = scene.model(unknowns, counts)
     unknowns.gains[1], unknowns.beam[0, 0] = np.log(1.5), np.log(1.2)
-    made = scene.model(unknowns, counts)
-    np.testing.assert_allclose(made[0], 1.2 * plain[0], rtol=1e-12)
-    np.testing.assert_allclose(made[1], 1.8 * plain[1], rtol=1e-12)
+    images = scene.model(unknowns, counts)
+    np.testing.assert_allclose(images[0], 1.2 * plain[0], rtol=1e-12)
+    np.testing.assert_allclose(images[1], 1.8 * plain[1], rtol=1e-12)
 
 
 def test_a_kernel_of_a_gaussian_spreads_as_the_gaussian(scene: Scene) -> None:
@@ -227,10 +228,10 @@ def test_a_kernel_of_a_gaussian_spreads_as_the_gaussian(scene: Scene) -> None:
     kernel = np.outer(line, line) / line.sum() ** 2
     unknowns = some(scene)
     counts = scene.ray_counts(unknowns)
-    gaussian, given = (
+    gaussian, by_kernel = (
         replace(scene, psf=[psf, psf]).model(unknowns, counts) for psf in (1.2, kernel)
     )
-    np.testing.assert_allclose(given, gaussian, atol=1e-4)
+    np.testing.assert_allclose(by_kernel, gaussian, atol=1e-4)
 
 
 def test_a_kernel_is_the_image_of_a_point(scene: Scene) -> None:
@@ -239,8 +240,8 @@ def test_a_kernel_is_the_image_of_a_point(scene: Scene) -> None:
     beams[:, PAD + 15, PAD + 20] = 1.0
     dot = replace(scene, beams=beams, beam_modes=0, spacing=0.1)
     nothing = dot.nothing()
-    made = dot.model(nothing, dot.ray_counts(nothing))[1]
-    np.testing.assert_allclose(made[14:17, 19:22], KERNEL, atol=0.02)
+    image = dot.model(nothing, dot.ray_counts(nothing))[1]
+    np.testing.assert_allclose(image[14:17, 19:22], KERNEL, atol=0.02)
 
 
 def test_blur_keeps_the_sum_and_has_the_width() -> None:

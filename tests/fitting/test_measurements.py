@@ -47,8 +47,8 @@ def given(**changes: Any) -> Measured:
 
 
 def protons(energy: float, **changes: Any) -> ProtonSetup:
-    known = {"source_object_distance": 0.01, "object_image_distance": 0.2, "pixel_size": 2e-6}
-    return ProtonSetup(energy=energy, **known | changes)
+    lengths = {"source_object_distance": 0.01, "object_image_distance": 0.2, "pixel_size": 2e-6}
+    return ProtonSetup(energy=energy, **lengths | changes)
 
 
 def with_pixel(value: float) -> FloatArray:
@@ -153,9 +153,9 @@ def test_one_image_and_an_unknown_source_are_taken_if_asked_for() -> None:
 
 
 def test_a_known_source_leaves_no_beam_to_be_found() -> None:
-    known = given(source=np.full(SIZE, 4.0))
-    assert known.scene.beam_modes == 0
-    assert not known.scene.free_gains
+    data = given(source=np.full(SIZE, 4.0))
+    assert data.scene.beam_modes == 0
+    assert not data.scene.free_gains
 
 
 def test_a_source_in_other_units_is_refused_unless_gains_are_free() -> None:
@@ -177,22 +177,22 @@ def test_images_at_nearly_one_energy_are_one_image(second: float, single: bool) 
 
 def test_images_are_in_units_of_their_beams() -> None:
     source = np.random.default_rng(1).uniform(3, 5, SIZE)
-    made = given(source=source, gains=[1, 2], noise=[0.1, 0.3])
-    pad = made.scene.pad
-    np.testing.assert_allclose(made.units, [source.mean(), 2 * source.mean()])
+    data = given(source=source, gains=[1, 2], noise=[0.1, 0.3])
+    pad = data.scene.pad
+    np.testing.assert_allclose(data.units, [source.mean(), 2 * source.mean()])
     for k, stack in enumerate(images()):
-        np.testing.assert_allclose(made.scene.images[k, :40, :51] * made.units[k], stack)
-        beam = made.scene.beams[k, pad : pad + 40, pad : pad + 51]
-        np.testing.assert_allclose(beam * made.units[k], (1 + k) * source)
-        noise = made.units[k] / np.sqrt(made.scene.weights[k, :40, :51])
+        np.testing.assert_allclose(data.scene.images[k, :40, :51] * data.units[k], stack)
+        beam = data.scene.beams[k, pad : pad + 40, pad : pad + 51]
+        np.testing.assert_allclose(beam * data.units[k], (1 + k) * source)
+        noise = data.units[k] / np.sqrt(data.scene.weights[k, :40, :51])
         np.testing.assert_allclose(noise, (0.1, 0.3)[k])
 
 
 def test_without_a_source_the_beam_is_uniform_with_the_mean_of_each_image() -> None:
     stack = images() * np.array([1, 3])[:, None, None]
-    made = given(images=stack)
-    np.testing.assert_allclose(made.units, stack.mean(axis=(1, 2)))
-    np.testing.assert_allclose(made.scene.beams, 1)
+    data = given(images=stack)
+    np.testing.assert_allclose(data.units, stack.mean(axis=(1, 2)))
+    np.testing.assert_allclose(data.scene.beams, 1)
 
 
 def test_pixels_that_fill_up_blocks_and_masked_ones_do_not_count() -> None:
@@ -200,24 +200,24 @@ def test_pixels_that_fill_up_blocks_and_masked_ones_do_not_count() -> None:
     mask[5, 6:9] = False
     stack = images()
     stack[:, ~mask] = np.nan
-    made = given(images=stack, mask=mask)
-    assert made.size == SIZE
-    assert made.scene.images.shape == (2, 40, 56)
-    np.testing.assert_array_equal(made.scene.weights[0, :40, :51] > 0, mask)
-    assert not made.scene.weights[:, :, 51:].any()
-    assert np.isfinite(made.scene.images).all()
+    data = given(images=stack, mask=mask)
+    assert data.size == SIZE
+    assert data.scene.images.shape == (2, 40, 56)
+    np.testing.assert_array_equal(data.scene.weights[0, :40, :51] > 0, mask)
+    assert not data.scene.weights[:, :, 51:].any()
+    assert np.isfinite(data.scene.images).all()
 
 
 def test_strengths_are_relative_to_the_first_image() -> None:
-    made = given(strengths=[[2, 4], [1, 3]])
-    np.testing.assert_allclose(made.scene.strengths, [[1, 1], [0.5, 0.75]])
+    data = given(strengths=[[2, 4], [1, 3]])
+    np.testing.assert_allclose(data.scene.strengths, [[1, 1], [0.5, 0.75]])
 
 
 def test_counts_vary_by_their_root() -> None:
     counts = np.random.default_rng(2).poisson(100, (2, *SIZE))
-    made = given(images=counts, noise="poisson")
-    assert made.counted
-    noise = made.units[:, None, None] / np.sqrt(made.scene.weights[:, :, :51])
+    data = given(images=counts, noise="poisson")
+    assert data.counted
+    noise = data.units[:, None, None] / np.sqrt(data.scene.weights[:, :, :51])
     np.testing.assert_allclose(noise, 10, rtol=0.1)
 
 
@@ -228,50 +228,50 @@ def test_noise_that_is_a_share_of_each_pixel() -> None:
     chance = np.random.default_rng(4).normal(size=(2, *SIZE))
     shots = beam * (1 + np.array([0.03, 0.06])[:, None, None] * chance)
     shots[:, hole] = 0
-    made = given(images=shots, noise="proportional", source=beam, mask=~hole)
-    assert not made.counted
-    used = made.scene.weights[:, :40, :51] > 0
-    noise = made.units[:, None, None] / np.sqrt(np.where(used, made.scene.weights[:, :40, :51], 1))
+    data = given(images=shots, noise="proportional", source=beam, mask=~hole)
+    assert not data.counted
+    used = data.scene.weights[:, :40, :51] > 0
+    noise = data.units[:, None, None] / np.sqrt(np.where(used, data.scene.weights[:, :40, :51], 1))
     for k, share in enumerate((0.03, 0.06)):
-        told = (noise[k] / beam)[used[k] & (noise[k] > 0.006 * made.units[k])]
-        assert np.median(told) == pytest.approx(share, rel=0.05)
-        assert np.abs(told / share - 1).max() < 0.25
+        measured_share = (noise[k] / beam)[used[k] & (noise[k] > 0.006 * data.units[k])]
+        assert np.median(measured_share) == pytest.approx(share, rel=0.05)
+        assert np.abs(measured_share / share - 1).max() < 0.25
 
 
 def test_noise_beyond_what_the_model_can_explain_is_not_believed() -> None:
-    made = given(noise=1e-9)
-    np.testing.assert_allclose(made.scene.weights[:, :, :51], 1 / 0.005**2)
+    data = given(noise=1e-9)
+    np.testing.assert_allclose(data.scene.weights[:, :, :51], 1 / 0.005**2)
 
 
 def test_fiducials_count_from_the_corner() -> None:
-    made = given(fiducials=[[3, 4, 0.5, -1, 0.2]])
-    known = made.scene.fiducials
-    assert known is not None
-    np.testing.assert_array_equal(known.places, [[3.5, 4.5]])
-    np.testing.assert_array_equal(known.displacements, [[0.5, -1]])
-    np.testing.assert_array_equal(known.errors, [0.2])
+    data = given(fiducials=[[3, 4, 0.5, -1, 0.2]])
+    fiducials = data.scene.fiducials
+    assert fiducials is not None
+    np.testing.assert_array_equal(fiducials.places, [[3.5, 4.5]])
+    np.testing.assert_array_equal(fiducials.displacements, [[0.5, -1]])
+    np.testing.assert_array_equal(fiducials.errors, [0.2])
 
 
 def test_kernels_have_the_sum_one_and_each_image_may_have_its_own() -> None:
-    made = given(psf=[1.5, np.full((3, 5), 2.0)])
-    assert made.scene.psf[0] == 1.5
-    np.testing.assert_allclose(made.scene.psf[1], np.full((3, 5), 1 / 15))
+    data = given(psf=[1.5, np.full((3, 5), 2.0)])
+    assert data.scene.psf[0] == 1.5
+    np.testing.assert_allclose(data.scene.psf[1], np.full((3, 5), 1 / 15))
     assert given(psf=0.7).scene.psf == [0.7, 0.7]
 
 
 def test_one_kernel_is_for_all_images_and_kernels_may_differ_in_size() -> None:
     for kernel in (np.ones((3, 5)), [[1, 1, 1]] * 5):
-        made = given(psf=kernel)
-        assert [np.shape(one) for one in made.scene.psf] == [np.shape(kernel)] * 2
-    made = given(psf=[np.ones((3, 3)), np.ones((5, 5))])
-    assert [np.shape(one) for one in made.scene.psf] == [(3, 3), (5, 5)]
+        data = given(psf=kernel)
+        assert [np.shape(psf) for psf in data.scene.psf] == [np.shape(kernel)] * 2
+    data = given(psf=[np.ones((3, 3)), np.ones((5, 5))])
+    assert [np.shape(psf) for psf in data.scene.psf] == [(3, 3), (5, 5)]
 
 
 @pytest.mark.parametrize(("align", "free"), [("none", 0), ("shift", 2), ("affine", 6)])
 def test_alignment_frees_the_numbers_of_a_frame(align: Any, free: int) -> None:
-    made = given(options=FitOptions(align=align, align_spread=0.3)).scene
-    assert made.free_frames.sum() == free
-    assert made.prior.frame_weights[0] == pytest.approx(1 / 0.3**2)
+    scene = given(options=FitOptions(align=align, align_spread=0.3)).scene
+    assert scene.free_frames.sum() == free
+    assert scene.prior.frame_weights[0] == pytest.approx(1 / 0.3**2)
 
 
 def test_a_free_edge_has_a_wider_strip_and_fades() -> None:
@@ -282,24 +282,24 @@ def test_a_free_edge_has_a_wider_strip_and_fades() -> None:
     fading = given(images=stack, strengths=[1])
     assert fading.scene.pad == 16
     assert fading.scene.decay == np.inf
-    own = given(options=FitOptions(edge="free", strip=40, fade_length=9.0))
-    assert (own.scene.pad, own.scene.decay) == (40, 9)
+    open_edge = given(options=FitOptions(edge="free", strip=40, fade_length=9.0))
+    assert (open_edge.scene.pad, open_edge.scene.decay) == (40, 9)
 
 
 def momentum_and_velocity(energy: float) -> tuple[float, float]:
     """Of a proton with a kinetic energy in MeV: p c in MeV, and β."""
-    rest = constants.m_p * constants.c**2 / constants.e / 1e6
-    momentum = np.sqrt((energy + rest) ** 2 - rest**2)
-    return momentum, momentum / (energy + rest)
+    rest_energy = constants.m_p * constants.c**2 / constants.e / 1e6
+    momentum = np.sqrt((energy + rest_energy) ** 2 - rest_energy**2)
+    return momentum, momentum / (energy + rest_energy)
 
 
 def test_strengths_follow_from_momenta_and_velocities() -> None:
     """A magnetic field deflects by 1 / p, an electric one by 1 / pβ."""
     energies = (3.0, 14.7, 60.0)
-    found = strengths_of([protons(energy) for energy in energies], ("B", "E"), 3)
+    strengths = strengths_of([protons(energy) for energy in energies], ("B", "E"), 3)
     p, beta = np.transpose([momentum_and_velocity(energy) for energy in energies])
-    np.testing.assert_allclose(found[:, 0], p[0] / p, rtol=1e-9)
-    np.testing.assert_allclose(found[:, 1], (p * beta)[0] / (p * beta), rtol=1e-9)
+    np.testing.assert_allclose(strengths[:, 0], p[0] / p, rtol=1e-9)
+    np.testing.assert_allclose(strengths[:, 1], (p * beta)[0] / (p * beta), rtol=1e-9)
 
 
 def test_strengths_grow_with_the_distance_over_which_rays_drift() -> None:
@@ -312,8 +312,8 @@ def test_strengths_grow_with_the_distance_over_which_rays_drift() -> None:
 
 
 def test_plasma_deflects_light_with_the_square_of_the_wavelength() -> None:
-    known = {"object_image_distance": 0.1, "pixel_size": 1e-6}
-    setups = [OpticalSetup(wavelength=length, **known) for length in (800e-9, 400e-9)]
+    lengths = {"object_image_distance": 0.1, "pixel_size": 1e-6}
+    setups = [OpticalSetup(wavelength=length, **lengths) for length in (800e-9, 400e-9)]
     np.testing.assert_allclose(strengths_of(setups, ("plasma",), 2)[:, 0], [1, 0.25])
 
 
@@ -358,6 +358,6 @@ def test_noise_is_estimated_beside_structure_and_dead_pixels() -> None:
 
 def test_noise_that_nobody_tells_is_estimated() -> None:
     stack = images() * np.array([1, 3])[:, None, None]
-    made = given(images=stack, noise=None)
-    noise = made.units[:, None] / np.sqrt(made.scene.weights[:, 0, :5])
+    data = given(images=stack, noise=None)
+    noise = data.units[:, None] / np.sqrt(data.scene.weights[:, 0, :5])
     np.testing.assert_allclose(noise / np.array([[0.1], [0.3]]), 1, atol=0.05)

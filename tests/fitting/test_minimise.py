@@ -54,16 +54,16 @@ def test_a_curved_valley_is_followed_to_its_end() -> None:
 
 
 def test_the_value_falls_with_each_step_that_is_told() -> None:
-    told: list[tuple[int, float]] = []
+    steps_and_values: list[tuple[int, float]] = []
     _, value, steps = minimise(
         rosenbrock,
         np.array([-1.2, 1.0]),
         iterations=200,
         least_gain=1e-15,
-        after_step=lambda step, now: told.append((step, now)),
+        after_step=lambda step, now: steps_and_values.append((step, now)),
     )
-    assert [step for step, _ in told] == list(range(1, steps + 1))
-    values = [now for _, now in told]
+    assert [step for step, _ in steps_and_values] == list(range(1, steps + 1))
+    values = [now for _, now in steps_and_values]
     assert values == sorted(values, reverse=True)
     assert values[-1] == value
 
@@ -84,18 +84,18 @@ def test_a_start_at_the_minimum_stays() -> None:
 
 def test_conjugate_gradients_solve_what_elimination_solves() -> None:
     matrix, right = positive_definite(40, 2), np.random.default_rng(3).normal(size=40)
-    found = solve(lambda v: matrix @ v, right, tolerance=1e-12, iterations=400)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), atol=1e-8)
+    solution = solve(lambda v: matrix @ v, right, tolerance=1e-12, iterations=400)
+    np.testing.assert_allclose(solution, np.linalg.solve(matrix, right), atol=1e-8)
 
 
 def test_conjugate_gradients_end_at_the_tolerance() -> None:
     matrix, right = positive_definite(40, 4), np.random.default_rng(5).normal(size=40)
     steps: list[int] = []
-    found = solve(
+    solution = solve(
         lambda v: matrix @ v, right, tolerance=0.05, iterations=400, after_step=steps.append
     )
-    left = np.linalg.norm(matrix @ found - right) / np.linalg.norm(right)
-    assert 1e-4 < left <= 0.05 * 1.001
+    residual = np.linalg.norm(matrix @ solution - right) / np.linalg.norm(right)
+    assert 1e-4 < residual <= 0.05 * 1.001
     assert steps == list(range(1, len(steps) + 1))
     solve(lambda v: matrix @ v, right, tolerance=0, iterations=3, after_step=steps.append)
     assert steps[-3:] == [1, 2, 3]

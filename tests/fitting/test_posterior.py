@@ -86,29 +86,29 @@ def test_samples_have_the_inverse_hessian_as_covariance(
         ways.append(like.flat())
     for way in ways:
         expected = way[free] @ covariance @ way[free]
-        found = ((samples @ way) ** 2).mean()
-        assert found == pytest.approx(expected, rel=tolerance)
+        variance = ((samples @ way) ** 2).mean()
+        assert variance == pytest.approx(expected, rel=tolerance)
 
 
 def test_what_is_known_does_not_vary(
     tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
 ) -> None:
     scene, unknowns, _, _ = tiny
-    drawn = Posterior(scene, unknowns, np.random.default_rng(1)).drawn()
-    assert not drawn.frames[0].any()
-    np.testing.assert_array_equal(drawn.frames[1] != 0, scene.free_frames)
-    assert drawn.beam[0, 0] == 0
+    sample = Posterior(scene, unknowns, np.random.default_rng(1)).drawn()
+    assert not sample.frames[0].any()
+    np.testing.assert_array_equal(sample.frames[1] != 0, scene.free_frames)
+    assert sample.beam[0, 0] == 0
 
 
 def test_the_same_seed_draws_the_same_samples(
     tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
 ) -> None:
     scene, unknowns, _, _ = tiny
-    one, other, third = (
+    first, second, third = (
         Posterior(scene, unknowns, np.random.default_rng(seed)).drawn().flat() for seed in (2, 2, 3)
     )
-    np.testing.assert_array_equal(one, other)
-    assert (one != third).any()
+    np.testing.assert_array_equal(first, second)
+    assert (first != third).any()
 
 
 def test_the_log_volume_falls_by_that_of_better_data(
@@ -118,17 +118,17 @@ def test_the_log_volume_falls_by_that_of_better_data(
     scene, unknowns, matrix, _ = tiny
     better = replace(scene, weights=16 * scene.weights)
     dense, _ = dense_hessian(better, unknowns)
-    exact = [half_log_determinant(one) for one in (matrix, dense)]
-    found = [
+    exact = [half_log_determinant(hessian) for hessian in (matrix, dense)]
+    volumes = [
         np.mean(
             [
-                Posterior(one, unknowns, rng).log_volume([rng])
+                Posterior(each, unknowns, rng).log_volume([rng])
                 for rng in map(np.random.default_rng, (4, 5))
             ]
         )
-        for one in (scene, better)
+        for each in (scene, better)
     ]
-    assert found[1] - found[0] == pytest.approx(exact[1] - exact[0], rel=0.1)
+    assert volumes[1] - volumes[0] == pytest.approx(exact[1] - exact[0], rel=0.1)
 
 
 @pytest.mark.parametrize("true", [30.0, 300.0])
@@ -144,13 +144,13 @@ def test_the_likeliest_smoothness_is_that_of_the_field(true: float) -> None:
     )
     rng = np.random.default_rng(5)
     truth = scene.nothing()
-    whole = scene.prior.of_rough[0].sum(axis=0)
-    waves = np.divide(1, np.sqrt(whole), out=np.zeros_like(whole), where=whole > 0)
+    roughness = scene.prior.of_rough[0].sum(axis=0)
+    waves = np.divide(1, np.sqrt(roughness), out=np.zeros_like(roughness), where=roughness > 0)
     # Of the longest waves, which neither images nor λ tell much about, little.
-    waves *= scene.prior.wave_numbers > (1.5 * np.pi / (KNOT * max(whole.shape))) ** 2
-    truth.potentials[0] = idctn(waves * rng.normal(size=whole.shape), norm="ortho")
-    made = scene.model(truth, scene.ray_counts(truth))
-    noisy = made + rng.normal(0, 0.05, made.shape)
+    waves *= scene.prior.wave_numbers > (1.5 * np.pi / (KNOT * max(roughness.shape))) ** 2
+    truth.potentials[0] = idctn(waves * rng.normal(size=roughness.shape), norm="ortho")
+    images = scene.model(truth, scene.ray_counts(truth))
+    noisy = images + rng.normal(0, 0.05, images.shape)
     # From far off; κ has no part in such a field.
     smoothness = np.array([[2000.0, 0.0]])
     unknowns = scene.nothing()
@@ -214,8 +214,8 @@ def test_open_beams_are_those_that_several_energies_cannot_exclude() -> None:
             scene, strengths=np.array(strengths)[:, None], weights=np.full((2, 24, 32), 1e6)
         )
         posterior = Posterior(shots, unknowns, np.random.default_rng(0))
-        drawn = posterior.open_beams(0.05, 4, np.random.default_rng(2))
-        return float(np.sqrt(np.mean([one[0] ** 2 for one in drawn])))
+        samples = posterior.open_beams(0.05, 4, np.random.default_rng(2))
+        return float(np.sqrt(np.mean([sample[0] ** 2 for sample in samples])))
 
     assert spread([1.0, 1.0]) > 0.02
     assert spread([1.0, 0.5]) < 0.01

@@ -57,29 +57,29 @@ def places(prior: Prior) -> tuple[FloatArray, FloatArray]:
 
 
 def test_the_slope_is_that_of_the_value(prior: Prior) -> None:
-    here, change = random(prior, 0), random(prior, 1)
-    _, slope = prior.value_and_slope(here)
+    point, change = random(prior, 0), random(prior, 1)
+    _, slope = prior.value_and_slope(point)
     step = 1e-4
     ahead, behind = (
-        prior.value_and_slope(here.plus(here.like(s * change.flat())))[0] for s in (step, -step)
+        prior.value_and_slope(point.plus(point.like(s * change.flat())))[0] for s in (step, -step)
     )
     assert along(slope, change) == pytest.approx((ahead - behind) / 2 / step, rel=1e-6)
 
 
 def test_times_is_the_change_of_the_slope(prior: Prior) -> None:
-    here, change = random(prior, 2), random(prior, 3)
-    _, before = prior.value_and_slope(here)
-    _, after = prior.value_and_slope(here.plus(change))
+    point, change = random(prior, 2), random(prior, 3)
+    _, before = prior.value_and_slope(point)
+    _, after = prior.value_and_slope(point.plus(change))
     np.testing.assert_allclose(
         prior.times(change).flat(), after.flat() - before.flat(), rtol=1e-9, atol=1e-8
     )
 
 
 def test_the_hessian_is_symmetric(prior: Prior) -> None:
-    one, other = random(prior, 4), random(prior, 5)
-    forth, back = along(other, prior.times(one)), along(one, prior.times(other))
+    first, second = random(prior, 4), random(prior, 5)
+    forth, back = along(second, prior.times(first)), along(first, prior.times(second))
     assert forth == pytest.approx(back, rel=1e-11)
-    assert along(one, prior.times(one)) > 0
+    assert along(first, prior.times(first)) > 0
 
 
 def test_random_slopes_have_the_hessian_as_covariance(prior: Prior) -> None:
@@ -94,15 +94,15 @@ def test_random_slopes_have_the_hessian_as_covariance(prior: Prior) -> None:
         ways[-1].potentials[field] = np.cos(x / 30)
     ways.append(like.zeros()._replace(beam=random(prior, 9).beam))
     ways.append(like.zeros()._replace(frames=random(prior, 9).frames))
-    drawn = np.stack([prior.drawn(like, rng).flat() for _ in range(DRAWS)])
-    table = drawn @ np.stack([way.flat() for way in ways]).T
+    samples = np.stack([prior.drawn(like, rng).flat() for _ in range(DRAWS)])
+    table = samples @ np.stack([way.flat() for way in ways]).T
     variances = np.array([along(way, prior.times(way)) for way in ways])
     tolerance = 4 * np.sqrt(2 / DRAWS)
     np.testing.assert_allclose((table**2).mean(axis=0) / variances, 1, atol=tolerance)
     np.testing.assert_allclose(table.mean(axis=0) / np.sqrt(variances), 0, atol=tolerance)
     mixed = along(ways[0], prior.times(ways[2])) / np.sqrt(variances[0] * variances[2])
-    found = (table[:, 0] * table[:, 2]).mean() / np.sqrt(variances[0] * variances[2])
-    assert found == pytest.approx(mixed, abs=tolerance)
+    covariance = (table[:, 0] * table[:, 2]).mean() / np.sqrt(variances[0] * variances[2])
+    assert covariance == pytest.approx(mixed, abs=tolerance)
 
 
 def test_nothing_in_the_way_costs_nothing(prior: Prior) -> None:
@@ -133,8 +133,8 @@ def test_the_strip_ties_the_potential_and_the_image_does_not() -> None:
     inside.potentials[0] = np.maximum(0, 1 - ((y - 12) ** 2 + (x - 16) ** 2) / 60)
     assert prior.value_and_slope(inside)[0] == 0
     outside.potentials[0] = y < 0
-    steps, held = len(x[0]), (y < 0).sum()
-    expected = 2.0 / 2 * (steps + held * (KNOT / 15) ** 2)
+    steps, count = len(x[0]), (y < 0).sum()
+    expected = 2.0 / 2 * (steps + count * (KNOT / 15) ** 2)
     assert prior.value_and_slope(outside)[0] == pytest.approx(expected, rel=1e-12)
 
 
@@ -145,10 +145,10 @@ def test_gains_frames_and_beam_are_held_with_their_spreads(prior: Prior) -> None
         moved = nothing(prior)
         moved.frames[1, number] += change
         assert free.value_and_slope(moved)[0] == pytest.approx(0.5)
-    known = replace(free, shift_spread=0.2)
+    spread = replace(free, shift_spread=0.2)
     moved = nothing(prior)
     moved.frames[1, 0] += 0.2 / 2
-    assert known.value_and_slope(moved)[0] == pytest.approx(0.5)
+    assert spread.value_and_slope(moved)[0] == pytest.approx(0.5)
     brighter = nothing(prior)
     brighter.gains[2] = 1
     assert free.value_and_slope(brighter)[0] == pytest.approx(0.5)
@@ -162,29 +162,29 @@ def test_gains_frames_and_beam_are_held_with_their_spreads(prior: Prior) -> None
 def test_fiducials_cost_what_the_displacement_misses_them_by(prior: Prior) -> None:
     """Splines hold a paraboloid exactly; the first image sees both fields at their strengths."""
     y, x = places(prior)
-    known = prior.fiducials
-    assert known is not None
+    fiducials = prior.fiducials
+    assert fiducials is not None
     bowl = nothing(prior)
     bowl.potentials[0] = 0.05 * y**2 + 0.02 * y * x - 0.03 * x**2
     bowl.potentials[1] = 0.4 * x
-    v, u = known.places.T
+    v, u = fiducials.places.T
     moved = -np.stack([0.1 * v + 0.02 * u, 0.02 * v - 0.06 * u + 0.5 * 0.4], axis=1)
-    missed = (moved - known.displacements) / known.errors[:, None]
+    missed = (moved - fiducials.displacements) / fiducials.errors[:, None]
     with_them, without = (
-        one.value_and_slope(bowl)[0] for one in (prior, replace(prior, fiducials=None))
+        each.value_and_slope(bowl)[0] for each in (prior, replace(prior, fiducials=None))
     )
     assert with_them - without == pytest.approx((missed**2).sum() / 2, rel=1e-9)
 
 
 def test_met_fiducials_pull_at_nothing(prior: Prior) -> None:
     y, x = places(prior)
-    known = prior.fiducials
-    assert known is not None
+    fiducials = prior.fiducials
+    assert fiducials is not None
     tilted = nothing(prior)
     tilted.potentials[0] = -0.7 * y + 0.2 * x
-    met = replace(prior, fiducials=known._replace(displacements=np.full((2, 2), [0.7, -0.2])))
+    met = replace(prior, fiducials=fiducials._replace(displacements=np.full((2, 2), [0.7, -0.2])))
     with_them, without = (
-        one.value_and_slope(tilted)[1] for one in (met, replace(prior, fiducials=None))
+        each.value_and_slope(tilted)[1] for each in (met, replace(prior, fiducials=None))
     )
     np.testing.assert_allclose(with_them.potentials, without.potentials, atol=1e-9)
 

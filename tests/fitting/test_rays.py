@@ -235,27 +235,27 @@ def test_what_is_not_wanted_of_a_jacobian_is_zero_and_the_rest_the_same() -> Non
     model = model_of()
     potential, beam = wavy(model, FOLDED), model.around(uneven())
     counts = model.ray_counts(potential)
-    whole = model.jacobian(potential, counts, beam, turned()).toarray()
+    complete = model.jacobian(potential, counts, beam, turned()).toarray()
     less = model.jacobian(
         potential, counts, beam, turned(), of_beam=False, of_frame=False
     ).toarray()
-    wanted = potential.size
-    np.testing.assert_allclose(less[:, :wanted], whole[:, :wanted], atol=1e-14)
-    assert whole[:, wanted:].any(axis=0).sum() > beam.size / 2
-    assert not less[:, wanted:].any()
+    size = potential.size
+    np.testing.assert_allclose(less[:, :size], complete[:, :size], atol=1e-14)
+    assert complete[:, size:].any(axis=0).sum() > beam.size / 2
+    assert not less[:, size:].any()
 
 
 def test_what_is_not_wanted_of_a_gradient_is_zero_and_the_rest_the_same() -> None:
     model = model_of()
     potential, beam = wavy(model, FOLDED), model.around(uneven())
     counts, pull = model.ray_counts(potential), np.random.default_rng(2).normal(size=SIZE)
-    whole = model.gradient(potential, counts, beam, pull)
+    complete = model.gradient(potential, counts, beam, pull)
     less = model.gradient(potential, counts, beam, pull, of_beam=False, of_frame=False)
-    assert whole.beam.any()
-    assert whole.frame.any()
+    assert complete.beam.any()
+    assert complete.frame.any()
     assert not less.beam.any()
     assert not less.frame.any()
-    np.testing.assert_allclose(less.potential, whole.potential, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(less.potential, complete.potential, rtol=1e-12, atol=1e-12)
 
 
 def test_threads_do_not_change_a_bit() -> None:
@@ -271,11 +271,11 @@ def test_threads_do_not_change_a_bit() -> None:
         several = model_of((80, 96), threads=threads)
         np.testing.assert_array_equal(several.image(potential, counts, beam, turned()), image)
         again = several.gradient(potential, counts, beam, pull, turned())
-        for one, other in zip(pulls, again, strict=True):
-            np.testing.assert_array_equal(one, other)
-        other = several.jacobian(potential, counts, beam, turned())
-        np.testing.assert_array_equal(other.indices, jacobian.indices)
-        np.testing.assert_array_equal(other.data, jacobian.data)
+        for first, repeated in zip(pulls, again, strict=True):
+            np.testing.assert_array_equal(first, repeated)
+        repeated = several.jacobian(potential, counts, beam, turned())
+        np.testing.assert_array_equal(repeated.indices, jacobian.indices)
+        np.testing.assert_array_equal(repeated.data, jacobian.data)
 
 
 def test_displacement_is_minus_the_slope_of_the_values() -> None:

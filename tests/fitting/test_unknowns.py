@@ -16,11 +16,11 @@ def test_flat_and_like_are_inverses() -> None:
     unknowns = some(0)
     flat = unknowns.flat()
     assert flat.shape == (2 * 4 * 5 + 9 + 2 + 12,)
-    for one, other in zip(unknowns, unknowns.like(flat), strict=True):
-        np.testing.assert_array_equal(one, other)
+    for part, restored in zip(unknowns, unknowns.like(flat), strict=True):
+        np.testing.assert_array_equal(part, restored)
 
 
 def test_sums_are_those_of_the_parts() -> None:
-    one, other = some(1), some(2)
-    np.testing.assert_array_equal(one.plus(other).flat(), one.flat() + other.flat())
-    np.testing.assert_array_equal(one.plus(one.zeros()).flat(), one.flat())
+    first, second = some(1), some(2)
+    np.testing.assert_array_equal(first.plus(second).flat(), first.flat() + second.flat())
+    np.testing.assert_array_equal(first.plus(first.zeros()).flat(), first.flat())

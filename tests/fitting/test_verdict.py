@@ -242,8 +242,8 @@ def test_one_image_does_not_tell_where_rays_meet_or_cross(
 
 
 def test_several_fields_that_explain_as_well_are_told() -> None:
-    others = [(0.01, 0.2), (0.02, 0.31), (0.005, 0.01), (0.5, 0.9)]
-    verdict, why = judged(**GOOD | {"others": others})
+    solutions = [(0.01, 0.2), (0.02, 0.31), (0.005, 0.01), (0.5, 0.9)]
+    verdict, why = judged(**GOOD | {"others": solutions})
     assert verdict is Verdict.SEVERAL
     assert why.startswith("3 different fields")  # one is the same, one explains worse
     assert "31%" in why
