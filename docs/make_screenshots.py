@@ -29,7 +29,7 @@ from qtpy.QtWidgets import QApplication
 
 import napari
 from napari_shadowinv import InversionOptions, add_inversion, invert
-from napari_shadowinv._napari.layer_metadata import mark, setup_of
+from napari_shadowinv._napari.layer_metadata import metadata_for, setup_of
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.physics.projection import project
@@ -238,7 +238,7 @@ def fit_window() -> None:
     for seed, energy in enumerate((14.7, 30.0)):
         film = setup.model_copy(update={"energy": energy})
         counts = np.random.default_rng(seed).poisson(1000 * project(truth, setup, film))
-        name, metadata = f"{energy:g} MeV", mark("shot", "counts", film)
+        name, metadata = f"{energy:g} MeV", metadata_for("shot", "counts", film)
         viewer.add_image(counts.astype(float), name=name, metadata=metadata)
     widget = open_widget(viewer, "Fit several images")
     widget.source.picker.set_kind("unknown")

@@ -39,7 +39,7 @@ def solved() -> Inversion:
 
 @pytest.fixture(scope="session")
 def film_pack(tmp_path_factory: pytest.TempPathFactory) -> Truth:
-    """Scans of three small films, and what describes them."""
+    """Scans of three small films, and their pack file."""
     folder = tmp_path_factory.mktemp("films") / "trio"
     return simulate(folder, layers=3, shape=(80, 100), strata=4, seed=2)
 
@@ -50,8 +50,8 @@ def pack_dataset(film_pack: Truth) -> Any:
 
 
 @pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What napari's user is told, as texts."""
+def messages(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The texts of napari's notifications."""
     from napari.utils import notifications
 
     texts: list[str] = []
@@ -65,7 +65,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.fixture
 def in_loop(qtbot: Any) -> Any:
-    """Call a function from within the event loop, as a menu does, and return its answer."""
+    """Call a function from within the event loop, as a menu does, and return its result."""
     from qtpy.QtCore import QTimer
 
     def call(function: Any, *args: Any) -> Any:

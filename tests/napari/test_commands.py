@@ -31,10 +31,10 @@ def test_invert_makes_the_layers_of_the_default_inversion(
 ) -> None:
     layer = add_shot(viewer, shot, proton_setup)
     layer.translate = (30.0, 60.0)
-    described = {role_of(keywords): (data, keywords)
+    by_role = {role_of(keywords): (data, keywords)
                  for data, keywords, _ in commands.invert_uniform(layer)}  # fmt: skip
     field = proton_setup.path_integrated_b(invert(shot).displacement)
-    data, keywords = described["field"]
+    data, keywords = by_role["field"]
     np.testing.assert_allclose(data, 1e6 * np.hypot(*field), rtol=1e-9)
     assert keywords["name"] == "|∫B×dz| (µT·m) – shot (doubtful)"
     assert keywords["translate"] == (30.0, 60.0)
@@ -81,7 +81,7 @@ def test_the_estimate_is_a_source_of_the_same_flux(
     "command", [commands.invert_uniform, commands.high_pass, commands.estimate_source]
 )
 def test_a_wrong_layer_is_one_sentence(viewer: ViewerModel, command: Any) -> None:
-    with pytest.raises(InputError, match="no layer is selected: select one image"):
+    with pytest.raises(InputError, match="no layer is selected: select an image"):
         command(None)
     with pytest.raises(InputError, match="'Points' is of type Points: select a grey image"):
         command(viewer.add_points(np.zeros((2, 2))))
@@ -102,8 +102,10 @@ def test_an_inversion_is_refined_from_any_of_its_layers(
     inversion = invert(shot, options=InversionOptions(n_sites=500))
     layers = add_inversion(viewer, inversion, proton_setup, name="shot", translate=(30.0, 60.0))
     arrows = next(layer for layer in layers if role_of(layer) == "arrows")
-    described = {role_of(one): (data, one) for data, one, _ in commands.refine(arrows, viewer)}
-    data, keywords = described["field"]
+    by_role = {
+        role_of(entries): (data, entries) for data, entries, _ in commands.refine(arrows, viewer)
+    }
+    data, keywords = by_role["field"]
     expected = fit(
         inversion.image,
         setups=[proton_setup],
@@ -115,7 +117,7 @@ def test_an_inversion_is_refined_from_any_of_its_layers(
     np.testing.assert_allclose(data, 1e6 * np.hypot(*field), rtol=1e-6, atol=1e-6 * data.max())
     assert " – shot refined" in keywords["name"]
     assert keywords["translate"] == (30.0, 60.0)
-    assert "uncertainty" in described
+    assert "uncertainty" in by_role
 
 
 def registered(name: str) -> Any:
@@ -147,20 +149,20 @@ def test_from_the_menu_an_inversion_brings_its_layers_and_the_scale_bar(
 
 
 def test_from_the_menu_a_mistake_is_one_notification(
-    make_napari_viewer: Any, in_loop: Any, qtbot: Any, told: list[str]
+    make_napari_viewer: Any, in_loop: Any, qtbot: Any, messages: list[str]
 ) -> None:
     window = make_napari_viewer()
     in_loop(registered("invert_uniform"))
-    assert told == ["No layer is selected: select one image in the layer list"]
+    assert messages == ["No layer is selected: select an image in the layer list"]
     add_shot(window, np.full((20, 20), -1.0))
     in_loop(registered("invert_uniform"))
-    qtbot.waitUntil(lambda: len(told) == 2, timeout=30_000)
-    assert told[1].startswith("Image has 400 negative pixels")
+    qtbot.waitUntil(lambda: len(messages) == 2, timeout=30_000)
+    assert messages[1].startswith("Image has 400 negative pixels")
     assert len(window.layers) == 1
 
 
 def test_the_cross_of_the_progress_bar_ends_an_inversion(
-    make_napari_viewer: Any, in_loop: Any, qtbot: Any, told: list[str]
+    make_napari_viewer: Any, in_loop: Any, qtbot: Any, messages: list[str]
 ) -> None:
     from napari.utils.progress import cancelable_progress, progress
 
@@ -173,4 +175,4 @@ def test_the_cross_of_the_progress_bar_ends_an_inversion(
     bar.cancel()
     qtbot.waitUntil(lambda: bar not in progress._all_instances, timeout=30_000)
     assert len(window.layers) == 1
-    assert told == []
+    assert messages == []

@@ -1,4 +1,4 @@
-"""A fit as layers: what is shown of it, saved, and shown again when its file is opened."""
+"""A fit as layers: shown, saved, and shown again when its file is opened."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.layer_metadata import (
     Result,
     displacement_of,
-    mark_of,
+    layer_key,
+    metadata_of,
     result_of,
     role_of,
-    slot_of,
     unit_of,
 )
 from napari_shadowinv._napari.layer_state import missing_layers
@@ -50,14 +50,16 @@ def image(setup: ProtonSetup, *, electric: bool) -> Any:
 
 
 def found(fields: tuple[str, ...]) -> Fit:
-    """A fit with a second answer, and with doubts."""
+    """A fit with an alternative solution, and the verdict on it."""
     images = [image(setup, electric=len(fields) > 1) for setup in SETUPS]
     options = FitOptions(steps=3, samples=2)
     best = fit(images, setups=SETUPS, fields=fields, noise=0.01, options=options)
     (first, *_) = best.basins
-    other = replace(first, start="from near", distance=0.5, displacement=first.displacement / 2)
-    doubts = {"verdict": Verdict.SEVERAL, "explanation": WHY}
-    return replace(best, basins=(first, other), **doubts)
+    alternative = replace(
+        first, start="from near", distance=0.5, displacement=first.displacement / 2
+    )
+    verdict = {"verdict": Verdict.SEVERAL, "explanation": WHY}
+    return replace(best, basins=(first, alternative), **verdict)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +75,7 @@ def two_fields() -> Fit:
 def opened(viewer: ViewerModel, path: Path) -> dict[str, Any]:
     viewer.layers.clear()
     viewer.open(str(path), plugin="napari-shadowinv")
-    slots = [slot_of(layer) for layer in viewer.layers]
+    slots = [layer_key(layer) for layer in viewer.layers]
     assert len(set(slots)) == len(slots)
     return dict(zip(slots, viewer.layers, strict=True))
 
@@ -82,17 +84,17 @@ def shown(viewer: ViewerModel, content: Fit, **place: Any) -> dict[str, Any]:
     """The layers of a fit as the widget adds them."""
     result = Result(content, content.setups[0], {"mask_origin": "painted"})
     layers = add_layers(viewer, fit_layers(result, Frame(**place), "pack fit"))
-    return {slot_of(layer): layer for layer in layers}
+    return {layer_key(layer): layer for layer in layers}
 
 
 def more(viewer: ViewerModel, layers: dict[str, Any]) -> dict[str, Any]:
     """All layers of a result of which only the main ones are shown."""
     missing = add_layers(viewer, missing_layers(viewer, layers["field"]))
-    return layers | {slot_of(layer): layer for layer in missing}
+    return layers | {layer_key(layer): layer for layer in missing}
 
 
 def test_a_file_of_the_command_shows_all_of_a_fit(
-    viewer: ViewerModel, two_fields: Fit, tmp_path: Path, told: list[str]
+    viewer: ViewerModel, two_fields: Fit, tmp_path: Path, messages: list[str]
 ) -> None:
     layers = opened(viewer, write(tmp_path / "pack.shadowinv", two_fields))
     layers = more(viewer, layers)
@@ -108,8 +110,8 @@ def test_a_file_of_the_command_shows_all_of_a_fit(
         assert tuple(layers[slot].scale) == pytest.approx((1, 1.5, 1.5))
     np.testing.assert_array_equal(layers["reprojection"].data, two_fields.reprojection)
     np.testing.assert_array_equal(layers["image"].data, two_fields.images)
-    for slot, one in zip(("field", "field E"), two_fields.fields, strict=True):
-        np.testing.assert_array_equal(displacement_of(layers[slot]), one.displacement)
+    for slot, fitted_field in zip(("field", "field E"), two_fields.fields, strict=True):
+        np.testing.assert_array_equal(displacement_of(layers[slot]), fitted_field.displacement)
     assert unit_of(layers["field"]).endswith("T·m")
     assert unit_of(layers["field E"]).endswith("V")
     assert unit_of(layers["uncertainty E"]) == unit_of(layers["field E"])
@@ -119,47 +121,51 @@ def test_a_file_of_the_command_shows_all_of_a_fit(
 
 
 def test_a_verdict_cannot_be_missed(
-    viewer: ViewerModel, doubtful: Fit, tmp_path: Path, told: list[str]
+    viewer: ViewerModel, doubtful: Fit, tmp_path: Path, messages: list[str]
 ) -> None:
     layers = opened(viewer, write(tmp_path / "pack.shadowinv", doubtful))
-    assert told == [f"pack.shadowinv: the fit's verdict is 'one of several': {WHY}"]
+    assert messages == [f"pack.shadowinv: the fit's verdict is 'one of several': {WHY}"]
     for layer in layers.values():
-        assert mark_of(layer)["verdict"] == "one of several"
-        assert mark_of(layer)["explanation"] == WHY
+        assert metadata_of(layer)["verdict"] == "one of several"
+        assert metadata_of(layer)["explanation"] == WHY
     assert layers["field"].name == "|∫B×dz| (µT·m) – pack (one of several)"
     good = replace(doubtful, verdict=Verdict.DETERMINED, explanation="all starts lead to one")
     layers = opened(viewer, write(tmp_path / "good.shadowinv", good))
-    assert len(told) == 1
-    assert mark_of(layers["field"])["verdict"] == "determined"
+    assert len(messages) == 1
+    assert metadata_of(layers["field"])["verdict"] == "determined"
     assert layers["field"].name == "|∫B×dz| (µT·m) – good"
 
 
 def test_warnings_of_a_saved_inversion_are_told(
-    viewer: ViewerModel, solved: Inversion, tmp_path: Path, told: list[str]
+    viewer: ViewerModel, solved: Inversion, tmp_path: Path, messages: list[str]
 ) -> None:
     report = replace(solved.report, warnings=(Caution("not-converged", "it did not converge"),))
     opened(viewer, write(tmp_path / "shot.shadowinv", replace(solved, report=report)))
-    assert told == ["shot.shadowinv: it did not converge"]
+    assert messages == ["shot.shadowinv: it did not converge"]
 
 
 def test_any_layer_stands_for_the_fit_when_it_is_saved(
-    viewer: ViewerModel, two_fields: Fit, tmp_path: Path, told: list[str]
+    viewer: ViewerModel, two_fields: Fit, tmp_path: Path, messages: list[str]
 ) -> None:
     turned = {"translate": (3.0, 4.0), "rotate": ((0.0, -1.0), (1.0, 0.0))}
     layers = shown(viewer, two_fields, **turned)
     layers["field E"].colormap = "viridis"
     layers["residual"].visible = True
     path = tmp_path / "pack.shadowinv"
-    for kept in (["residual", "field E"], ["field E"]):
-        viewer.layers.selection = {layers[slot] for slot in kept}
+    for saved in (["residual", "field E"], ["field E"]):
+        viewer.layers.selection = {layers[slot] for slot in saved}
         viewer.layers.save(str(path), selected=True, plugin="napari-shadowinv")
         assert read(path).attrs["mask_origin"] == "painted"
         again = Fit.from_dataset(read(path))
-        for one, other in zip(again.fields, two_fields.fields, strict=True):
-            np.testing.assert_array_equal(one.displacement, other.displacement)
+        for reloaded_field, fitted_field in zip(again.fields, two_fields.fields, strict=True):
+            np.testing.assert_array_equal(reloaded_field.displacement, fitted_field.displacement)
         viewer.layers.clear()
         reopened = opened(viewer, path)
-        assert {slot for slot, one in reopened.items() if one.visible} <= {"field", "arrows", *kept}
+        assert {slot for slot, layer in reopened.items() if layer.visible} <= {
+            "field",
+            "arrows",
+            *saved,
+        }
         assert reopened["field E"].colormap.name == "viridis"
         assert tuple(reopened["field"].translate) == (3, 4)
         np.testing.assert_array_equal(reopened["field"].rotate, turned["rotate"])
@@ -167,7 +173,7 @@ def test_any_layer_stands_for_the_fit_when_it_is_saved(
         viewer.layers.clear()
         layers = shown(viewer, two_fields, **turned)
         layers["field E"].colormap = "viridis"
-    assert not [text for text in told if "changed" in text]
+    assert not [text for text in messages if "changed" in text]
 
 
 def test_a_beam_is_shown_once_unless_images_have_different_ones(doubtful: Fit) -> None:
@@ -177,7 +183,7 @@ def test_a_beam_is_shown_once_unless_images_have_different_ones(doubtful: Fit) -
 
     assert beam(doubtful) is None
     uneven = 1 + np.arange(SHAPE[1]) * np.ones(SHAPE) / 100
-    same = np.stack([uneven, 1.3 * uneven])
-    np.testing.assert_array_equal(beam(replace(doubtful, source=same)), uneven)
-    other = np.stack([uneven, uneven[:, ::-1]])
-    np.testing.assert_array_equal(beam(replace(doubtful, source=other)), other)
+    proportional = np.stack([uneven, 1.3 * uneven])
+    np.testing.assert_array_equal(beam(replace(doubtful, source=proportional)), uneven)
+    different = np.stack([uneven, uneven[:, ::-1]])
+    np.testing.assert_array_equal(beam(replace(doubtful, source=different)), different)

@@ -1,4 +1,4 @@
-"""Layers of a result: what they show, where they lie, and how fast they are there."""
+"""Layers of a result: content, placement, and the order in which they appear."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pytest
 from napari.components import ViewerModel
 
 from napari_shadowinv import InputError, OpticalSetup, ProtonSetup, add_inversion, invert
-from napari_shadowinv._napari.frame import frame_for, place
+from napari_shadowinv._napari.frame import frame_for, place_image
 from napari_shadowinv._napari.layer_metadata import result_of, role_of, setup_of, unit_of
-from napari_shadowinv._napari.layers import inversion_layers, thinned_arrows
+from napari_shadowinv._napari.layers import inversion_layers, sample_arrows
 from napari_shadowinv._napari.sites import power_cells
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion import Inversion
@@ -129,7 +129,7 @@ def test_place_gives_a_stack_the_pixels_of_a_setup(
     viewer: ViewerModel, proton_setup: ProtonSetup
 ) -> None:
     layer = viewer.add_image(np.zeros((3, 20, 20)), contrast_limits=(0, 1))
-    place(layer, proton_setup)
+    place_image(layer, proton_setup)
     np.testing.assert_allclose(layer.scale, [1, 1.5, 1.5])
     assert [str(unit) for unit in layer.units] == ["pixel", "micrometer", "micrometer"]
     assert layer.axis_labels[-2:] == ("y", "x")
@@ -143,14 +143,14 @@ def test_arrows_are_true_displacements_on_a_grid_that_can_be_read(
     np.testing.assert_array_equal(steps, solved.displacement[:, starts[:, 0], starts[:, 1]].T)
     # Drawn, nearly all keep to their own place, and the longest reach to the next but one.
     spacing = np.diff(np.unique(starts[:, 1])).min()
-    drawn = arrows.length * np.hypot(*steps.T) / spacing
-    assert np.percentile(drawn, 94) < 1
-    assert 0.9 < drawn.max() < 2
+    lengths = arrows.length * np.hypot(*steps.T) / spacing
+    assert np.percentile(lengths, 94) < 1
+    assert 0.9 < lengths.max() < 2
 
 
 @pytest.mark.parametrize("shape", [(64, 200), (700, 500), (20, 20)])
 def test_about_thirty_arrows_lie_along_the_longer_side(shape: tuple[int, int]) -> None:
-    data, spacing = thinned_arrows(np.ones((2, *shape)))
+    data, spacing = sample_arrows(np.ones((2, *shape)))
     for axis in (0, 1):
         places = np.unique(data[:, 0, axis])
         np.testing.assert_array_equal(np.diff(places), spacing)
@@ -196,8 +196,8 @@ def test_power_cells_tile_the_image(viewer: ViewerModel, solved: Inversion, boun
     if boundary == "free":
         options = solved.options.model_copy(update={"boundary": boundary})
         solved = invert(solved.image, options=options)
-    polygons, kept = power_cells(solved)
-    assert len(kept) == len(solved.sites) or boundary == "free"
+    polygons, sites = power_cells(solved)
+    assert len(sites) == len(solved.sites) or boundary == "free"
     areas = []
     for polygon in polygons:
         y, x = polygon.T
@@ -208,7 +208,7 @@ def test_power_cells_tile_the_image(viewer: ViewerModel, solved: Inversion, boun
     assert corners.min() >= -0.5 - 1e-9
     assert (corners <= [height - 0.5 + 1e-9, width - 0.5 + 1e-9]).all()
     cells = by_role(add_inversion(viewer, solved, cells=True))["cells"]
-    assert len(cells.data) == len(kept)
+    assert len(cells.data) == len(sites)
 
 
 def test_too_many_cells_are_refused_in_one_sentence(solved: Inversion) -> None:
@@ -220,7 +220,7 @@ def test_too_many_cells_are_refused_in_one_sentence(solved: Inversion) -> None:
 def test_many_sites_are_thinned_and_the_name_says_so(
     viewer: ViewerModel, solved: Inversion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("napari_shadowinv._napari.layers._MOST_SITES_SHOWN", 200)
+    monkeypatch.setattr("napari_shadowinv._napari.layers._MAX_SHOWN_SITES", 200)
     sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
     np.testing.assert_array_equal(sites.data, solved.sites[::3])
     assert sites.name == "sites (1 in 3)"
@@ -240,8 +240,8 @@ def test_each_layer_knows_the_whole_result(
 def test_an_uneven_source_has_its_layer(viewer: ViewerModel, solved: Inversion) -> None:
     source = solved.source * np.linspace(0.5, 1.5, solved.source.shape[1])
     uneven = replace(solved, source=source)
-    described = {role_of(keywords): data for data, keywords, _ in inversion_layers(uneven)}
-    assert described["source"] is source
+    layer_data = {role_of(keywords): data for data, keywords, _ in inversion_layers(uneven)}
+    assert layer_data["source"] is source
 
 
 @pytest.fixture(scope="module")
@@ -267,7 +267,7 @@ def test_layers_share_the_arrays_of_a_large_result(large: Inversion) -> None:
     assert np.shares_memory(layers["sites"].data, large.sites)
 
 
-def show_layers(viewer: Any, qtbot: Any, described: list[Any]) -> tuple[list[str], Any]:
+def show_layers(viewer: Any, qtbot: Any, layer_data: list[Any]) -> tuple[list[str], Any]:
     """Layers in the order in which they are drawn or complete, and the layers."""
     from napari_shadowinv._napari.widgets._results import ResultLayers
 
@@ -280,7 +280,7 @@ def show_layers(viewer: Any, qtbot: Any, described: list[Any]) -> tuple[list[str
     canvas = viewer.window._qt_viewer.canvas._scene_canvas
     canvas.events.draw.connect(on_draw)
     results.complete.connect(lambda: events.append("complete"))
-    results.show(described)
+    results.show(layer_data)
     qtbot.waitUntil(lambda: "complete" in events, timeout=60_000)
     canvas.events.draw.disconnect(on_draw)
     return events, results
@@ -291,14 +291,14 @@ def test_the_field_of_a_megapixel_is_drawn_before_hidden_layers(
 ) -> None:
     window = make_napari_viewer(show=True)
     qtbot.wait(100)
-    described = inversion_layers(large)
-    names = [keywords["name"] for _, keywords, _ in described]
+    layer_data = inversion_layers(large)
+    names = [keywords["name"] for _, keywords, _ in layer_data]
     inserted: list[str] = []
     window.layers.events.inserted.connect(lambda event: inserted.append(role_of(event.value)))
-    events, _ = show_layers(window, qtbot, described)
+    events, _ = show_layers(window, qtbot, layer_data)
     assert inserted[:2] == ["field", "arrows"]
-    drawn = [int(event.split()[0]) for event in events if event.endswith("drawn")]
-    assert min(count for count in drawn if count) <= 2
+    counts = [int(event.split()[0]) for event in events if event.endswith("drawn")]
+    assert min(count for count in counts if count) <= 2
     assert [layer.name for layer in window.layers] == names
     assert role_of(window.layers.selection.active) == "field"
 
@@ -307,15 +307,15 @@ def test_layers_keep_their_order_when_some_are_deleted_between_results(
     solved: Inversion, make_napari_viewer: Any, qtbot: Any
 ) -> None:
     window = make_napari_viewer(show=True)
-    described = inversion_layers(solved)
-    names = [keywords["name"] for _, keywords, _ in described]
-    _, results = show_layers(window, qtbot, described)
+    layer_data = inversion_layers(solved)
+    names = [keywords["name"] for _, keywords, _ in layer_data]
+    _, results = show_layers(window, qtbot, layer_data)
     for name in ("|d| (px)", "dx (px)", "sites"):
         window.layers.remove(name)
     window.add_image(np.ones((9, 9)), name="other")
     complete: list[bool] = []
     results.complete.connect(lambda: complete.append(True))
-    results.show(described, select=False)
+    results.show(layer_data, select=False)
     qtbot.waitUntil(lambda: bool(complete), timeout=60_000)
     assert [layer.name for layer in window.layers if layer.name != "other"] == names
     assert window.layers.selection.active is window.layers["other"]

@@ -1,4 +1,4 @@
-"""The manifest, and what is imported because of it."""
+"""The manifest, and the imports that it causes."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ def manifest() -> Any:
 
 
 def test_it_is_valid_and_each_command_can_be_imported() -> None:
-    found = manifest()
-    found.validate_imports()
-    assert found.name == "napari-shadowinv"
+    validated = manifest()
+    validated.validate_imports()
+    assert validated.name == "napari-shadowinv"
 
 
 def test_its_readers_and_writers_are_those_of_the_registry() -> None:
     from napari_shadowinv.io import formats
 
-    found = manifest().contributions
-    (reader,) = found.readers
+    contributions = manifest().contributions
+    (reader,) = contributions.readers
     readable = {end for each in formats.FORMATS if each.reader for end in each.suffixes}
     assert sorted(reader.filename_patterns) == sorted(
         f"*{suffix}" for suffix in readable - formats.OPENED_BY_NAPARI
     )
     # A store is a folder, and folders are offered whatever their name.
     assert reader.accepts_directories
-    written = [suffix for writer in found.writers for suffix in writer.filename_extensions]
+    written = [suffix for writer in contributions.writers for suffix in writer.filename_extensions]
     writers = {each.suffix for each in formats.FORMATS if each.result_writer}
     assert sorted(written) == sorted(writers)
 
@@ -44,8 +44,10 @@ def test_napari_itself_opens_what_is_left_to_it() -> None:
 
     from napari_shadowinv.io.formats import OPENED_BY_NAPARI
 
-    own = PluginManifest.from_file(Path(napari_builtins.__file__).with_name("builtins.yaml"))
-    patterns = {name for reader in own.contributions.readers for name in reader.filename_patterns}
+    builtins = PluginManifest.from_file(Path(napari_builtins.__file__).with_name("builtins.yaml"))
+    patterns = {
+        name for reader in builtins.contributions.readers for name in reader.filename_patterns
+    }
     assert {f"*{suffix}" for suffix in OPENED_BY_NAPARI} <= patterns
 
 
@@ -58,14 +60,14 @@ def test_its_menus_exist() -> None:
 
 
 def test_every_command_is_used_and_every_use_is_a_command() -> None:
-    found = manifest().contributions
-    ids = {command.id for command in found.commands}
+    contributions = manifest().contributions
+    ids = {command.id for command in contributions.commands}
     used = [
-        *(item.command for item in found.readers),
-        *(item.command for item in found.writers),
-        *(item.command for item in found.widgets or ()),
-        *(item.command for item in found.sample_data),
-        *(item.command for items in found.menus.values() for item in items),
+        *(item.command for item in contributions.readers),
+        *(item.command for item in contributions.writers),
+        *(item.command for item in contributions.widgets or ()),
+        *(item.command for item in contributions.sample_data),
+        *(item.command for items in contributions.menus.values() for item in items),
     ]
     assert ids == set(used)
 

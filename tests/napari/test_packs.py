@@ -12,8 +12,8 @@ from napari.layers import Layer
 
 from napari_shadowinv import read, write
 from napari_shadowinv._napari import packs
-from napari_shadowinv._napari.layer_metadata import mark_of, role_of, setup_of, usable_of
-from napari_shadowinv._napari.viewer_sync import keep_in_step
+from napari_shadowinv._napari.layer_metadata import metadata_of, role_of, setup_of, usable_of
+from napari_shadowinv._napari.viewer_sync import connect_viewer
 
 PLUGIN = "napari-shadowinv"
 
@@ -44,8 +44,10 @@ def test_a_pack_opens_as_stacks_of_films(
         assert layer.data.shape == pack_dataset["fluence"].shape
         assert layer.axis_labels == ("layer", "y", "x")
         np.testing.assert_allclose(layer.scale, (1, pixel, pixel))
-        assert mark_of(layer)["energies"] == pack_dataset["energy"].values.tolist()
-        assert mark_of(layer)["times_of_flight"] == pack_dataset["time_of_flight"].values.tolist()
+        assert metadata_of(layer)["energies"] == pack_dataset["energy"].values.tolist()
+        assert (
+            metadata_of(layer)["times_of_flight"] == pack_dataset["time_of_flight"].values.tolist()
+        )
     np.testing.assert_array_equal(layers["fluence"].data, pack_dataset["fluence"].values)
     np.testing.assert_array_equal(layers["dose"].data, pack_dataset["dose"].values)
     np.testing.assert_array_equal(layers["unusable"].data == 0, pack_dataset["usable"].values)
@@ -57,25 +59,25 @@ def test_a_pack_without_setup_has_the_pixels_of_its_scans(
     file = write(tmp_path / "bare.shadowinv", without_setup(pack_dataset))
     fluence = opened(viewer, file)["fluence"]
     np.testing.assert_allclose(fluence.scale[1:], 1e6 * pack_dataset.attrs["scan_pixel_size"])
-    assert mark_of(fluence)["films"][1] == f"film 2: {pack_dataset['energy'].values[1]:.3g} MeV"
+    assert metadata_of(fluence)["films"][1] == f"film 2: {pack_dataset['energy'].values[1]:.3g} MeV"
 
 
 def test_the_film_in_view_is_named_and_has_its_own_contrast(
     viewer: ViewerModel, file: Path, pack_dataset: Any
 ) -> None:
     energies, times = pack_dataset["energy"].values, 1e12 * pack_dataset["time_of_flight"].values
-    told = [
+    labels = [
         f"{energy:.3g} MeV, {time:.3g} ps" for energy, time in zip(energies, times, strict=True)
     ]
-    keep_in_step(viewer)
+    connect_viewer(viewer)
     fluence = opened(viewer, file)["fluence"]
     text = viewer.canvas.overlays.text
     viewer.dims.set_current_step(0, 0)
     assert text.visible
-    assert text.text == f"film 1: {told[0]}"
+    assert text.text == f"film 1: {labels[0]}"
     first = tuple(fluence.contrast_limits)
     viewer.dims.set_current_step(0, 2)
-    assert text.text == f"film 3: {told[2]}"
+    assert text.text == f"film 3: {labels[2]}"
     middle = fluence.data[2][20:60, 20:80]
     assert fluence.contrast_limits[1] < 1.5 * np.percentile(middle, 99.9) < first[1]
     fluence.contrast_limits = (0, 7e12)
@@ -104,11 +106,11 @@ def test_saved_layers_are_the_whole_pack_again(
 
 
 def test_warnings_are_told_when_a_pack_is_opened(
-    viewer: ViewerModel, pack_dataset: Any, tmp_path: Path, told: list[str]
+    viewer: ViewerModel, pack_dataset: Any, tmp_path: Path, messages: list[str]
 ) -> None:
     warned = pack_dataset.assign_attrs(warnings='["film 2 is too dark"]')
     opened(viewer, write(tmp_path / "dark.shadowinv", warned))
-    assert told == ["dark.shadowinv: film 2 is too dark"]
+    assert messages == ["dark.shadowinv: film 2 is too dark"]
 
 
 def test_a_spectrum_is_the_mean_of_usable_pixels(pack_dataset: Any) -> None:
@@ -116,12 +118,12 @@ def test_a_spectrum_is_the_mean_of_usable_pixels(pack_dataset: Any) -> None:
     region[30:50, 10:40] = True
     region = region[: pack_dataset.sizes["y"], : pack_dataset.sizes["x"]]
     for inside in (None, region):
-        found = packs.spectrum_in(pack_dataset, inside)
+        spectrum = packs.spectrum_in(pack_dataset, inside)
         for k in range(3):
             used = pack_dataset["usable"].values[k] & (True if inside is None else inside)
             fluence = pack_dataset["fluence"].values[k][used].astype(float)
-            assert found.fluence[k] == pytest.approx(fluence.mean(), rel=1e-12)
-            assert found.error[k] == np.median(pack_dataset["fluence_error"].values[k][used])
+            assert spectrum.fluence[k] == pytest.approx(fluence.mean(), rel=1e-12)
+            assert spectrum.error[k] == np.median(pack_dataset["fluence_error"].values[k][used])
     nothing = packs.spectrum_in(pack_dataset, np.zeros_like(region))
     assert np.isnan(nothing.fluence).all()
 
@@ -130,7 +132,7 @@ def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_dataset: Any)
     lost = pack_dataset.copy(deep=True)
     lost["usable"].values[1] = False
     frame = packs.pack_frame(lost)
-    layers = [Layer.create(*one) for one in packs.film_layers(lost, frame, "trio")]
+    layers = [Layer.create(*layer_data) for layer_data in packs.film_layers(lost, frame, "trio")]
     first, _, last = (f"{energy:.3g} MeV" for energy in pack_dataset["energy"].values)
     assert [layer.name for layer in layers] == [f"film 1, {first}", f"film 3, {last}"]
     for layer, k in zip(layers, (0, 2), strict=True):

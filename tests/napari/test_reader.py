@@ -16,9 +16,15 @@ from napari.utils.notifications import notification_manager
 from scipy.io import savemat
 
 from napari_shadowinv import FileFormatError, ProtonSetup, write
-from napari_shadowinv._napari.layer_metadata import mark_of, result_of, role_of, setup_of, source_of
+from napari_shadowinv._napari.layer_metadata import (
+    metadata_of,
+    result_of,
+    role_of,
+    setup_of,
+    source_of,
+)
 from napari_shadowinv._napari.layer_state import missing_layers
-from napari_shadowinv._napari.layers import add_layers, thinned_arrows
+from napari_shadowinv._napari.layers import add_layers, sample_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
 from napari_shadowinv._napari.stores import follow_shots
 from napari_shadowinv._napari.widgets._layers import warnings_of
@@ -62,7 +68,7 @@ def test_pradformat_opens_with_its_pixels_and_setup(
     assert {str(unit) for unit in layer.units} == {"micrometer"}
     assert (layer.name, layer.axis_labels) == ("d3he", ("y", "x"))
     np.testing.assert_array_equal(layer.data, shot)
-    assert mark_of(layer)["file"]["sha256"]
+    assert metadata_of(layer)["file"]["sha256"]
 
 
 def test_pixels_stay_pixels_where_the_magnification_is_unknown(
@@ -74,7 +80,7 @@ def test_pixels_stay_pixels_where_the_magnification_is_unknown(
     (layer,) = viewer.open(path, plugin=PLUGIN)
     assert setup_of(layer) is None
     assert {str(unit) for unit in layer.units} == {"pixel"}
-    assert mark_of(layer)["file"]["geometry"]["detector_pixel_size"] == 163.8e-6
+    assert metadata_of(layer)["file"]["geometry"]["detector_pixel_size"] == 163.8e-6
 
 
 @pytest.mark.parametrize("suffix", [".mat", ".txt", ".dat", ".b16"])
@@ -144,7 +150,7 @@ def test_a_folder_is_a_lazy_stack_in_counting_order(viewer: ViewerModel, run: Pa
     assert layer.axis_labels == ("shot", "y", "x")
     assert layer.name == "run 3"
     np.testing.assert_array_equal(layer.data[:, 0, 0].compute(), [1, 2, 10])
-    names = [Path(path).name for path in mark_of(layer)["paths"]]
+    names = [Path(path).name for path in metadata_of(layer)["paths"]]
     assert names == ["shot1.tif", "shot2.tif", "shot10.tif"]
 
 
@@ -153,19 +159,19 @@ def test_only_the_first_shot_is_read(
 ) -> None:
     import napari_shadowinv.io
 
-    read, seen = napari_shadowinv.io.read_radiograph, []
+    read, names = napari_shadowinv.io.read_radiograph, []
 
     def watched(path: Path, **keywords: Any) -> Any:
-        seen.append(path.name)
+        names.append(path.name)
         return read(path, **keywords)
 
     monkeypatch.setattr(napari_shadowinv.io, "read_radiograph", watched)
     ((data, keywords, _),) = read_paths(str(run))
-    assert seen == ["shot1.tif"]
+    assert names == ["shot1.tif"]
     viewer.add_image(data, **keywords)  # shows the middle one
-    assert seen == ["shot1.tif", "shot2.tif"]
+    assert names == ["shot1.tif", "shot2.tif"]
     viewer.dims.set_point(0, 2)
-    assert seen == ["shot1.tif", "shot2.tif", "shot10.tif"]
+    assert names == ["shot1.tif", "shot2.tif", "shot10.tif"]
 
 
 def test_lists_and_patterns_are_stacks_too(viewer: ViewerModel, run: Path) -> None:
@@ -180,8 +186,8 @@ def test_lists_and_patterns_are_stacks_too(viewer: ViewerModel, run: Path) -> No
 
 def test_a_stray_file_is_dark_and_gives_a_warning(run: Path) -> None:
     tifffile.imwrite(run / "shot3.tif", np.ones((5, 5), np.float32))
-    whole = (run / "shot1.tif").read_bytes()
-    (run / "shot4.tif").write_bytes(whole[:-40])
+    complete = (run / "shot1.tif").read_bytes()
+    (run / "shot4.tif").write_bytes(complete[:-40])
     ((data, _, _),) = read_paths(str(run))
     with pytest.warns(
         UserWarning, match=r"shown as zeros: .*shot3.tif has 5×5 pixels, but the first.*6×8"
@@ -252,12 +258,12 @@ def test_bad_files_raise_one_sentence_in_a_script(
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_one_notification_in_a_window(
-    viewer: ViewerModel, tmp_path: Path, name: str, in_loop: Any, told: list[str]
+    viewer: ViewerModel, tmp_path: Path, name: str, in_loop: Any, messages: list[str]
 ) -> None:
     content, words = BAD[name]
     (tmp_path / name).write_bytes(content)
     assert in_loop(lambda: viewer.open(tmp_path / name, plugin=None)) == []
-    (text,) = told
+    (text,) = messages
     assert words in text
     assert "Traceback" not in text
     assert "\n" not in text
@@ -268,16 +274,16 @@ def store(solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path) -> Path:
     """Three shots, the first still empty, as a run writes them."""
     import xarray as xr
 
-    one = solved.to_dataset(proton_setup)
-    half = one.copy()
-    empty = one.copy(deep=True)
+    result = solved.to_dataset(proton_setup)
+    half = result.copy()
+    empty = result.copy(deep=True)
     for name in ("potential", "displacement", "reprojection", "residual"):
-        half[name] = 0.5 * one[name]
-        empty[name] = np.nan * one[name]
+        half[name] = 0.5 * result[name]
+        empty[name] = np.nan * result[name]
     run = xr.concat(
-        [part.drop_dims("site") for part in (empty, one, half)], "shot", data_vars="all"
+        [part.drop_dims("site") for part in (empty, result, half)], "shot", data_vars="all"
     )
-    run.attrs = one.attrs
+    run.attrs = result.attrs
     path = tmp_path / "night.shadowinv.zarr"
     run.chunk({"shot": 1}).to_zarr(path, consolidated=False)
     return path
@@ -313,7 +319,7 @@ def test_a_store_opens_as_lazy_layers(
 
 def rays(solved: Inversion, factor: float = 1.0) -> Any:
     """Start and displacement of the arrows of a shot of the store."""
-    return thinned_arrows(factor * solved.displacement)[0]
+    return sample_arrows(factor * solved.displacement)[0]
 
 
 def test_arrows_follow_the_shot_in_view(
@@ -363,12 +369,12 @@ def test_shots_that_are_marked_as_pending_are_not_looked_at(store: Path, solved:
     with xr.open_zarr(store, consolidated=False) as run:
         marks = xr.Dataset({"status": ("shot", np.array([0, 0, 1], np.int8))}, attrs=run.attrs)
     marks.to_zarr(store, mode="a", consolidated=False)
-    described = {role_of(keywords): keywords for _, keywords, _ in read_paths(str(store))}
+    by_role = {role_of(keywords): keywords for _, keywords, _ in read_paths(str(store))}
     strongest = np.hypot(*solved.displacement).max()
-    setup = setup_of(described["field"])
+    setup = setup_of(by_role["field"])
     assert isinstance(setup, ProtonSetup)
     factor = np.hypot(*setup.path_integrated_b([1.0, 0.0])) * 1e6  # half is below 1 mT·m
-    assert described["field"]["contrast_limits"][1] == pytest.approx(0.5 * factor * strongest)
+    assert by_role["field"]["contrast_limits"][1] == pytest.approx(0.5 * factor * strongest)
 
 
 def test_a_damaged_store_is_one_sentence(store: Path) -> None:
@@ -385,11 +391,13 @@ def test_a_scan_of_film_is_told_and_so_is_its_result(viewer: ViewerModel, tmp_pa
     film[6:-6, 8:-8] = 20_000
     tifffile.imwrite(tmp_path / "film.tif", film)
     tifffile.imwrite(tmp_path / "film2.tif", film)
-    ((_, own, _),) = read_paths([str(tmp_path / "film.tif"), str(tmp_path / "film2.tif")])
-    (told,) = [record for record in notification_manager.records if "film.tif" in record.message]
-    (warning,) = mark_of(own)["warnings"]
+    ((_, keywords, _),) = read_paths([str(tmp_path / "film.tif"), str(tmp_path / "film2.tif")])
+    (record_of_film,) = [
+        record for record in notification_manager.records if "film.tif" in record.message
+    ]
+    (warning,) = metadata_of(keywords)["warnings"]
     assert "wrong sign" in warning.text
-    assert warning.text in told.message
+    assert warning.text in record_of_film.message
     (read_by_napari,) = viewer.open(tmp_path / "film.tif", plugin="napari")
     assert warnings_of(read_by_napari) == (warning,)
     assert warnings_of(viewer.add_image(film)) == ()
@@ -400,8 +408,8 @@ def test_pradreader_brings_its_source_and_its_mask(
 ) -> None:
     mask = np.zeros(shot.shape)
     mask[:, :3] = 1
-    told = "\n".join(f"{name} {shot.shape}" for name in ("flux2D", "flux2D_ref", "mask"))
-    np.savetxt(tmp_path / "input.txt", np.vstack([shot, shot + 1, mask]), header=told)
+    header = "\n".join(f"{name} {shot.shape}" for name in ("flux2D", "flux2D_ref", "mask"))
+    np.savetxt(tmp_path / "input.txt", np.vstack([shot, shot + 1, mask]), header=header)
     layers = viewer.open(tmp_path / "input.txt", plugin=PLUGIN)
     assert [role_of(layer) for layer in layers] == ["source", "mask", "shot"]
     np.testing.assert_array_equal(layers[1].data, mask)  # painted is unusable

@@ -1,4 +1,4 @@
-"""Sample data: there at once, with setup and source, and as they were meant."""
+"""Sample data: available at once, with setup and source, and with the intended content."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ def test_two_energies_are_fitted_as_they_open(
     setups: Any = [shot.setup for shot in job.shots]
     assert [setup.energy for setup in setups] == [14.7, 3.0]
     choices = job.choices.model_copy(update={"options": FitOptions(samples=0)})
-    found = replace(job, recipe=job.recipe.model_copy(update={"fit": choices})).fitted()
-    assert found.verdict is Verdict.DETERMINED
-    (field,) = found.fields
+    fit_result = replace(job, recipe=job.recipe.model_copy(update={"fit": choices})).compute()
+    assert fit_result.verdict is Verdict.DETERMINED
+    (field,) = fit_result.fields
     strength = np.hypot(*setups[0].path_integrated_b(field.displacement, "MG um"))
     assert strength.max() == pytest.approx(30.3, rel=0.02)
-    unevenness = found.source[0].std() / found.source[0].mean()
+    unevenness = fit_result.source[0].std() / fit_result.source[0].mean()
     assert unevenness == pytest.approx(0.103, rel=0.05)
 
 

@@ -1,4 +1,4 @@
-"""What keeps in step with a viewer: the colour bar, images that are opened beside results."""
+"""Synchronisation with a viewer: the colour bar, and images that are opened next to results."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from napari.components import ViewerModel
 
 from napari_shadowinv import ProtonSetup, add_inversion
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.layer_metadata import mark, role_of
+from napari_shadowinv._napari.layer_metadata import metadata_for, role_of
 from napari_shadowinv.inversion import Inversion
 
 
 def bars(viewer: ViewerModel) -> list[str]:
     """Names beside visible colour bars."""
-    shown = [one for one in viewer.layers if hasattr(one, "colorbar") and one.colorbar.visible]
-    assert all(one.name_overlay.visible and one.visible for one in shown)
-    tags = [one for one in viewer.layers if one.name_overlay.visible]
-    assert tags == shown
-    return [one.name for one in shown]
+    with_bar = [
+        layer for layer in viewer.layers if hasattr(layer, "colorbar") and layer.colorbar.visible
+    ]
+    assert all(layer.name_overlay.visible and layer.visible for layer in with_bar)
+    tags = [layer for layer in viewer.layers if layer.name_overlay.visible]
+    assert tags == with_bar
+    return [layer.name for layer in with_bar]
 
 
 def test_only_the_image_that_is_seen_has_a_colour_bar(
@@ -51,7 +53,7 @@ def test_a_colour_bar_that_was_switched_off_stays_off(
     viewer.layers["|d| (px) – a"].colorbar.visible = False
     viewer.layers["|d| (px) – a"].visible = False
     viewer.layers["residual (% of mean) – a"].visible = True
-    assert not any(one.colorbar.visible for one in viewer.layers if hasattr(one, "colorbar"))
+    assert not any(layer.colorbar.visible for layer in viewer.layers if hasattr(layer, "colorbar"))
 
 
 def test_a_long_name_is_smaller_beside_the_colour_bar(
@@ -66,44 +68,44 @@ def test_a_long_name_is_smaller_beside_the_colour_bar(
 
 
 def test_an_image_of_the_same_size_lies_on_the_result(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, told: list[str],
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, messages: list[str],
     tmp_path: Path,
 ) -> None:  # fmt: skip
     layers = add_inversion(viewer, solved, proton_setup, name="a", translate=(3.0, 4.0))
-    frame = frame_of(next(one for one in layers if role_of(one) == "field"))
+    frame = frame_of(next(layer for layer in layers if role_of(layer) == "field"))
     for data in (np.ones((40, 52)), np.ones((5, 40, 52)), np.ones((40, 52), np.uint8)):
-        told.clear()
-        other = viewer.add_image(data, name="other")
-        assert frame_of(other) == frame
-        assert f"'{other.name}' has the same size in pixels as '|∫B×dz| (mT·m) – a'" in told[-1]
-        assert "1.5 µm" in told[-1]
+        messages.clear()
+        image = viewer.add_image(data, name="other")
+        assert frame_of(image) == frame
+        assert f"'{image.name}' has the same size in pixels as '|∫B×dz| (mT·m) – a'" in messages[-1]
+        assert "1.5 µm" in messages[-1]
     np.savetxt(tmp_path / "other.txt", np.ones((40, 52)))
     (opened,) = viewer.open(tmp_path / "other.txt", plugin="napari-shadowinv")
     assert frame_of(opened) == frame
-    assert {str(unit) for one in viewer.layers for unit in one.units[-2:]} == {"micrometer"}
+    assert {str(unit) for layer in viewer.layers for unit in layer.units[-2:]} == {"micrometer"}
 
 
 def test_an_image_of_another_size_is_told_how_to_get_a_scale(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, told: list[str]
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, messages: list[str]
 ) -> None:
     add_inversion(viewer, solved, proton_setup, name="a")
-    other = viewer.add_image(np.ones((30, 52)), name="other")
-    assert tuple(other.scale) == (1, 1)
-    assert "'other' is in pixels, the results are in µm" in told[-1]
-    assert "Invert shot" in told[-1]
+    image = viewer.add_image(np.ones((30, 52)), name="other")
+    assert tuple(image.scale) == (1, 1)
+    assert "'other' is in pixels, the results are in µm" in messages[-1]
+    assert "Invert shot" in messages[-1]
 
 
 def test_what_has_a_place_keeps_it(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, told: list[str]
+    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, messages: list[str]
 ) -> None:
     viewer.add_image(np.ones((40, 52)))
     add_inversion(viewer, solved, name="in pixels")
     first = viewer.add_image(np.ones((40, 52)))
     add_inversion(viewer, solved, proton_setup, name="a")
-    told.clear()
-    placed = viewer.add_image(np.ones((40, 52)), scale=(2, 2), units=("um", "um"))
-    own = viewer.add_image(np.ones((40, 52)), metadata=mark("image", ""))
+    messages.clear()
+    with_scale = viewer.add_image(np.ones((40, 52)), scale=(2, 2), units=("um", "um"))
+    of_plugin = viewer.add_image(np.ones((40, 52)), metadata=metadata_for("image", ""))
     viewer.add_labels(np.ones((40, 52), int))
-    assert tuple(placed.scale) == (2, 2)
-    assert tuple(own.scale) == tuple(first.scale) == (1, 1)
-    assert not any("same position" in text or "in pixels" in text for text in told)
+    assert tuple(with_scale.scale) == (2, 2)
+    assert tuple(of_plugin.scale) == tuple(first.scale) == (1, 1)
+    assert not any("same position" in text or "in pixels" in text for text in messages)

@@ -11,7 +11,7 @@ import pytest
 from napari.components import ViewerModel
 
 from napari_shadowinv import FileFormatError, ProtonSetup, add_inversion, read
-from napari_shadowinv._napari.layer_metadata import mark_of, result_of, role_of
+from napari_shadowinv._napari.layer_metadata import metadata_of, result_of, role_of
 from napari_shadowinv._napari.writer import write_result
 from napari_shadowinv.inversion import Inversion
 
@@ -60,7 +60,7 @@ def assert_same_layer(one: Any, two: Any) -> None:
     if hasattr(one, "features"):
         assert list(one.features) == list(two.features)
         np.testing.assert_array_equal(two.features, one.features)
-    facts = [{**mark_of(layer), "result": None, "source": None} for layer in (one, two)]
+    facts = [{**metadata_of(layer), "result": None, "source": None} for layer in (one, two)]
     assert facts[0] == facts[1]
 
 
@@ -85,8 +85,8 @@ def test_all_layers_come_back_as_they_were(
     assert saved == [str(tmp_path / "a.shadowinv")]
     after = other_viewer.open(tmp_path / "a.shadowinv", plugin=None)
     assert len(before) == len(after) == 12
-    for one, two in zip(before, after, strict=True):
-        assert_same_layer(one, two)
+    for layer, two in zip(before, after, strict=True):
+        assert_same_layer(layer, two)
 
 
 def test_nothing_of_the_result_is_lost(
@@ -113,7 +113,7 @@ def test_one_saved_layer_stands_for_the_main_ones(
     back = other_viewer.open(tmp_path / "a.shadowinv", plugin=PLUGIN)
     roles = ["image", "residual", "potential", "field", "caustic", "arrows"]
     assert [role_of(layer) for layer in back] == roles
-    assert [role_of(one) for one in back if one.visible] == ["potential", "field", "arrows"]
+    assert [role_of(layer) for layer in back if layer.visible] == ["potential", "field", "arrows"]
     assert all(layer.name.endswith(" – shot") for layer in back)
 
 
@@ -124,28 +124,28 @@ def test_a_place_that_no_setup_tells_comes_back(
     before = add_inversion(viewer, solved, **place, all_layers=True)
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     after = other_viewer.open(tmp_path / "a.shadowinv", plugin=PLUGIN)
-    for one, two in zip(before, after, strict=True):
-        assert_same_layer(one, two)
+    for layer, two in zip(before, after, strict=True):
+        assert_same_layer(layer, two)
 
 
 def test_painted_caustics_are_kept(viewer: ViewerModel, solved: Inversion, tmp_path: Path) -> None:
     caustics = by_role(add_inversion(viewer, solved))["caustic"]
     caustics.data[:5, :6] = 1
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
-    kept = read(tmp_path / "a.shadowinv")["caustic"].values
-    assert kept[:5, :6].all()
-    np.testing.assert_array_equal(kept[5:], solved.caustic[5:])
+    caustic = read(tmp_path / "a.shadowinv")["caustic"].values
+    assert caustic[:5, :6].all()
+    np.testing.assert_array_equal(caustic[5:], solved.caustic[5:])
 
 
 def test_a_layer_that_was_changed_is_named(
-    viewer: ViewerModel, solved: Inversion, tmp_path: Path, told: list[str]
+    viewer: ViewerModel, solved: Inversion, tmp_path: Path, messages: list[str]
 ) -> None:
     layers = by_role(add_inversion(viewer, solved, all_layers=True))
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
-    assert told == []
+    assert messages == []
     layers["potential"].data = layers["potential"].data + 1
     viewer.layers.save(str(tmp_path / "b.shadowinv"), plugin=PLUGIN)
-    (text,) = told
+    (text,) = messages
     assert "'potential (px²)' changed since the result was made" in text
 
 
@@ -189,8 +189,8 @@ def test_a_field_of_other_origin_can_be_kept_as_a_result(
     before = viewer.open(tmp_path / "a.h5", plugin=PLUGIN)
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     after = other_viewer.open(tmp_path / "a.shadowinv", plugin=PLUGIN)
-    for one, two in zip(before, after, strict=True):
-        assert_same_layer(one, two)
+    for layer, two in zip(before, after, strict=True):
+        assert_same_layer(layer, two)
 
 
 def test_layers_of_two_results_are_refused(
@@ -201,13 +201,15 @@ def test_layers_of_two_results_are_refused(
 ) -> None:
     add_inversion(viewer, solved, name="one")
     add_inversion(viewer, make_inversion((24, 32)), name="two")
-    with pytest.raises(FileFormatError, match=r"the layers show 2 results .*select layers of one"):
+    with pytest.raises(
+        FileFormatError, match=r"the layers belong to 2 results .*select layers of one"
+    ):
         viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
 
 
 def test_layers_of_no_result_are_refused(viewer: ViewerModel, tmp_path: Path) -> None:
     viewer.add_image(np.zeros((4, 4)), name="holiday", contrast_limits=(0, 1))
-    with pytest.raises(FileFormatError, match=r"no layer shows a result .'holiday'."):
+    with pytest.raises(FileFormatError, match=r"no layer belongs to a result .'holiday'."):
         viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
 
 
@@ -217,7 +219,7 @@ def test_napari_still_writes_its_own_csv(viewer: ViewerModel, tmp_path: Path) ->
     assert "axis-0" in (tmp_path / "points.csv").read_text()
 
 
-def described(viewer: ViewerModel) -> list[Any]:
+def described_layers(viewer: ViewerModel) -> list[Any]:
     return [layer.as_layer_data_tuple() for layer in viewer.layers]
 
 
@@ -226,10 +228,10 @@ def test_an_ending_is_added_but_never_onto_an_existing_file(
 ) -> None:
     add_inversion(viewer, solved)
     target = tmp_path / "shot.07"
-    assert write_result(str(target), described(viewer)) == [f"{target}.shadowinv"]
+    assert write_result(str(target), described_layers(viewer)) == [f"{target}.shadowinv"]
     # The dialog asked about "shot.07", not about this.
     with pytest.raises(FileFormatError, match=r"shot.07.shadowinv exists: choose another name"):
-        write_result(str(target), described(viewer))
+        write_result(str(target), described_layers(viewer))
 
 
 def test_a_failed_write_leaves_the_old_file_whole(

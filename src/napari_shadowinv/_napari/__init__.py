@@ -1,5 +1,5 @@
 """The napari plugin: layers of a result, readers, writers, sample data, commands, widgets.
 
-Nothing else in the package imports it, and it imports napari only inside functions: layers are
-described as tuples (data, keywords, type), which need no window.
+No other part of the package imports it, and it imports napari only inside functions: layers are
+represented as tuples (data, keywords, type), which need no window.
 """

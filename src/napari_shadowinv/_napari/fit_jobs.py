@@ -1,6 +1,6 @@
 """Fits of layers.
 
-- what is to be fitted: `FitJob`; what has been found, with its layers: `FitAnswer`
+- a fit to run: `FitJob`; its result with layers: `FinishedFit`
 - the job that refines an inversion: `refinement`
 """
 
@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv._napari.fit_course import PACE, Course, Forecast, forecast_of
 from napari_shadowinv._napari.fit_layers import fit_layers, setup_of_fit
+from napari_shadowinv._napari.fit_progress import PACE, FitProgress, TimeEstimate, estimate_fit_time
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layer_metadata import Result, mark_of, result_of
-from napari_shadowinv._napari.shots import loaded
+from napari_shadowinv._napari.layer_metadata import Result, metadata_of, result_of
+from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
@@ -31,13 +31,12 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class FitAnswer:
+class FinishedFit:
     result: Result
-    described: list[FullLayerData]
+    layer_data: list[FullLayerData]
 
     @property
     def fit(self) -> Fit:
-        """What was found."""
         content = self.result.content
         assert isinstance(content, Fit)
         return content
@@ -45,14 +44,14 @@ class FitAnswer:
 
 @dataclass(frozen=True, eq=False)
 class FitJob:
-    """A fit to be made, and the place of its layers; images and sources may be lazy."""
+    """A fit to run, and the frame of its layers; images and sources may be lazy."""
 
     recipe: Recipe  # with the fit's choices, and the setup of the first image
     shots: tuple[FitShot, ...]
     names: tuple[str, ...]  # of the images
     name: str
     frame: Frame
-    given: Sequence[tuple[str, str]]  # what it was given, in words
+    inputs: Sequence[tuple[str, str]]  # rows of the report
     attributes: Mapping[str, str]
     layer: Any = None  # of the first image
     companions: tuple[Any, ...] = ()
@@ -64,57 +63,57 @@ class FitJob:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the images after the steps."""
+        """Shape of the images after the steps."""
         image: Any = self.shots[0].image
         return self.recipe.shape_after(image.image.shape)
 
     @cached_property
-    def course(self) -> Course:
-        """How far it is, and the objectives so far."""
-        return Course(self.forecast)
+    def progress(self) -> FitProgress:
+        """Progress of the fit, and its objectives so far."""
+        return FitProgress(self.time_estimate)
 
     @property
-    def forecast(self) -> Forecast:
-        """What its time depends on."""
+    def time_estimate(self) -> TimeEstimate:
+        """Estimate of the fit's time."""
         choices = self.choices
         source = choices.beam if choices.beam == "unknown" else None
         fields = len(choices.fields or ("B",))
-        return forecast_of(self.shape, len(self.names), fields, source, choices.options)
+        return estimate_fit_time(self.shape, len(self.names), fields, source, choices.options)
 
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FitAnswer:
-        """Fit and describe the layers, all of it beside the window."""
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FinishedFit:
+        """Fit the images and describe the layers."""
 
-        def heard(news: Progress) -> None:
-            on_progress(self.course.heard(news))
+        def update(progress: Progress) -> None:
+            on_progress(self.progress.update(progress))
 
-        found = self.fitted(heard, should_stop)
-        PACE.learn(self.forecast, sum(found.report.seconds.values()))
-        result = Result(found, setup_of_fit(found), dict(self.attributes))
-        return FitAnswer(result, fit_layers(result, self.frame, self.name))
+        fit = self.compute(update, should_stop)
+        PACE.learn(self.time_estimate, sum(fit.report.seconds.values()))
+        result = Result(fit, setup_of_fit(fit), dict(self.attributes))
+        return FinishedFit(result, fit_layers(result, self.frame, self.name))
 
-    def fitted(
+    def compute(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Fit:
-        """Read the images, do the recipe's steps to them, and fit."""
+        """Load the images, apply the recipe's steps, and fit."""
         names = [f"'{name}'" for name in self.names]
-        shots = [_loaded(shot, name) for shot, name in zip(self.shots, names, strict=True)]
+        shots = [_load(shot, name) for shot, name in zip(self.shots, names, strict=True)]
         return run_fit(
             self.recipe, shots, names=names, on_progress=on_progress, should_stop=should_stop
         )
 
 
-def _loaded(shot: FitShot, name: str) -> FitShot:
+def _load(shot: FitShot, name: str) -> FitShot:
     image, source = shot.image, shot.source
     if isinstance(image, Radiograph):
-        image = loaded(image, name)
+        image = load_radiograph(image, name)
     if isinstance(source, Radiograph):
-        source = loaded(source, f"the source of {name}")
+        source = load_radiograph(source, f"the source of {name}")
     return replace(shot, image=image, source=source)
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement(FitJob):
-    """A fit that starts from an inversion, whose image it explains."""
+    """A fit to the image of an inversion, starting from the inversion."""
 
     inversion: Inversion | None = None
     setup: Setup | None = None
@@ -124,7 +123,7 @@ class Refinement(FitJob):
         assert self.inversion is not None
         return self.inversion.image.shape
 
-    def fitted(
+    def compute(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Fit:
         """Fit, starting from the inversion."""
@@ -139,20 +138,20 @@ class Refinement(FitJob):
 
 
 def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
-    """The fit to an inversion's image, with its source, mask and setup, that starts from it.
+    """Return the job that fits an inversion's image with its source, mask and setup.
 
-    `layer` shows a part of the inversion, `image` is the layer of its shot, or it again.
+    `layer` belongs to the inversion, `image` is the layer of its shot, or `layer` again.
     """
     result = result_of(layer)
     if result is None or not isinstance(result.content, Inversion):
         kind = "a fit" if result is not None and isinstance(result.content, Fit) else "no inversion"
         raise InputError(
             f"layer '{layer.name}' shows {kind}: select a layer of an inversion's result, such as "
-            "its field"
+            "the field"
         )
     inversion, setup = result.content, result.setup
     choices = refinement_choices(inversion, setup, psf)
-    given = [
+    inputs = [
         ("Start", f"the inversion of '{name}'"),
         ("Point spread", f"σ {psf:g} px" if psf else "none"),
     ]
@@ -163,7 +162,7 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
         names=(name,),
         name=f"{name} refined",
         frame=frame_of(layer),
-        given=given,
+        inputs=inputs,
         attributes=attributes,
         layer=image,
         inversion=inversion,
@@ -172,5 +171,5 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
 
 
 def name_of_result(layer: Any) -> str:
-    """Return the name of the result that a layer shows a part of, or else that of the layer."""
-    return str(mark_of(layer).get("name") or layer.name)
+    """Return the name of the result that a layer belongs to, or else the layer's name."""
+    return str(metadata_of(layer).get("name") or layer.name)

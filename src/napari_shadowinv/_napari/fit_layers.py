@@ -1,4 +1,4 @@
-"""The result of a fit as napari layers: its fields, its beam, and how it explains the images."""
+"""The result of a fit as napari layers: fields, beam, re-projections and residuals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.kinds import KINDS, layer_name
-from napari_shadowinv._napari.layer_metadata import KEY, Result, mark, role_of
+from napari_shadowinv._napari.layer_metadata import KEY, Result, metadata_for, role_of
 from napari_shadowinv._napari.layers import FullLayerData, dataset_layers, symmetric_limits
 from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._typing import FloatArray
@@ -21,25 +21,25 @@ if TYPE_CHECKING:
     from napari_shadowinv.fitting import Basin, Fit, FittedField
     from napari_shadowinv.physics.setup import Setup
 
-# In another answer only what differs is of interest.
-_COMPARED = ("field", "arrows")
+# Of alternative solutions only these are shown.
+_ALTERNATIVE_ROLES = ("field", "arrows")
 _KINDS = {kind.role: kind for kind in KINDS if kind.shown_of != "stack"}
-_SAME_BEAM = 1e-6  # of the beam's mean, but for a gain
+_MAX_BEAM_DIFFERENCE = 1e-6  # relative to the mean
 
 
 def fit_layers(
     result: Result, frame: Frame, name: str, *, alone: bool = False
 ) -> list[FullLayerData]:
-    """Describe the layers of a fit, the lowest first; of several fields the first is visible.
+    """Describe the layers of a fit, the lowest first; the first of several fields is visible.
 
-    A fit that comes `alone`, as from a file, has layers of its images and of all other answers.
+    With `alone`, as for a file, they include the images and all alternative solutions.
     """
     fit = _fit_of(result)
     facts = _facts(result, fit, name)
     layers = _image_layers(fit, frame, name, facts, with_images=alone)
     if alone:
         for number in range(len(fit.basins) - 1, 0, -1):
-            for layer in answer_layers(result, number, frame, name):
+            for layer in alternative_layers(result, number, frame, name):
                 layer[1]["visible"] = False
                 layers.append(layer)
     for number, field in reversed(list(enumerate(fit.fields))):
@@ -51,57 +51,57 @@ def fit_layers(
             variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
         if field.uncertainty is not None:
             variables["displacement_uncertainty"] = ("component", "y", "x"), field.uncertainty
-        titled = f"{_titled(name, fit, field)}{doubt_in_words(fit)}"
-        described = _field_layers(variables, field, setup_of_fit(fit), frame, titled, facts)
+        title = f"{_field_title(name, fit, field)}{verdict_suffix(fit)}"
+        layer_data = _field_layers(variables, field, setup_of_fit(fit), frame, title, facts)
         if number:
-            _part(described, field.name)
-        for _, keywords, _ in described:
+            _set_part(layer_data, field.name)
+        for _, keywords, _ in layer_data:
             keywords["visible"] &= number == 0
-        layers += described
+        layers += layer_data
     return layers
 
 
-def answer_layers(result: Result, number: int, frame: Frame, name: str) -> list[FullLayerData]:
-    """Describe the fields of another answer, the one of the fit's basin `number`."""
+def alternative_layers(result: Result, number: int, frame: Frame, name: str) -> list[FullLayerData]:
+    """Describe the fields of an alternative solution, the fit's basin `number`."""
     fit = _fit_of(result)
     basin = fit.basins[number]
     layers: list[FullLayerData] = []
     for m, field in reversed(list(enumerate(fit.fields))):
         displacement = _full_size(basin.displacement[m], field.potential.shape)
-        described = _field_layers(
+        layer_data = _field_layers(
             {"displacement": (("component", "y", "x"), displacement)},
             field,
             setup_of_fit(fit),
             frame,
-            _titled(f"{name} {start_in_words(basin)}", fit, field),
+            _field_title(f"{name} {start_name(basin)}", fit, field),
             _facts(result, fit, name),
         )
-        kept = [layer for layer in described if role_of(layer[1]) in _COMPARED]
-        for _, keywords, _ in kept:
+        layer_data = [layer for layer in layer_data if role_of(layer[1]) in _ALTERNATIVE_ROLES]
+        for _, keywords, _ in layer_data:
             keywords["visible"] &= m == 0
-        layers += _part(kept, f"{field.name} {number}")
+        layers += _set_part(layer_data, f"{field.name} {number}")
     return layers
 
 
-def start_in_words(basin: Basin) -> str:
-    """Return from where an answer was reached; the only field that is given is an inversion's."""
+def start_name(basin: Basin) -> str:
+    """Return the name of a solution's starting point; a given start is always an inversion."""
     return "from the inversion" if basin.start == "given" else basin.start
 
 
-def doubt_in_words(fit: Fit) -> str:
-    """Return what a name has after it unless the fields are determined, the verdict."""
+def verdict_suffix(fit: Fit) -> str:
+    """Return the verdict as a suffix of names; empty if the fields are determined."""
     from napari_shadowinv.fitting import Verdict
 
     return "" if fit.verdict is Verdict.DETERMINED else f" ({fit.verdict.value})"
 
 
-def verdict_in_words(fit: Fit) -> str:
-    """Return the verdict and why, in a sentence."""
+def verdict_sentence(fit: Fit) -> str:
+    """Return the verdict and its reason as a sentence."""
     return f"the fit's verdict is '{fit.verdict.value}': {window_text(fit.explanation)}"
 
 
 def setup_of_fit(fit: Fit) -> Setup | None:
-    """Return the experiment that the fields are told in: that of the first image."""
+    """Return the setup of the fields, which is the first image's."""
     return fit.setups[0] if fit.setups else None
 
 
@@ -123,7 +123,7 @@ def _facts(result: Result, fit: Fit, name: str) -> dict[str, Any]:
     }
 
 
-def _titled(name: str, fit: Fit, field: FittedField) -> str:
+def _field_title(name: str, fit: Fit, field: FittedField) -> str:
     return name if len(fit.fields) == 1 else f"{name} {field.name}"
 
 
@@ -142,33 +142,33 @@ def _field_layers(
     return dataset_layers(dataset, setup, frame, name, facts, deflector=FIELDS[field.name])
 
 
-def _part(described: Sequence[FullLayerData], part: str) -> list[FullLayerData]:
-    """Tell layers from those of the first field."""
-    for _, keywords, _ in described:
+def _set_part(layer_data: Sequence[FullLayerData], part: str) -> list[FullLayerData]:
+    """Distinguish layers from the layers of the first field."""
+    for _, keywords, _ in layer_data:
         keywords["metadata"][KEY]["part"] = part
-    return list(described)
+    return list(layer_data)
 
 
 def _image_layers(
     fit: Fit, frame: Frame, name: str, facts: dict[str, Any], *, with_images: bool
 ) -> list[FullLayerData]:
-    """Hidden layers of the beam, if it is uneven, and of how the images are explained."""
+    """Describe hidden layers of the re-projections, the residuals and a non-uniform beam."""
     setup = setup_of_fit(fit)
     grey = intensity_limits(fit.images[0])
     means = [image[use].mean() for image, use in zip(fit.images, fit.mask, strict=True)]
     percent = np.where(fit.mask, 100 * fit.residual / np.array(means)[:, None, None], np.nan)
-    shown = {"reprojection": (fit.reprojection, grey), "residual": (percent, None)}
+    content = {"reprojection": (fit.reprojection, grey), "residual": (percent, None)}
     if np.ptp(fit.source[0]):
-        shown = {"source": (_without_gains(fit.source), grey), **shown}
+        content = {"source": (_without_gains(fit.source), grey), **content}
     if with_images:
-        shown = {"image": (fit.images, grey), **shown}
+        content = {"image": (fit.images, grey), **content}
     layers: list[FullLayerData] = []
-    for role, (planes, limits) in shown.items():
+    for role, (planes, limits) in content.items():
         kind = _KINDS[role]
         data = planes[0] if len(planes) == 1 else planes
         keywords = {
             "name": layer_name(kind.title, name),
-            "metadata": mark(role, kind.unit, setup, **facts, main=role != "reprojection"),
+            "metadata": metadata_for(role, kind.unit, setup, **facts, main=role != "reprojection"),
             "visible": False,
             **frame.keywords(stacked=data.ndim == 3),
             "colormap": kind.colormap,
@@ -181,13 +181,15 @@ def _image_layers(
 
 
 def _without_gains(beams: FloatArray) -> FloatArray:
-    """The first beam only, where all are the same but for a factor."""
-    scaled = beams / beams.mean(axis=(1, 2), keepdims=True)
-    return beams[:1] if np.abs(scaled - scaled[0]).max() < _SAME_BEAM else beams
+    """Return the first beam only if all beams are proportional to each other."""
+    normalised = beams / beams.mean(axis=(1, 2), keepdims=True)
+    return beams[:1] if np.abs(normalised - normalised[0]).max() < _MAX_BEAM_DIFFERENCE else beams
 
 
 def _full_size(displacement: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Values at every other pixel, between pairs of pixels, at each of them."""
+    """Interpolate values at every second pixel, between pixel pairs, to all pixels."""
     grid = np.mgrid[: shape[0], : shape[1]]
-    places = (grid - 0.5) / 2
-    return np.stack([map_coordinates(one, places, order=1, mode="nearest") for one in displacement])
+    points = (grid - 0.5) / 2
+    return np.stack(
+        [map_coordinates(plane, points, order=1, mode="nearest") for plane in displacement]
+    )

@@ -1,4 +1,4 @@
-"""Where an image lies in napari's world: `Frame`."""
+"""Placement of images in napari's world: `Frame`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 Matrix = tuple[tuple[float, ...], ...]
 
-# Up to here a length in µm has four digits at most.
-_LONGEST_IN_MICROMETRES = 10_000.0
+_MAX_LENGTH_UM = 10_000.0  # longer sides are in mm
 
 
 @dataclass(frozen=True)
@@ -26,26 +25,26 @@ class Frame:
     scale: tuple[float, float] = (1.0, 1.0)
     translate: tuple[float, float] = (0.0, 0.0)
     units: tuple[str, str] = ("pixel", "pixel")
-    # A rotation matrix, the slant of the rows, and a homogeneous matrix after all that.
+    # A rotation matrix, a shear of the rows, and then a homogeneous matrix.
     rotate: Matrix = ((1.0, 0.0), (0.0, 1.0))
     shear: float = 0.0
     affine: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
     def beneath(self, matrix: FloatArray) -> Frame:
-        """Frame of an image made of this one; `matrix` takes (y, x, 1) in it to (y, x, 1) here."""
-        slanted = np.array([[1.0, self.shear], [0.0, 1.0]]) * self.scale
-        pixels = np.array(self.rotate) @ slanted
+        """Return the frame of a derived image; `matrix` maps its (y, x, 1) to (y, x, 1) here."""
+        sheared = np.array([[1.0, self.shear], [0.0, 1.0]]) * self.scale
+        pixels = np.array(self.rotate) @ sheared
         y, x = (float(value) for value in self.translate + pixels @ matrix[:2, 2])
-        moved = replace(self, translate=(y, x))
+        translated = replace(self, translate=(y, x))
         factor = float(matrix[0, 0])
         if np.array_equal(matrix[:2, :2], factor * np.eye(2)):
-            return replace(moved, scale=(factor * self.scale[0], factor * self.scale[1]))
+            return replace(translated, scale=(factor * self.scale[0], factor * self.scale[1]))
         rotate, upright = np.linalg.qr(pixels @ matrix[:2, :2])
         # napari's order: first the scale, which alone may mirror, then the shear.
         signs = np.sign(upright[0, 0]) * np.array([1.0, np.round(np.linalg.det(rotate))])
         rotate, upright = rotate * signs, signs[:, None] * upright
         return replace(
-            moved,
+            translated,
             scale=(float(upright[0, 0]), float(upright[1, 1])),
             shear=float(upright[0, 1] / upright[1, 1]),
             rotate=matrix_of(rotate),
@@ -78,20 +77,20 @@ def frame_for(
     units: Sequence[str] | None = None,
     pixel_size: float | None = None,
 ) -> Frame:
-    """Choose a frame in µm, in mm for more than 1 cm, or in pixels; what is given goes before.
+    """Choose a frame in µm, in mm above 1 cm, or in pixels; other arguments take precedence.
 
-    Without a setup, `pixel_size` (m) may be known.
+    `pixel_size` (m) is used without a setup.
     """
     frame = Frame()
     side = pixel_size if setup is None else setup.object_pixel_size
     if side is not None:
         pixel, unit = side * 1e6, "um"
-        if max(shape[-2:]) * pixel > _LONGEST_IN_MICROMETRES:
+        if max(shape[-2:]) * pixel > _MAX_LENGTH_UM:
             pixel, unit = pixel * 1e-3, "mm"
         frame = Frame(scale=(pixel, pixel), units=(unit, unit))
-    given = {"scale": scale, "translate": translate, "units": units}
+    overrides = {"scale": scale, "translate": translate, "units": units}
     changes: dict[str, Any] = {
-        name: tuple(value)[-2:] for name, value in given.items() if value is not None
+        name: tuple(value)[-2:] for name, value in overrides.items() if value is not None
     }
     return replace(frame, **changes)
 
@@ -109,21 +108,21 @@ def frame_of(layer: Any) -> Frame:
 
 
 def matrix_of(values: Any) -> Matrix:
-    """Rows of a matrix as tuples, which can be compared."""
+    """Return the rows of a matrix as tuples, which can be compared."""
     return tuple(tuple(float(value) for value in row) for row in values)
 
 
 def _with_shots(matrix: Matrix, stacked: bool) -> FloatArray:
-    """A matrix of the axes y and x that leaves an axis of shots before them alone."""
+    """Extend a matrix of the axes y and x by an unchanged first axis of shots."""
     if not stacked:
         return np.array(matrix)
-    whole = np.eye(len(matrix) + 1)
-    whole[1:, 1:] = matrix
-    return whole
+    extended = np.eye(len(matrix) + 1)
+    extended[1:, 1:] = matrix
+    return extended
 
 
-def place(layer: Any, setup: Setup) -> None:
-    """Give an image, whose last axes are y and x, the pixel size of its results."""
+def place_image(layer: Any, setup: Setup) -> None:
+    """Set the pixel size of an image, whose last axes are y and x, from a setup."""
     frame = frame_for(layer.data.shape, setup)
     layer.scale = (*layer.scale[:-2], *frame.scale)
     layer.units = (*layer.units[:-2], *frame.units)

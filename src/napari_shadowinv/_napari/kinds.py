@@ -1,4 +1,4 @@
-"""Kinds of layers of a result, their names, and which of them are shown by default."""
+"""Kinds of layers of a result, their names, and the kinds shown by default."""
 
 from __future__ import annotations
 
@@ -6,14 +6,19 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from napari_shadowinv._napari.layer_metadata import belongs_to_result, mark_of, role_of, slot_of
+from napari_shadowinv._napari.layer_metadata import (
+    belongs_to_result,
+    layer_key,
+    metadata_of,
+    role_of,
+)
 
 _LayerData = tuple[Any, dict[str, Any], str]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of layer; ``{unit}`` and ``{symbol}`` in a title depend on the setup."""
+    """A kind of layer; the setup sets ``{unit}`` and ``{symbol}`` in a title."""
 
     role: str
     variable: str
@@ -22,7 +27,7 @@ class Kind:
     colormap: str = ""
     type: str = "image"
     visible: bool = False
-    main: bool = False  # shown by default; all others by *More layers*
+    main: bool = False  # shown by default; the others by *More layers*
     shown_of: Literal["shot", "stack", "both"] = "both"
 
 
@@ -63,17 +68,17 @@ MASKED_ROLES = {"reprojection", "residual", "potential", "field y", "field x", "
 MASKED_ROLES |= {"uncertainty"}
 
 
-def main_layers(described: Sequence[_LayerData], also: Collection[str] = ()) -> list[_LayerData]:
-    """Select the layers shown by default, and those whose role and part are in `also`."""
+def main_layers(layer_data: Sequence[_LayerData], also: Collection[str] = ()) -> list[_LayerData]:
+    """Select the layers shown by default, and layers whose keys are in `also`."""
     return [
         layer
-        for layer in described
+        for layer in layer_data
         if role_of(layer[1]) in _MAIN_ROLES
-        or mark_of(layer[1]).get("main", not belongs_to_result(layer[1]))
-        or slot_of(layer[1]) in also
+        or metadata_of(layer[1]).get("main", not belongs_to_result(layer[1]))
+        or layer_key(layer[1]) in also
     ]
 
 
 def layer_name(title: str, name: str) -> str:
-    """Name a layer by its quantity and then its result: long names are cut in the middle."""
+    """Name a layer by its quantity, then its result: napari cuts long names in the middle."""
     return f"{title} – {name}" if name else title

@@ -1,4 +1,4 @@
-"""What a layer of this plugin knows about itself: a plain dict in its metadata, under `KEY`."""
+"""Metadata of this plugin's layers: a plain dict under `KEY`."""
 
 from __future__ import annotations
 
@@ -20,116 +20,119 @@ if TYPE_CHECKING:
 KEY = "napari-shadowinv"
 
 SHOT, SOURCE, MASK = "shot", "source", "mask"
-"""Roles of what goes into an inversion. The layers of a result have roles of their own, and
-either the result or its store in their metadata."""
+"""Roles of inputs of an inversion. Layers of a result have other roles, and the result or its store
+in their metadata."""
 
 CAME_WITH = "came with"
-"""How the origin of a setup begins that a file or a sample brought; all others are the user's."""
+"""Start of the origin of a setup from a file or sample; other setups are the user's."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What the layers of one result show, whole: all that is needed to write it."""
+    """The complete result that its layers show, with everything needed to save it."""
 
-    content: Inversion | Fit | xarray.Dataset  # a dataset where a file holds only a field
+    content: Inversion | Fit | xarray.Dataset  # a dataset if a file contains only a field
     setup: Setup | None = None
-    attributes: Mapping[str, str] = field(default_factory=dict)  # words about its origin
+    attributes: Mapping[str, str] = field(default_factory=dict)  # its origins, in words
 
 
-def mark(role: str | None, unit: str, setup: Setup | None = None, **more: Any) -> dict[str, Any]:
-    """Make the metadata of a layer; `role` and `unit` are None and empty where unknown."""
-    described = {} if setup is None else {"setup": setup.model_dump()}
-    return {KEY: {"role": role, "unit": unit, **described, **more}}
+def metadata_for(
+    role: str | None, unit: str, setup: Setup | None = None, **more: Any
+) -> dict[str, Any]:
+    """Return the metadata of a layer; an unknown role is None, an unknown unit empty."""
+    entries = {} if setup is None else {"setup": setup.model_dump()}
+    return {KEY: {"role": role, "unit": unit, **entries, **more}}
 
 
-def mark_of(layer: Any) -> dict[str, Any]:
-    """Return what a layer, or the keywords of one, tell about it; empty for other origins."""
+def metadata_of(layer: Any) -> dict[str, Any]:
+    """Return this plugin's metadata of a layer or of its keywords; empty for other layers."""
     metadata = layer.get("metadata") if isinstance(layer, Mapping) else layer.metadata
-    found = (metadata or {}).get(KEY)
-    return found if isinstance(found, dict) else {}
+    entries = (metadata or {}).get(KEY)
+    return entries if isinstance(entries, dict) else {}
 
 
 def role_of(layer: Any) -> str | None:
-    """Return what a layer shows, such as ``"potential"``; None for a layer of other origin."""
-    return mark_of(layer).get("role")
+    """Return the role of a layer, such as ``"potential"``; None for other layers."""
+    return metadata_of(layer).get("role")
 
 
-def slot_of(layer: Any) -> str:
-    """Return what tells a layer from all others of its result: its role, and its `part`, if any."""
-    return f"{role_of(layer)} {mark_of(layer).get('part', '')}".strip()
+def layer_key(layer: Any) -> str:
+    """Return the key of a layer in its result: its role and, if any, its `part`."""
+    return f"{role_of(layer)} {metadata_of(layer).get('part', '')}".strip()
 
 
 def unit_of(layer: Any) -> str:
     """Return the unit of a layer's values; empty where it is unknown."""
-    return str(mark_of(layer).get("unit", ""))
+    return str(metadata_of(layer).get("unit", ""))
 
 
 def setup_of(layer: Any) -> Setup | None:
-    """Return the experiment that a layer belongs to, None where it is unknown."""
+    """Return the setup of a layer, or None."""
     from napari_shadowinv.physics.setup import setup_from_dict
 
-    found = mark_of(layer).get("setup")
-    return None if found is None else setup_from_dict(found, "the layer's setup")
+    entries = metadata_of(layer).get("setup")
+    return None if entries is None else setup_from_dict(entries, "the layer's setup")
 
 
 def setup_origin_of(layer: Any) -> str:
     """Return where a layer's setup comes from, such as ``"came with shot.h5"``; empty if none."""
-    return str(mark_of(layer).get("setup_origin", ""))
+    return str(metadata_of(layer).get("setup_origin", ""))
 
 
-def keep_setup(layer: Any, setup: Setup | None, origin: str) -> None:
-    """Make a setup, which comes from `origin`, the one of a layer; None takes it away."""
+def store_setup(layer: Any, setup: Setup | None, origin: str) -> None:
+    """Store a setup and its origin with a layer; None removes the setup."""
     # A new dict: a duplicate of the layer may share the old one.
-    known = dict(mark_of(layer))
-    known.pop("setup", None)
-    known.pop("setup_origin", None)
-    given = {} if setup is None else {"setup": setup.model_dump(), "setup_origin": origin}
-    layer.metadata[KEY] = known | given
+    entries = dict(metadata_of(layer))
+    entries.pop("setup", None)
+    entries.pop("setup_origin", None)
+    if setup is not None:
+        entries |= {"setup": setup.model_dump(), "setup_origin": origin}
+    layer.metadata[KEY] = entries
 
 
 def may_be_shot(layer: Any) -> bool:
-    """Whether a layer is a shot, or may be one; of a result's layers only its image."""
+    """Whether a layer may be a shot; of a result's layers only its image."""
     return role_of(layer) in (None, SHOT, "image")
 
 
 def may_be_source(layer: Any) -> bool:
-    """Whether a layer may be an undisturbed beam: also a shot, of which the object was taken."""
+    """Whether a layer may be an undisturbed beam, including a shot without the object."""
     return role_of(layer) in (None, SHOT, SOURCE)
 
 
 def may_be_mask(layer: Any) -> bool:
-    """Whether somebody may have painted a layer to mark pixels; a result has labels, too."""
+    """Whether a layer may be a painted mask, unlike the labels of a result."""
     return role_of(layer) in (None, MASK)
 
 
 def result_of(layer: Any) -> Result | None:
-    """Return the result that a layer shows a part of, None for any other layer."""
-    found = mark_of(layer).get("result")
-    return found if isinstance(found, Result) else None
+    """Return the result that a layer belongs to, or None."""
+    result = metadata_of(layer).get("result")
+    return result if isinstance(result, Result) else None
 
 
 def belongs_to_result(layer: Any) -> bool:
-    """Whether a layer shows a part of a result, or of a store of results."""
-    return not {"result", "store"}.isdisjoint(mark_of(layer))
+    """Whether a layer belongs to a result or to a store of results."""
+    return not {"result", "store"}.isdisjoint(metadata_of(layer))
 
 
 def displacement_of(layer: Any) -> FloatArray | None:
-    """Return the displacement in px that a layer of a result stands for, None for any other."""
-    result, own = result_of(layer), mark_of(layer).get("displacement")
-    if own is not None or result is None:
-        return own
+    """Return the displacement in px behind a layer of a result, or None."""
+    result, displacement = result_of(layer), metadata_of(layer).get("displacement")
+    if displacement is not None or result is None:
+        return displacement
     content: Any = result.content
-    found = getattr(content, "displacement", None)  # a film pack has none
-    return None if found is None else np.asarray(found)
+    displacement = getattr(content, "displacement", None)  # a film pack has none
+    return None if displacement is None else np.asarray(displacement)
 
 
 def usable_of(layer: Any) -> BoolArray | None:
-    """Return the usable pixels that came with an image, None if all are, or nobody knows."""
-    found = mark_of(layer).get("usable")
-    return None if found is None else np.asarray(found, dtype=np.bool_)
+    """Return the usable pixels that came with an image, or None."""
+    usable = metadata_of(layer).get("usable")
+    return None if usable is None else np.asarray(usable, dtype=np.bool_)
 
 
 def source_of(layer: Any) -> FloatArray | None:
-    """Return the undisturbed beam that came with an image, None if none did."""
-    found = mark_of(layer).get("source")
-    return None if found is None else np.asarray(found)
+    """Return the undisturbed beam that came with an image, or None."""
+    source = metadata_of(layer).get("source")
+    return None if source is None else np.asarray(source)

@@ -1,4 +1,4 @@
-"""How layers looked, kept with a result, so that they come back as they were."""
+"""Appearance of layers, saved with a result and restored when it is opened."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._napari.fit_layers import fit_layers, verdict_in_words
+from napari_shadowinv._napari.fit_layers import fit_layers, verdict_sentence
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, matrix_of
 from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.layer_metadata import (
     SHOT,
     SOURCE,
     Result,
-    mark_of,
+    layer_key,
+    metadata_of,
     role_of,
-    slot_of,
 )
 from napari_shadowinv._napari.layers import FullLayerData, result_layers
 from napari_shadowinv._napari.packs import pack_frame, pack_layers, pack_result, warnings_of_pack
@@ -35,21 +35,21 @@ if TYPE_CHECKING:
 
 _LOOKS, _NAME = "napari_layers", "napari_name"
 
-# Attributes that the dataset of a result makes anew.
-_OWN_ATTRIBUTES = {_LOOKS, _NAME, "format", "options", "report", "image_residual", "errors_si"}
-_OWN_ATTRIBUTES |= {"setup", "provenance", "package_version", "created"}
-_OWN_ATTRIBUTES |= {"verdict", "explanation", "folded", "fields", "setups"}
+# Attributes that are recomputed when a result is saved.
+_COMPUTED_ATTRIBUTES = {_LOOKS, _NAME, "format", "options", "report", "image_residual", "errors_si"}
+_COMPUTED_ATTRIBUTES |= {"setup", "provenance", "package_version", "created"}
+_COMPUTED_ATTRIBUTES |= {"verdict", "explanation", "folded", "fields", "setups"}
 
-_PLACE = ("scale", "translate", "units")
-_TURN = ("rotate", "shear", "affine")
-_KEPT: dict[str, tuple[str, ...]] = {
+_PLACEMENT = ("scale", "translate", "units")
+_TRANSFORM = ("rotate", "shear", "affine")
+_SAVED_KEYWORDS: dict[str, tuple[str, ...]] = {
     "image": ("colormap", "contrast_limits", "gamma", "interpolation2d"),
     "labels": (),
     "points": ("face_colormap", "face_contrast_limits"),
     "vectors": ("length", "edge_width", "vector_style"),
     "shapes": ("edge_width",),
 }
-_KEPT_BY_ALL = ("name", "visible", "opacity", "blending", *_PLACE, *_TURN)
+_COMMON_KEYWORDS = ("name", "visible", "opacity", "blending", *_PLACEMENT, *_TRANSFORM)
 
 
 def layers_of_result(
@@ -66,72 +66,75 @@ def layers_of_result(
 
 
 def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]:
-    """Describe the layers of a result as they were saved, the main ones, and its image."""
+    """Describe the saved layers of a result, the main layers, and its image."""
     name = dataset.attrs.get(_NAME, name)
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     if is_pack(dataset.attrs):
         layers = pack_layers(pack_result(dataset), pack_frame(dataset), name)
-        return _looking(layers, looks)
+        return _with_looks(layers, looks)
     setup = setup_from_dataset(dataset)
     result = Result(
         _content(dataset),
         setup,
-        {key: value for key, value in dataset.attrs.items() if key not in _OWN_ATTRIBUTES},
+        {key: value for key, value in dataset.attrs.items() if key not in _COMPUTED_ATTRIBUTES},
     )
-    place = next(iter(looks.values()), {})
+    placement = next(iter(looks.values()), {})
     shape = dataset.sizes["y"], dataset.sizes["x"]
-    frame = frame_for(shape, setup, **{key: place.get(key) for key in _PLACE})
-    if all(name in place for name in _TURN):  # not in files of older versions
+    frame = frame_for(shape, setup, **{key: placement.get(key) for key in _PLACEMENT})
+    if all(name in placement for name in _TRANSFORM):  # not in files of older versions
         frame = replace(
             frame,
-            rotate=matrix_of(np.array(place["rotate"])[-2:, -2:]),
-            shear=float(place["shear"][-1]),
-            affine=matrix_of(np.array(place["affine"])[-3:, -3:]),
+            rotate=matrix_of(np.array(placement["rotate"])[-2:, -2:]),
+            shear=float(placement["shear"][-1]),
+            affine=matrix_of(np.array(placement["affine"])[-3:, -3:]),
         )
     layers = layers_of_result(result, frame, name, cells="cells" in looks)
-    return _looking(main_layers(layers, also={*looks, "image"}), looks)
+    return _with_looks(main_layers(layers, also={*looks, "image"}), looks)
 
 
-def _looking(layers: list[FullLayerData], looks: dict[str, dict[str, Any]]) -> list[FullLayerData]:
-    """Give layers the looks that were saved."""
+def _with_looks(
+    layers: list[FullLayerData], looks: dict[str, dict[str, Any]]
+) -> list[FullLayerData]:
+    """Return layers with their saved looks."""
     return [
-        (data, keywords | looks.get(slot_of(keywords), {}), kind) for data, keywords, kind in layers
+        (data, keywords | looks.get(layer_key(keywords), {}), kind)
+        for data, keywords, kind in layers
     ]
 
 
 def missing_layers(viewer: Any, layer: Any) -> list[FullLayerData]:
-    """Describe the layers of a result, or of a store, that a viewer does not show yet.
+    """Describe the layers of a result or store that are missing in a viewer.
 
-    `layer` shows a part of it. An image that was inverted as it was is a layer already.
+    `layer` belongs to it. An image that no step changed counts as present.
     """
     from napari_shadowinv._napari.stores import store_layers
 
-    facts = mark_of(layer)
+    facts = metadata_of(layer)
     result, store = facts.get("result"), facts.get("store")
     if result is not None:
-        described = layers_of_result(result, frame_of(layer), str(facts.get("name", "")))
+        layer_data = layers_of_result(result, frame_of(layer), str(facts.get("name", "")))
     elif store is not None:
-        described = store_layers(Path(store), str(facts.get("name", "")))
-        place = {"cache": False, **frame_of(layer).keywords(stacked=True)}
-        described = [(data, keywords | place, kind) for data, keywords, kind in described]
+        layer_data = store_layers(Path(store), str(facts.get("name", "")))
+        placement = {"cache": False, **frame_of(layer).keywords(stacked=True)}
+        layer_data = [(data, keywords | placement, kind) for data, keywords, kind in layer_data]
     else:
         raise InputError(
-            f"'{layer.name}' shows no result: select a layer of one, or press Run first"
+            f"'{layer.name}' shows no result: select a layer of a result, or press Run first"
         )
-    alike = [
-        shown
-        for shown in viewer.layers
-        if mark_of(shown).get("result") is result and mark_of(shown).get("store") == store
+    present = [
+        layer
+        for layer in viewer.layers
+        if metadata_of(layer).get("result") is result and metadata_of(layer).get("store") == store
     ]
-    slots = {slot_of(shown) for shown in alike} | _inputs_shown(viewer, result)
-    missing = [each for each in described if slot_of(each[1]) not in slots]
+    keys = {layer_key(layer) for layer in present} | _shown_inputs(viewer, result)
+    missing = [entry for entry in layer_data if layer_key(entry[1]) not in keys]
     for _, keywords, _ in missing:
         keywords["visible"] = False
     return missing
 
 
-def _inputs_shown(viewer: Any, result: Result | None) -> set[str]:
-    """Roles of what a viewer shows already as a shot and its source, because no step changed it."""
+def _shown_inputs(viewer: Any, result: Result | None) -> set[str]:
+    """Return roles that a viewer shows as the shot and its source, unchanged by any step."""
     content = None if result is None else result.content
     recipe = getattr(getattr(content, "provenance", None), "recipe", None)
     if recipe is None or recipe.steps:
@@ -142,15 +145,15 @@ def _inputs_shown(viewer: Any, result: Result | None) -> set[str]:
     shape = () if planes is None else tuple(planes.shape[-2:])
     inputs = {SHOT: "image", SOURCE: "source", None: "image"}
     return {
-        inputs[role_of(shown)]
-        for shown in viewer.layers
-        if type(shown).__name__ == "Image"
-        and role_of(shown) in inputs
-        and tuple(shown.data.shape) == shape
+        inputs[role_of(layer)]
+        for layer in viewer.layers
+        if type(layer).__name__ == "Image"
+        and role_of(layer) in inputs
+        and tuple(layer.data.shape) == shape
     }
 
 
-def doubts_of(result: Result) -> tuple[Caution, ...]:
+def warnings_for(result: Result) -> tuple[Caution, ...]:
     """Return the reasons to doubt a result."""
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
@@ -161,29 +164,29 @@ def doubts_of(result: Result) -> tuple[Caution, ...]:
     if isinstance(content, Inversion):
         return content.report.warnings
     if isinstance(content, Fit) and content.verdict_caution:
-        return (replace(content.verdict_caution, text=verdict_in_words(content)),)
+        return (replace(content.verdict_caution, text=verdict_sentence(content)),)
     return ()
 
 
 def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray.Dataset:
-    """Make the dataset of a result that keeps how its layers look, with caustics as painted."""
+    """Return the dataset of a result with its layers' appearance and painted caustics."""
     import xarray as xr
 
     from napari_shadowinv.fitting import Fit
 
     content = result.content
-    looks = {slot_of(keywords): _look(keywords, kind) for _, keywords, kind in layers}
-    name = next((mark_of(keywords).get("name") for _, keywords, _ in layers), None)
-    kept = {_LOOKS: json.dumps(looks), **({} if name is None else {_NAME: name})}
+    looks = {layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
+    name = next((metadata_of(keywords).get("name") for _, keywords, _ in layers), None)
+    attributes = {_LOOKS: json.dumps(looks), **({} if name is None else {_NAME: name})}
     if isinstance(content, xr.Dataset):
-        return content.assign_attrs(kept)
-    told = {**result.attributes, **kept}
+        return content.assign_attrs(attributes)
+    attributes = {**result.attributes, **attributes}
     if isinstance(content, Fit):
-        return content.to_dataset(attributes=told)
+        return content.to_dataset(attributes=attributes)
     for data, keywords, _ in layers:
         if role_of(keywords) == "caustic":
             content = replace(content, caustic=np.asarray(data) > 0)
-    return content.to_dataset(result.setup, attributes=told)
+    return content.to_dataset(result.setup, attributes=attributes)
 
 
 def _is_pack(result: Result) -> bool:
@@ -191,7 +194,7 @@ def _is_pack(result: Result) -> bool:
 
 
 def _content(dataset: xarray.Dataset) -> Inversion | Fit | xarray.Dataset:
-    """The result that a dataset holds; itself where that is only a field."""
+    """Return the result in a dataset, or the dataset if it contains only a field."""
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
 
@@ -201,12 +204,12 @@ def _content(dataset: xarray.Dataset) -> Inversion | Fit | xarray.Dataset:
 
 
 def _look(keywords: dict[str, Any], kind: str) -> dict[str, Any]:
-    names = (*_KEPT_BY_ALL, *_KEPT.get(kind, ()))
+    names = (*_COMMON_KEYWORDS, *_SAVED_KEYWORDS.get(kind, ()))
     return {name: _plain(keywords[name]) for name in names if keywords.get(name) is not None}
 
 
 def _plain(value: Any) -> Any:
-    """Make a keyword fit for JSON."""
+    """Convert a keyword to JSON types."""
     if isinstance(value, dict):
         return _plain_colormap(value)
     if isinstance(value, np.ndarray):
@@ -219,7 +222,7 @@ def _plain(value: Any) -> Any:
 
 
 def _plain_colormap(colormap: dict[str, Any]) -> Any:
-    """Keep a colour map that napari knows by its name, any other by its colours."""
+    """Return the name of one of napari's colour maps, or else its colours."""
     from napari.utils.colormaps import AVAILABLE_COLORMAPS, ensure_colormap
 
     name = colormap.get("name")
@@ -227,5 +230,5 @@ def _plain_colormap(colormap: dict[str, Any]) -> Any:
         ensure_colormap(name).colors, colormap["colors"]
     ):
         return name
-    kept = ("name", "colors", "controls")
-    return {key: _plain(colormap[key]) for key in kept if key in colormap}
+    keys = ("name", "colors", "controls")
+    return {key: _plain(colormap[key]) for key in keys if key in colormap}

@@ -1,4 +1,4 @@
-"""Results as napari layers, of one shot or of a stack of shots; the lowest layer comes first."""
+"""Results as napari layers, for a shot or a stack of shots; the lowest layer comes first."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from napari_shadowinv._napari.kinds import KINDS, MASKED_ROLES, Kind, layer_name
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
     Result,
-    mark,
+    metadata_for,
     role_of,
 )
 from napari_shadowinv._napari.sites import Cells, power_cells, site_features
-from napari_shadowinv._napari.viewer_sync import keep_in_step, show_scale_bar
+from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.inversion.labels import VARIABLES
 from napari_shadowinv.io.store_setups import of_each_setup
@@ -38,16 +38,16 @@ if TYPE_CHECKING:
 FullLayerData = tuple[Any, dict[str, Any], str]
 Limits = tuple[float, float]
 
-# Both stand out of every colour of the field's map.
+# Both stand out from all colours of the field's map.
 _CAUSTIC_COLOUR = "#5dff5d"
 _ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
 
-_OF_A_FIELD = ("displacement", "potential")
-_ARROWS_ALONG = 28
-_SHORTEST_ARROW = 0.05
-_MOST_SITES_SHOWN = 200_000
-_BRIGHTEST = 99.7  # percentile
-_ENOUGH_PIXELS = 100_000
+_FIELD_VARIABLES = ("displacement", "potential")
+_MAX_ARROWS_PER_SIDE = 28
+_MIN_ARROW_LENGTH = 0.05  # relative to the longest
+_MAX_SHOWN_SITES = 200_000
+_LIMITS_PERCENTILE = 99.7
+_LIMITS_SAMPLE_SIZE = 100_000  # pixels
 
 
 def inversion_layers(
@@ -57,11 +57,11 @@ def inversion_layers(
     name: str = "",
     cells: bool = False,
     attributes: Mapping[str, str] | None = None,
-    **place: Any,
+    **placement: Any,
 ) -> list[FullLayerData]:
-    """Describe the layers of a result; the keywords are those of `add_inversion`."""
+    """Describe the layers of a result, with the keywords of `add_inversion`."""
     setup = inversion.setup if setup is None else setup
-    frame = frame_for(inversion.potential.shape, setup, **place)
+    frame = frame_for(inversion.potential.shape, setup, **placement)
     return result_layers(Result(inversion, setup, dict(attributes or {})), frame, name, cells=cells)
 
 
@@ -85,17 +85,17 @@ def add_inversion(
         Where to add them; a `ViewerModel` needs neither a window nor a display.
     inversion : Inversion
     setup : Setup, optional
-        Gives pixel size and SI units; default: that of the inversion's provenance, if any.
+        Sets pixel size and SI units; default: the setup of the inversion's provenance, if any.
     name : str
         Name of the shot; the layers' names end with it.
     all_layers : bool
-        Add all of the result, hidden: also image, source, re-projection, potential, components,
-        field arrows and sites.
+        Also add the hidden layers: image, source, re-projection, potential, components, field
+        arrows and sites.
     **keywords
-        ``scale``, ``translate``, ``units`` (in axis order y, x): place of the image in the world,
-        where it is not the setup's, such as those of the layer that it was cropped from.
+        ``scale``, ``translate``, ``units`` (in axis order y, x): placement of the image in the
+        world instead of the setup's, such as the placement of the layer it was cropped from.
         ``cells`` (bool): whether to add the power cells as polygons, for up to 5,000 sites.
-        ``attributes`` (mapping of str to str): words about its origin, kept for writing.
+        ``attributes`` (mapping of str to str): origins in words, saved with the result.
 
     Returns
     -------
@@ -105,11 +105,11 @@ def add_inversion(
     Raises
     ------
     InputError
-        If cells are asked for and there are too many.
+        If `cells` is set and there are too many sites.
 
     Examples
     --------
-    The names say that nothing deflects the rays of a blank image:
+    A blank image has no field:
 
     >>> from napari.components import ViewerModel
     >>> from napari_shadowinv import invert
@@ -118,33 +118,33 @@ def add_inversion(
     >>> [layer.name for layer in layers if layer.visible]
     ['|d| (px) – blank (doubtful)', 'displacement arrows – blank (doubtful)']
     """
-    described = inversion_layers(inversion, setup, name=name, **keywords)
-    return add_layers(viewer, described if all_layers else main_layers(described))
+    layer_data = inversion_layers(inversion, setup, name=name, **keywords)
+    return add_layers(viewer, layer_data if all_layers else main_layers(layer_data))
 
 
 def add_layers(
-    viewer: Any, described: Sequence[FullLayerData], *, below: Any | None = None
+    viewer: Any, layer_data: Sequence[FullLayerData], *, below: Any | None = None
 ) -> list[Any]:
-    """Add layers on top or below a layer, select the field, switch on scale bar and colour bar."""
+    """Add layers on top or below a layer, select the field, show scale bar and colour bar."""
     from napari.layers import Layer
 
-    added = [Layer.create(*layer) for layer in described]
+    added = [Layer.create(*layer) for layer in layer_data]
     for layer in added:
-        place = len(viewer.layers) if below is None else viewer.layers.index(below)
-        viewer.layers.insert(place, layer)
+        index = len(viewer.layers) if below is None else viewer.layers.index(below)
+        viewer.layers.insert(index, layer)
     for layer in added:
         if role_of(layer) in ("field", "fluence"):
-            # The status line then tells the value below the mouse.
+            # The status line then shows the value below the mouse.
             viewer.layers.selection.active = layer
     show_scale_bar(viewer)
-    keep_in_step(viewer)
+    connect_viewer(viewer)
     return added
 
 
 def result_layers(
     result: Result, frame: Frame, name: str = "", *, cells: bool = False
 ) -> list[FullLayerData]:
-    """Describe the layers of an inversion or of a mere field; with `cells`, its power cells."""
+    """Describe the layers of an inversion or of a field only; with `cells`, its power cells."""
     import xarray as xr
 
     from napari_shadowinv.inversion import Inversion
@@ -152,32 +152,32 @@ def result_layers(
     content = result.content
     facts = {"result": result, "made_from": dict(result.attributes), "name": name}
     if isinstance(content, xr.Dataset):
-        field = content[[variable for variable in _OF_A_FIELD if variable in content]]
+        field = content[[variable for variable in _FIELD_VARIABLES if variable in content]]
         return dataset_layers(field, result.setup, frame, name, facts)
     assert isinstance(content, Inversion)
     dataset = xr.Dataset(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     )
     diagram = power_cells(content) if cells else None
-    described = dataset_layers(
+    layer_data = dataset_layers(
         dataset,
         result.setup,
         frame,
         name,
         facts,
         cells=diagram,
-        doubt=doubt_of_inversion(content),
+        suffix=trust_label(content),
     )
-    for _, keywords, _ in described:
+    for _, keywords, _ in layer_data:
         if role_of(keywords) == "image":
-            # With its beam and mask it can be inverted again.
+            # With beam and mask, the image can be inverted again.
             usable = None if content.mask.all() else content.mask
             keywords["metadata"][KEY] |= {"source": content.source, "usable": usable}
-    return described
+    return layer_data
 
 
-def doubt_of_inversion(inversion: Inversion) -> str:
-    """Return the mark in the names of layers that must not be trusted blindly, or nothing."""
+def trust_label(inversion: Inversion) -> str:
+    """Return the level of trust as a suffix of layers' names; empty for a sound result."""
     from napari_shadowinv.facts import Level
 
     level = inversion.headline.level
@@ -193,24 +193,24 @@ def dataset_layers(
     shot: int | None = None,
     cells: Cells | None = None,
     deflector: str | None = None,
-    doubt: str = "",
+    suffix: str = "",
 ) -> list[FullLayerData]:
-    """Describe the layers of a result, or of a stack in the units and contrast of one `shot`.
+    """Describe the layers of a result, or of a stack with units and contrast of one `shot`.
 
-    All names end with `doubt`.
+    All names end with `suffix`.
     """
-    shown = _Shown(dataset, setup, shot, cells, deflector)
+    view = _View(dataset, setup, shot, cells, deflector)
     layers = []
     for kind in KINDS:
-        if not shown.has(kind):
+        if not view.has(kind):
             continue
-        data, words, look = _CONTENTS[kind.type](shown, kind)
-        if kind.role in MASKED_ROLES and shown.masked is not None:
-            data = _where(shown.masked, np.nan, data)
+        data, words, look = _CONTENTS[kind.type](view, kind)
+        if kind.role in MASKED_ROLES and view.masked is not None:
+            data = _where(view.masked, np.nan, data)
         unit = words.get("unit", kind.unit)
         keywords = {
-            "name": f"{layer_name(kind.title.format(**words), name)} {doubt}".rstrip(),
-            "metadata": mark(kind.role, unit, setup, **facts),
+            "name": f"{layer_name(kind.title.format(**words), name)} {suffix}".rstrip(),
+            "metadata": metadata_for(kind.role, unit, setup, **facts),
             "visible": kind.visible,
             **frame.keywords(stacked=shot is not None),
             **look,
@@ -220,8 +220,8 @@ def dataset_layers(
 
 
 @dataclass
-class _Shown:
-    """A result, or a stack of which one shot decides on units and contrast."""
+class _View:
+    """A result, or a stack with the units and contrast of one shot."""
 
     dataset: xarray.Dataset
     setup: Setup | None
@@ -241,19 +241,19 @@ class _Shown:
         return kind.role != "source" or bool(np.ptp(self.plane("source")))
 
     def along_shots(self, variable: str) -> bool:
-        """Whether there is a variable, in a stack one of each shot."""
-        found = self.dataset.get(variable)
-        return found is not None and (self.shot is None or "shot" in found.dims)
+        """Whether the dataset has a variable, in a stack for each shot."""
+        values = self.dataset.get(variable)
+        return values is not None and (self.shot is None or "shot" in values.dims)
 
     def plane(self, variable: str) -> FloatArray:
-        """Values in one shot, as numbers."""
+        """Return the values of a variable in the shot."""
         values = self.dataset[variable]
-        one = values if self.shot is None else values.isel(shot=self.shot)
-        return np.asarray(one, dtype=np.float64)
+        plane = values if self.shot is None else values.isel(shot=self.shot)
+        return np.asarray(plane, dtype=np.float64)
 
     @cached_property
     def masked(self) -> Any | None:
-        """Pixels without data: of the shot, or of all shots, lazily; None if there are none."""
+        """Pixels without data in the shot, or lazily in all shots; None if there are none."""
         mask = self.dataset.get("mask")
         if mask is None or (self.shot is not None and "shot" not in mask.dims and mask.all()):
             return None
@@ -261,7 +261,7 @@ class _Shown:
 
     @cached_property
     def used(self) -> BoolArray:
-        """Pixels with data, in one shot."""
+        """Pixels with data in the shot."""
         if self.masked is None:
             return np.ones(self.dataset["displacement"].shape[-2:], dtype=np.bool_)
         plane = self.masked[self.shot] if self.masked.ndim == 3 else self.masked
@@ -278,7 +278,7 @@ class _Shown:
 
     @property
     def per_pixel(self) -> float:
-        """Strength of the field, in its unit, that displaces by 1 px."""
+        """Strength of the field, in its unit, for a displacement of 1 px."""
         return _ratio(self.magnitude, np.hypot(*self.plane("displacement")))
 
     @cached_property
@@ -291,18 +291,18 @@ class _Shown:
         first = np.tensordot(matrix, self.plane("displacement"), axes=1)
         matrix = matrix * _ratio(self.field.vectors, first)
         stack = self.dataset["displacement"].transpose("component", "shot", "y", "x").data
-        own = self.relative_to_shot(lambda one: float(np.linalg.norm(_field_per_pixel(one))))
+        ratio = self.relative_to_shot(lambda setup: float(np.linalg.norm(_field_per_pixel(setup))))
         return [
-            sum((own * factor) * stack[k] for k, factor in enumerate(row) if factor)
+            sum((ratio * factor) * stack[k] for k, factor in enumerate(row) if factor)
             for row in matrix
         ]
 
     def relative_to_shot(self, measure: Callable[[Setup], Any]) -> Any:
-        """What a setup tells of each shot, relative to `shot`; 1 where all share one setup."""
-        of_each = of_each_setup(self.dataset, measure)
-        if of_each is None or self.setup is None:
+        """Return a quantity of each shot's setup relative to `shot`; 1 for a common setup."""
+        quantities = of_each_setup(self.dataset, measure)
+        if quantities is None or self.setup is None:
             return 1.0
-        return (of_each / measure(self.setup))[:, np.newaxis, np.newaxis]
+        return (quantities / measure(self.setup))[:, np.newaxis, np.newaxis]
 
     @cached_property
     def intensity_limits(self) -> Limits:
@@ -314,57 +314,57 @@ class _Shown:
 
 
 def _field_per_pixel(setup: Setup) -> FloatArray:
-    """What a setup's main field (y, x) is of displacements by 1 px along y and along x."""
+    """Return a setup's main field (y, x) for displacements by 1 px along y and along x."""
     return setup.field_in_si(setup.main_field.name, np.eye(2))
 
 
 Content = tuple[Any, dict[str, str], dict[str, Any]]  # data, words of the title, keywords
 
 
-def _image(shown: _Shown, kind: Kind) -> Content:
+def _image(view: _View, kind: Kind) -> Content:
     words: dict[str, str] = {}
-    data = shown.dataset[kind.variable].data
+    data = view.dataset[kind.variable].data
     if kind.role == "uncertainty":
-        # Whatever the unit, a field is as long as its displacement, but for a factor.
-        data = shown.per_pixel * np.hypot(*shown.plane(kind.variable))
-        words = {"unit": shown.field.unit, "symbol": shown.field.symbol}
-        limits = 0.0, float(np.percentile(data[shown.used], _BRIGHTEST))
+        # A field is proportional to its displacement.
+        data = view.per_pixel * np.hypot(*view.plane(kind.variable))
+        words = {"unit": view.field.unit, "symbol": view.field.symbol}
+        limits = 0.0, float(np.percentile(data[view.used], _LIMITS_PERCENTILE))
     elif kind.variable == "displacement":
-        data, limits, words = _field(shown, kind.role)
+        data, limits, words = _field(view, kind.role)
     elif kind.role == "potential":
-        plane = shown.plane("potential")
-        values, unit = shown_potential(plane, shown.setup)
-        if shown.shot is None:
+        plane = view.plane("potential")
+        values, unit = shown_potential(plane, view.setup)
+        if view.shot is None:
             data = values
         else:
-            own = shown.relative_to_shot(lambda one: float(one.potential(np.ones(1))[0]))
-            data = data * (own * _ratio(values, plane))
-        used = values[shown.used]
+            ratio = view.relative_to_shot(lambda setup: float(setup.potential(np.ones(1))[0]))
+            data = data * (ratio * _ratio(values, plane))
+        used = values[view.used]
         limits, words = (float(used.min()), float(used.max())), {"unit": unit}
     elif kind.role == "residual":
         if kind.unit == "%":
-            used = shown.plane("image")[shown.dataset["mask"].values]
+            used = view.plane("image")[view.dataset["mask"].values]
             data = 100 * data / used.mean()
-        plane = data if shown.shot is None else shown.plane("residual")
+        plane = data if view.shot is None else view.plane("residual")
         limits = symmetric_limits(plane)
     else:
-        limits = shown.intensity_limits
-    return data, words, {"colormap": kind.colormap, "contrast_limits": _opened(limits)}
+        limits = view.intensity_limits
+    return data, words, {"colormap": kind.colormap, "contrast_limits": _nonempty(limits)}
 
 
-def _field(shown: _Shown, role: str) -> tuple[Any, Limits, dict[str, str]]:
-    """Strength or a component of the field, its limits, its unit and symbol."""
-    field = shown.field
-    strongest = float(shown.magnitude[shown.used].max())
+def _field(view: _View, role: str) -> tuple[Any, Limits, dict[str, str]]:
+    """Return strength or a component of the field, its limits, unit and symbol."""
+    field = view.field
+    peak = float(view.magnitude[view.used].max())
     if role == "field":
         # On lazy arrays, numpy's functions are dask's.
-        data = shown.magnitude if shown.shot is None else np.hypot(*shown.vectors)
-        return data, (0.0, strongest), {"unit": field.unit, "symbol": field.symbol}
+        data = view.magnitude if view.shot is None else np.hypot(*view.vectors)
+        return data, (0.0, peak), {"unit": field.unit, "symbol": field.symbol}
     axis = "yx".index(role[-1])
     # In another shot of a stack the field may lie along the other axis.
-    limit = strongest if shown.shot is not None else _largest(field.vectors, shown.used)
+    limit = peak if view.shot is not None else _largest(field.vectors, view.used)
     words = {"unit": field.unit, "symbol": field.components[axis]}
-    return shown.vectors[axis], (-limit, limit), words
+    return view.vectors[axis], (-limit, limit), words
 
 
 def _largest(vectors: FloatArray, used: BoolArray) -> float:
@@ -372,7 +372,7 @@ def _largest(vectors: FloatArray, used: BoolArray) -> float:
 
 
 def _where(condition: Any, value: float, data: Any) -> Any:
-    """Do as `numpy.where`, lazily where either array is lazy."""
+    """Apply `numpy.where`, lazily if either array is lazy."""
     if isinstance(condition, np.ndarray) and isinstance(data, np.ndarray):
         return np.where(condition, value, data)
     from dask import array
@@ -380,80 +380,82 @@ def _where(condition: Any, value: float, data: Any) -> Any:
     return array.where(condition, value, data)
 
 
-def _caustics(shown: _Shown, kind: Kind) -> Content:
+def _caustics(view: _View, kind: Kind) -> Content:
     from napari.utils.colormaps import CyclicLabelColormap
     from napari.utils.colormaps.standardize_color import transform_color
 
-    # A dictionary of colours would do, but napari compiles code for it, for two seconds.
+    # For a dictionary of colours, napari would compile code for two seconds.
     colours = transform_color(["transparent", _CAUSTIC_COLOUR])
     look = {"colormap": CyclicLabelColormap(colours), "opacity": 0.5}
-    return shown.dataset["caustic"].data.astype(np.uint8), {}, look
+    return view.dataset["caustic"].data.astype(np.uint8), {}, look
 
 
-def _arrows(shown: _Shown, kind: Kind) -> Content:
-    """Vectors of few enough rays that each arrow can be seen."""
+def _arrows(view: _View, kind: Kind) -> Content:
+    """Return arrows on a grid, few enough to be distinguishable."""
     is_field = kind.role == "field arrows"
-    vectors = shown.field.vectors if is_field else shown.plane("displacement")
-    data, spacing = thinned_arrows(np.where(shown.used, vectors, 0.0))
+    vectors = view.field.vectors if is_field else view.plane("displacement")
+    data, spacing = sample_arrows(np.where(view.used, vectors, 0.0))
     lengths = np.hypot(*data[:, 1].T)
-    # Most arrows keep to their own place; the strongest reach to the next but one at most.
-    usual = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
+    # Most arrows stay within their cell of the grid; the longest cross two cells at most.
+    typical_length = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
     look = {
         "features": {"field" if is_field else "displacement": lengths},
         "vector_style": "arrow",
         "edge_color": _ARROW_COLOURS[kind.role],
         "edge_width": spacing / 9,
-        # The data keep their unit; only the drawing is stretched.
-        "length": float(0.95 * spacing / usual) if usual else 1.0,
+        # The data keep their unit; only the drawing is scaled.
+        "length": float(0.95 * spacing / typical_length) if typical_length else 1.0,
         "opacity": 0.75,
     }
-    words = {"unit": shown.field.unit, "arrows": shown.field.arrows} if is_field else {}
-    return data if shown.shot is None else at_shot(data, shown.shot), words, look
+    words = {"unit": view.field.unit, "arrows": view.field.arrows} if is_field else {}
+    return data if view.shot is None else arrows_in_shot(data, view.shot), words, look
 
 
-def thinned_arrows(field: FloatArray) -> tuple[FloatArray, float]:
-    """Pick long enough vectors (y, x) on a grid: starts and vectors (n, 2, 2), and the spacing."""
+def sample_arrows(field: FloatArray) -> tuple[FloatArray, float]:
+    """Sample long vectors (y, x) on a grid: starts and vectors (n, 2, 2), and the spacing."""
     height, width = field.shape[1:]
-    step = max(1, -(-max(height, width) // _ARROWS_ALONG))
+    step = max(1, -(-max(height, width) // _MAX_ARROWS_PER_SIDE))
     rows, columns = (
         index.ravel() for index in np.mgrid[step // 2 : height : step, step // 2 : width : step]
     )
     starts = np.column_stack([rows, columns])
     data = np.stack([starts, field[:, rows, columns].T], axis=1).astype(np.float64)
     lengths = np.hypot(*data[:, 1].T)
-    return data[lengths > _SHORTEST_ARROW * lengths.max(initial=0.0)], float(step)
+    return data[lengths > _MIN_ARROW_LENGTH * lengths.max(initial=0.0)], float(step)
 
 
-def at_shot(arrows: FloatArray, shot: int) -> FloatArray:
-    """Return arrows of a plane, shape (n, 2, 2), as those of a shot, shape (n, 2, 3)."""
+def arrows_in_shot(arrows: FloatArray, shot: int) -> FloatArray:
+    """Return arrows of a plane, shape (n, 2, 2), in a shot of a stack, shape (n, 2, 3)."""
     stacked = np.zeros((len(arrows), 2, 3))
     stacked[:, 0, 0] = shot
     stacked[:, :, 1:] = arrows
     return stacked
 
 
-def _sites(shown: _Shown, kind: Kind) -> Content:
-    sites = shown.dataset["sites"].values
-    every = -(-len(sites) // _MOST_SITES_SHOWN)
-    features = {key: values[::every] for key, values in site_features(shown.dataset).items()}
-    spacing = (shown.dataset["potential"].size / len(sites)) ** 0.5
+def _sites(view: _View, kind: Kind) -> Content:
+    sites = view.dataset["sites"].values
+    step = -(-len(sites) // _MAX_SHOWN_SITES)
+    features = {key: values[::step] for key, values in site_features(view.dataset).items()}
+    spacing = (view.dataset["potential"].size / len(sites)) ** 0.5
     look = {
         "features": features,
         "face_color": "displacement",
         "face_colormap": kind.colormap,
-        "face_contrast_limits": _opened((0.0, float(features["displacement"].max(initial=0.0)))),
+        "face_contrast_limits": _nonempty((0.0, float(features["displacement"].max(initial=0.0)))),
         "border_width": 0.0,
-        "size": 0.7 * spacing * every**0.5,
+        "size": 0.7 * spacing * step**0.5,
         "symbol": "disc",
     }
-    return sites[::every], {"share": "" if every == 1 else f" (1 in {every})"}, look
+    return sites[::step], {"share": "" if step == 1 else f" (1 in {step})"}, look
 
 
-def _cells(shown: _Shown, kind: Kind) -> Content:
-    polygons, kept = shown.cells or ([], [])
+def _cells(view: _View, kind: Kind) -> Content:
+    polygons, site_numbers = view.cells or ([], [])
     look = {
         "shape_type": "polygon",
-        "features": {key: values[kept] for key, values in site_features(shown.dataset).items()},
+        "features": {
+            key: values[site_numbers] for key, values in site_features(view.dataset).items()
+        },
         "face_color": "transparent",
         "edge_color": _CAUSTIC_COLOUR,
         "edge_width": 0.05,
@@ -462,7 +464,7 @@ def _cells(shown: _Shown, kind: Kind) -> Content:
     return polygons, {}, look
 
 
-_CONTENTS: dict[str, Callable[[_Shown, Kind], Content]] = {
+_CONTENTS: dict[str, Callable[[_View, Kind], Content]] = {
     "image": _image,
     "labels": _caustics,
     "vectors": _arrows,
@@ -471,25 +473,25 @@ _CONTENTS: dict[str, Callable[[_Shown, Kind], Content]] = {
 }
 
 
-def _ratio(shown: FloatArray, plane: FloatArray) -> float:
-    """Factor between two planes that differ by a factor only."""
+def _ratio(values: FloatArray, plane: FloatArray) -> float:
+    """Return the factor between two proportional planes."""
     largest = np.unravel_index(np.argmax(np.abs(plane)), plane.shape)
-    return float(shown[largest] / plane[largest]) if plane[largest] else 1.0
+    return float(values[largest] / plane[largest]) if plane[largest] else 1.0
 
 
 def symmetric_limits(residual: AnyArray) -> Limits:
-    """Return limits around 0 that a handful of pixels at a caustic cannot blow up."""
-    limit = float(np.nanpercentile(np.abs(_sample(residual)), _BRIGHTEST))
-    return _opened((-limit, limit))
+    """Return limits around 0 that ignore a few extreme pixels at caustics."""
+    limit = float(np.nanpercentile(np.abs(_sample(residual)), _LIMITS_PERCENTILE))
+    return _nonempty((-limit, limit))
 
 
 def _sample(plane: AnyArray) -> AnyArray:
-    """Enough pixels of a large image for its limits."""
-    step = max(1, int(np.sqrt(plane.size / _ENOUGH_PIXELS)))
+    """Sample enough pixels of a large image for its limits."""
+    step = max(1, int(np.sqrt(plane.size / _LIMITS_SAMPLE_SIZE)))
     return plane[::step, ::step]
 
 
-def _opened(limits: Limits) -> Limits:
-    """Return limits with something between them, also where all values are one."""
+def _nonempty(limits: Limits) -> Limits:
+    """Return limits that differ, also for constant values."""
     low, high = limits
     return (low, high) if high > low else (low, low + 1.0)

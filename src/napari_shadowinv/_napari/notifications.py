@@ -1,4 +1,4 @@
-"""What napari's user is told: one sentence for a mistake, not a traceback."""
+"""Messages to napari's user: a sentence for a user's error instead of a traceback."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import Any, TypeVar
 
 from napari_shadowinv.errors import InputError
 
-MISTAKES = (InputError, OSError, MemoryError)
-"""What a user can mend; all else is a fault of the program, whose traceback is needed."""
+USER_ERRORS = (InputError, OSError, MemoryError)
+"""Errors that a user can resolve; all others are bugs, whose traceback is needed."""
 
-Answer = TypeVar("Answer")
+ReturnValue = TypeVar("ReturnValue")
 
-# Hints for the command line or for Python, and names of options outside such hints.
+# Hints for the command line or Python, and names of options elsewhere.
 _HINT = re.compile(r"\s*\([^()]*(?:--[a-z]|\b[a-z_]+=)[^()]*\)")
 _OPTION = re.compile(r"--([a-z][a-z-]*)|\b([a-z]+(?:_[a-z]+)+)\b")
 
 
 def window_text(text: str) -> str:
-    """Replace flags and keys of options by the labels of the forms, and leave out hints on them."""
+    """Replace flags and keys of options by their labels in the forms, and remove hints on them."""
 
     def label(match: re.Match[str]) -> str:
         key = (match[1] or match[2]).replace("-", "_")
@@ -43,7 +43,7 @@ def _labels() -> dict[str, str]:
 
 
 def in_event_loop() -> bool:
-    """Whether the call comes from a menu, a dialog, napari's console, and not from a script."""
+    """Whether the call comes from a menu, a dialog or napari's console, not from a script."""
     if "qtpy" not in sys.modules:
         return False
     from qtpy.QtCore import QThread
@@ -52,18 +52,20 @@ def in_event_loop() -> bool:
     return thread is not None and thread.loopLevel() > 0
 
 
-def notify_errors(otherwise: Callable[[], Answer]) -> Callable[..., Callable[..., Answer]]:
-    """Turn a user's mistake, in a window, into one notification; `otherwise` makes the answer."""
+def notify_errors(
+    otherwise: Callable[[], ReturnValue],
+) -> Callable[..., Callable[..., ReturnValue]]:
+    """Show a user's error in a window as a notification, and return `otherwise()`."""
 
-    def decorate(function: Callable[..., Answer]) -> Callable[..., Answer]:
+    def decorate(function: Callable[..., ReturnValue]) -> Callable[..., ReturnValue]:
         @functools.wraps(function)
-        def guarded(*args: Any, **kwargs: Any) -> Answer:
+        def guarded(*args: Any, **kwargs: Any) -> ReturnValue:
             try:
                 return function(*args, **kwargs)
-            except MISTAKES as error:
+            except USER_ERRORS as error:
                 if not in_event_loop():
                     raise
-                show_mistake(error)
+                show_user_error(error)
                 return otherwise()
 
         return guarded
@@ -71,8 +73,8 @@ def notify_errors(otherwise: Callable[[], Answer]) -> Callable[..., Callable[...
     return decorate
 
 
-def show_mistake(error: BaseException) -> None:
-    """Show a mistake as one notification."""
+def show_user_error(error: BaseException) -> None:
+    """Show a user's error as a notification."""
     from napari.utils.notifications import show_error
 
     text = window_text(str(error)) or "there is not enough memory for this"
@@ -80,7 +82,7 @@ def show_mistake(error: BaseException) -> None:
 
 
 def show_caution(text: str) -> None:
-    """Show what the user should know before trusting a file."""
+    """Show a warning as a notification."""
     from napari.utils.notifications import show_warning
 
     show_warning(window_text(text))

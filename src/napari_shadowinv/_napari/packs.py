@@ -1,9 +1,9 @@
 """A film pack as layers.
 
-- what `run_film` found, as stacks with a plane for each film: `pack_layers`
-- each film as an image to be inverted or fitted: `film_layers`
+- the dataset of `run_film` as stacks with a plane for each film: `pack_layers`
+- each film as an image to invert or fit: `film_layers`
 - the mean spectrum in a region: `spectrum_in`
-- pixels that were painted by hand: `painted_by_hand`
+- pixels painted by hand: `painted_by_hand`
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.kinds import Kind
-from napari_shadowinv._napari.layer_metadata import CAME_WITH, Result, mark
+from napari_shadowinv._napari.layer_metadata import CAME_WITH, Result, metadata_for
 from napari_shadowinv._napari.layers import FullLayerData, Limits
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._system.validation import validated
@@ -40,26 +40,26 @@ KINDS = (
     Kind(UNUSABLE, "usable", "unusable", type="labels"),
 )
 
-LEFT_OUT, BY_HAND = 1, 2
-"""Labels of unusable pixels: as `run_film` found them, and as somebody painted them."""
+EXCLUDED, BY_HAND = 1, 2
+"""Labels of unusable pixels: excluded by `run_film`, and painted by the user."""
 
 _LABEL_COLOURS = ["transparent", "#5dff5d", "#00c8ff"]
 _MIN_SIGNIFICANCE = 2.0  # fluence over its error
-_SHORT = 1e-9  # s
-_DARK_AND_BRIGHT = (0.1, 99.7)  # percentiles
-_NEARLY_DARK = 0.3
+_MIN_TIME_IN_NS = 1e-9  # s; shorter times are in ps
+_LIMITS_PERCENTILES = (0.1, 99.7)
+_MAX_DARK_FRACTION = 0.3  # of the upper limit, for limits that start at zero
 
 
 class Spectrum(NamedTuple):
-    """Mean over the usable pixels of a region, by film; NaN for films without any."""
+    """Mean over the usable pixels of a region, by film; NaN for films without usable pixels."""
 
     energies: FloatArray  # MeV
     fluence: FloatArray  # protons per m² and MeV
-    error: FloatArray  # median standard deviation of its pixels, which largely share it
+    error: FloatArray  # median standard deviation of a pixel; mostly common to all pixels
     bands: FloatArray  # shape (n, 2), MeV
     is_measured: BoolArray
-    """False for a layer without usable pixels, one whose fluence is below twice its error, and the
-    last one, whose fluence depends on the assumed spectrum beyond it."""
+    """False for layers without usable pixels or with a fluence below twice its error, and for the
+    last layer, whose fluence depends on the assumed spectrum beyond it."""
 
 
 def pack_layers(
@@ -76,21 +76,21 @@ def pack_layers(
     Parameters
     ----------
     result : Result
-        Its content is what `run_film` returns.
+        With the dataset of `run_film` as its content.
     frame : Frame
     name : str
-        Of the pack; the layers' names begin with it.
+        Name of the pack, with which the layers' names start.
     by_hand : ndarray of bool, shape (n, H, W), optional
-        Unusable pixels that were painted.
+        Painted pixels, which are not usable.
     plane : int
-        The film in view, which decides on the contrast.
+        The displayed film, which sets the contrast.
     **facts
-        Kept with each layer.
+        Metadata of each layer.
     """
     dataset = _dataset_of(result)
     usable = dataset["usable"].values.astype(bool)
     films = {
-        "films": film_texts(dataset),
+        "films": film_labels(dataset),
         "energies": dataset["energy"].values.tolist(),
         "times_of_flight": _times(dataset),
     }
@@ -100,14 +100,14 @@ def pack_layers(
         look: dict[str, Any] = {}
         if kind.type == "labels":
             data, look = _labels(usable, by_hand)
-        more: dict[str, Any] = {**films, **facts, "result": result}
+        metadata: dict[str, Any] = {**films, **facts, "result": result}
         if kind.type == "image":
-            limits = [_limits(one, used) for one, used in zip(data, usable, strict=True)]
-            more["limits"] = limits
+            limits = [_limits(film, used) for film, used in zip(data, usable, strict=True)]
+            metadata["limits"] = limits
             look = {"colormap": kind.colormap, "contrast_limits": limits[plane]}
         keywords = {
             "name": f"{name} {kind.title}".strip(),
-            "metadata": mark(kind.role, kind.unit, result.setup, **more),
+            "metadata": metadata_for(kind.role, kind.unit, result.setup, **metadata),
             "visible": kind.visible,
             **frame.keywords(stacked=True),
             **look,
@@ -118,11 +118,11 @@ def pack_layers(
 
 
 def film_layers(dataset: xarray.Dataset, frame: Frame, name: str) -> list[FullLayerData]:
-    """Describe an image of each film's fluence, with what an inversion needs to know of it.
+    """Describe an image of each film's fluence, with the metadata that an inversion needs.
 
-    Films without usable pixels are left out; in others, unusable pixels are zero. Without setups
-    the images know how strongly a magnetic field displaces their protons, relative to each other.
-    Only the first is visible.
+    Films without usable pixels are omitted; in others, unusable pixels are zero. Without setups,
+    the metadata contain the displacements in a magnetic field relative to each other. Only the
+    first image is visible.
     """
     setups = _setups(dataset)
     layers: list[FullLayerData] = []
@@ -130,7 +130,7 @@ def film_layers(dataset: xarray.Dataset, frame: Frame, name: str) -> list[FullLa
         if not used.any():
             continue
         image = np.where(used, dataset["fluence"].values[k], 0.0)
-        described = shot_layer(
+        layer = shot_layer(
             image,
             f"film {_number(dataset, k)}, {float(dataset['energy'][k]):.3g} MeV",
             setups[k] if setups else None,
@@ -142,19 +142,19 @@ def film_layers(dataset: xarray.Dataset, frame: Frame, name: str) -> list[FullLa
             energies=[float(dataset["energy"][k])],
             strength=None if setups else float(dataset["strength"][k]),
         )
-        described[1]["visible"] = not layers
-        layers.append(described)
+        layer[1]["visible"] = not layers
+        layers.append(layer)
     return layers
 
 
 def pack_result(dataset: xarray.Dataset) -> Result:
-    """What the layers of a pack show, with the setup of its first film, if it has setups."""
+    """Return the result behind a pack's layers, with the setup of its first film, if any."""
     setups = _setups(dataset)
     return Result(dataset, setups[0] if setups else None)
 
 
 def pack_frame(dataset: xarray.Dataset) -> Frame:
-    """Pixels of the object plane; without a setup those of the first film's scan."""
+    """Return the frame with pixels of the object plane, or of the first scan without a setup."""
     setups = _setups(dataset)
     shape = dataset["fluence"].shape
     side = dataset.attrs.get("scan_pixel_size")
@@ -162,31 +162,37 @@ def pack_frame(dataset: xarray.Dataset) -> Frame:
 
 
 def pack_of(dataset: xarray.Dataset) -> Pack:
-    """Return what a dataset was made from, or raise an `InputError`."""
+    """Return the pack that a dataset was computed from, or raise an `InputError`."""
     return validated(Pack, json.loads(dataset.attrs["pack"]), "the result's pack")
 
 
 def warnings_of_pack(dataset: xarray.Dataset) -> tuple[Caution, ...]:
-    """Return the reasons to doubt the dataset of a pack."""
+    """Return the warnings about the dataset of a pack."""
     return tuple(map(Caution.from_json, json.loads(dataset.attrs.get("warnings", "[]"))))
 
 
-def scales_of(dataset: xarray.Dataset) -> FloatArray:
-    """Return how much larger each film shows the object than the first."""
-    found = np.array([one.magnification for one in _setups(dataset)])
-    return found / found[0] if found.size else np.ones(dataset.sizes["layer"])
+def relative_scales(dataset: xarray.Dataset) -> FloatArray:
+    """Return the magnification of each film relative to the first."""
+    magnifications = np.array([setup.magnification for setup in _setups(dataset)])
+    return (
+        magnifications / magnifications[0]
+        if magnifications.size
+        else np.ones(dataset.sizes["layer"])
+    )
 
 
-def film_texts(dataset: xarray.Dataset) -> list[str]:
-    """Tell number, energy and time of flight of each film."""
+def film_labels(dataset: xarray.Dataset) -> list[str]:
+    """Return number, energy and time of flight of each film as text."""
     texts = []
     times = _times(dataset)
     for k in range(dataset.sizes["layer"]):
         text = f"film {_number(dataset, k)}: {float(dataset['energy'][k]):.3g} MeV"
         if times is not None:
             time = times[k]
-            text += f", {1e12 * time:.3g} ps" if time < _SHORT else f", {1e9 * time:.3g} ns"
-        texts.append(text if dataset["usable"].values[k].any() else f"{text}, left out")
+            text += (
+                f", {1e12 * time:.3g} ps" if time < _MIN_TIME_IN_NS else f", {1e9 * time:.3g} ns"
+            )
+        texts.append(text if dataset["usable"].values[k].any() else f"{text}, excluded")
     return texts
 
 
@@ -195,20 +201,22 @@ def spectrum_in(dataset: xarray.Dataset, region: BoolArray | None = None) -> Spe
     usable = dataset["usable"].values.astype(bool)
     inside = usable if region is None else usable & region
 
-    def of_each(name: str, what: Callable[[AnyArray], Any]) -> FloatArray:
-        planes = zip(dataset[name].values, inside, strict=True)
-        return np.array([what(one[used]) if used.any() else np.nan for one, used in planes], float)
+    def reduce(name: str, statistic: Callable[[AnyArray], Any]) -> FloatArray:
+        films = zip(dataset[name].values, inside, strict=True)
+        return np.array(
+            [statistic(plane[used]) if used.any() else np.nan for plane, used in films], float
+        )
 
-    fluence = of_each("fluence", partial(np.mean, dtype=np.float64))
-    error = of_each("fluence_error", np.median)
-    is_measured = fluence > _MIN_SIGNIFICANCE * error  # not where they are NaN
+    fluence = reduce("fluence", partial(np.mean, dtype=np.float64))
+    error = reduce("fluence_error", np.median)
+    is_measured = fluence > _MIN_SIGNIFICANCE * error  # False for NaN
     is_measured[-1] = False
     bands = np.stack([dataset["energy_low"].values, dataset["energy_high"].values], axis=1)
     return Spectrum(dataset["energy"].values, fluence, error, bands, is_measured)
 
 
 def painted_by_hand(labels: AnyArray, dataset: xarray.Dataset) -> BoolArray:
-    """Return which pixels of the labels of a pack somebody painted."""
+    """Return the pixels of a pack's labels that the user painted."""
     usable = dataset["usable"].values.astype(bool)
     return np.asarray((labels == BY_HAND) | (usable & (labels > 0)))
 
@@ -217,7 +225,7 @@ def _labels(usable: BoolArray, by_hand: BoolArray | None) -> tuple[AnyArray, dic
     from napari.utils.colormaps import CyclicLabelColormap
     from napari.utils.colormaps.standardize_color import transform_color
 
-    labels = np.where(usable, 0, LEFT_OUT).astype(np.uint8)
+    labels = np.where(usable, 0, EXCLUDED).astype(np.uint8)
     if by_hand is not None:
         labels[by_hand] = BY_HAND
     colours = CyclicLabelColormap(transform_color(_LABEL_COLOURS))
@@ -225,17 +233,17 @@ def _labels(usable: BoolArray, by_hand: BoolArray | None) -> tuple[AnyArray, dic
 
 
 def _limits(plane: AnyArray, used: BoolArray) -> Limits:
-    """Contrast of one film, by its usable pixels."""
+    """Return the contrast limits of a film from its usable pixels."""
     if not used.any():
         return 0.0, 1.0
-    dark, bright = (float(value) for value in np.percentile(plane[used], _DARK_AND_BRIGHT))
-    low = 0.0 if 0 <= dark < _NEARLY_DARK * bright else dark
+    dark, bright = (float(value) for value in np.percentile(plane[used], _LIMITS_PERCENTILES))
+    low = 0.0 if 0 <= dark < _MAX_DARK_FRACTION * bright else dark
     return (low, bright) if bright > low else (low, low + 1.0)
 
 
 def _setups(dataset: xarray.Dataset) -> list[Setup]:
-    found = json.loads(dataset.attrs.get("setups", "[]"))
-    return [setup_from_dict(one, "the pack's setup") for one in found]
+    entries = json.loads(dataset.attrs.get("setups", "[]"))
+    return [setup_from_dict(entry, "the pack's setup") for entry in entries]
 
 
 def _times(dataset: xarray.Dataset) -> list[float] | None:

@@ -1,4 +1,4 @@
-"""What napari opens with this plugin; to ask imports no napari and reads a header at most."""
+"""Reader of napari's files; `get_reader` imports no napari and reads at most a header."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ReaderFunction = Callable[[str | Sequence[str]], "list[Any]"]
 
 
 def get_reader(path: str | Sequence[str]) -> ReaderFunction | None:
-    """Return what reads a file, folder, pattern with ``*`` or list of files, or None."""
+    """Return the reader of a file, folder, pattern with ``*`` or list of files, or None."""
     if not isinstance(path, str):
         return read_paths if path and all(_is_image_name(Path(item)) for item in path) else None
     if path.endswith(STORE.suffix) or Path(path).suffix.lower() in RESULT.suffixes:
@@ -37,7 +37,7 @@ def _can_read(path: Path) -> bool:
     if path.suffix.lower() in PRADFORMAT.suffixes:
         from napari_shadowinv.io.pradformat import is_ours
 
-        # Pradformat or a result; much else has the ending of HDF5.
+        # Other programs use the suffix of HDF5, too.
         try:
             return is_ours(path)
         except FileFormatError:
@@ -49,9 +49,9 @@ def _is_image_name(path: Path) -> bool:
     return path.suffix.lower() in RADIOGRAPH_SUFFIXES
 
 
-@notify_errors(otherwise=lambda: [(None,)])  # napari's sign for: dealt with, and nothing to add
+@notify_errors(otherwise=lambda: [(None,)])  # napari then adds no layer
 def read_paths(path: str | Sequence[str]) -> list[Any]:
-    """Read what `get_reader` accepts as layers; in a window, errors are shown to the user."""
+    """Read paths that `get_reader` accepts as layers; in a window, errors become notifications."""
     from napari_shadowinv._napari.shots import images_in, stack_layers
 
     if not isinstance(path, str):
@@ -84,7 +84,7 @@ def _matches(pattern: str) -> list[Path]:
 @refusing_damage
 def _read_file(path: Path) -> list[FullLayerData]:
     from napari_shadowinv._napari.layer_metadata import result_of
-    from napari_shadowinv._napari.layer_state import doubts_of, layers_of_dataset
+    from napari_shadowinv._napari.layer_state import layers_of_dataset, warnings_for
     from napari_shadowinv._napari.shots import radiograph_layers
     from napari_shadowinv.io import Radiograph, read
 
@@ -96,17 +96,17 @@ def _read_file(path: Path) -> list[FullLayerData]:
     layers = layers_of_dataset(content, path.stem)
     _show_in_window(layers)
     result = result_of(layers[0][1])
-    for caution in () if result is None else doubts_of(result):
+    for caution in () if result is None else warnings_for(result):
         show_caution(f"{path.name}: {caution.text}")
     return layers
 
 
 def _show_in_window(layers: Sequence[FullLayerData]) -> None:
-    """Give a result that is being opened in a window its colour bar, scale bar and selection."""
+    """Show colour bar and scale bar of an opened result in a window, and select its field."""
     from napari_shadowinv._napari.stores import viewer_in_window
-    from napari_shadowinv._napari.viewer_sync import keep_in_step, select_once_added
+    from napari_shadowinv._napari.viewer_sync import connect_viewer, select_once_added
 
     viewer = viewer_in_window()
     if viewer is not None:
-        keep_in_step(viewer)
+        connect_viewer(viewer)
         select_once_added(viewer, layers)

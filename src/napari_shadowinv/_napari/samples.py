@@ -1,4 +1,4 @@
-"""Sample data: shots of known objects with setup and source, made or downloaded on request."""
+"""Sample data: simulated and downloaded shots with setup and source."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from napari_shadowinv.physics.setup import setup_from_dict
 from napari_shadowinv.physics.units import intensity_limits
 
 _SHAPE = (200, 200)
-_COUNTS = 400.0  # of a pixel: 5 % of noise
+_COUNTS = 400.0  # per pixel: 5 % noise
 
 _FILM_SHAPE = (96, 96)
 _FILMS = {14.7: 400.0, 3.0: 300.0}  # protons per pixel at each energy in MeV
@@ -53,28 +53,28 @@ def coaxial_line() -> list[FullLayerData]:
 
 
 def two_energies() -> list[FullLayerData]:
-    """Two opposite toroidal fields at 14.7 and 3 MeV; of the beam, uneven by 10 %, no image."""
+    """Two opposite toroidal fields at 14.7 and 3 MeV; the beam varies by 10 % and has no image."""
     lengths = {"source_object_distance": 0.01, "object_image_distance": 0.28, "pixel_size": 5e-6}
     films = [{"kind": "proton", "energy": energy, **lengths} for energy in _FILMS]
-    setups: list[Any] = [setup_from_dict(one, "the sample") for one in films]
+    setups: list[Any] = [setup_from_dict(film, "the sample") for film in films]
     first = setups[0]
     truth = (
         phantoms.toroid(_FILM_SHAPE, first, 30.0, 48e-6, center=(43, 38)).displacement
         + phantoms.toroid(_FILM_SHAPE, first, -20.0, 34e-6, center=(59, 67)).displacement
     )
-    y, x = _places(_FILM_SHAPE)
+    y, x = _coordinates(_FILM_SHAPE)
     beam = np.exp(0.14 * np.sin(1.9 * x + 0.4) * np.cos(1.4 * y - 0.5) + 0.06 * x)
     layers = []
     for seed, (setup, level) in enumerate(zip(setups, _FILMS.values(), strict=True)):
         # Fields displace in inverse proportion to the momentum.
-        moved = truth * first.momentum / setup.momentum
-        image = _counted(moved, level * beam, seed)
+        displacement = truth * first.momentum / setup.momentum
+        image = _counts_image(displacement, level * beam, seed)
         layers += radiograph_layers(Radiograph(image, setup=setup), f"{setup.energy:g} MeV")
     return layers
 
 
 def wakefield_run() -> list[FullLayerData]:
-    """Twenty optical shots of a plasma wave that moves, grows and fades; made when shown."""
+    """Twenty optical shots of a plasma wave that moves, grows and fades, computed when shown."""
     stack = lazy_stack(_wakefield_shot, range(_RUN_LENGTH), _RUN_SHAPE)
     limits = intensity_limits(_wakefield_shot(_RUN_LENGTH // 2))
     origin = f"{CAME_WITH} the sample 'wakefield run'"
@@ -98,34 +98,34 @@ def _proton_shot(
 ) -> list[FullLayerData]:
     source = None if beam is None else _COUNTS * beam
     undisturbed = np.full(_SHAPE, _COUNTS) if source is None else source
-    image = _counted(phantom.displacement, undisturbed, seed=1)
+    image = _counts_image(phantom.displacement, undisturbed, seed=1)
     return radiograph_layers(Radiograph(image, setup=phantoms.paper_setup(), source=source), name)
 
 
-def _counted(displacement: FloatArray, source: FloatArray, seed: int) -> FloatArray:
-    """Image of a source through an object, with the noise of counting."""
+def _counts_image(displacement: FloatArray, source: FloatArray, seed: int) -> FloatArray:
+    """Return the image of a source through an object with counting noise."""
     expected = synthetic_image(displacement, source)
     return np.random.default_rng(seed).poisson(expected).astype(np.float64)
 
 
-def _places(shape: tuple[int, int] = _SHAPE) -> tuple[AnyArray, AnyArray]:
-    """Coordinates from -1 to 1 on both axes."""
+def _coordinates(shape: tuple[int, int] = _SHAPE) -> tuple[AnyArray, AnyArray]:
+    """Return coordinates from -1 to 1 on both axes."""
     y, x = (np.linspace(-1, 1, side) for side in shape)
     return y[:, None], x[None, :]
 
 
 def _gaussian_beam() -> FloatArray:
-    y, x = _places()
+    y, x = _coordinates()
     return np.asarray(0.25 + np.exp(-((y - 0.1) ** 2 + (x + 0.15) ** 2) / 1.4))
 
 
 def _uneven_beam() -> FloatArray:
-    y, x = _places()
+    y, x = _coordinates()
     return np.asarray(1 + 0.3 * np.sin(2.3 * x + 0.4) * np.cos(1.7 * y - 0.3) + 0.15 * x)
 
 
 def _wakefield_shot(shot: int) -> FloatArray:
-    """One moment: the wave comes in from the left, is strongest in the middle, and decays."""
+    """Return a shot: the wave enters from the left, is strongest at the centre, and decays."""
     phase = shot / (_RUN_LENGTH - 1)
     height, width = _RUN_SHAPE
     wave = phantoms.wakefield(
@@ -134,4 +134,4 @@ def _wakefield_shot(shot: int) -> FloatArray:
         0.8 * np.sin(np.pi * (0.15 + 0.75 * phase)) ** 2,
         center=((height - 1) / 2, width * (0.2 + 0.6 * phase)),
     )
-    return _counted(wave.displacement, np.full(_RUN_SHAPE, 2500.0), seed=shot)
+    return _counts_image(wave.displacement, np.full(_RUN_SHAPE, 2500.0), seed=shot)

@@ -1,4 +1,4 @@
-"""Radiographs as layers: one, or a run of them as a lazy stack; and layers as radiographs."""
+"""Radiographs as layers, single or as a lazy stack, and layers as radiographs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from napari_shadowinv._napari.layer_metadata import (
     MASK,
     SHOT,
     SOURCE,
-    mark,
-    mark_of,
+    metadata_for,
+    metadata_of,
     role_of,
 )
 from napari_shadowinv._napari.layers import FullLayerData
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def radiograph_layers(shot: io.Radiograph, name: str = "") -> list[FullLayerData]:
-    """Describe an image, above its undisturbed beam and its mask, painted where not usable."""
+    """Describe an image, above its undisturbed beam and its mask of unusable pixels."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
     frame = _frame(shot)
@@ -51,7 +51,7 @@ def radiograph_layers(shot: io.Radiograph, name: str = "") -> list[FullLayerData
         keywords = {
             "name": f"{name} mask",
             "visible": False,
-            "metadata": mark(MASK, "", shot.setup, **facts),
+            "metadata": metadata_for(MASK, "", shot.setup, **facts),
             **frame.keywords(stacked=False),
         }
         layers.append(((~shot.mask).astype(np.uint8), keywords, "labels"))
@@ -71,21 +71,21 @@ def shot_layer(
     frame: Frame | None = None,
     **more: Any,
 ) -> FullLayerData:
-    """Describe an image or a stack of images; facts that are None are left out."""
+    """Describe an image or a stack of images; omit metadata that are None."""
     frame = frame or frame_for(data.shape, setup)
-    known = {key: value for key, value in more.items() if value is not None}
+    metadata = {key: value for key, value in more.items() if value is not None}
     keywords = {
         "name": name,
         "colormap": "gray",
-        "contrast_limits": limits,  # napari would read two shots of a stack to find some
-        "metadata": mark(role, "intensity", setup, **known),
+        "contrast_limits": limits,  # otherwise napari would read two shots of a stack
+        "metadata": metadata_for(role, "intensity", setup, **metadata),
         **frame.keywords(stacked=data.ndim > 2),
     }
     return data, keywords, "image"
 
 
 def _facts(shot: io.Radiograph, origin: str) -> dict[str, Any]:
-    """What is known of a file; a layer keeps no more than this of it."""
+    """Return the metadata of a file for its layers."""
     return {
         "setup_origin": None if shot.setup is None else f"{CAME_WITH} {origin}",
         "file": dict(shot.metadata) or None,
@@ -95,7 +95,7 @@ def _facts(shot: io.Radiograph, origin: str) -> dict[str, Any]:
 
 
 def _frame(shot: io.Radiograph) -> Frame:
-    """Pixels of the object plane, if the file tells their size, even where it tells no more."""
+    """Return the frame of the object plane, also if a file contains only the pixel size."""
     side = dict(shot.metadata.get("geometry") or {}).get("pixel_size")
     if shot.setup is not None or side is None:
         return frame_for(shot.image.shape, shot.setup)
@@ -103,45 +103,45 @@ def _frame(shot: io.Radiograph) -> Frame:
 
 
 def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> io.Radiograph:
-    """An image of a layer, or a plane of a stack, which may be lazy still, with its file."""
-    known = mark_of(layer)
-    path = known.get("path") or layer.source.path
-    shot = io.Radiograph(image, warnings=tuple(known.get("warnings", ())))
-    if known.get("result") is not None:
-        return shot  # after the steps of its recipe it is no file's image any more
-    paths = known.get("paths", ())
+    """Return a layer's image or a plane of a stack, perhaps lazy, as a radiograph with its file."""
+    metadata = metadata_of(layer)
+    path = metadata.get("path") or layer.source.path
+    shot = io.Radiograph(image, warnings=tuple(metadata.get("warnings", ())))
+    if metadata.get("result") is not None:
+        return shot  # processed images differ from their file
+    paths = metadata.get("paths", ())
     if plane is not None and len(paths) == len(layer.data):
         return replace(shot, path=Path(paths[plane]))
-    # What was split off a stack still knows the first of its files.
-    if layer.ndim != 2 or len(known.get("paths", ())) > 1 or path is None:
+    # A plane split off a stack keeps the path of the first file.
+    if layer.ndim != 2 or len(metadata.get("paths", ())) > 1 or path is None:
         return shot
-    return replace(shot, path=Path(path), metadata=known.get("file") or {})
+    return replace(shot, path=Path(path), metadata=metadata.get("file") or {})
 
 
 def source_of_shot(
     layer: Any, image: Any, shot: io.Radiograph, plane: int | None = None
 ) -> io.Radiograph:
-    """A layer's image as the source of a shot, with its file unless that is another shot's."""
+    """Return a layer's image as the source of a shot, without the file of another shot."""
     beam = radiograph_of(layer, image, plane)
     if role_of(layer) != SOURCE or beam.path == shot.path:
         return beam
-    # It came with the other shot, whose file holds more than the source.
+    # It came with another shot, whose file contains more than the source.
     return replace(beam, path=None, metadata={})
 
 
-def loaded(shot: io.Radiograph, name: str) -> io.Radiograph:
-    """The same with its image read, and with the checksum of its file."""
+def load_radiograph(shot: io.Radiograph, name: str) -> io.Radiograph:
+    """Return the radiograph with its image in memory, and the checksum of its file."""
     from napari_shadowinv.pipeline._run import plane_of
 
-    told = dict(shot.metadata)
-    if shot.path is not None and "sha256" not in told and shot.path.is_file():
-        told["sha256"] = sha256(shot.path)
-    return replace(shot, image=plane_of(shot.image, name), metadata=told)
+    metadata = dict(shot.metadata)
+    if shot.path is not None and "sha256" not in metadata and shot.path.is_file():
+        metadata["sha256"] = sha256(shot.path)
+    return replace(shot, image=plane_of(shot.image, name), metadata=metadata)
 
 
 def images_in(folder: Path) -> list[Path]:
-    """List a folder's images of the most frequent ending in the order in which people count."""
-    # A table of settings beside a run of TIFFs is not a shot.
+    """List a folder's images with the most frequent suffix, in natural order."""
+    # A table of settings next to a run of TIFFs is not a shot.
     files = [
         path
         for path in folder.iterdir()
@@ -150,20 +150,20 @@ def images_in(folder: Path) -> list[Path]:
     counts = Counter(path.suffix.lower() for path in files)
     if not counts:
         return []
-    chosen = max(sorted(counts), key=lambda suffix: counts[suffix])
-    return in_counting_order(path for path in files if path.suffix.lower() == chosen)
+    most_frequent = max(sorted(counts), key=lambda suffix: counts[suffix])
+    return in_counting_order(path for path in files if path.suffix.lower() == most_frequent)
 
 
 def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
-    """Describe a run of shots as one lazy stack; only the first that can be read is read now."""
-    # A shot that cannot be read, or of another shape, is dark and gives a warning when shown.
-    first, at = _first_readable(paths)
+    """Describe a run of shots as a lazy stack; only the first readable shot is read now."""
+    # Unreadable shots, or shots of another shape, are zero and give a warning when shown.
+    first, index = _first_readable(paths)
     for caution in first.warnings:
-        show_caution(f"{paths[at].name}: {caution.text}")
+        show_caution(f"{paths[index].name}: {caution.text}")
     height, width = first.image.shape
     plane_of = partial(_plane_of, shape=(height, width))
-    stack = lazy_stack(plane_of, paths, (height, width), ready=first.image, at=at)
-    origin = paths[at].name + (f", one of {len(paths)} shots" if len(paths) > 1 else "")
+    stack = lazy_stack(plane_of, paths, (height, width), ready=first.image, ready_index=index)
+    origin = paths[index].name + (f", one of {len(paths)} shots" if len(paths) > 1 else "")
     layer = shot_layer(
         stack,
         name or paths[0].parent.name or "shots",
@@ -181,34 +181,34 @@ def lazy_stack(
     items: Sequence[Any],
     shape: tuple[int, int],
     ready: FloatArray | None = None,
-    at: int = 0,
+    ready_index: int = 0,
 ) -> Any:
-    """Stack the planes that `make` makes of items, one chunk each; the one `at` may be ready."""
+    """Stack the planes that `make` returns for items, a chunk each; one may be in memory."""
     from dask import array
     from dask.delayed import delayed
 
-    made = delayed(make, pure=True)
+    delayed_make = delayed(make, pure=True)
     planes = [
         array.from_array(ready, chunks=shape)  # type: ignore[no-untyped-call]
-        if ready is not None and index == at
-        else array.from_delayed(made(item), shape=shape, dtype=np.float64)  # type: ignore[no-untyped-call]
+        if ready is not None and index == ready_index
+        else array.from_delayed(delayed_make(item), shape=shape, dtype=np.float64)  # type: ignore[no-untyped-call]
         for index, item in enumerate(items)
     ]
     return array.stack(planes)  # type: ignore[no-untyped-call]
 
 
 def _first_readable(paths: Sequence[Path]) -> tuple[io.Radiograph, int]:
-    mistakes: list[str] = []
+    messages: list[str] = []
     for index, path in enumerate(paths):
         try:
             return io.read_radiograph(path), index
         except (FileFormatError, InputError) as error:
-            mistakes.append(str(error))
-    raise FileFormatError(f"none of {len(paths)} files can be read as a shot: {mistakes[0]}")
+            messages.append(str(error))
+    raise FileFormatError(f"none of {len(paths)} files can be read as a shot: {messages[0]}")
 
 
 def _plane_of(path: Path, shape: tuple[int, int]) -> FloatArray:
-    """Read one shot of a stack; a stray file does not end the show."""
+    """Read a shot of a stack; return zeros for a stray file."""
     try:
         image = io.read_radiograph(path).image
         if image.shape != shape:

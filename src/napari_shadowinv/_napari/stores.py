@@ -1,4 +1,4 @@
-"""The results of a run of shots as lazy layers; only the first finished shot is read at once."""
+"""The results of a run of shots as lazy layers; only the first finished shot is read now."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari.frame import frame_for
-from napari_shadowinv._napari.layer_metadata import mark_of, role_of
-from napari_shadowinv._napari.layers import FullLayerData, at_shot, dataset_layers, thinned_arrows
+from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
+from napari_shadowinv._napari.layers import (
+    FullLayerData,
+    arrows_in_shot,
+    dataset_layers,
+    sample_arrows,
+)
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset
@@ -24,37 +29,37 @@ if TYPE_CHECKING:
 
 
 @refusing_damage
-def store_layers(path: Path, name: str = "", first: int | None = None) -> list[FullLayerData]:
+def store_layers(path: Path, name: str = "", shot: int | None = None) -> list[FullLayerData]:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot.
 
-    That is the first one that is done, which also decides on units, unless it is given.
+    `shot` also sets the units and contrast; default: the first finished shot.
     """
-    dataset = _opened(path)
+    dataset = _open(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
-    first = _first_done(dataset, path) if first is None else first
-    setup = setup_from_dataset(dataset.isel(shot=first))
+    shot = _first_done(dataset, path) if shot is None else shot
+    setup = setup_from_dataset(dataset.isel(shot=shot))
     frame = frame_for(dataset["displacement"].shape, setup)
     facts = {"store": str(path), "name": name, "shots": _shot_names(dataset)}
-    return dataset_layers(dataset, setup, frame, name, facts, first)
+    return dataset_layers(dataset, setup, frame, name, facts, shot)
 
 
 @refusing_damage
 def first_shot(path: Path) -> int:
-    """Return the number of the first shot of a store that is done."""
-    return _first_done(_opened(path), path)
+    """Return the index of the first finished shot of a store."""
+    return _first_done(_open(path), path)
 
 
 @refusing_damage
-def _opened(path: Path) -> xarray.Dataset:
-    """Open a store lazily, the axis of shots first, or say why it is none."""
+def _open(path: Path) -> xarray.Dataset:
+    """Open a store lazily with the axis of shots first, or raise a `FileFormatError`."""
     import xarray as xr
 
     from napari_shadowinv.io.store_files import CheckedStore, describes_arrays
 
     if not path.is_dir():
         raise FileFormatError(f"{path} does not exist: expected a folder made by an inversion")
-    # Nothing in it is a time, whatever its units look like. While a store grows, only the folder's
-    # own copy gives all arrays one length.
+    # No variable is a time, whatever its unit. While a store grows, only the folder's consolidated
+    # metadata give all arrays the same length.
     dataset: xr.Dataset = xr.open_zarr(
         CheckedStore(path),
         chunks={},
@@ -72,12 +77,12 @@ def _opened(path: Path) -> xarray.Dataset:
 
 @refusing_damage
 def shot_of_store(path: Path, index: int) -> xarray.Dataset:
-    """Read one shot of a store as the dataset of its own result.
+    """Read a shot of a store as the dataset of a single result.
 
     Raises
     ------
     InputError
-        If the shot is not done.
+        If the shot is not finished.
     """
     from napari_shadowinv.io.store import DONE, STATUS_NAMES, StackStore, read_stack
 
@@ -91,8 +96,8 @@ def shot_of_store(path: Path, index: int) -> xarray.Dataset:
     shot = read_stack(path).isel(shot=index)
     labels = {name: str(shot[name].values) for name in ("name", "report") if name in shot}
     planes = [str(name) for name in shot.data_vars if "y" in shot[name].dims]
-    saved: xarray.Dataset = shot[planes].drop_vars("shot", errors="ignore").compute()
-    return saved.assign_attrs(shot=labels.get("name", str(index)))
+    result: xarray.Dataset = shot[planes].drop_vars("shot", errors="ignore").compute()
+    return result.assign_attrs(shot=labels.get("name", str(index)))
 
 
 def _first_done(dataset: xarray.Dataset, path: Path) -> int:
@@ -103,7 +108,7 @@ def _first_done(dataset: xarray.Dataset, path: Path) -> int:
     if "status" in dataset and "shot" in dataset["status"].dims:
         shots = np.flatnonzero(dataset["status"].values == DONE)
     for shot in shots:
-        with suppress(FileFormatError):  # it is damaged
+        with suppress(FileFormatError):  # the shot is damaged
             if np.isfinite(displacement[shot].values).all():
                 return int(shot)
     raise FileFormatError(f"{path} contains no finished shot yet: wait for the first one")
@@ -117,9 +122,9 @@ def _shot_names(dataset: xarray.Dataset) -> list[str]:
 
 
 def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
-    """Let arrows, which cannot be lazy, show the shot in view; return what reads them again."""
+    """Show the arrows of the shot in view, as they cannot be lazy; return how to reload them."""
     displacement = _displacement(layer)
-    shown: list[int] = []
+    current: list[int] = []
 
     def shot_in_view() -> int:
         return round(float(layer.world_to_data(viewer.dims.point[-layer.ndim :])[0]))
@@ -128,22 +133,22 @@ def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
         shot = shot_in_view()
         if not layer.visible or not 0 <= shot < len(displacement):
             return
-        shown[:] = [shot]
+        current[:] = [shot]
         try:
             plane = displacement[shot].values
         except OSError:
-            return  # the field comes from the same place, and reports it
-        data, _ = thinned_arrows(plane)
-        layer.data = at_shot(data, shot)
+            return  # the field, from the same chunk, reports it
+        data, _ = sample_arrows(plane)
+        layer.data = arrows_in_shot(data, shot)
         layer.features = {"displacement": np.hypot(*data[:, 1].T)}
 
-    def read_again() -> None:
+    def reload() -> None:
         nonlocal displacement
         displacement = _displacement(layer)
         read()
 
     def follow(_: Any = None) -> None:
-        if shown != [shot_in_view()]:
+        if current != [shot_in_view()]:
             read()
 
     def leave(event: Any) -> None:
@@ -155,15 +160,15 @@ def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
     viewer.layers.events.removed.connect(leave)
     layer.events.visible.connect(follow)
     follow()
-    return read_again
+    return reload
 
 
 def _displacement(layer: Any) -> xarray.DataArray:
-    return _opened(Path(mark_of(layer)["store"]))["displacement"]
+    return _open(Path(metadata_of(layer)["store"]))["displacement"]
 
 
 def viewer_in_window() -> Any | None:
-    """Return the viewer of the window that asks, None without a window."""
+    """Return the viewer of the current window, None without a window."""
     if "napari._qt" not in sys.modules:
         return None
     from napari import current_viewer
@@ -171,16 +176,17 @@ def viewer_in_window() -> Any | None:
     return current_viewer()
 
 
-def follow_once_added(described: Sequence[FullLayerData]) -> None:
-    """Let arrows follow in the window that asked for them; without one, nobody leafs."""
+def follow_once_added(layer_data: Sequence[FullLayerData]) -> None:
+    """Make the arrows follow the shot in view once they are in the window."""
     viewer = viewer_in_window()
-    stores = {mark_of(one[1]).get("store") for one in described if role_of(one[1]) == "arrows"}
+    arrows = [keywords for _, keywords, _ in layer_data if role_of(keywords) == "arrows"]
+    stores = {metadata_of(keywords).get("store") for keywords in arrows}
     if viewer is None or not stores:
         return
 
     def begin(event: Any) -> None:
         layer = event.value
-        if role_of(layer) == "arrows" and mark_of(layer).get("store") in stores:
+        if role_of(layer) == "arrows" and metadata_of(layer).get("store") in stores:
             viewer.layers.events.inserted.disconnect(begin)
             follow_shots(viewer, layer)
 

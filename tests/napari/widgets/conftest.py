@@ -1,4 +1,4 @@
-"""A real window with the plugin's widgets in it; nothing is read from or left to the user."""
+"""A real window with the plugin's widgets, independent of the user's settings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def settings_folder(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def _lasting() -> None:
-    """Napari collects garbage twice a test: not among what lasts until the end."""
+    """Exclude lasting objects from the garbage collections of napari, two a test."""
     import_module("napari._qt.qt_main_window")
     gc.collect()
     gc.freeze()
@@ -44,13 +44,13 @@ def shot() -> np.ndarray[Any, Any]:
 
 @pytest.fixture(scope="session")
 def _compiled(shot: np.ndarray[Any, Any]) -> None:
-    """Compile what an inversion needs, so that no test waits for it."""
+    """Compile the kernels of an inversion, so that no test waits for them."""
     invert(shot, options=InversionOptions(n_sites=700))
 
 
 @pytest.fixture
 def window(make_napari_viewer: Any, qtbot: Any, _compiled: None) -> Iterator[Any]:
-    """A viewer in a window that can be seen; at the end no thread of ours runs on."""
+    """A viewer in a visible window; at the end none of the plugin's threads runs."""
     viewer = make_napari_viewer(show=True)
     viewer.window._qt_window.resize(1280, 800)
     yield viewer

@@ -1,4 +1,4 @@
-"""The widget that turns the scans of a film pack into fluences; a window only where it counts."""
+"""The widget that converts scans of a film pack to fluences, mostly without a window."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ PATIENCE = 60_000  # ms
 
 @pytest.fixture
 def tool(viewer: ViewerModel, qtbot: Any) -> Any:
-    made = FilmPack(viewer)
-    qtbot.addWidget(made)
-    return made
+    widget = FilmPack(viewer)
+    qtbot.addWidget(widget)
+    return widget
 
 
 @pytest.fixture
@@ -59,8 +59,8 @@ def evaluated(viewer: ViewerModel, tool: Any, pack_dataset: Any, tmp_path: Path)
 
 
 def of_role(viewer: Any, role: str) -> Any:
-    (found,) = [layer for layer in viewer.layers if role_of(layer) == role]
-    return found
+    (match,) = [layer for layer in viewer.layers if role_of(layer) == role]
+    return match
 
 
 def scratch_of(tool: Any) -> list[Path]:
@@ -86,12 +86,14 @@ def test_a_run_shows_the_fluences_of_the_films(
     first, _, last = (f"{energy:.3g}" for energy in pack_dataset["energy"].values)
     assert tool.report.texts()["Films"] == f"3, {first} to {last} MeV"
     used = pack_dataset["usable"].values
-    means = [plane[one].astype(float).mean() for plane, one in zip(fluence.data, used, strict=True)]
+    means = [
+        plane[mask].astype(float).mean() for plane, mask in zip(fluence.data, used, strict=True)
+    ]
     np.testing.assert_allclose(tool.plot.shown.fluence, means)
     hatched = [patch for patch in tool.plot.figure.axes[0].patches if patch.get_hatch()]
     assert len(hatched) == 1
-    left, right = hatched[0].get_x(), hatched[0].get_x() + hatched[0].get_width()
-    assert left <= tool.plot.shown.energies[-1] <= right
+    low, high = hatched[0].get_x(), hatched[0].get_x() + hatched[0].get_width()
+    assert low <= tool.plot.shown.energies[-1] <= high
     # The same pack again takes the place of its result.
     tool.panel.button.click()
     wait(tool)
@@ -107,7 +109,7 @@ def test_the_spectrum_follows_the_region(evaluated: Any, pack_dataset: Any, qtbo
     def mean(rows: slice, columns: slice) -> list[float]:
         used = pack_dataset["usable"].values[:, rows, columns]
         fluence = pack_dataset["fluence"].values[:, rows, columns]
-        return [one[here].astype(float).mean() for one, here in zip(fluence, used, strict=True)]
+        return [film[mask].astype(float).mean() for film, mask in zip(fluence, used, strict=True)]
 
     region = tool.regions.layer
     np.testing.assert_allclose(region.scale, scale)
@@ -128,22 +130,22 @@ def test_corners_are_shown_dragged_and_used(
     of_role(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
     viewer.dims.set_current_step(0, 1)
     tool.show_corners.click()
-    known = pack_dataset["corners"].values
-    np.testing.assert_allclose(tool.corners.polygon.data[0], known[1], atol=1e-4)
+    corners = pack_dataset["corners"].values
+    np.testing.assert_allclose(tool.corners.polygon.data[0], corners[1], atol=1e-4)
     assert tool.corners.scan.rgb
     assert tool.corners.corners(pack_dataset) is None
-    moved = known + np.array([[-2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    moved = corners + np.array([[-2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     tool.corners.polygon.data = [moved[1]]
     viewer.dims.set_current_step(0, 2)
     qtbot.waitUntil(lambda: tool.corners.scan.name == "scan of film 3", timeout=5000)
-    np.testing.assert_allclose(tool.corners.polygon.data[0], known[2], atol=1e-4)
+    np.testing.assert_allclose(tool.corners.polygon.data[0], corners[2], atol=1e-4)
     tool.corners.polygon.data = [moved[2]]
     tool.run_again.click()
     wait(tool)
     dataset = tool._chosen()[1]
     assert dataset is not pack_dataset
     table = read_corners(pack_of(dataset).corners)
-    np.testing.assert_allclose(table["1"], known[0], atol=0.006)
+    np.testing.assert_allclose(table["1"], corners[0], atol=0.006)
     np.testing.assert_allclose(table["2"], moved[1], atol=0.006)
     np.testing.assert_allclose(table["3"], moved[2], atol=0.006)
     assert list(table) == ["1", "2", "3"]
@@ -295,7 +297,7 @@ def test_films_become_images_that_can_be_fitted(
 
 
 def test_layers_are_written_with_a_table(
-    evaluated: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: list[str]
+    evaluated: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, messages: list[str]
 ) -> None:
     folder = tmp_path / "layers"
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_, **__: str(folder))
@@ -320,12 +322,12 @@ def test_without_a_setup_films_know_how_strongly_they_are_displaced(
     qtbot.addWidget(fit)
     fit.source.picker.set_kind("unknown")
     strengths = pack_dataset["strength"].values
-    told = [shot.strength[0] for shot in fit.request().shots]
-    np.testing.assert_allclose(told, strengths)
+    in_fit = [shot.strength[0] for shot in fit.request().shots]
+    np.testing.assert_allclose(in_fit, strengths)
     # The first that is used is the reference, whatever the pack's first film is.
     fit.images.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
-    told = [shot.strength[0] for shot in fit.request().shots]
-    np.testing.assert_allclose(told, strengths[1:] / strengths[1])
+    in_fit = [shot.strength[0] for shot in fit.request().shots]
+    np.testing.assert_allclose(in_fit, strengths[1:] / strengths[1])
 
 
 def test_new_pack_is_described_in_the_window(

@@ -18,16 +18,16 @@ from scipy.ndimage import zoom
 from typer.testing import CliRunner
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
-from napari_shadowinv._napari.fit_jobs import FitAnswer
+from napari_shadowinv._napari.fit_jobs import FinishedFit
 from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.layer_metadata import (
     Result,
     displacement_of,
-    keep_setup,
-    mark,
+    metadata_for,
     result_of,
     role_of,
     setup_of,
+    store_setup,
     unit_of,
 )
 from napari_shadowinv._napari.widgets import _fitting
@@ -45,7 +45,7 @@ from napari_shadowinv.pipeline._fit import FitInputs, gathered_fit
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 120_000  # ms
-DRAWN_EVERY = _fitting._DRAW_EVERY  # ms
+REDRAW_MS = _fitting._REDRAW_MS  # ms
 SHAPE = (48, 64)
 LENGTHS = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2, "pixel_size": 1.5e-6}
 ENERGIES = (14.7, 6.0)
@@ -65,14 +65,14 @@ def images(noise: float = 0.01) -> list[Array]:
 
 @pytest.fixture(autouse=True)
 def _curve_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw the curve once: to draw it again and again takes as long as these fits."""
-    monkeypatch.setattr(_fitting, "_DRAW_EVERY", PATIENCE)
+    """Draw the curve once: repeated drawing would take as long as these fits."""
+    monkeypatch.setattr(_fitting, "_REDRAW_MS", PATIENCE)
 
 
 @pytest.fixture
 def tool(window: Any, open_widget: Callable[[str], Any]) -> Any:
     for energy, setup, image in zip(ENERGIES, SETUPS, images(), strict=True):
-        window.add_image(image, name=f"{energy} MeV", metadata=mark("shot", "", setup))
+        window.add_image(image, name=f"{energy} MeV", metadata=metadata_for("shot", "", setup))
     widget = open_widget("Fit several images")
     widget.options.set_values(QUICK)
     return widget
@@ -80,7 +80,7 @@ def tool(window: Any, open_widget: Callable[[str], Any]) -> Any:
 
 @pytest.fixture(scope="session")
 def fitted() -> Fit:
-    """What the widget finds from its two images, without the window."""
+    """The fit of the widget to its two images, without the window."""
     options = FitOptions(samples=2, steps=5, spacing=0.25)
     return fit(np.stack(images()), setups=SETUPS, psf=[0, 0], options=options)
 
@@ -92,8 +92,8 @@ def show(qtbot: Any) -> Callable[[Any, Fit], None]:
     def shown(tool: Any, found: Fit) -> None:
         job = tool.request()
         result = Result(found, found.setups[0], job.attributes)
-        described = fit_layers(result, job.frame, job.name)
-        tool.show_result(FitAnswer(result, described), job)
+        layer_data = fit_layers(result, job.frame, job.name)
+        tool.show_result(FinishedFit(result, layer_data), job)
         qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
 
     return shown
@@ -117,13 +117,13 @@ def run(qtbot: Any) -> Callable[[Any], Any]:
 
 
 def layer_of(viewer: Any, role: str, word: str = "") -> Any:
-    found = [one for one in viewer.layers if role_of(one) == role and word in one.name]
-    assert len(found) == 1, [one.name for one in viewer.layers]
-    return found[0]
+    matches = [layer for layer in viewer.layers if role_of(layer) == role and word in layer.name]
+    assert len(matches) == 1, [layer.name for layer in viewer.layers]
+    return matches[0]
 
 
 def inputs_of(tool: Any) -> FitInputs:
-    """What the fit that is asked for is made of."""
+    """Return the inputs of the requested fit."""
     job = tool.request()
     return gathered_fit(job.recipe, job.shots, names=job.names)
 
@@ -140,7 +140,7 @@ def type_in(tool: Any, row: int, column: int, text: str) -> None:
 def test_the_table_is_filled_from_the_layers(window: Any, tool: Any, assert_it_fits: Any) -> None:
     window.add_image(np.ones((20, 30)), name="another size")
     window.add_image(np.ones((*SHAPE, 3)), name="colour", rgb=True)
-    window.add_image(np.ones(SHAPE), name="beam", metadata=mark("source", ""))
+    window.add_image(np.ones(SHAPE), name="beam", metadata=metadata_for("source", ""))
     assert texts(tool, 0) == ["14.7 MeV", "6.0 MeV", "another size"]
     assert texts(tool, BEAM) == ["14.7", "6", ""]
     assert tool.images.table.horizontalHeaderItem(BEAM).text() == "Energy (MeV)"
@@ -158,7 +158,7 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
     type_in(tool, 1, PSF, "0.8 px")
     tool.noise.restore("poisson")
     inputs = inputs_of(tool)
-    assert [one.energy for one in inputs.setups] == [14.7, 7.0]
+    assert [setup.energy for setup in inputs.setups] == [14.7, 7.0]
     assert inputs.keywords["gains"] == (1.0, 1.2)
     assert inputs.keywords["psf"] == [0.0, 0.8]
     assert inputs.keywords["noise"] == "poisson"
@@ -181,29 +181,29 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
 def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qtbot: Any) -> None:
     flat = {"beam_variation": 0.0}
     tool.options.set_values({"samples": 2, "steps": 5, "spacing": 0.25} | flat)
-    found = run(tool)
-    assert found.verdict is Verdict.DETERMINED
-    error = found.fields[0].displacement - TRUTH
+    result = run(tool)
+    assert result.verdict is Verdict.DETERMINED
+    error = result.fields[0].displacement - TRUTH
     assert np.sqrt((error**2).mean() / (TRUTH**2).mean()) < 0.1
     field = layer_of(window, "field")
     assert field.visible
     assert unit_of(field).endswith("T·m")
     factor = {"µT·m": 1e6, "mT·m": 1e3, "T·m": 1.0}[unit_of(field)]
-    strength = factor * np.hypot(*SETUPS[0].path_integrated_b(found.fields[0].displacement))
+    strength = factor * np.hypot(*SETUPS[0].path_integrated_b(result.fields[0].displacement))
     np.testing.assert_allclose(field.data, strength, rtol=1e-6, atol=1e-6 * strength.max())
-    sigma = factor * np.hypot(*SETUPS[0].path_integrated_b(found.fields[0].uncertainty))
-    shown = layer_of(window, "uncertainty")
-    np.testing.assert_allclose(shown.data, sigma, rtol=1e-6)
-    assert unit_of(shown) == unit_of(field)
+    sigma = factor * np.hypot(*SETUPS[0].path_integrated_b(result.fields[0].uncertainty))
+    uncertainty = layer_of(window, "uncertainty")
+    np.testing.assert_allclose(uncertainty.data, sigma, rtol=1e-6)
+    assert unit_of(uncertainty) == unit_of(field)
     tool.more_layers.click()
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    np.testing.assert_array_equal(layer_of(window, "reprojection").data, found.reprojection)
+    np.testing.assert_array_equal(layer_of(window, "reprojection").data, result.reprojection)
     residual = layer_of(window, "residual").data
     assert residual.shape == (2, *SHAPE)
-    np.testing.assert_allclose(residual[1], 100 * found.residual[1] / found.images[1].mean())
+    np.testing.assert_allclose(residual[1], 100 * result.residual[1] / result.images[1].mean())
     assert tuple(field.scale) == pytest.approx((1.5, 1.5))
     assert tuple(window.layers["6.0 MeV"].scale) == pytest.approx((1.5, 1.5))
-    # It can be told, projected and saved like the result of an inversion.
+    # It can be messages, projected and saved like the result of an inversion.
     assert result_of(field).setup == SETUPS[0]
     report = tool.view.report.texts()
     assert "6 MeV proton" in report["Image 2"]
@@ -211,19 +211,19 @@ def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qt
 
 
 def test_a_good_verdict_is_shown_and_a_bad_one_is_told(
-    window: Any, tool: Any, show: Any, fitted: Fit, told: list[str]
+    window: Any, tool: Any, show: Any, fitted: Fit, messages: list[str]
 ) -> None:
     show(tool, fitted)
     assert "Verdict: determined" in tool.view.verdict.text()
     assert not tool.view.verdict.styleSheet()
-    assert told == []
+    assert messages == []
     count = len(window.layers)
     explanation = "the forward model does not explain image 2"
     show(tool, replace(fitted, verdict=Verdict.MISFIT, explanation=explanation))
     assert "Verdict: does not fit" in tool.view.verdict.text()
     assert explanation[1:] in tool.view.verdict.text()
     assert tool.view.verdict.styleSheet()
-    assert told == [f"The fit's verdict is 'does not fit': {explanation}"]
+    assert messages == [f"The fit's verdict is 'does not fit': {explanation}"]
     # The layers of the same images' earlier fit are replaced.
     assert len(window.layers) == count
     tool._last.keep_earlier.setChecked(True)
@@ -244,24 +244,27 @@ def test_two_fields_are_told_apart_and_named(
             transferred_displacement(d, setups[0], setup, deflector=f"{kind} field")
             for d, kind in ((0.5 * TRUTH, "magnetic"), (0.5 * electric, "electric"))
         )
-        metadata = mark("shot", "", setup)
+        metadata = metadata_for("shot", "", setup)
         noisy = synthetic_image(moved) + rng.normal(0, 0.01, SHAPE)
         window.add_image(noisy, name=f"{setup.energy}", metadata=metadata)
     tool = open_widget("Fit several images")
     tool.options.set_values(QUICK)
     tool.fields.restore("B and E")
-    found = run(tool)
-    assert [one.name for one in found.fields] == ["B", "E"]
-    magnetic, other = layer_of(window, "field", "∫B×dz"), layer_of(window, "field", "∫E dz")
+    result = run(tool)
+    assert [field.name for field in result.fields] == ["B", "E"]
+    magnetic, electric_layer = (
+        layer_of(window, "field", "∫B×dz"),
+        layer_of(window, "field", "∫E dz"),
+    )
     assert magnetic.visible
-    assert not other.visible
-    assert unit_of(other).endswith("V")
-    factor = {"V": 1.0, "kV": 1e-3, "MV": 1e-6}[unit_of(other)]
-    expected = factor * np.hypot(*setups[0].path_integrated_e(found.fields[1].displacement))
-    np.testing.assert_allclose(other.data, expected, rtol=1e-6, atol=1e-6 * expected.max())
-    assert result_of(other).content is result_of(magnetic).content is found
-    for layer, one in zip((magnetic, other), found.fields, strict=True):
-        np.testing.assert_array_equal(displacement_of(layer), one.displacement)
+    assert not electric_layer.visible
+    assert unit_of(electric_layer).endswith("V")
+    factor = {"V": 1.0, "kV": 1e-3, "MV": 1e-6}[unit_of(electric_layer)]
+    expected = factor * np.hypot(*setups[0].path_integrated_e(result.fields[1].displacement))
+    np.testing.assert_allclose(electric_layer.data, expected, rtol=1e-6, atol=1e-6 * expected.max())
+    assert result_of(electric_layer).content is result_of(magnetic).content is result
+    for layer, field in zip((magnetic, electric_layer), result.fields, strict=True):
+        np.testing.assert_array_equal(displacement_of(layer), field.displacement)
 
 
 def test_an_unknown_beam_is_fitted_and_shown(window: Any, tool: Any, run: Any) -> None:
@@ -288,7 +291,7 @@ def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
     for layer in window.layers:
         layer.data = np.kron(layer.data, large)
     beam = 300 + np.arange(SHAPE[1]) + np.zeros(SHAPE)
-    window.add_image(np.kron(beam, large), name="beam", metadata=mark("source", ""))
+    window.add_image(np.kron(beam, large), name="beam", metadata=metadata_for("source", ""))
     tool.source.layers.layer = window.layers["beam"]
     tool.source.picker.set_kind("layer")
     painted = np.zeros((96, 128), np.uint8)
@@ -303,7 +306,7 @@ def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
     np.testing.assert_array_equal(keywords["mask"], usable)
     np.testing.assert_allclose(planes[usable], np.stack(before)[usable])
     np.testing.assert_allclose(keywords["source"][usable], np.stack([beam, beam])[usable])
-    assert [one.object_pixel_size for one in keywords["setups"]] == pytest.approx([3e-6, 3e-6])
+    assert [setup.object_pixel_size for setup in keywords["setups"]] == pytest.approx([3e-6, 3e-6])
     assert job.frame.scale == pytest.approx((3, 3))
     assert job.frame.translate == pytest.approx((0.75, 0.75))
     assert "bin" in dict(job.given)["Steps"].lower()
@@ -311,7 +314,7 @@ def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
 
 def test_a_stack_has_a_row_for_each_plane(window: Any, open_widget: Any) -> None:
     stack = np.stack([*images(), images()[0]])
-    layer = window.add_image(stack, name="run", metadata=mark("shot", "", SETUPS[0]))
+    layer = window.add_image(stack, name="run", metadata=metadata_for("shot", "", SETUPS[0]))
     tool = open_widget("Fit several images")
     tool.images.stacks.layer = layer
     assert texts(tool, 0) == ["run 0", "run 1", "run 2"]
@@ -327,7 +330,7 @@ def test_a_stack_has_a_row_for_each_plane(window: Any, open_widget: Any) -> None
     tool.images.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
     assert tool.setup.setup().energy == 6
     tool.images.table.item(0, 0).setCheckState(Qt.CheckState.Checked)
-    assert [one.energy for one in inputs_of(tool).setups] == [14.7, 6.0]
+    assert [setup.energy for setup in inputs_of(tool).setups] == [14.7, 6.0]
 
 
 def test_without_a_setup_strengths_are_asked_for(window: Any, open_widget: Any, run: Any) -> None:
@@ -340,8 +343,8 @@ def test_without_a_setup_strengths_are_asked_for(window: Any, open_widget: Any, 
     with pytest.raises(InputError, match="'weak' has no strength"):
         tool.request()
     type_in(tool, 1, BEAM, "0.6")
-    found = run(tool)
-    assert found.strengths.ravel().tolist() == [1.0, 0.6]
+    result = run(tool)
+    assert result.strengths.ravel().tolist() == [1.0, 0.6]
     assert unit_of(layer_of(window, "field")) == "px"
 
 
@@ -349,7 +352,7 @@ def test_light_has_wavelengths_and_its_own_fields(window: Any, open_widget: Any)
     green = OpticalSetup(wavelength=532e-9, object_image_distance=0.01, pixel_size=1e-6)
     red = green.model_copy(update={"wavelength": 810e-9})
     for setup in (green, red):
-        window.add_image(np.ones(SHAPE), name=setup.probe, metadata=mark("shot", "", setup))
+        window.add_image(np.ones(SHAPE), name=setup.probe, metadata=metadata_for("shot", "", setup))
     tool = open_widget("Fit several images")
     assert texts(tool, BEAM) == ["532 nm", "810 nm"]
     keys = [tool.fields.itemData(index) for index in range(tool.fields.count())]
@@ -371,72 +374,74 @@ def test_light_has_wavelengths_and_its_own_fields(window: Any, open_widget: Any)
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_sentence(
-    tool: Any, told: list[str], spoil: Callable[[Any], None], sentence: str
+    tool: Any, messages: list[str], spoil: Callable[[Any], None], sentence: str
 ) -> None:
     spoil(tool)
     tool.panel.button.click()
     assert not tool.panel.runner.running
-    (text,) = told
+    (text,) = messages
     assert text.lower().startswith(sentence.lower())
     assert tool.panel.status.text() == text
 
 
 def test_without_images_it_says_what_is_needed(
-    window: Any, open_widget: Callable[[str], Any], told: list[str]
+    window: Any, open_widget: Callable[[str], Any], messages: list[str]
 ) -> None:
     tool = open_widget("Fit several images")
     tool.panel.button.click()
-    assert told[0].startswith("No images are checked, expected two or more")
-    (first,) = (window.add_image(one, name="a") for one in images()[:1])
+    assert messages[0].startswith("No images are checked, expected two or more")
+    (first,) = (window.add_image(image, name="a") for image in images()[:1])
     tool.panel.button.click()
-    assert told[1].startswith("1 image is checked")
+    assert messages[1].startswith("1 image is checked")
     window.layers.remove(first)
     assert texts(tool, 0) == []
     tool.panel.button.click()
-    assert told[2] == told[0]
+    assert messages[2] == messages[0]
 
 
 def test_what_other_widgets_change_is_followed(window: Any, tool: Any, qtbot: Any) -> None:
     tool.hide()
     for layer, energy in zip(window.layers, (15.0, 7.0), strict=True):
-        keep_setup(layer, SETUPS[0].model_copy(update={"energy": energy}), "typed elsewhere")
+        store_setup(layer, SETUPS[0].model_copy(update={"energy": energy}), "typed elsewhere")
     tool.show()
     qtbot.waitUntil(tool.isVisible, timeout=PATIENCE)
     assert texts(tool, BEAM) == ["15", "7"]
-    assert [one.energy for one in inputs_of(tool).setups] == [15.0, 7.0]
+    assert [setup.energy for setup in inputs_of(tool).setups] == [15.0, 7.0]
     assert tool.setup.origin == "typed elsewhere"
 
 
 def test_doubts_of_the_reader_are_told(window: Any, tool: Any) -> None:
-    window.layers[1].metadata = mark(
+    window.layers[1].metadata = metadata_for(
         "shot", "", SETUPS[1], warnings=[Caution("film-scan", "it may be film")]
     )
     assert ("Warning", "'6.0 MeV': it may be film") in tool.request().given
 
 
 def test_images_that_do_not_fit_are_refused(
-    window: Any, tool: Any, told: list[str], qtbot: Any
+    window: Any, tool: Any, messages: list[str], qtbot: Any
 ) -> None:
-    window.add_image(np.ones((40, 64)), name="crop", metadata=mark("shot", "", SETUPS[0]))
+    window.add_image(np.ones((40, 64)), name="crop", metadata=metadata_for("shot", "", SETUPS[0]))
     for row in range(3):
         tool.images.table.item(row, 0).setCheckState(Qt.CheckState.Checked)
     tool.panel.button.click()
-    assert "'crop' has shape (40, 64), '14.7 MeV' (48, 64)" in told[-1]
+    assert "'crop' has shape (40, 64), '14.7 MeV' (48, 64)" in messages[-1]
     # What only the fit itself can see reaches the window in the same way.
     tool.images.table.item(2, 0).setCheckState(Qt.CheckState.Unchecked)
     window.layers["6.0 MeV"].data = np.full(SHAPE, np.nan)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
-    assert told[-1].startswith("'6.0 MeV' has 3072 pixels that are NaN")
-    assert len(told) == 2
-    assert tool.panel.status.text() == told[-1]
+    assert messages[-1].startswith("'6.0 MeV' has 3072 pixels that are NaN")
+    assert len(messages) == 2
+    assert tool.panel.status.text() == messages[-1]
 
 
-def test_a_fit_is_cancelled_at_once(window: Any, tool: Any, qtbot: Any, told: list[str]) -> None:
-    tool.view._drawing.setInterval(DRAWN_EVERY)
+def test_a_fit_is_cancelled_at_once(
+    window: Any, tool: Any, qtbot: Any, messages: list[str]
+) -> None:
+    tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.set_values({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.course.history), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.progress.history), timeout=PATIENCE)
     qtbot.waitUntil(lambda: "Fitting: " in tool.panel.status.text(), timeout=PATIENCE)
     assert "objective" in tool.panel.status.text()
     qtbot.waitUntil(tool.view.curve.isVisible, timeout=PATIENCE)
@@ -444,7 +449,7 @@ def test_a_fit_is_cancelled_at_once(window: Any, tool: Any, qtbot: Any, told: li
     assert tool.panel.status.text() == "Cancelled."
     assert tool.panel.button.text() == "Run"
     assert not [layer for layer in window.layers if role_of(layer) == "field"]
-    assert told == []
+    assert messages == []
 
 
 def enlarged(window: Any, times: int = 4) -> None:
@@ -460,7 +465,7 @@ BEFORE = {"full size": {"smoothness": 5.0}, "samples": {"smoothness": 5.0, "step
 
 
 def threads() -> list[str]:
-    return [one.name for one in threading.enumerate() if one.name == "shadowinv"]
+    return [thread.name for thread in threading.enumerate() if thread.name == "shadowinv"]
 
 
 def cancel(tool: Any, qtbot: Any) -> None:
@@ -470,7 +475,7 @@ def cancel(tool: Any, qtbot: Any) -> None:
 
 @pytest.fixture
 def traced_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """One item for each image whose rays have been traced."""
+    """A list with an entry for each image whose rays have been traced."""
     traced: list[int] = []
     trace = RayModel.image
 
@@ -484,16 +489,18 @@ def traced_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize("stage", ["transport", "from near", "smoothness", "full size", "samples"])
 def test_each_stage_ends_soon_after_cancel(
-    window: Any, tool: Any, qtbot: Any, told: list[str], stage: str, traced_images: list[int]
+    window: Any, tool: Any, qtbot: Any, messages: list[str], stage: str, traced_images: list[int]
 ) -> None:
     tool.panel.runner._patience = math.inf  # the fit has to end by itself
     enlarged(window)
-    tool.view._drawing.setInterval(DRAWN_EVERY)
+    tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.set_values({"samples": 1000, "steps": 100} | BEFORE.get(stage, {}))
     before = list(window.layers)
     tool.panel.button.click()
-    course = tool.panel.runner.tag.course
-    qtbot.waitUntil(lambda: any(one == stage for one, _ in course.history), timeout=PATIENCE)
+    course = tool.panel.runner.tag.progress
+    qtbot.waitUntil(
+        lambda: any(reached == stage for reached, _ in course.history), timeout=PATIENCE
+    )
     assert course.history[-1][0] == stage
     traced_images.clear()
     cancel(tool, qtbot)
@@ -502,7 +509,7 @@ def test_each_stage_ends_soon_after_cancel(
     assert not threads()
     qtbot.wait(50)
     assert list(window.layers) == before
-    assert told == []
+    assert messages == []
     assert tool.cost.text().startswith("2 images of 192 × 256 px: about ")
 
 
@@ -523,58 +530,61 @@ def test_the_compiler_is_told_and_does_not_hold_up_cancelling(
 
 
 def test_a_window_is_closed_during_a_fit(
-    make_napari_viewer: Any, qtbot: Any, told: list[str]
+    make_napari_viewer: Any, qtbot: Any, messages: list[str]
 ) -> None:
     viewer = make_napari_viewer(show=True)
     for energy, setup, image in zip(ENERGIES, SETUPS, images(), strict=True):
-        viewer.add_image(image, name=f"{energy} MeV", metadata=mark("shot", "", setup))
+        viewer.add_image(image, name=f"{energy} MeV", metadata=metadata_for("shot", "", setup))
     _, tool = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Fit several images")
-    tool.view._drawing.setInterval(DRAWN_EVERY)
+    tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.set_values({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: len(tool.panel.runner.tag.course.history) > 100, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: len(tool.panel.runner.tag.progress.history) > 100, timeout=PATIENCE)
     viewer.close()
     qtbot.waitUntil(lambda: not threads(), timeout=1000)
-    assert told == []
+    assert messages == []
 
 
 def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
-    window: Any, tool: Any, qtbot: Any, told: list[str], fitted: Fit
+    window: Any, tool: Any, qtbot: Any, messages: list[str], fitted: Fit
 ) -> None:
     # As if it had been removed: drawing right after a removal crashes Mesa at times.
     job = replace(tool.request(), layer=object(), companions=tuple(window.layers))
     result = Result(fitted, SETUPS[0], job.attributes)
-    tool.show_result(FitAnswer(result, fit_layers(result, job.frame, job.name)), job)
+    tool.show_result(FinishedFit(result, fit_layers(result, job.frame, job.name)), job)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    assert told == ["'14.7 MeV' was deleted during its fit; the result is shown anyway"]
+    assert messages == ["'14.7 MeV' was deleted during its fit; the result is shown anyway"]
     # Pixels beside micrometres would take the scale bar's unit away.
     assert tuple(window.layers["6.0 MeV"].scale) == pytest.approx((1.5, 1.5))
     assert {str(layer.units[-1]) for layer in window.layers} == {"micrometer"}
 
 
-def test_closing_the_dock_ends_the_fit(window: Any, tool: Any, qtbot: Any, told: list[str]) -> None:
-    tool.view._drawing.setInterval(DRAWN_EVERY)
+def test_closing_the_dock_ends_the_fit(
+    window: Any, tool: Any, qtbot: Any, messages: list[str]
+) -> None:
+    tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.set_values({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.course.history), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.progress.history), timeout=PATIENCE)
     window.window.remove_dock_widget(tool)
     tool.deleteLater()
     qtbot.waitUntil(
-        lambda: not any(one.name == "shadowinv" for one in threading.enumerate()), timeout=5000
+        lambda: not any(thread.name == "shadowinv" for thread in threading.enumerate()),
+        timeout=5000,
     )
     qtbot.wait(100)
     window.add_image(np.ones((8, 8)))
-    assert told == []
+    assert messages == []
 
 
 def test_other_answers_are_shown_beside_the_best(
-    window: Any, tool: Any, show: Any, fitted: Fit, qtbot: Any, told: list[str]
+    window: Any, tool: Any, show: Any, fitted: Fit, qtbot: Any, messages: list[str]
 ) -> None:
-    found = fitted
-    show(tool, found)
-    assert not tool.view.answers.isVisible()
-    best = found.basins[0]
-    other = replace(
+    result = fitted
+    show(tool, result)
+    assert not tool.view.solutions.isVisible()
+    best = result.basins[0]
+    alternative = replace(
         best,
         start="from near",
         objective=1.02 * best.objective,
@@ -582,48 +592,51 @@ def test_other_answers_are_shown_beside_the_best(
         displacement=0.5 * best.displacement,
     )
     doubtful = replace(
-        found, basins=(best, other), verdict=Verdict.SEVERAL, explanation="2 different fields"
+        result,
+        basins=(best, alternative),
+        verdict=Verdict.SEVERAL,
+        explanation="2 different fields",
     )
     show(tool, doubtful)
-    assert len(told) == 1
-    answers = tool.view.answers
+    assert len(messages) == 1
+    answers = tool.view.solutions
     assert answers.isVisible()
     assert answers.itemText(0).endswith("the best")
-    assert answers.itemText(1) == "from near: +2.0 %, 50% off"
+    assert answers.itemText(1) == "from near: +2.0 %, differs by 50%"
     count = len(window.layers)
     answers.setCurrentIndex(1)
     qtbot.waitUntil(lambda: not tool.view._others.busy, timeout=PATIENCE)
-    shown = layer_of(window, "field", "from near")
-    assert shown.data.shape == SHAPE
-    coarse = np.hypot(*SETUPS[0].path_integrated_b(other.displacement[0]))
-    factor = {"µT·m": 1e6, "mT·m": 1e3, "T·m": 1.0}[unit_of(shown)]
+    field = layer_of(window, "field", "from near")
+    assert field.data.shape == SHAPE
+    coarse = np.hypot(*SETUPS[0].path_integrated_b(alternative.displacement[0]))
+    factor = {"µT·m": 1e6, "mT·m": 1e3, "T·m": 1.0}[unit_of(field)]
     # Its pixels lie between pairs of the image's.
-    pairs = shown.data.reshape(24, 2, 32, 2).mean(axis=(1, 3)) / factor
+    pairs = field.data.reshape(24, 2, 32, 2).mean(axis=(1, 3)) / factor
     assert np.abs(pairs - coarse)[2:-2, 2:-2].max() < 0.1 * coarse.max()
     answers.setCurrentIndex(0)
     assert len(window.layers) == count
 
 
 def test_refine_starts_from_the_last_inversion(
-    window: Any, open_widget: Any, qtbot: Any, told: list[str]
+    window: Any, open_widget: Any, qtbot: Any, messages: list[str]
 ) -> None:
     shot = images()[0][MIDDLE]
-    window.add_image(shot, name="shot", metadata=mark("shot", "", SETUPS[0]))
+    window.add_image(shot, name="shot", metadata=metadata_for("shot", "", SETUPS[0]))
     tool = open_widget("Invert shot")
     tool.options.set_values({"n_sites": 600})
-    tool.refining.button.click()
-    assert "there is no inversion of this image" in told.pop().lower()
+    tool.refine_section.button.click()
+    assert "there is no inversion of this image" in messages.pop().lower()
     tool.panel.button.click()
     qtbot.waitUntil(lambda: hasattr(tool, "results"), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     inversion = result_of(layer_of(window, "field")).content
-    tool.refining.psf.setValue(0.5)
+    tool.refine_section.psf.setValue(0.5)
     answers: list[Any] = []
     tool.panel.runner.ended.connect(answers.append)
-    tool.refining.button.click()
+    tool.refine_section.button.click()
     assert tool.panel.button.text() == "Cancel"
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
-    found = answers[0].value.fit
+    result = answers[0].value.fit
     expected = fit(
         inversion.image,
         setups=[SETUPS[0]],
@@ -632,12 +645,14 @@ def test_refine_starts_from_the_last_inversion(
         psf=0.5,
         start=inversion.potential,
     )
-    np.testing.assert_allclose(found.fields[0].potential, expected.fields[0].potential)
-    assert any(basin.start == "given" for basin in found.basins)
+    np.testing.assert_allclose(result.fields[0].potential, expected.fields[0].potential)
+    assert any(basin.start == "given" for basin in result.basins)
     qtbot.waitUntil(lambda: "Verdict" in tool.fit_view.verdict.text(), timeout=PATIENCE)
     names = [layer.name for layer in window.layers]
     qtbot.waitUntil(
-        lambda: any("refined" in one.name and role_of(one) == "arrows" for one in window.layers),
+        lambda: any(
+            "refined" in layer.name and role_of(layer) == "arrows" for layer in window.layers
+        ),
         timeout=PATIENCE,
     )
     assert any(name.startswith("|∫B×dz| (mT·m) – shot") for name in names), names
@@ -653,7 +668,7 @@ def test_refine_starts_from_the_last_inversion(
 
 
 def test_the_menu_refines_an_inversion_of_a_file(
-    window: Any, qtbot: Any, in_loop: Any, tmp_path: Any, told: list[str]
+    window: Any, qtbot: Any, in_loop: Any, tmp_path: Any, messages: list[str]
 ) -> None:
     from napari._app_model import get_app_model
 
@@ -661,39 +676,39 @@ def test_the_menu_refines_an_inversion_of_a_file(
         get_app_model().commands.execute_command("napari-shadowinv.refine").result()
 
     path = tmp_path / "shot.shadowinv"
-    found = invert(images()[0][MIDDLE], options=InversionOptions(n_sites=600))
-    write(path, found, setup=SETUPS[0])
+    inversion = invert(images()[0][MIDDLE], options=InversionOptions(n_sites=600))
+    write(path, inversion, setup=SETUPS[0])
     window.open(str(path), plugin="napari-shadowinv")
     window.layers.selection.active = layer_of(window, "arrows")
     in_loop(refine)
     (dock,) = window.window.dock_widgets.values()
     tool = dock if hasattr(dock, "refining") else dock._magic_widget
-    assert tool.refining.folded.isExpanded()
+    assert tool.refine_section.folded.isExpanded()
     assert tool.panel.runner.running
     in_loop(refine)
-    assert told[-1].startswith("Invert shot is at work")
+    assert messages[-1].startswith("Invert shot is at work")
     qtbot.waitUntil(lambda: "Verdict" in tool.fit_view.verdict.text(), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool._refined.busy, timeout=PATIENCE)
     assert layer_of(window, "field", "shot refined").visible
     assert tool.fit_view.report.texts()["Start"] == "the inversion of 'shot'"
     window.layers.selection.active = layer_of(window, "field", "refined")
     in_loop(refine)
-    assert "shows a fit: select a layer of an inversion" in told[-1]
+    assert "shows a fit: select a layer of an inversion" in messages[-1]
 
 
 def test_a_saved_fit_comes_back_as_it_was(
     window: Any, tool: Any, show: Any, fitted: Fit, tmp_path: Any
 ) -> None:
-    found = fitted
-    show(tool, found)
+    result = fitted
+    show(tool, result)
     qt_path = tmp_path / "fit.shadowinv"
     layers = [layer for layer in window.layers if result_of(layer) is not None]
     window.layers.selection = set(layers)
     window.layers.save(str(qt_path), selected=True, plugin="napari-shadowinv")
     dataset = read(qt_path)
-    assert dataset.attrs["verdict"] == found.verdict.value
+    assert dataset.attrs["verdict"] == result.verdict.value
     assert json.loads(dataset.attrs["fields"]) == ["B"]
-    np.testing.assert_array_equal(dataset["displacement"], found.fields[0].displacement)
+    np.testing.assert_array_equal(dataset["displacement"], result.fields[0].displacement)
     names = {layer.name for layer in layers}
     window.layers.clear()
     window.open(str(qt_path), plugin="napari-shadowinv")
@@ -705,12 +720,12 @@ def test_choices_are_kept_between_sessions(window: Any, tool: Any, open_widget: 
     tool.fields.restore("B and E")
     tool.gains.restore("free")
     tool.noise.restore("poisson")
-    kept = json.loads(json.dumps(tool.state()))
+    state = json.loads(json.dumps(tool.state()))
     tool.fields.restore("B")
     tool.gains.restore("known")
     tool.noise.restore("")
-    del kept["setup"]  # a matter of the image
-    tool.restore(kept)
+    del state["setup"]  # a matter of the image
+    tool.restore(state)
     choices = tool.request().choices
     assert choices.fields == ("B", "E")
     assert choices.gains == "free"
@@ -732,8 +747,10 @@ def assert_same(one: Fit, other: Fit) -> None:
 
 
 def save(viewer: Any, content: Fit, path: Path) -> None:
-    shown = [one for one in viewer.layers if getattr(result_of(one), "content", None) is content]
-    viewer.layers.selection = set(shown)
+    layers = [
+        layer for layer in viewer.layers if getattr(result_of(layer), "content", None) is content
+    ]
+    viewer.layers.selection = set(layers)
     viewer.layers.save(str(path), selected=True, plugin="napari-shadowinv")
 
 
@@ -774,16 +791,16 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     painted = np.zeros(SHAPE, np.uint8)
     painted[:4, :6] = 1
     tool.masks.layer = window.add_labels(painted, name="dust")
-    found = run(tool)
-    made = found.provenance
-    assert [one.image.file for one in made.images] == ["fast.txt", "slow.txt"]
-    assert [one.source.file for one in made.images] == ["beam.txt"] * 2
-    assert all(one.image.sha256 and one.source.sha256 for one in made.images)
-    save(window, found, tmp_path / "window.shadowinv")
-    told = command("rerun", "window.shadowinv", "--out", "again.shadowinv")
-    assert "changed nothing" in told
-    assert "bit for bit" in told
-    assert_same(Fit.from_dataset(read(tmp_path / "again.shadowinv")), found)
+    result = run(tool)
+    provenance = result.provenance
+    assert [image.image.file for image in provenance.images] == ["fast.txt", "slow.txt"]
+    assert [image.source.file for image in provenance.images] == ["beam.txt"] * 2
+    assert all(image.image.sha256 and image.source.sha256 for image in provenance.images)
+    save(window, result, tmp_path / "window.shadowinv")
+    output = command("rerun", "window.shadowinv", "--out", "again.shadowinv")
+    assert "changed nothing" in output
+    assert "bit for bit" in output
+    assert_same(Fit.from_dataset(read(tmp_path / "again.shadowinv")), result)
     tifffile.imwrite(tmp_path / "usable.tif", (painted == 0).astype(np.uint8))
     by_flags = [
         *("fit", "fast.txt", "slow.txt", "--energies", "14.7,6", "--setup", "setup.toml"),
@@ -792,11 +809,16 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
         *("--out", "command.shadowinv"),
     ]
     command(*by_flags)
-    assert_same(Fit.from_dataset(read(tmp_path / "command.shadowinv")), found)
+    assert_same(Fit.from_dataset(read(tmp_path / "command.shadowinv")), result)
 
 
 def test_a_refined_inversion_is_made_again(
-    window: Any, open_widget: Any, files: list[Path], qtbot: Any, tmp_path: Path, told: list[str]
+    window: Any,
+    open_widget: Any,
+    files: list[Path],
+    qtbot: Any,
+    tmp_path: Path,
+    messages: list[str],
 ) -> None:
     tifffile.imwrite(tmp_path / "fast.tif", np.loadtxt(files[0])[MIDDLE])
     window.open("fast.tif", plugin="napari")
@@ -806,18 +828,18 @@ def test_a_refined_inversion_is_made_again(
     tool.steps.add("low-pass")
     tool.panel.button.click()
     qtbot.waitUntil(lambda: hasattr(tool, "results") and not tool.results.busy, timeout=PATIENCE)
-    tool.refining.psf.setValue(0.5)
+    tool.refine_section.psf.setValue(0.5)
     answers: list[Any] = []
     tool.panel.runner.ended.connect(answers.append)
-    tool.refining.button.click()
+    tool.refine_section.button.click()
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool._refined.busy, timeout=PATIENCE)
-    found = answers[0].value.fit
-    assert found.provenance.start.image.file == "fast.tif"
-    save(window, found, tmp_path / "refined.shadowinv")
+    result = answers[0].value.fit
+    assert result.provenance.start.image.file == "fast.tif"
+    save(window, result, tmp_path / "refined.shadowinv")
     again = command("rerun", "refined.shadowinv", "--out", "again.shadowinv")
     assert "bit for bit" in again
-    assert_same(Fit.from_dataset(read(tmp_path / "again.shadowinv")), found)
+    assert_same(Fit.from_dataset(read(tmp_path / "again.shadowinv")), result)
     assert "low-pass" in command("info", "refined.shadowinv")
 
 
@@ -825,18 +847,18 @@ def test_what_was_no_file_is_asked_for(
     window: Any, tool: Any, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    found = run(tool)
-    assert [one.image.file for one in found.provenance.images] == ["", ""]
-    assert [one.setup for one in found.provenance.images] == list(SETUPS)
-    save(window, found, tmp_path / "window.shadowinv")
+    result = run(tool)
+    assert [image.image.file for image in result.provenance.images] == ["", ""]
+    assert [image.setup for image in result.provenance.images] == list(SETUPS)
+    save(window, result, tmp_path / "window.shadowinv")
     refused = CliRunner().invoke(app, ["rerun", "window.shadowinv"])
     assert refused.exit_code == 2
     assert "image 1 was not made from a file: name the file" in " ".join(refused.output.split())
     for number, layer in enumerate(list(window.layers)[:2]):
         np.save(tmp_path / f"{number}.npy", layer.data)
-    told = command("rerun", "window.shadowinv", "0.npy", "1.npy", "--out", "again.shadowinv")
-    assert "image 2 was no file before" in told
-    assert_same(Fit.from_dataset(read(tmp_path / "again.shadowinv")), found)
+    output = command("rerun", "window.shadowinv", "0.npy", "1.npy", "--out", "again.shadowinv")
+    assert "image 2 was no file before" in output
+    assert_same(Fit.from_dataset(read(tmp_path / "again.shadowinv")), result)
 
 
 def test_what_the_table_rounds_is_taken_exactly(window: Any, open_widget: Any) -> None:
@@ -845,7 +867,7 @@ def test_what_the_table_rounds_is_taken_exactly(window: Any, open_widget: Any) -
         for setup in SETUPS
     ]
     for setup in setups:
-        window.add_image(np.ones(SHAPE), metadata=mark("shot", "", setup))
+        window.add_image(np.ones(SHAPE), metadata=metadata_for("shot", "", setup))
     tool = open_widget("Fit several images")
     assert texts(tool, BEAM) == ["14.7", "6"]
     assert inputs_of(tool).setups == tuple(setups)
@@ -877,9 +899,9 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     type_in(tool, 1, BEAM, "6")
     assert tool.masks.layer is not None
     tool.masks.layer = None
-    found = run(tool)
-    assert found.mask.all()
-    save(window, found, tmp_path / "window.shadowinv")
+    result = run(tool)
+    assert result.mask.all()
+    save(window, result, tmp_path / "window.shadowinv")
     assert "bit for bit" in command("rerun", "window.shadowinv", "--out", "again.shadowinv")
     single = open_widget("Invert shot")
     single.options.set_values({"n_sites": 500})
@@ -910,9 +932,9 @@ def test_a_stack_of_files_knows_the_file_of_each_plane(
 def test_a_source_of_another_file_is_not_taken_for_that_file(
     window: Any, tool: Any, tmp_path: Path
 ) -> None:
-    known = {"path": str(tmp_path / "a.h5"), "file": {"sha256": "1" * 64}}
-    window.layers[0].metadata = mark("shot", "", SETUPS[0], **known)
-    beam = window.add_image(np.full(SHAPE, 300.0), metadata=mark("source", "", **known))
+    metadata = {"path": str(tmp_path / "a.h5"), "file": {"sha256": "1" * 64}}
+    window.layers[0].metadata = metadata_for("shot", "", SETUPS[0], **metadata)
+    beam = window.add_image(np.full(SHAPE, 300.0), metadata=metadata_for("source", "", **metadata))
     tool.source.layers.layer = beam
     tool.source.picker.set_kind("layer")
     first, second = inputs_of(tool).provenance.images
@@ -921,12 +943,12 @@ def test_a_source_of_another_file_is_not_taken_for_that_file(
 
 
 def test_the_same_image_twice_is_told_by_the_names_of_its_layers(
-    window: Any, tool: Any, told: list[str], qtbot: Any
+    window: Any, tool: Any, messages: list[str], qtbot: Any
 ) -> None:
     window.layers[1].data = window.layers[0].data.copy()
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
-    assert told == ["'14.7 MeV' and '6.0 MeV' are the same: give each image once"]
+    assert messages == ["'14.7 MeV' and '6.0 MeV' are the same: give each image once"]
 
 
 def lies_in_view(tool: Any, part: Any) -> bool:
@@ -940,7 +962,7 @@ def test_run_is_in_view_at_once_and_the_verdict_at_the_end(
 ) -> None:
     window.window._qt_window.resize(1366, 768)
     for setup, image in zip(SETUPS, images(), strict=True):
-        metadata = mark("shot", "", setup, setup_origin="came with pack.h5")
+        metadata = metadata_for("shot", "", setup, setup_origin="came with pack.h5")
         window.add_image(image, name=setup.probe, metadata=metadata)
     tool = open_widget("Fit several images")
     qtbot.wait(100)
@@ -1001,7 +1023,7 @@ def test_a_recipe_is_the_same_for_window_and_command(
 
 
 def test_a_recipe_tells_noise_and_point_spread(
-    window: Any, tool: Any, tmp_path: Path, told: list[str]
+    window: Any, tool: Any, tmp_path: Path, messages: list[str]
 ) -> None:
     path = tmp_path / "recipe.toml"
     choices = '[fit]\nfields = ["E", "B"]\nnoise = 3.5\nsource_size = 3e-6\nresolution = 4e-5\n'
@@ -1009,12 +1031,14 @@ def test_a_recipe_tells_noise_and_point_spread(
     tool.recipes.load(path)
     assert inputs_of(tool).keywords["noise"] == (3.5, 3.5)
     assert tool.fields.state() == "B and E"
-    by_command = gathered_fit(read_recipe(path), [FitShot(np.ones(SHAPE), one) for one in SETUPS])
+    by_command = gathered_fit(
+        read_recipe(path), [FitShot(np.ones(SHAPE), setup) for setup in SETUPS]
+    )
     assert inputs_of(tool).keywords["psf"] == pytest.approx(by_command.keywords["psf"], rel=1e-12)
     assert 1 < by_command.keywords["psf"][0] < 2
     tool.setup.picker.set_kind("none")
     tool.recipes.load(path)
-    assert told[-1].endswith("choose the setup first, or give the point spread in px (psf)")
+    assert messages[-1].endswith("select the setup first, or give the point spread in px (psf)")
 
 
 @pytest.mark.parametrize(
@@ -1027,12 +1051,12 @@ def test_a_recipe_tells_noise_and_point_spread(
     ],
 )
 def test_a_recipe_that_cannot_be_shown_changes_nothing(
-    tool: Any, told: list[str], tmp_path: Path, text: str, sentence: str
+    tool: Any, messages: list[str], tmp_path: Path, text: str, sentence: str
 ) -> None:
     path = tmp_path / "recipe.toml"
     path.write_text(text)
     before = tool.state()
     tool.recipes.load(path)
-    assert sentence in told[0]
-    assert tool.panel.status.text() == told[0]
+    assert sentence in messages[0]
+    assert tool.panel.status.text() == messages[0]
     assert tool.state() == before

@@ -1,4 +1,4 @@
-"""Forms made from the models, and the files that they read and write."""
+"""Forms generated from the models, and the files that they read and write."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> 
 
 
 def test_the_buttons_save_and_load(
-    qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: list[str],
+    qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, messages: list[str],
     proton_setup: ProtonSetup,
 ) -> None:  # fmt: skip
     picker = SetupPicker()
@@ -136,8 +136,8 @@ def test_the_buttons_save_and_load(
     monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (path, ""))
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (path, ""))
     picker.files.save_button.click()
-    assert len(told) == 1
-    assert "no setup to save" in told[0]
+    assert len(messages) == 1
+    assert "no setup to save" in messages[0]
     picker.show_setup(proton_setup.model_dump())
     picker.files.save_button.click()
     picker.picker.set_kind("none")
@@ -145,23 +145,23 @@ def test_the_buttons_save_and_load(
     assert picker.setup() == proton_setup
     Path(path).write_text("kind = 'proton'\nenergie = 3")
     picker.files.load_button.click()
-    assert len(told) == 2
-    assert "energie" in told[1]
+    assert len(messages) == 2
+    assert "energie" in messages[1]
     assert picker.setup() == proton_setup
 
 
 def test_a_picker_remembers_what_each_kind_holds(qtbot: Any) -> None:
-    picker, other = (ModelPicker("Method", kinds_of(ESTIMATES)) for _ in range(2))
-    for one in (picker, other):
-        qtbot.addWidget(one)
+    picker, restored = (ModelPicker("Method", kinds_of(ESTIMATES)) for _ in range(2))
+    for widget in (picker, restored):
+        qtbot.addWidget(widget)
     picker.set_kind("polynomial")
     assert picker.form is not None
     picker.form.editors["degree"].set_value(7)
     picker.set_kind("low-pass")
-    other.restore(picker.state())
-    assert other.kind == "low-pass"
-    other.set_kind("polynomial")
-    assert other.model() == ESTIMATES["polynomial"](degree=7)  # type: ignore[call-arg]
+    restored.restore(picker.state())
+    assert restored.kind == "low-pass"
+    restored.set_kind("polynomial")
+    assert restored.model() == ESTIMATES["polynomial"](degree=7)  # type: ignore[call-arg]
 
 
 def test_what_was_kept_is_loaded_and_damage_is_forgiven(qtbot: Any, settings_folder: Path) -> None:

@@ -18,7 +18,7 @@ from napari.utils import progress
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.layer_metadata import mark, result_of, role_of, unit_of
+from napari_shadowinv._napari.layer_metadata import metadata_for, result_of, role_of, unit_of
 from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._napari.widgets import _runner, invert_shot
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
@@ -79,18 +79,18 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 
 def computed(tool: Any) -> Any:
-    """The inversion that the controls ask for, without its layers."""
+    """Return the inversion of the controls, without its layers."""
     return tool.request().inversion()
 
 
 def settled(tool: Any) -> bool:
-    return not tool.panel.runner.running and not tool._settle.isActive()
+    return not tool.panel.runner.running and not tool._preview_timer.isActive()
 
 
 def layer_of(viewer: Any, role: str, word: str = "") -> Any:
-    found = [one for one in viewer.layers if role_of(one) == role and word in one.name]
-    assert len(found) == 1, [one.name for one in viewer.layers]
-    return found[0]
+    matches = [layer for layer in viewer.layers if role_of(layer) == role and word in layer.name]
+    assert len(matches) == 1, [layer.name for layer in viewer.layers]
+    return matches[0]
 
 
 def test_the_window_thread_computes_nothing_during_a_run(
@@ -119,7 +119,7 @@ def test_the_window_thread_computes_nothing_during_a_run(
 
 
 def test_closing_the_window_ends_the_run(
-    make_napari_viewer: Any, qtbot: Any, shot: Array, slow: threading.Event, told: list[str]
+    make_napari_viewer: Any, qtbot: Any, shot: Array, slow: threading.Event, messages: list[str]
 ) -> None:
     viewer = make_napari_viewer(show=True)
     viewer.add_image(shot, name="shot")
@@ -128,15 +128,16 @@ def test_closing_the_window_ends_the_run(
     qtbot.waitUntil(lambda: widget.panel.button.text() == "Cancel", timeout=PATIENCE)
     viewer.close()
     qtbot.waitUntil(
-        lambda: not any(one.name == "shadowinv" for one in threading.enumerate()), timeout=5000
+        lambda: not any(thread.name == "shadowinv" for thread in threading.enumerate()),
+        timeout=5000,
     )
     qtbot.wait(100)
-    assert told == []
+    assert messages == []
     assert not progress._all_instances
 
 
 def test_an_image_deleted_during_the_run_is_told_once(
-    window: Any, tool: Any, slow: threading.Event, told: list[str], qtbot: Any
+    window: Any, tool: Any, slow: threading.Event, messages: list[str], qtbot: Any
 ) -> None:
     tool.panel.button.click()
     qtbot.waitUntil(lambda: tool.panel.button.text() == "Cancel", timeout=PATIENCE)
@@ -144,8 +145,8 @@ def test_an_image_deleted_during_the_run_is_told_once(
     slow.set()
     qtbot.waitUntil(lambda: hasattr(tool, "results"), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    assert len(told) == 1
-    assert "was deleted" in told[0]
+    assert len(messages) == 1
+    assert "was deleted" in messages[0]
     assert layer_of(window, "field").data.any()
 
 
@@ -196,7 +197,7 @@ def test_crop_mask_and_source_are_used(
     beam = 300 * (1 + np.linspace(0, 0.2, shot.shape[1]) + np.zeros(shot.shape))
     np.save(tmp_path / "beam.npy", beam)
     window.add_image(beam, name="beam")
-    metadata = mark("shot", "", proton_setup, source=beam)
+    metadata = metadata_for("shot", "", proton_setup, source=beam)
     window.add_image(shot, name="measured", metadata=metadata)
     tool.source.layers.layer = window.layers["beam"]
     tool.source.file.edit.setText(str(tmp_path / "beam.npy"))
@@ -217,8 +218,10 @@ def test_crop_mask_and_source_are_used(
 def test_what_a_file_brings_is_used_and_told(window: Any, tool: Any, shot: Array) -> None:
     mask = np.zeros(shot.shape, np.uint8)
     mask[:, :5] = 1
-    window.add_labels(mask, metadata=mark("mask", "", path="a.txt"))
-    metadata = mark("shot", "", path="a.txt", warnings=[Caution("film-scan", "it may be film")])
+    window.add_labels(mask, metadata=metadata_for("mask", "", path="a.txt"))
+    metadata = metadata_for(
+        "shot", "", path="a.txt", warnings=[Caution("film-scan", "it may be film")]
+    )
     tool.masks.painted_is_unusable.setChecked(False)
     tool.image.layer = window.add_image(shot, name="other", metadata=metadata)
     inversion = computed(tool)
@@ -237,12 +240,12 @@ def test_a_saved_result_tells_how_it_was_made(
     tool.crop.layer = window.add_shapes(np.array([[4, 8], [4, 50], [40, 50], [40, 8]]))
     run(tool)
     window.layers.save(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
-    told = Provenance.of(read(tmp_path / "a.shadowinv").attrs)
-    assert told is not None
+    provenance = Provenance.of(read(tmp_path / "a.shadowinv").attrs)
+    assert provenance is not None
     file = (tmp_path / "flame.npy").read_bytes()
-    assert told.image.file == "flame.npy"
-    assert told.image.sha256 == hashlib.sha256(file).hexdigest()
-    assert told.recipe == Recipe(
+    assert provenance.image.file == "flame.npy"
+    assert provenance.image.sha256 == hashlib.sha256(file).hexdigest()
+    assert provenance.recipe == Recipe(
         steps=(Crop(y=(4, 41), x=(8, 51)), LowPassFilter(width=1.0)),
         source=PolynomialEstimate(degree=2),
         options=InversionOptions(**FEW),
@@ -266,17 +269,17 @@ def test_cancel_ends_the_work_itself(
     run = _runner._run
 
     def run_held(work: Any, box: Any) -> None:
-        """Hold the work at its first site until it is cancelled, and note what it does then."""
+        """Hold the work at its first site until it is cancelled, and record its later stages."""
 
         def held(on_progress: Any, should_stop: Any) -> Any:
-            def note(news: Any) -> None:
+            def watch(progress: Any) -> None:
                 if cancelled.is_set():
-                    stages_after_cancel.append(news.stage)
-                on_progress(news)
-                if news.stage == "sites":
+                    stages_after_cancel.append(progress.stage)
+                on_progress(progress)
+                if progress.stage == "sites":
                     cancelled.wait()
 
-            return work(note, should_stop)
+            return work(watch, should_stop)
 
         run(held, box)
 
@@ -303,7 +306,7 @@ def test_a_run_replaces_the_last_result_of_its_shot(
     run: Any,
     shot: Array,
     proton_setup: ProtonSetup,
-    told: list[str],
+    messages: list[str],
     qtbot: Any,
 ) -> None:
     run(tool)
@@ -335,20 +338,20 @@ def test_a_run_replaces_the_last_result_of_its_shot(
 
     # Another shot has results of its own, and so has a run that is told to keep the last.
     count = len(window.layers)
-    assert all(text.startswith("Doubtful: ") for text in told)
-    metadata = mark("shot", "", proton_setup)
+    assert all(text.startswith("Doubtful: ") for text in messages)
+    metadata = metadata_for("shot", "", proton_setup)
     tool.image.layer = window.add_image(2 * shot, name="second", metadata=metadata)
     run(tool)
     assert len(window.layers) == count + 1 + 4
     tool.keep_earlier.setChecked(True)
     run(tool)
     assert len(window.layers) == count + 1 + 2 * 4
-    bars = [one.name for one in window.layers if getattr(one, "colorbar", None) is not None]
-    shown = [one for one in window.layers if one.name in bars and one.colorbar.visible]
-    assert [(role_of(one), one.visible) for one in shown] == [("field", True)]
+    bars = [image.name for image in window.layers if getattr(image, "colorbar", None) is not None]
+    with_bar = [image for image in window.layers if image.name in bars and image.colorbar.visible]
+    assert [(role_of(image), image.visible) for image in with_bar] == [("field", True)]
 
 
-MISTAKES = {
+USER_ERRORS = {
     "no image": None,
     "colour": np.ones((20, 20, 3)),
     "Split Stack": np.ones((3, 20, 20)),
@@ -360,18 +363,20 @@ MISTAKES = {
 
 
 @pytest.fixture
-def expecting(told: list[str], qtbot: Any) -> Any:
-    """Press Run, and check that one notification with some words comes of it."""
+def expecting(messages: list[str], qtbot: Any) -> Any:
+    """Press Run, and check that it sends one notification with these words."""
 
     def of_tool(tool: Any) -> Any:
         def expect(words: str) -> None:
-            told.clear()
+            messages.clear()
             tool.panel.button.click()
-            qtbot.waitUntil(lambda: bool(told) and not tool.panel.runner.running, timeout=PATIENCE)
+            qtbot.waitUntil(
+                lambda: bool(messages) and not tool.panel.runner.running, timeout=PATIENCE
+            )
             qtbot.wait(30)
-            assert len(told) == 1, told
-            assert words in told[0]
-            assert "\n" not in told[0]
+            assert len(messages) == 1, messages
+            assert words in messages[0]
+            assert "\n" not in messages[0]
             # It can be read when the notification is gone.
             assert words.lower() in tool.panel.status.text().lower()
             assert tool.panel.status.isVisible()
@@ -391,7 +396,7 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
 
     expect = expecting(tool)
 
-    for words, data in MISTAKES.items():
+    for words, data in USER_ERRORS.items():
         window.layers.clear()
         if data is not None:
             rgb = data.shape[-1] == 3
@@ -442,7 +447,7 @@ def test_a_mistake_in_a_layer_of_another_kind_is_told_once(
 
 
 def test_whole_numbers_and_the_finest_of_many_scales_are_inverted(
-    window: Any, tool: Any, shot: Array, run: Any, told: list[str]
+    window: Any, tool: Any, shot: Array, run: Any, messages: list[str]
 ) -> None:
     counts = np.round(shot).astype(np.uint16)
     tool.image.layer = window.add_image(counts, name="counts")
@@ -455,11 +460,11 @@ def test_whole_numbers_and_the_finest_of_many_scales_are_inverted(
     assert field.data.shape == shot.shape
     np.testing.assert_allclose(pyramid.scale, 1.5)
     np.testing.assert_allclose(field.data_to_world((20, 30)), pyramid.data_to_world((20, 30)))
-    assert told == []
+    assert messages == []
 
 
 def test_the_result_lies_on_an_image_that_was_turned(
-    window: Any, tool: Any, shot: Array, run: Any, told: list[str]
+    window: Any, tool: Any, shot: Array, run: Any, messages: list[str]
 ) -> None:
     turned = window.add_image(
         shot, name="turned", rotate=30, shear=[0.2], scale=(2, 3), translate=(7, -4),
@@ -481,11 +486,11 @@ def test_the_result_lies_on_an_image_that_was_turned(
     stack = window.add_image(np.ones((2, *shot.shape)), name="stacked", **stacked)
     np.testing.assert_allclose(stack.data_to_world((1, 3, 4))[1:], turned.data_to_world((3, 4)))
     assert frame_of(stack) == frame_of(turned)
-    assert [text.partition(":")[0] for text in told] == ["Doubtful"]
+    assert [text.partition(":")[0] for text in messages] == ["Doubtful"]
 
 
 def test_the_preview_follows_in_its_own_layers(
-    window: Any, tool: Any, qtbot: Any, told: list[str]
+    window: Any, tool: Any, qtbot: Any, messages: list[str]
 ) -> None:
     noise = np.random.default_rng(0).normal(0, 0.05, (200, 200))
     shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement) + noise
@@ -531,7 +536,7 @@ def test_the_preview_follows_in_its_own_layers(
     assert outcomes[-1].value is not None
     assert len(outcomes) < 21
     assert [a is b for a, b in zip(before, tool.previewed.layers, strict=True)] == [True] * 2
-    assert told == []
+    assert messages == []
 
 
 def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fits: Any) -> None:
@@ -549,21 +554,21 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
     assert again.setup.setup() == paper_setup()
     assert again.source.picker.model() == tool.source.picker.model()
     assert again.steps.steps() == tuple(step() for step in STEPS.values())
-    steps = "Steps first: subtract dark level, rotate, crop, remove hot pixels, bin"
+    steps = "Steps: subtract dark level, rotate, crop, remove hot pixels, bin"
     assert again.steps.folded.text().startswith(steps)
 
 
 def test_doubts_stand_under_run_with_a_notification(
-    window: Any, tool: Any, run: Any, told: list[str]
+    window: Any, tool: Any, run: Any, messages: list[str]
 ) -> None:
     tool.options.set_values({**FEW, "max_iterations": 1})
     run(tool)
     assert "Failed" in tool.verdict.text()
-    (text,) = told
+    (text,) = messages
     assert text.startswith("Failed: ")
     assert "--" not in tool.verdict.text()
     assert layer_of(window, "field").name.endswith("(failed)")
-    told.clear()
+    messages.clear()
     x = np.mgrid[:48, :60][1]
     edge = synthetic_image(np.stack([0 * x, 0.03 * (x - 20.0)]))
     window.layers["shot"].data = edge
@@ -573,21 +578,21 @@ def test_doubts_stand_under_run_with_a_notification(
     assert report.converged
     assert report.warnings
     assert "Doubtful" in tool.verdict.text()
-    assert told[-1].startswith("Doubtful: ")
+    assert messages[-1].startswith("Doubtful: ")
     assert layer_of(window, "field").name.endswith("(doubtful)")
     assert "Iterations" in tool.report.texts()
     assert not tool.report.details.isExpanded()
 
 
 def test_preview_shows_its_verdict_and_residual(
-    window: Any, tool: Any, qtbot: Any, told: list[str]
+    window: Any, tool: Any, qtbot: Any, messages: list[str]
 ) -> None:
     tool.live.setChecked(True)
     qtbot.waitUntil(lambda: len(tool.previewed.layers) == 2 and settled(tool), timeout=PATIENCE)
     assert "Preview: " in tool.verdict.text()
     content = result_of(layer_of(window, "field", "preview")).content
     assert f"{100 * content.report.image_residual:.3g} %" in tool.panel.status.text()
-    assert told == []
+    assert messages == []
 
 
 def test_menu_brings_a_hidden_tab_to_the_front(
@@ -636,5 +641,5 @@ def test_camera_fits_after_units_change(
 
 def test_window_texts_have_labels_in_place_of_flags() -> None:
     text = "try a free boundary (--boundary free), or give the noise_level; see --max-shots"
-    told = window_text(text)
-    assert told == "try a free boundary, or give the 'Noise level'; see --max-shots"
+    in_window = window_text(text)
+    assert in_window == "try a free boundary, or give the 'Noise level'; see --max-shots"

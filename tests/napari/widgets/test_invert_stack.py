@@ -54,7 +54,7 @@ def prepared(widget: Any, out: Path) -> Any:
 
 @pytest.fixture
 def run(qtbot: Any) -> Callable[[Any], None]:
-    """Press Run and wait until all is there."""
+    """Press Run and wait until run and layers are complete."""
 
     def pressed(tool: Any) -> None:
         tool.panel.button.click()
@@ -64,7 +64,7 @@ def run(qtbot: Any) -> Callable[[Any], None]:
 
 
 def at_rest(tool: Any) -> bool:
-    return not (tool.panel.runner.running or tool.results.busy or tool._soon.isActive())
+    return not (tool.panel.runner.running or tool.results.busy or tool._refresh_timer.isActive())
 
 
 @pytest.fixture
@@ -85,8 +85,8 @@ def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 
 def layer_of(viewer: Any, role: str) -> Any:
-    (found,) = [one for one in viewer.layers if role_of(one) == role]
-    return found
+    (match,) = [layer for layer in viewer.layers if role_of(layer) == role]
+    return match
 
 
 def written(out: Path) -> dict[str, int]:
@@ -96,8 +96,8 @@ def written(out: Path) -> dict[str, int]:
 
 
 def running() -> list[str]:
-    """Threads of ours, of the run and of its shots."""
-    names = [one.name for one in threading.enumerate()]
+    """Names of the threads of the run and its shots."""
+    names = [thread.name for thread in threading.enumerate()]
     return [name for name in names if name.startswith(("shot", "shadowinv"))]
 
 
@@ -107,13 +107,13 @@ def test_a_stack_layer_becomes_a_store_and_layers(
     run: Any,
     stack: Array,
     out: Path,
-    told: list[str],
+    messages: list[str],
     proton_setup: ProtonSetup,
 ) -> None:
     tool.setup.show_setup(proton_setup.model_dump())
     tool.engine.workers.setValue(2)
     run(tool)
-    assert told == []
+    assert messages == []
     assert (StackStore(out).statuses() == DONE).all()
     assert tool.panel.status.text() == "4 of 4 done, in run.shadowinv.zarr"
     assert tool.panel.status.toolTip() == str(out)
@@ -121,8 +121,8 @@ def test_a_stack_layer_becomes_a_store_and_layers(
     field, image = layer_of(window, "field"), window.layers["shots"]
     expected = invert(stack[2], options=InversionOptions(**FEW))
     strength = np.hypot(*proton_setup.path_integrated_b(expected.displacement))
-    shown = np.asarray(field.data[2])
-    np.testing.assert_allclose(shown / shown.max(), strength / strength.max(), atol=1e-5)
+    plane = np.asarray(field.data[2])
+    np.testing.assert_allclose(plane / plane.max(), strength / strength.max(), atol=1e-5)
     assert field.data.shape == stack.shape
     np.testing.assert_allclose(field.scale, image.scale)
     assert image.scale[-1] == pytest.approx(1.5)
@@ -133,7 +133,7 @@ def test_a_stack_layer_becomes_a_store_and_layers(
     before = written(out)
     run(tool)
     assert written(out) == before
-    assert [role_of(one) for one in window.layers].count("field") == 1
+    assert [role_of(layer) for layer in window.layers].count("field") == 1
 
 
 def test_a_lazy_layer_is_read_shot_by_shot(
@@ -152,32 +152,34 @@ def test_a_lazy_layer_is_read_shot_by_shot(
     stored = StackStore(out)
     assert (stored.statuses() == DONE).all()
     expected = invert(stack[3], options=InversionOptions(**FEW))
-    shown = np.asarray(read_stack(out)["potential"][3])
-    np.testing.assert_allclose(shown, expected.potential, atol=1e-5 * np.ptp(expected.potential))
+    potential = np.asarray(read_stack(out)["potential"][3])
+    np.testing.assert_allclose(
+        potential, expected.potential, atol=1e-5 * np.ptp(expected.potential)
+    )
 
 
 def test_a_corrupt_file_is_listed_and_the_others_are_done(
-    window: Any, tool: Any, run: Any, stack: Array, out: Path, tmp_path: Path, told: list[str]
+    window: Any, tool: Any, run: Any, stack: Array, out: Path, tmp_path: Path, messages: list[str]
 ) -> None:
     for index, image in enumerate(stack):
         np.save(tmp_path / f"shot_{index}.npy", image)
-    whole = (tmp_path / "shot_1.npy").read_bytes()
-    (tmp_path / "shot_1.npy").write_bytes(whole[:200])
+    content = (tmp_path / "shot_1.npy").read_bytes()
+    (tmp_path / "shot_1.npy").write_bytes(content[:200])
     tool.shots.picker.set_kind("files")
     tool.shots.files.edit.setText(str(tmp_path / "shot_*.npy"))
     run(tool)
-    assert told == []
+    assert messages == []
     assert StackStore(out).statuses().tolist() == [DONE, FAILED, DONE, DONE]
-    (name, reason), *others = tool.failures.texts().items()
+    (name, reason), *further = tool.failures.texts().items()
     assert name == "shot_1.npy"
     assert reason == StackStore(out).report(1)["reason"]
-    assert others == []
+    assert further == []
     assert tool.failures.isVisible()
     assert tool.panel.status.text() == "3 of 4 done, 1 failed, in run.shadowinv.zarr"
     assert np.isnan(np.asarray(layer_of(window, "field").data[1])).all()
 
     # It stays so until it is to be tried again, which takes a box.
-    (tmp_path / "shot_1.npy").write_bytes(whole)
+    (tmp_path / "shot_1.npy").write_bytes(content)
     before = written(out)
     run(tool)
     assert list(tool.failures.texts()) == ["shot_1.npy"]
@@ -190,7 +192,13 @@ def test_a_corrupt_file_is_listed_and_the_others_are_done(
 
 
 def test_cancelled_in_the_middle_it_goes_on_from_there(
-    window: Any, tool: Any, run: Any, out: Path, qtbot: Any, held: threading.Event, told: list[str]
+    window: Any,
+    tool: Any,
+    run: Any,
+    out: Path,
+    qtbot: Any,
+    held: threading.Event,
+    messages: list[str],
 ) -> None:
     tool.panel.button.click()
     qtbot.waitUntil(lambda: tool.panel.bar.value() == 2, timeout=PATIENCE)
@@ -208,7 +216,7 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     tool.panel.button.click()
     assert tool.panel.button.text() == "Cancelling…"
     qtbot.waitUntil(lambda: at_rest(tool), timeout=PATIENCE)
-    assert tool.panel.status.text() == "Cancelled: 2 of 4 done; press Run to resume."
+    assert tool.panel.status.text() == "Cancelled: 2 of 4 done. Press Run to resume."
     assert StackStore(out).statuses().tolist() == [DONE, DONE, PENDING, PENDING]
     before = written(out)
     assert len(before) == 2
@@ -229,7 +237,7 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     assert field.contrast_limits[1] == pytest.approx(float(field.data.max().compute()))
     assert layer_of(window, "potential") is potential
     assert tuple(potential.contrast_limits) == (-3.0, 4.0)
-    assert told == []
+    assert messages == []
 
 
 def test_closing_the_window_ends_the_run(
@@ -238,7 +246,7 @@ def test_closing_the_window_ends_the_run(
     stack: Array,
     out: Path,
     held: threading.Event,
-    told: list[str],
+    messages: list[str],
 ) -> None:
     viewer = make_napari_viewer(show=True)
     viewer.add_image(stack, name="shots")
@@ -248,7 +256,7 @@ def test_closing_the_window_ends_the_run(
     viewer.close()
     qtbot.waitUntil(lambda: not running(), timeout=5000)
     qtbot.wait(100)
-    assert told == []
+    assert messages == []
     assert StackStore(out).statuses().tolist() == [DONE, DONE, PENDING, PENDING]
 
 
@@ -257,18 +265,18 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool: Any,
     run: Any,
     out: Path,
-    told: list[str],
+    messages: list[str],
     qtbot: Any,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def expect(words: str) -> None:
-        told.clear()
+        messages.clear()
         tool.panel.button.click()
-        qtbot.waitUntil(lambda: bool(told) and at_rest(tool), timeout=PATIENCE)
+        qtbot.waitUntil(lambda: bool(messages) and at_rest(tool), timeout=PATIENCE)
         qtbot.wait(30)
-        assert len(told) == 1, told
-        assert words in told[0]
+        assert len(messages) == 1, messages
+        assert words in messages[0]
         assert tool.panel.button.text() == "Run"
         assert tool.panel.button.isEnabled()
 
@@ -331,9 +339,9 @@ def test_shots_are_filtered_and_their_sources_guessed(
     clean = LowPassFilter(width=1.0).filtered(stack[1], mask)
     source = LowPassEstimate(width=6.0).source(np.where(mask, clean, 0), mask)
     expected = invert(clean, source=source, mask=mask, options=InversionOptions(**FEW))
-    shown = np.asarray(read_stack(out)["potential"][1])
+    potential = np.asarray(read_stack(out)["potential"][1])
     np.testing.assert_allclose(
-        shown[mask], expected.potential[mask], atol=1e-4 * np.ptp(expected.potential)
+        potential[mask], expected.potential[mask], atol=1e-4 * np.ptp(expected.potential)
     )
 
 

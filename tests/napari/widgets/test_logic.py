@@ -1,4 +1,4 @@
-"""What the widgets compute and hold, without a window."""
+"""Computations behind the widgets, without a window."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from napari_shadowinv import (
     InversionCancelled,
     InversionOptions,
 )
-from napari_shadowinv._napari.widgets._fields import parsed, shown
-from napari_shadowinv._napari.widgets._forecast import BlobRecipe, ForwardJob, ToroidRecipe
+from napari_shadowinv._napari.widgets._editors import format_number, parse_number
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._panels import report_rows
+from napari_shadowinv._napari.widgets._phantoms import BlobRecipe, ForwardJob, ToroidRecipe
 from napari_shadowinv._napari.widgets._stacking import StackJob
 from napari_shadowinv._napari.widgets.estimate_source import SourceRequest
-from napari_shadowinv._napari.widgets.invert_shot import cost_of
+from napari_shadowinv._napari.widgets.invert_shot import estimate_cost
 from napari_shadowinv._napari.widgets.line_profile import (
     Profile,
-    abreast,
-    along,
-    sampled,
+    interpolate,
+    sample_path,
+    sample_strip,
     table_text,
 )
 from napari_shadowinv._system.progress import Progress
@@ -79,8 +79,8 @@ Array = np.ndarray[Any, Any]
 def test_a_quantity_is_read_exactly_and_shown_so_that_it_reads_back(
     text: str, unit: str, value: float
 ) -> None:
-    assert parsed(text, unit) == value
-    assert parsed(shown(value, unit), unit) == value
+    assert parse_number(text, unit) == value
+    assert parse_number(format_number(value, unit), unit) == value
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_a_quantity_is_read_exactly_and_shown_so_that_it_reads_back(
 )
 def test_what_is_no_quantity_is_refused(text: str, unit: str) -> None:
     with pytest.raises(InputError):
-        parsed(text, unit)
+        parse_number(text, unit)
 
 
 def test_a_crop_gives_the_field_of_the_cropped_image(shot: Array) -> None:
@@ -152,8 +152,8 @@ def test_a_preview_starts_from_the_one_before_and_a_run_does_not() -> None:
     # But for the last digit of the uniform source, which another filter rounds otherwise.
     np.testing.assert_allclose(cold.displacement, alone.displacement, atol=1e-11)
     assert cold.report.iterations == alone.report.iterations
-    other = cache.plan(2 + np.eye(*shot.shape), None, FEW)
-    assert cache.solved(other) is None
+    plan = cache.plan(2 + np.eye(*shot.shape), None, FEW)
+    assert cache.solved(plan) is None
 
 
 def test_a_step_does_the_same_to_image_and_source_as_alone(shot: Array) -> None:
@@ -163,10 +163,10 @@ def test_a_step_does_the_same_to_image_and_source_as_alone(shot: Array) -> None:
     beam = 1 + np.random.default_rng(0).random(shot.shape)
     recipe = Recipe(steps=(LowPassFilter(width=1.5),), options=FEW)
     mine = run(recipe, image, source=beam, mask=usable)
-    told, source = (LowPassFilter(width=1.5).filtered(one, usable) for one in (image, beam))
-    alone = invert(told, source=source, mask=usable, options=FEW)
+    smooth, source = (LowPassFilter(width=1.5).filtered(plane, usable) for plane in (image, beam))
+    alone = invert(smooth, source=source, mask=usable, options=FEW)
     np.testing.assert_array_equal(mine.displacement, alone.displacement)
-    assert np.isfinite(told).all()
+    assert np.isfinite(smooth).all()
 
 
 @pytest.mark.parametrize("step", [HighPassFilter(), BackgroundFilter(), ButterworthFilter()])
@@ -186,12 +186,12 @@ def test_a_stack_tells_that_it_compiles(
     shot: Array, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
-    told: list[Progress] = []
+    progress: list[Progress] = []
     job = StackJob(shot[None], tmp_path / "a.shadowinv.zarr", Recipe(options=FEW))
-    books = job.run(told.append, lambda: False)
-    assert list(dict.fromkeys(news.stage for news in told)) == ["prepare", "shots"]
-    assert any(news.message.startswith("compiling, ") for news in told)
-    assert books.text == "1 of 1 done"
+    status = job.run(progress.append, lambda: False)
+    assert list(dict.fromkeys(report.stage for report in progress)) == ["prepare", "shots"]
+    assert any(report.message.startswith("compiling, ") for report in progress)
+    assert status.text == "1 of 1 done"
 
 
 def test_a_uniform_source_is_the_same_after_a_filter(shot: Array) -> None:
@@ -235,8 +235,8 @@ def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
     hidden = np.hypot(y - 24, x - 30) > 10
     cache = Cache()
     for _ in range(2):
-        told = warnings(GaussianEstimate(), beam * shot, mask=hidden, cache=cache)
-        assert "the Gaussian beam rises to" in told
+        text = warnings(GaussianEstimate(), beam * shot, mask=hidden, cache=cache)
+        assert "the Gaussian beam rises to" in text
 
 
 def test_the_axis_of_an_isotropic_source_is_in_the_middle_of_the_whole_image(shot: Array) -> None:
@@ -302,9 +302,9 @@ def test_a_quick_total_variation_removes_the_object_and_keeps_the_edge() -> None
 )
 def test_a_mistake_gets_a_sentence(change: dict[str, Any], words: str) -> None:
     good = {"recipe": Recipe(), "image": np.ones((20, 20))}
-    given = {**good, **change}
+    arguments = {**good, **change}
     with pytest.raises((InputError, OSError), match=words):
-        run(given.pop("recipe"), given.pop("image"), **given)
+        run(arguments.pop("recipe"), arguments.pop("image"), **arguments)
 
 
 def test_a_job_ends_when_it_is_asked_to(shot: Array) -> None:
@@ -363,9 +363,9 @@ def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Pa
     stack, out = np.stack([shot, shot]), tmp_path / "a.shadowinv.zarr"
     job = StackJob(stack, out, Recipe(options=FEW), workers=1)
     counted: list[tuple[int | None, int]] = []
-    job.run(lambda _: None, lambda: False, lambda index: counted.append((index, job.books.ended)))
+    job.run(lambda _: None, lambda: False, lambda index: counted.append((index, job.status.ended)))
     assert counted == [(0, 0), (1, 1)]
-    assert job.books.ended == 2
+    assert job.status.ended == 2
 
 
 def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:
@@ -385,20 +385,20 @@ def test_a_potential_and_its_object_make_the_same_image() -> None:
 
 
 def test_a_magnetic_object_asks_for_particles() -> None:
-    with pytest.raises(InputError, match="choose the setup"):
+    with pytest.raises(InputError, match="select the setup"):
         ForwardJob(ToroidRecipe()).run()
 
 
 def test_a_plane_is_sampled_exactly_at_its_place_in_the_world() -> None:
     y, x = np.mgrid[:30, :40]
     plane = 2.0 * y + 0.5 * x
-    points, distance = along([[5.0, 10.0], [35.0, 50.0]], 0.5)
-    values = sampled(plane, points, lambda at: (at - np.array([3.0, 4.0])) / 2.0)
+    points, distance = sample_path([[5.0, 10.0], [35.0, 50.0]], 0.5)
+    values = interpolate(plane, points, lambda at: (at - np.array([3.0, 4.0])) / 2.0)
     expected = (points[:, 0] - 3) + 0.25 * (points[:, 1] - 4)
     inside = ((points[:, 1] - 4) / 2 >= 0) & ((points[:, 1] - 4) / 2 <= 39)
     np.testing.assert_allclose(values[inside], expected[inside], atol=1e-12)
     assert distance[-1] == pytest.approx(50)
-    assert np.isnan(sampled(plane, np.array([[-1.0, 0.0]]), lambda at: at)).all()
+    assert np.isnan(interpolate(plane, np.array([[-1.0, 0.0]]), lambda at: at)).all()
 
 
 def test_a_table_names_each_unit_once() -> None:
@@ -429,8 +429,8 @@ def test_painted_pixels_are_unusable_or_the_only_usable_ones() -> None:
 
 def test_a_drawn_crop_follows_the_scale_of_its_image() -> None:
     image = Image(np.ones((20, 30)), scale=(2.0, 2.0), translate=(10.0, 0.0))
-    drawn = Shapes([np.array([[14, 8], [14, 40], [30, 40], [30, 8]])], shape_type="rectangle")
-    assert crop_of(drawn, image) == (slice(2, 11), slice(4, 21))
+    rectangle = Shapes([np.array([[14, 8], [14, 40], [30, 40], [30, 8]])], shape_type="rectangle")
+    assert crop_of(rectangle, image) == (slice(2, 11), slice(4, 21))
     beyond = Shapes([np.array([[-90, -90], [-90, 90], [90, 90], [90, -90]])])
     assert crop_of(beyond, image) == (slice(0, 20), slice(0, 30))
     assert crop_of(Shapes(ndim=2), image) is None
@@ -438,8 +438,8 @@ def test_a_drawn_crop_follows_the_scale_of_its_image() -> None:
 
 def test_a_drawn_mask_covers_the_pixels_under_it() -> None:
     image = Image(np.ones((20, 30)), scale=(2.0, 2.0))
-    drawn = Shapes([np.array([[8, 8], [8, 20], [16, 20], [16, 8]])], shape_type="rectangle")
-    usable = mask_of(drawn, image, True)
+    rectangle = Shapes([np.array([[8, 8], [8, 20], [16, 20], [16, 8]])], shape_type="rectangle")
+    usable = mask_of(rectangle, image, True)
     assert usable is not None
     assert not usable[5:8, 5:10].any()
     assert usable[:3].all()
@@ -458,37 +458,37 @@ def test_layers_that_are_no_single_image_are_refused() -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, 33.0, 90.0, 200.0])
 def test_a_strip_averages_across_the_line_and_not_along_it(degrees: float) -> None:
-    """The mean of cos ks over a width w is sinc kw/2; over none of what varies along the line."""
+    """The mean of cos ks across a width w is sinc kw/2; variations along the line are kept."""
     turned = np.deg2rad(degrees)
     tangent = np.array([np.sin(turned), np.cos(turned)])
     normal = np.array([np.cos(turned), -np.sin(turned)])
     middle, k, width = np.array([60.0, 65.0]), 0.15, 21.0
     place = np.moveaxis(np.mgrid[:121, :131].astype(float), 0, -1) - middle
     line = [middle - 30 * tangent, middle + 30 * tangent]
-    _, distance = along(line, 1.0)
-    strip = abreast(line, distance, width, 1.0)
+    _, distance = sample_path(line, 1.0)
+    strip = sample_strip(line, distance, width, 1.0)
     assert strip.shape == (21, len(distance), 2)
-    across = sampled(np.cos(k * place @ normal), strip, lambda at: at)
+    across = interpolate(np.cos(k * place @ normal), strip, lambda at: at)
     half = k * width / 2
     np.testing.assert_allclose(across, np.sin(half) / half, atol=0.003)
-    on_line = sampled(np.cos(k * place @ tangent), strip, lambda at: at)
+    on_line = interpolate(np.cos(k * place @ tangent), strip, lambda at: at)
     np.testing.assert_allclose(on_line, np.cos(k * (distance - 30)), atol=0.003)
 
 
 def test_a_strip_of_whole_pixels_is_the_mean_of_their_rows() -> None:
     y, x = np.mgrid[:40, :50].astype(float)
     line = [[20.0, 5.0], [20.0, 45.0]]
-    _, distance = along(line, 1.0)
+    _, distance = sample_path(line, 1.0)
     for width in (1, 5, 9):
-        values = sampled(y**2 + x, abreast(line, distance, width, 1.0), lambda at: at)
+        values = interpolate(y**2 + x, sample_strip(line, distance, width, 1.0), lambda at: at)
         np.testing.assert_allclose(values, 400 + (width**2 - 1) / 12 + 5 + distance)
     # A row that is partly outside counts as far as it is inside.
     edge = [[0.0, 5.0], [0.0, 45.0]]
-    values = sampled(y, abreast(edge, distance, 5, 1.0), lambda at: at)
+    values = interpolate(y, sample_strip(edge, distance, 5, 1.0), lambda at: at)
     np.testing.assert_allclose(values, 1.0)
     path = [[5.0, 5.0], [5.0, 15.0], [25.0, 15.0]]
-    _, distance = along(path, 1.0)
-    strip = abreast(path, distance, 3.0, 1.0)
+    _, distance = sample_path(path, 1.0)
+    strip = sample_strip(path, distance, 3.0, 1.0)
     np.testing.assert_allclose(np.ptp(strip[:, distance < 9.5, 0], axis=0), 2)
     np.testing.assert_allclose(np.ptp(strip[:, distance > 10.5, 1], axis=0), 2)
 
@@ -502,16 +502,16 @@ def test_the_table_tells_what_is_averaged() -> None:
 
 def test_the_cost_of_a_large_image_is_told_beforehand() -> None:
     few = InversionOptions(n_sites=10_000)
-    assert cost_of((500, 500), few).text == ""
-    four = cost_of((2000, 2000), few)
+    assert estimate_cost((500, 500), few).text == ""
+    four = estimate_cost((2000, 2000), few)
     # Measured: a process of 0.8 GB at its peak, without the layers of 7 planes.
     assert 0.8e9 < four.memory < 2 * (0.8e9 + 7 * 8 * 4e6)
     # Measured: 16 s of processor time, which two cores share.
     assert 16 / 2 < four.seconds < 16
     assert four.text == "4 Mpx with 10,000 sites: about 10 s and up to 1.3 GB."
-    assert "about 40 s" in cost_of((2000, 2000), few, pace=3).text
-    sixteen = cost_of((4000, 4000), few)
+    assert "about 40 s" in estimate_cost((2000, 2000), few, pace=3).text
+    sixteen = estimate_cost((4000, 4000), few)
     assert sixteen.seconds == pytest.approx(4 * four.seconds, rel=0.05)
-    huge = cost_of((100_000, 100_000), few)
+    huge = estimate_cost((100_000, 100_000), few)
     assert huge.is_too_much
     assert "GB: crop or bin the image" in huge.text

@@ -1,4 +1,4 @@
-"""The run button with its bar: what is seen during a run, and what that costs."""
+"""The run button with its bar: display during a run, and its cost."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Work:
 
 @pytest.fixture
 def panel(window: Any, qtbot: Any) -> RunPanel:
-    made = RunPanel("Some work", "Run", "Do it.")
-    window.window.add_dock_widget(made, name="work", area="right")
+    run_panel = RunPanel("Some work", "Run", "Do it.")
+    window.window.add_dock_widget(run_panel, name="work", area="right")
     qtbot.wait(500)
-    return made
+    return run_panel
 
 
 def finish(panel: RunPanel, qtbot: Any) -> None:
@@ -48,10 +48,10 @@ def finish(panel: RunPanel, qtbot: Any) -> None:
 def test_a_run_seldom_makes_the_window_be_drawn(
     panel: RunPanel, window: Any, qtbot: Any, total: int | None
 ) -> None:
-    """Each time the canvas is composed anew costs a core 20 ms without a graphics card."""
-    drawn: list[str] = []  # the line of text at each composition
+    """Each composition of the canvas takes 20 ms of a core without a graphics card."""
+    composed: list[str] = []  # the line of text at each composition
     canvas = window.window._qt_viewer.canvas.native
-    canvas.aboutToCompose.connect(lambda: drawn.append(panel.status.text()))
+    canvas.aboutToCompose.connect(lambda: composed.append(panel.status.text()))
     texts: list[str] = []
     panel.runner.progressed.connect(lambda _: texts.append(panel.status.text()))
     panel.run(Work(total))
@@ -59,7 +59,7 @@ def test_a_run_seldom_makes_the_window_be_drawn(
     assert len(texts) > 15
     # Bar and text change together, and are then laid out anew; a busy bar never rests.
     changes = sum(first != second for first, second in itertools.pairwise(["", *texts, ""]))
-    assert len(drawn) <= 6 * changes
+    assert len(composed) <= 6 * changes
     assert len({text for text in texts if "Solving the transport: at" in text}) >= 2
     assert panel.bar.maximum() > 0
 
@@ -79,7 +79,7 @@ def test_a_panel_that_cannot_be_seen_uses_the_activity_dock(
 
 
 def test_what_went_wrong_stays_until_the_next_run(
-    panel: RunPanel, qtbot: Any, told: list[str]
+    panel: RunPanel, qtbot: Any, messages: list[str]
 ) -> None:
     def mistaken(*_: Any) -> None:
         raise InputError("the film has no grain: expected some; take another one")
@@ -88,7 +88,7 @@ def test_what_went_wrong_stays_until_the_next_run(
     finish(panel, qtbot)
     qtbot.wait(700)
     status = panel.status
-    assert status.text() == told[0] == "The film has no grain: expected some; take another one"
+    assert status.text() == messages[0] == "The film has no grain: expected some; take another one"
     assert status.isVisible()
     assert status.wordWrap()
     assert status.textInteractionFlags() & Qt.TextInteractionFlag.TextSelectableByMouse

@@ -1,4 +1,4 @@
-"""Recipes: the list of steps, where results lie, and the same file for window and command."""
+"""Recipes: the list of steps, the placement of results, and files for window and command."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layer_metadata import mark, role_of, setup_origin_of
+from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, setup_origin_of
 from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets._steps import StepsSection
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
@@ -48,16 +48,16 @@ PATIENCE = 60_000  # ms
 @pytest.fixture
 def opened(viewer: ViewerModel, qtbot: Any) -> Iterator[Callable[..., Any]]:
     """Make a widget of a class, with few sites."""
-    made: list[Any] = []
+    widgets: list[Any] = []
 
     def make(kind: Any = InvertShot) -> Any:
-        made.append(kind(viewer))
-        qtbot.addWidget(made[-1])
-        made[-1].options.set_values({"n_sites": 300})
-        return made[-1]
+        widgets.append(kind(viewer))
+        qtbot.addWidget(widgets[-1])
+        widgets[-1].options.set_values({"n_sites": 300})
+        return widgets[-1]
 
     yield make
-    for widget in made:
+    for widget in widgets:
         widget._keeper._timer.stop()
 
 
@@ -96,16 +96,16 @@ def by_command(*arguments: Any) -> None:
 def test_steps_are_added_moved_and_removed(qtbot: Any) -> None:
     section = StepsSection()
     qtbot.addWidget(section)
-    heard: list[None] = []
-    section.changed.connect(lambda: heard.append(None))
-    assert section.folded.text() == "Steps first: nothing"
+    changes: list[None] = []
+    section.changed.connect(lambda: changes.append(None))
+    assert section.folded.text() == "Steps: none"
     assert not section.folded.isExpanded()
     offered = [section.choice.itemData(i) for i in range(1, section.choice.count())]
     assert offered == list(STEPS)
     for name in ("low-pass", "bin"):
         section.choice.activated.emit(section.choice.findData(name))
     first, second = section.forms
-    assert section.folded.text() == "Steps first: low-pass (smooth), bin"
+    assert section.folded.text() == "Steps: low-pass (smooth), bin"
     assert set(second.form.editors) == {"factor"}
     second.form.editors["factor"].set_value(3)
     assert not first.up.isEnabled()
@@ -119,9 +119,9 @@ def test_steps_are_added_moved_and_removed(qtbot: Any) -> None:
     assert second.title.text() == "bin, factor 3"
     second.remove.click()
     first.remove.click()
-    assert section.folded.text() == "Steps first: nothing"
+    assert section.folded.text() == "Steps: none"
     assert section.steps() == ()
-    assert len(heard) >= 6
+    assert len(changes) >= 6
 
 
 def test_every_step_comes_back_from_its_state(qtbot: Any) -> None:
@@ -129,8 +129,8 @@ def test_every_step_comes_back_from_its_state(qtbot: Any) -> None:
     steps = tuple(
         Crop(y=(3, 40), x=(5, None)) if name == "crop" else kind() for name, kind in STEPS.items()
     )
-    for one in (section, later):
-        qtbot.addWidget(one)
+    for steps_section in (section, later):
+        qtbot.addWidget(steps_section)
     section.show_steps(steps)
     later.restore(section.state())
     assert later.steps() == steps
@@ -142,10 +142,10 @@ def test_a_range_that_is_none_is_refused_where_it_is_typed(qtbot: Any) -> None:
     section = StepsSection()
     qtbot.addWidget(section)
     rows = section.add("crop").form.editors["y"].inner
-    for text, kept in (("10:40", (10, 40)), ("10:", (10, None)), ("", (0, None))):
+    for text, rows_kept in (("10:40", (10, 40)), ("10:", (10, None)), ("", (0, None))):
         rows.setText(text)
         rows.editingFinished.emit()
-        assert section.steps() == (Crop(y=kept),)
+        assert section.steps() == (Crop(y=rows_kept),)
     rows.setText("ten")
     rows.editingFinished.emit()
     with pytest.raises(InputError, match="such as 10:200"):
@@ -212,13 +212,15 @@ def test_a_feature_of_image_and_result_is_at_one_place(
     run(tool)
     tool.more_layers.click()
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    (seen,) = (layer for layer in viewer.layers if role_of(layer) == "image")
-    spot = np.argwhere(np.asarray(seen.data) > 0.9 * seen.data.max()).mean(axis=0)
+    (result_image,) = (layer for layer in viewer.layers if role_of(layer) == "image")
+    spot = np.argwhere(np.asarray(result_image.data) > 0.9 * result_image.data.max()).mean(axis=0)
     expected = image.data_to_world((25.5, 37.5))
-    np.testing.assert_allclose(seen.data_to_world(spot), expected, atol=0.75 * image.scale[0])
-    assert str(seen.units[0]) == "micrometer"
+    np.testing.assert_allclose(
+        result_image.data_to_world(spot), expected, atol=0.75 * image.scale[0]
+    )
+    assert str(result_image.units[0]) == "micrometer"
     size = recipe_size(tool, proton_setup)
-    assert np.hypot(seen.scale[0], 0) == pytest.approx(size)
+    assert np.hypot(result_image.scale[0], 0) == pytest.approx(size)
 
 
 def recipe_size(tool: Any, setup: ProtonSetup) -> float:
@@ -238,11 +240,12 @@ def test_a_result_of_larger_pixels_is_in_the_units_of_these(
     recipe = Recipe(steps=(Bin(factor=2),), setup=proton_setup, options=FEW)
     alone = run_recipe(recipe, shot)
     fresh = add_inversion(ViewerModel(), alone)
-    mine, other = (
-        next(one for one in layers if role_of(one) == "field") for layers in (viewer.layers, fresh)
+    mine, expected = (
+        next(layer for layer in layers if role_of(layer) == "field")
+        for layers in (viewer.layers, fresh)
     )
-    assert mine.name.replace(" – shot", "") == other.name
-    np.testing.assert_allclose(mine.data, other.data)
+    assert mine.name.replace(" – shot", "") == expected.name
+    np.testing.assert_allclose(mine.data, expected.data)
 
 
 def test_a_turned_result_comes_back_where_it_was(
@@ -251,7 +254,9 @@ def test_a_turned_result_comes_back_where_it_was(
     tool = opened()
     tool.steps.show_steps((Rotate(angle=10), Crop(y=(5, 40), x=(8, 50))))
     run(tool)
-    before = next(one for one in viewer.layers if role_of(one) == "field")
+    before = next(
+        result_layer for result_layer in viewer.layers if role_of(result_layer) == "field"
+    )
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
     later = ViewerModel()
     later.open(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
@@ -281,7 +286,7 @@ def test_the_command_does_what_the_window_saves(
     tool.source_masks.layer.data[12:30, 22:45] = 1
     tool.setup.show_setup(proton_setup.model_dump())
     run(tool)
-    field = next(one for one in viewer.layers if role_of(one) == "field")
+    field = next(layer for layer in viewer.layers if role_of(layer) == "field")
     mine = field.metadata["napari-shadowinv"]["result"].content
     tool.recipes.save(tmp_path / "how.toml")
     assert {path.name for path in tmp_path.glob("how*")} == {
@@ -292,13 +297,13 @@ def test_the_command_does_what_the_window_saves(
     by_command(
         "invert", shot_file, "--recipe", tmp_path / "how.toml", "--out", tmp_path / "a.shadowinv"
     )
-    told = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))
-    np.testing.assert_array_equal(told.displacement, mine.displacement)
-    assert told.provenance is not None
-    assert told.provenance.recipe == mine.provenance.recipe
-    assert told.provenance.image.sha256 == mine.provenance.image.sha256
-    assert told.provenance.setup == mine.provenance.setup
-    np.testing.assert_array_equal(told.provenance.mask.mask(), mine.provenance.mask.mask())
+    reloaded = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))
+    np.testing.assert_array_equal(reloaded.displacement, mine.displacement)
+    assert reloaded.provenance is not None
+    assert reloaded.provenance.recipe == mine.provenance.recipe
+    assert reloaded.provenance.image.sha256 == mine.provenance.image.sha256
+    assert reloaded.provenance.setup == mine.provenance.setup
+    np.testing.assert_array_equal(reloaded.provenance.mask.mask(), mine.provenance.mask.mask())
 
 
 def test_the_window_does_what_the_command_saves(
@@ -315,7 +320,7 @@ def test_the_window_does_what_the_command_saves(
         "--source", tmp_path / "beam.npy", "--setup", tmp_path / "setup.toml", "--n-sites", 300,
         "--save-recipe", tmp_path / "how.toml", "--out", tmp_path / "a.shadowinv",
     )  # fmt: skip
-    told = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))
+    reloaded = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))
     tool = opened()
     tool.recipes.load(tmp_path / "how.toml")
     assert tool.crop.layer.name == "shot crop"
@@ -323,7 +328,7 @@ def test_the_window_does_what_the_command_saves(
     assert tool.setup.setup().pixel_size == 2e-6
     assert setup_origin_of(image) == "loaded from how.toml for 'shot'"
     mine = tool.request().inversion()
-    np.testing.assert_array_equal(mine.displacement, told.displacement)
+    np.testing.assert_array_equal(mine.displacement, reloaded.displacement)
     assert mine.provenance.recipe.steps[0] == Crop(y=(4, 44), x=(10, 60))
     assert mine.provenance.source.file == "beam.npy"
     assert mine.provenance.source.shape == shot.shape
@@ -357,14 +362,16 @@ def test_a_source_that_is_no_file_is_written_beside_the_recipe(
 ) -> None:
     beam = 300 + np.random.default_rng(0).random(shot.shape)
     tool = opened()
-    tool.source.layers.layer = viewer.add_image(beam, name="beam", metadata=mark("source", ""))
+    tool.source.layers.layer = viewer.add_image(
+        beam, name="beam", metadata=metadata_for("source", "")
+    )
     tool.source.picker.set_kind("layer")
     tool.recipes.save(tmp_path / "how.toml")
     np.testing.assert_array_equal(np.load(tmp_path / "how_source.npy"), beam)
     out = tmp_path / "a.shadowinv"
     by_command("invert", shot_file, "--recipe", tmp_path / "how.toml", "--out", out)
-    told = Inversion.from_dataset(read(out))
-    np.testing.assert_array_equal(tool.request().inversion().displacement, told.displacement)
+    reloaded = Inversion.from_dataset(read(out))
+    np.testing.assert_array_equal(tool.request().inversion().displacement, reloaded.displacement)
 
 
 def test_a_stack_is_inverted_by_a_saved_recipe(
@@ -383,24 +390,26 @@ def test_a_stack_is_inverted_by_a_saved_recipe(
     assert tool.steps.steps() == recipe.steps
     tool.store.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: any(role_of(one) == "field" for one in viewer.layers), timeout=PATIENCE)
+    qtbot.waitUntil(
+        lambda: any(role_of(layer) == "field" for layer in viewer.layers), timeout=PATIENCE
+    )
     qtbot.waitUntil(
         lambda: not tool.panel.runner.running and not tool.results.busy, timeout=PATIENCE
     )
     alone = run_recipe(recipe, shot[::-1])
     dataset = read_stack(tmp_path / "a.shadowinv.zarr")
-    found = dataset["displacement"].values[1]
-    np.testing.assert_allclose(found, alone.displacement, atol=1e-5)
-    field = next(one for one in viewer.layers if role_of(one) == "field")
+    displacement = dataset["displacement"].values[1]
+    np.testing.assert_allclose(displacement, alone.displacement, atol=1e-5)
+    field = next(layer for layer in viewer.layers if role_of(layer) == "field")
     assert field.data.shape == (2, 22, 30)
     np.testing.assert_allclose(field.data_to_world((1, 0, 0)), stack.data_to_world((1, 2.5, 0.5)))
-    told = Provenance.of(dataset.attrs)
-    assert told is not None
-    np.testing.assert_array_equal(told.mask.mask(), usable)
+    provenance = Provenance.of(dataset.attrs)
+    assert provenance is not None
+    np.testing.assert_array_equal(provenance.mask.mask(), usable)
 
 
 def test_what_cannot_be_loaded_or_saved_is_one_sentence_and_changes_nothing(
-    viewer: ViewerModel, opened: Any, image: Any, tmp_path: Path, told: list[str]
+    viewer: ViewerModel, opened: Any, image: Any, tmp_path: Path, messages: list[str]
 ) -> None:
     tool = opened()
     tool.steps.add("bin")
@@ -419,20 +428,20 @@ def test_what_cannot_be_loaded_or_saved_is_one_sentence_and_changes_nothing(
     for name, (text, words) in wrong.items():
         path = tmp_path / f"{name}.toml"
         path.write_text(text)
-        told.clear()
+        messages.clear()
         tool.recipes.load(path)
-        assert len(told) == 1, (name, told)
-        assert words in told[0]
-        assert "\n" not in told[0]
-        assert tool.panel.status.text() == told[0]
+        assert len(messages) == 1, (name, messages)
+        assert words in messages[0]
+        assert "\n" not in messages[0]
+        assert tool.panel.status.text() == messages[0]
         assert tool.recipe() == before
         assert list(viewer.layers) == layers
     (tmp_path / "new_mask.png").write_text("somebody's")
     tool.masks.paint()
     tool.masks.layer.data[2:4] = 1
-    told.clear()
+    messages.clear()
     tool.recipes.save(tmp_path / "new.toml")
-    assert "new_mask.png exists" in told[0]
+    assert "new_mask.png exists" in messages[0]
     assert not (tmp_path / "new.toml").exists()
     assert (tmp_path / "new_mask.png").read_text() == "somebody's"
 

@@ -1,4 +1,4 @@
-"""Work beside the window: how it is stopped."""
+"""Work in a thread: how it is stopped."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def window(qtbot: Any) -> QWidget:
 
 
 class Stubborn:
-    """Work that does not look whether to stop before it is told to."""
+    """Work that checks whether to stop only when allowed to."""
 
     def __init__(self) -> None:
         self.may_look = threading.Event()

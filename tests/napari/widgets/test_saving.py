@@ -1,4 +1,4 @@
-"""Saving a result with a button, and using what comes back."""
+"""Saving a result with a button, and using the reopened result."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import tifffile
 from qtpy.QtWidgets import QFileDialog, QMessageBox
 
 from napari_shadowinv import ProtonSetup, read
-from napari_shadowinv._napari.layer_metadata import mark, result_of, role_of
+from napari_shadowinv._napari.layer_metadata import metadata_for, result_of, role_of
 from napari_shadowinv.physics.phantoms import paper_setup
 
 PATIENCE = 60_000  # ms
@@ -35,7 +35,7 @@ def choose(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 @pytest.fixture
 def tool(window: Any, open_widget: Callable[[str], Any], shot: Any) -> Any:
-    window.add_image(shot, name="shot", metadata=mark("shot", "", paper_setup()))
+    window.add_image(shot, name="shot", metadata=metadata_for("shot", "", paper_setup()))
     widget = open_widget("Invert shot")
     widget.options.set_values({"n_sites": 300})
     return widget
@@ -49,7 +49,7 @@ def run(tool: Any, qtbot: Any) -> None:
 
 
 def test_saved_result_comes_back_and_is_inverted_again(
-    window: Any, tool: Any, qtbot: Any, tmp_path: Path, choose: Any, told: list[str]
+    window: Any, tool: Any, qtbot: Any, tmp_path: Path, choose: Any, messages: list[str]
 ) -> None:
     run(tool, qtbot)
     verdict, peak = tool.verdict.text(), window.layers.selection.active.data.max()
@@ -57,7 +57,7 @@ def test_saved_result_comes_back_and_is_inverted_again(
     tool.save_result.click()
     path = tmp_path / "a.shadowinv"
     assert str(path) in tool.panel.status.text()
-    assert str(path) in told[-1]
+    assert str(path) in messages[-1]
     names = [layer.name for layer in window.layers if result_of(layer) is not None]
     window.layers.clear()
     assert tool.verdict.text() != verdict
@@ -90,23 +90,23 @@ def test_save_asks_before_it_replaces_a_file(
 
 
 def test_save_without_a_result_says_what_to_do(
-    tool: Any, tmp_path: Path, choose: Any, told: list[str]
+    tool: Any, tmp_path: Path, choose: Any, messages: list[str]
 ) -> None:
     choose(tmp_path / "a")
     tool.save_result.click()
-    assert told == ["There is no result yet: press Run first, or select a layer of a result"]
+    assert messages == ["There is no result yet: press Run first, or select a layer of a result"]
     assert not list(tmp_path.glob("a*"))
 
 
 def test_save_that_fails_leaves_no_file(
-    tool: Any, qtbot: Any, tmp_path: Path, choose: Any, told: list[str]
+    tool: Any, qtbot: Any, tmp_path: Path, choose: Any, messages: list[str]
 ) -> None:
     run(tool, qtbot)
     choose(tmp_path / "nowhere" / "a")
     tool.save_result.click()
-    assert "nowhere" in told[-1]
-    assert "\n" not in told[-1]
-    assert tool.panel.status.text() == told[-1]
+    assert "nowhere" in messages[-1]
+    assert "\n" not in messages[-1]
+    assert tool.panel.status.text() == messages[-1]
     assert not (tmp_path / "nowhere").exists()
 
 
@@ -120,7 +120,11 @@ def test_more_layers_adds_those_that_are_missing(tool: Any, window: Any, qtbot: 
     assert added == {
         "reprojection", "potential", "field y", "field x", "field arrows", "sites"
     }  # fmt: skip
-    assert {role_of(one) for one in window.layers if one.visible} == {"shot", "field", "arrows"}
+    assert {role_of(layer) for layer in window.layers if layer.visible} == {
+        "shot",
+        "field",
+        "arrows",
+    }
     count = len(window.layers)
     tool.more_layers.click()
     run(tool, qtbot)
@@ -148,7 +152,7 @@ def test_shot_of_a_store_is_saved_alone(
     proton_setup: ProtonSetup,
 ) -> None:  # fmt: skip
     stack = np.stack([shot, shot[:, ::-1]])
-    window.add_image(stack, name="run", metadata=mark("shot", "", proton_setup))
+    window.add_image(stack, name="run", metadata=metadata_for("shot", "", proton_setup))
     tool = open_widget("Invert stack")
     tool.options.set_values({"n_sites": 300})
     tool.store.edit.setText(str(tmp_path / "run.shadowinv.zarr"))
@@ -167,8 +171,10 @@ def test_shot_of_a_store_is_saved_alone(
     assert np.abs(blob).max() < np.abs(field[1]).max() * 1.001
     window.layers.clear()
     (layer, *_) = [
-        one
-        for one in window.open(str(tmp_path / "second.shadowinv"), plugin="napari-shadowinv")
-        if role_of(one) == "field"
+        opened_layer
+        for opened_layer in window.open(
+            str(tmp_path / "second.shadowinv"), plugin="napari-shadowinv"
+        )
+        if role_of(opened_layer) == "field"
     ]
     assert "mT·m" in layer.name or "µT·m" in layer.name

@@ -69,14 +69,16 @@ def use(tool: Any, row: int, *, used: bool) -> None:
 def run(tool: Any, qtbot: Any) -> StackStore:
     tool.panel.button.click()
     qtbot.waitUntil(
-        lambda: not (tool.panel.runner.running or tool.results.busy or tool._soon.isActive()),
+        lambda: (
+            not (tool.panel.runner.running or tool.results.busy or tool._refresh_timer.isActive())
+        ),
         timeout=60_000,
     )
     return StackStore(tool.store.store)
 
 
 def test_a_table_is_shown_changed_and_inverted(
-    window: Any, tool: Any, qtbot: Any, pack: Path, told: list[str]
+    window: Any, tool: Any, qtbot: Any, pack: Path, messages: list[str]
 ) -> None:
     cells = tool.shots.table.table
     assert cells.isVisible()
@@ -90,7 +92,7 @@ def test_a_table_is_shown_changed_and_inverted(
     write(tool, 0, MASK, "")
     use(tool, 2, used=False)
     store = run(tool, qtbot)
-    assert told == []
+    assert messages == []
     assert store.names == ("film0.npy", "film1.npy")
     assert (store.statuses() == DONE).all()
     stack = read(tool.store.store)
@@ -98,7 +100,7 @@ def test_a_table_is_shown_changed_and_inverted(
     assert "mask" not in store.report(0)["provenance"]
     assert store.report(0)["provenance"]["gain"] == 1.5
     # The layer is in the units of each shot's own energy: the same field twice.
-    (field,) = [one for one in window.layers if role_of(one) == "field"]
+    (field,) = [layer for layer in window.layers if role_of(layer) == "field"]
     first, second = (np.asarray(field.data[k]) for k in range(2))
     assert first.max() == pytest.approx(second.max(), rel=0.02)
     reach = np.hypot(*stack["displacement"].values.swapaxes(0, 1)).max(axis=(1, 2))
@@ -109,11 +111,13 @@ def test_a_table_is_shown_changed_and_inverted(
     assert table_rows(pack)[0].energy == 9
 
 
-def test_a_changed_row_is_noticed_when_the_run_goes_on(tool: Any, qtbot: Any, told: Any) -> None:
+def test_a_changed_row_is_noticed_when_the_run_goes_on(
+    tool: Any, qtbot: Any, messages: Any
+) -> None:
     run(tool, qtbot)
     write(tool, 0, ENERGY, "6")
     run(tool, qtbot)
-    assert "row of shot 0 (film0.npy) (energy: 9.0 there, 6.0 now) has changed" in told[0]
+    assert "row of shot 0 (film0.npy) (energy: 9.0 there, 6.0 now) has changed" in messages[0]
 
 
 def test_the_mask_of_one_row_is_wrong(tool: Any, qtbot: Any, pack: Path) -> None:
@@ -124,12 +128,12 @@ def test_the_mask_of_one_row_is_wrong(tool: Any, qtbot: Any, pack: Path) -> None
     assert "mask has shape (4, 4), image (48, 48)" in tool.failures.item(0, 1).text()
 
 
-def test_mistakes_are_told(tool: Any, qtbot: Any, told: list[str]) -> None:
+def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:
     def expect(words: str) -> None:
-        before = len(told)
+        before = len(messages)
         tool.panel.button.click()
         qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=60_000)
-        assert words in told[before]
+        assert words in messages[before]
 
     write(tool, 1, ENERGY, "much")
     expect("'film1.npy': 'much' is not a number")

@@ -1,4 +1,4 @@
-"""What the widgets remember and offer; most of it needs no window, only a list of layers."""
+"""The state that widgets save and restore; most tests need only a list of layers."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from napari.components import ViewerModel
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
 from napari_shadowinv._napari import commands
 from napari_shadowinv._napari.layer_metadata import (
-    mark,
-    mark_of,
+    metadata_for,
+    metadata_of,
     result_of,
     role_of,
     setup_of,
@@ -44,16 +44,16 @@ PLUGIN = "napari-shadowinv"
 @pytest.fixture
 def opened(viewer: ViewerModel, qtbot: Any) -> Iterator[Any]:
     """Make a widget of a class, as a session does when its menu is used first."""
-    made: list[Any] = []
+    widgets: list[Any] = []
 
     def make(kind: Any) -> Any:
-        made.append(kind(viewer))
-        qtbot.addWidget(made[-1])
-        return made[-1]
+        widgets.append(kind(viewer))
+        qtbot.addWidget(widgets[-1])
+        return widgets[-1]
 
     yield make
     # None writes into the settings of the next test.
-    for widget in made:
+    for widget in widgets:
         widget._keeper._timer.stop()
 
 
@@ -61,7 +61,7 @@ def opened(viewer: ViewerModel, qtbot: Any) -> Iterator[Any]:
 def of_a_file(viewer: ViewerModel, shot: Array, proton_setup: ProtonSetup) -> Any:
     """A shot that came with its setup."""
     origin = "came with experiment.h5"
-    metadata = mark("shot", "", proton_setup, setup_origin=origin)
+    metadata = metadata_for("shot", "", proton_setup, setup_origin=origin)
     return viewer.add_image(shot, name="measured", metadata=metadata)
 
 
@@ -135,22 +135,22 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(
 ) -> None:
     tool = opened(InvertShot)
     typed(tool, 5.0)
-    own = tool.setup.setup()
-    assert own.pixel_size == pytest.approx(2e-6)
-    assert setup_of(plain) == own
-    other = viewer.add_image(shot, name="other")
-    tool.image.layer = other
+    entered = tool.setup.setup()
+    assert entered.pixel_size == pytest.approx(2e-6)
+    assert setup_of(plain) == entered
+    image = viewer.add_image(shot, name="other")
+    tool.image.layer = image
     assert tool.setup.setup() is None
-    assert setup_of(other) is None
+    assert setup_of(image) is None
     tool.setup.picker.set_kind("proton")
-    assert tool.setup.setup() == own
+    assert tool.setup.setup() == entered
     assert tool.setup.note.text() == "Typed for 'plain'."
-    assert setup_origin_of(other) == "typed for 'plain'"
+    assert setup_origin_of(image) == "typed for 'plain'"
     # An image keeps what was chosen for it, none too.
     tool.image.layer = plain
     tool.setup.picker.set_kind("none")
-    tool.image.layer = other
-    assert tool.setup.setup() == own
+    tool.image.layer = image
+    assert tool.setup.setup() == entered
     tool.image.layer = plain
     assert tool.setup.setup() is None
 
@@ -160,7 +160,7 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(
     later = opened(InvertShot)
     assert later.setup.setup() is None
     later.setup.picker.set_kind("proton")
-    assert later.setup.setup() == own
+    assert later.setup.setup() == entered
     assert setup_origin_of(new) == "typed for 'plain', in an earlier session"
     typed(later, 6.0)
     assert setup_origin_of(new) == "typed for 'new'"
@@ -204,7 +204,8 @@ def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(
     tools = [opened(kind) for kind in (InvertShot, EstimateSource, InvertStack)]
     viewer.open_sample(PLUGIN, "toroid")
     shot, source = (
-        next(one for one in viewer.layers if role_of(one) == role) for role in ("shot", "source")
+        next(layer for layer in viewer.layers if role_of(layer) == role)
+        for role in ("shot", "source")
     )
     for tool in tools:
         images = tool.shots.layers if isinstance(tool, InvertStack) else tool.image
@@ -264,12 +265,12 @@ def test_one_click_takes_the_setup_of_the_layer_and_says_so(
     ):
         for _, keywords, _ in commands.invert_uniform(layer):
             assert setup_of(keywords) == setup
-            assert mark_of(keywords)["made_from"].get("setup_origin") == origin
+            assert metadata_of(keywords)["made_from"].get("setup_origin") == origin
 
 
 def test_a_source_can_be_filtered_and_stays_one(viewer: ViewerModel, opened: Any) -> None:
     viewer.open_sample(PLUGIN, "toroid")
-    source = next(one for one in viewer.layers if role_of(one) == "source")
+    source = next(layer for layer in viewer.layers if role_of(layer) == "source")
     ((_, keywords, _),) = commands.high_pass(source)
     assert role_of(keywords) == "source"
     assert setup_origin_of(keywords) == "came with the sample 'toroid'"
@@ -294,31 +295,31 @@ def test_the_source_that_was_chosen_comes_back_after_a_sample(
 
 @pytest.fixture(scope="module")
 def hump() -> tuple[Array, Array, Array]:
-    """A shot of an object under an uneven beam, its true potential, and where the object is."""
+    """A shot of an object under an uneven beam, its true potential, and the object's pixels."""
     blob = gaussian_blob((64, 72), 30.0, 6.0, (30.0, 40.0))
     y, x = np.mgrid[:64, :72]
     beam = 300 * (1 + 0.3 * x / 72 + 0.2 * (y / 64) ** 2)
-    there = np.hypot(y - 30, x - 40) < 22
-    return synthetic_image(blob.displacement, beam), blob.potential, there
+    is_object = np.hypot(y - 30, x - 40) < 22
+    return synthetic_image(blob.displacement, beam), blob.potential, is_object
 
 
 def test_a_source_mask_hides_the_object_from_the_estimate_alone(
     hump: tuple[Array, Array, Array],
 ) -> None:
-    shot, potential, there = hump
+    shot, potential, is_object = hump
     recipe = Recipe(source=PolynomialEstimate(degree=2), options=InversionOptions(n_sites=1500))
-    found = run_recipe(recipe, shot, source_mask=~there)
-    assert found.mask.all()
-    assert np.ptp(found.potential) == pytest.approx(np.ptp(potential), rel=0.1)
+    inversion = run_recipe(recipe, shot, source_mask=~is_object)
+    assert inversion.mask.all()
+    assert np.ptp(inversion.potential) == pytest.approx(np.ptp(potential), rel=0.1)
     cropped = Recipe(steps=(Crop(y=(2, 62), x=(4, 70)),))
-    moved = cropped.moved(Radiograph(shot, source_mask=~there)).source_mask
-    np.testing.assert_array_equal(moved, ~there[2:62, 4:70])
+    moved = cropped.moved(Radiograph(shot, source_mask=~is_object)).source_mask
+    np.testing.assert_array_equal(moved, ~is_object[2:62, 4:70])
     with pytest.raises(InputError, match="source mask has shape"):
-        run_recipe(recipe, shot, source_mask=there[1:])
+        run_recipe(recipe, shot, source_mask=is_object[1:])
 
 
 def the_masks(tool: Any) -> Any:
-    """What holds the masks that a run would be given."""
+    """Return the object with the masks of a run."""
     return tool.request().shot if isinstance(tool, InvertShot) else tool.request().job
 
 
@@ -326,7 +327,7 @@ def the_masks(tool: Any) -> Any:
 def test_both_masks_can_be_chosen(
     viewer: ViewerModel, opened: Any, hump: tuple[Array, Array, Array], kind: Any, tmp_path: Path
 ) -> None:
-    shot, _, there = hump
+    shot, _, is_object = hump
     viewer.add_image(shot if kind is InvertShot else np.stack([shot, shot]), name="shot")
     tool = opened(kind)
     if kind is InvertStack:
@@ -337,12 +338,12 @@ def test_both_masks_can_be_chosen(
     tool.source_masks.paint()
     assert tool.source_masks.layer.name == "shot source mask"
     assert role_of(tool.source_masks.layer) == "mask"
-    tool.source_masks.layer.data = there.astype(int)
+    tool.source_masks.layer.data = is_object.astype(int)
     tool.masks.paint()
     tool.masks.layer.data[:3, :3] = 1
-    given = the_masks(tool)
-    np.testing.assert_array_equal(given.source_mask, ~there)
-    assert (~given.mask).sum() == 9
+    masks = the_masks(tool)
+    np.testing.assert_array_equal(masks.source_mask, ~is_object)
+    assert (~masks.mask).sum() == 9
     # A mask that is not shown has no say.
     tool.source.picker.set_kind("uniform")
     assert tool.source_masks.isHidden()
@@ -350,16 +351,20 @@ def test_both_masks_can_be_chosen(
 
 
 def test_a_mask_over_the_object_is_refused(
-    viewer: ViewerModel, opened: Any, hump: tuple[Array, Array, Array], qtbot: Any, told: list[str]
+    viewer: ViewerModel,
+    opened: Any,
+    hump: tuple[Array, Array, Array],
+    qtbot: Any,
+    messages: list[str],
 ) -> None:
-    shot, _, there = hump
+    shot, _, is_object = hump
     image = viewer.add_image(shot, name="shot")
-    labels = viewer.add_labels(there.astype(int), name="object")
+    labels = viewer.add_labels(is_object.astype(int), name="object")
     tool = opened(InvertShot)
     tool.source.picker.set_kind("polynomial")
     tool.masks.layer = tool.source_masks.layer = labels
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(told) and not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(messages) and not tool.panel.runner.running, timeout=PATIENCE)
     words = "the object would be excluded from the inversion"
     assert words in tool.panel.status.text()
 
@@ -388,17 +393,17 @@ def test_a_mask_over_the_object_is_refused(
 def test_a_stack_is_inverted_with_both_masks(
     hump: tuple[Array, Array, Array], tmp_path: Path
 ) -> None:
-    shot, potential, there = hump
+    shot, potential, is_object = hump
     job = StackJob(
         np.stack([shot]),
         tmp_path / "a.shadowinv.zarr",
         Recipe(source=PolynomialEstimate(degree=2), options=InversionOptions(n_sites=1500)),
-        source_mask=~there,
+        source_mask=~is_object,
         scheduler="synchronous",
     )
     job.run(lambda _: None, lambda: False)
-    found = np.asarray(read(job.out)["potential"][0])
-    assert np.ptp(found) == pytest.approx(np.ptp(potential), rel=0.1)
+    recovered = np.asarray(read(job.out)["potential"][0])
+    assert np.ptp(recovered) == pytest.approx(np.ptp(potential), rel=0.1)
 
 
 # What is said of a run
@@ -431,18 +436,18 @@ def test_a_result_says_where_everything_came_from(
     assert "Mask" not in rows
     assert rows["Setup"] == "particles (protons, …), came with experiment.h5"
     field = next(layer for layer in viewer.layers if role_of(layer) == "field")
-    told = mark_of(field)["made_from"]
-    assert told["setup_origin"] == "came with experiment.h5"
-    assert told["source_origin"] == rows["Source"]
-    assert told["source_mask_origin"] == rows["Source mask"]
-    assert dict(result_of(field).attributes) == told  # type: ignore[union-attr]
+    origins = metadata_of(field)["made_from"]
+    assert origins["setup_origin"] == "came with experiment.h5"
+    assert origins["source_origin"] == rows["Source"]
+    assert origins["source_mask_origin"] == rows["Source mask"]
+    assert dict(result_of(field).attributes) == origins  # type: ignore[union-attr]
     provenance = result_of(field).content.provenance  # type: ignore[union-attr]
     assert provenance.recipe.source == PolynomialEstimate()
     assert provenance.source_mask.mask() is not None
 
 
 def test_the_report_of_one_run_does_not_stand_beside_another(
-    opened: Any, plain: Any, of_a_file: Any, run: Any, qtbot: Any, told: list[str]
+    opened: Any, plain: Any, of_a_file: Any, run: Any, qtbot: Any, messages: list[str]
 ) -> None:
     tool = opened(InvertShot)
     tool.options.set_values({"n_sites": 300})
@@ -468,14 +473,14 @@ def test_the_report_of_one_run_does_not_stand_beside_another(
     tool.panel.button.click()
     assert tool.report.texts() == {}
     # The notification goes; the sentence stays until something else happens.
-    assert told == [tool.panel.status.text()]
+    assert messages == [tool.panel.status.text()]
     assert "o source file" in tool.panel.status.text()
     tool.image.layer = of_a_file
     assert tool.panel.status.text() == ""
 
 
 def test_what_the_core_refuses_stays_in_the_widget(
-    opened: Any, plain: Any, qtbot: Any, told: list[str], monkeypatch: pytest.MonkeyPatch
+    opened: Any, plain: Any, qtbot: Any, messages: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise InputError("both masks hide the object")
@@ -484,8 +489,8 @@ def test_what_the_core_refuses_stays_in_the_widget(
     tool = opened(InvertShot)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
-    assert told == ["Both masks hide the object"]
-    assert tool.panel.status.text() == told[0]
+    assert messages == ["Both masks hide the object"]
+    assert tool.panel.status.text() == messages[0]
 
 
 # The forward model
@@ -496,24 +501,24 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
 ) -> None:
     tool = opened(ForwardModel)
     assert tool.setup.setup() == paper_setup()
-    assert tool.setup.note.text() == "The paper's beam."
+    assert tool.setup.note.text() == "Example from the paper."
     typed(tool, 7.0)
-    own = tool.setup.setup()
+    entered = tool.setup.setup()
     add_inversion(viewer, solved, proton_setup, name="solved")
     tool.object.set_kind("layer")
     assert tool.setup.setup() == proton_setup
     tool.object.set_kind("toroid")
-    assert tool.setup.setup() == own
+    assert tool.setup.setup() == entered
     tool._keeper.write()
     later = opened(ForwardModel)
-    assert later.setup.setup() == own
+    assert later.setup.setup() == entered
     tool.height_px.setValue(20)
     tool.width_px.setValue(20)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: role_of(viewer.layers[-1]) == "shot", timeout=PATIENCE)
-    made = viewer.layers[-1]
-    assert setup_of(made) == own
-    assert setup_origin_of(made).startswith("came with the forward model")
-    assert source_of(made) is None
+    prediction = viewer.layers[-1]
+    assert setup_of(prediction) == entered
+    assert setup_origin_of(prediction).startswith("came with the forward model")
+    assert source_of(prediction) is None
     # Opened in Invert shot, it is a file's setup like any other.
-    assert opened(InvertShot).setup.setup() == own
+    assert opened(InvertShot).setup.setup() == entered

@@ -1,4 +1,4 @@
-"""The widgets beside the inversion, in a real window."""
+"""The widgets other than the inversions, in a real window."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from qtpy.QtWidgets import QFileDialog
 
 from napari_shadowinv import ProtonSetup
-from napari_shadowinv._napari.layer_metadata import mark, role_of, source_of, unit_of
+from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets.line_profile import measure_peak
 from napari_shadowinv.inversion import Inversion
@@ -58,7 +58,7 @@ def test_a_widget_fits_beside_the_canvas(
 
 
 def test_an_estimate_becomes_a_layer_after_its_preview(
-    window: Any, open_widget: Any, shot: Array, qtbot: Any, told: list[str]
+    window: Any, open_widget: Any, shot: Array, qtbot: Any, messages: list[str]
 ) -> None:
     window.add_image(shot, name="shot", scale=(2, 2), translate=(5, 7))
     tool = open_widget("Estimate source")
@@ -84,11 +84,11 @@ def test_an_estimate_becomes_a_layer_after_its_preview(
     assert tuple(source.translate) == (5, 7)
     assert role_of(source) == "source"
     assert not preview.visible
-    assert told == []
+    assert messages == []
 
 
 def test_an_object_makes_its_image_and_caustics_are_warned_of(
-    window: Any, open_widget: Any, qtbot: Any, told: list[str], solved: Inversion,
+    window: Any, open_widget: Any, qtbot: Any, messages: list[str], solved: Inversion,
     proton_setup: ProtonSetup,
 ) -> None:  # fmt: skip
     tool = open_widget("Forward model")
@@ -97,7 +97,9 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
         before = [layer.data for layer in window.layers]
 
         def new() -> list[Any]:
-            return [one for one in window.layers if not any(one.data is old for old in before)]
+            return [
+                layer for layer in window.layers if not any(layer.data is old for old in before)
+            ]
 
         tool.panel.button.click()
         qtbot.waitUntil(lambda: bool(new()), timeout=PATIENCE)
@@ -119,66 +121,68 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     assert "Caustics" in tool.warning.text()
 
     add_inversion(window, solved, proton_setup, name="solved", all_layers=True)
-    potential = next(one for one in window.layers if role_of(one) == "potential")
+    potential = next(
+        result_layer for result_layer in window.layers if role_of(result_layer) == "potential"
+    )
     assert unit_of(potential) != "px²"
     tool.object.set_kind("layer")
     tool.potential.layer = potential
     tool.setup.show_setup(proton_setup.model_dump())
     again = made().data
     inner = (slice(3, -3), slice(3, -3))
-    shown = solved.reprojection / solved.source.mean()
-    assert abs(again - shown)[inner].max() < 0.02 * shown.max()
+    relative = solved.reprojection / solved.source.mean()
+    assert abs(again - relative)[inner].max() < 0.02 * relative.max()
 
     # It knows its experiment.
     tool.setup.picker.set_kind("none")
     np.testing.assert_allclose(made().data, again)
-    assert told == []
-    lost = window.add_image(potential.data, name="lost", metadata=mark("potential", "µm"))
+    assert messages == []
+    lost = window.add_image(potential.data, name="lost", metadata=metadata_for("potential", "µm"))
     tool.potential.layer = lost
-    told.clear()  # napari's own word on the units
+    messages.clear()  # napari's own word on the units
     tool.panel.button.click()
-    assert len(told) == 1
-    assert "choose the setup" in told[0]
-    assert "choose the setup" in tool.panel.status.text()
+    assert len(messages) == 1
+    assert "select the setup" in messages[0]
+    assert "select the setup" in tool.panel.status.text()
 
 
 def test_only_what_may_be_a_field_is_offered_and_it_says_what_it_is_taken_for(
-    window: Any, open_widget: Any, qtbot: Any, told: list[str], solved: Inversion,
+    window: Any, open_widget: Any, qtbot: Any, messages: list[str], solved: Inversion,
     proton_setup: ProtonSetup, shot: Array,
 ) -> None:  # fmt: skip
     tool = open_widget("Forward model")
     tool.object.set_kind("layer")
-    assert "open a .shadowinv file" in tool.expected.text()
+    assert "open a .shadowinv file" in tool.interpretation.text()
     tool.panel.button.click()
-    assert len(told) == 1
-    assert "there is no potential or result" in told[0].lower()
-    assert tool.panel.status.text() == told[0]
-    told.clear()
+    assert len(messages) == 1
+    assert "there is no potential or result" in messages[0].lower()
+    assert tool.panel.status.text() == messages[0]
+    messages.clear()
 
     window.add_image(shot, name="counts")
-    window.add_image(shot, name="beam", metadata=mark("source", "intensity"))
+    window.add_image(shot, name="beam", metadata=metadata_for("source", "intensity"))
     add_inversion(window, solved, proton_setup, name="solved", all_layers=True)
     offered = [tool.potential.itemText(n) for n in range(tool.potential.count())]
     assert len(offered) == 5  # potential, three of the field, and the image of unknown origin
     assert "counts" in offered
     assert "beam" not in offered
     tool.potential.layer = window.layers["counts"]
-    assert "treated as a potential in px²" in tool.expected.text()
+    assert "treated as a potential in px²" in tool.interpretation.text()
     tool.object.set_kind("toroid")
     tool.object.set_kind("layer")
     assert role_of(tool.potential.layer) == "field"
-    assert tool.expected.text() == "The displacement of this result."
+    assert tool.interpretation.text() == "The displacement of this result."
     assert tool.setup.setup() == proton_setup
 
 
 def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
-    window: Any, open_widget: Any, qtbot: Any, told: list[str], solved: Inversion,
+    window: Any, open_widget: Any, qtbot: Any, messages: list[str], solved: Inversion,
     proton_setup: ProtonSetup,
 ) -> None:  # fmt: skip
     add_inversion(window, solved, proton_setup, name="solved", all_layers=True)
     tool = open_widget("Forward model")
-    shown = [tool.deflector.itemData(index) for index in range(tool.deflector.count())]
-    assert tuple(shown[1:]) == get_args(Deflector)
+    choices = [tool.deflector.itemData(index) for index in range(tool.deflector.count())]
+    assert tuple(choices[1:]) == get_args(Deflector)
     tool.object.set_kind("layer")
     slow = proton_setup.model_copy(update={"energy": 3.0})
     tool.setup.show_setup(slow.model_dump())
@@ -201,22 +205,22 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     tool.setup.show_setup(proton_setup.model_dump())
     np.testing.assert_allclose(image(), synthetic_image(solved.displacement))
     # A potential in µm goes the same way.
-    potential = next(one for one in window.layers if role_of(one) == "potential")
+    potential = next(layer for layer in window.layers if role_of(layer) == "potential")
     tool.potential.layer = potential
     tool.deflector.setCurrentIndex(0)
     tool.setup.show_setup(slow.model_dump())
     expected = project(displacement_from_potential(solved.potential), proton_setup, slow)
     np.testing.assert_allclose(image(), expected, atol=1e-9)
-    assert told == []
+    assert messages == []
 
 
 def test_a_potential_from_a_file_and_the_shot_in_view_of_a_stack_make_their_images(
-    window: Any, open_widget: Any, qtbot: Any, told: list[str], tmp_path: Path
+    window: Any, open_widget: Any, qtbot: Any, messages: list[str], tmp_path: Path
 ) -> None:
     potentials = [gaussian_blob((40, 50), size, 6.0).potential for size in (10.0, 20.0)]
     np.save(tmp_path / "phi.npy", potentials[0])
     window.open(str(tmp_path / "phi.npy"), plugin="napari")
-    window.add_image(np.stack(potentials), name="run", metadata=mark("potential", "px²"))
+    window.add_image(np.stack(potentials), name="run", metadata=metadata_for("potential", "px²"))
     tool = open_widget("Forward model")
     tool.setup.picker.set_kind("none")
     tool.object.set_kind("layer")
@@ -229,11 +233,11 @@ def test_a_potential_from_a_file_and_the_shot_in_view_of_a_stack_make_their_imag
             window.layers[f"{name} image"].data,
             synthetic_image(displacement_from_potential(expected)),
         )
-    assert told == []
+    assert messages == []
 
 
 def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
-    window: Any, open_widget: Any, qtbot: Any, told: list[str]
+    window: Any, open_widget: Any, qtbot: Any, messages: list[str]
 ) -> None:
     tool = open_widget("Forward model")
     tool.object.set_kind("coaxial")
@@ -246,11 +250,11 @@ def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
     np.testing.assert_array_equal(source_of(layer), dark)
     shot = open_widget("Invert shot")
     np.testing.assert_array_equal(shot.source.measured(shot.image.layer).image, dark)
-    assert told == []
+    assert messages == []
 
 
 def test_an_object_brings_the_beam_that_it_needs(
-    window: Any, open_widget: Any, qtbot: Any, told: list[str]
+    window: Any, open_widget: Any, qtbot: Any, messages: list[str]
 ) -> None:
     tool = open_widget("Forward model")
     tool.object.set_kind("wakefield")
@@ -265,26 +269,26 @@ def test_an_object_brings_the_beam_that_it_needs(
     assert tool.object.model().density == pytest.approx(2e25)
 
     # What somebody has typed is not replaced.
-    own = wakefield_setup().model_copy(update={"wavelength": 532e-9})
-    tool.setup.show_setup(own.model_dump())
+    entered = wakefield_setup().model_copy(update={"wavelength": 532e-9})
+    tool.setup.show_setup(entered.model_dump())
     tool.object.set_kind("toroid")
     assert tool.setup.setup() == paper_setup()
     tool.object.set_kind("wakefield")
-    assert tool.setup.setup() == own
+    assert tool.setup.setup() == entered
     tool.setup.picker.set_kind("none")
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(told), timeout=PATIENCE)
-    assert len(told) == 1
-    assert "choose the setup 'light'" in told[0]
+    qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
+    assert len(messages) == 1
+    assert "select the setup 'light'" in messages[0]
 
 
 @pytest.fixture
 def profile(window: Any, open_widget: Any) -> Any:
     """A profile across a plane in nm and another one in T, of pixels of 2 µm."""
     y, x = np.mgrid[:40, :50]
-    placed = {"scale": (2.0, 2.0), "units": ("um", "um")}
+    placement = {"scale": (2.0, 2.0), "units": ("um", "um")}
     for name, plane, unit in (("height", 3.0 * y + x, "nm"), ("field", 1.0 * x, "T")):
-        window.add_image(plane, name=name, metadata=mark("image", unit), **placed)
+        window.add_image(plane, name=name, metadata=metadata_for("image", unit), **placement)
     tool = open_widget("Line profile")
     for name in ("height", "field"):
         tool.check(window.layers[name])
@@ -382,11 +386,11 @@ def test_a_profile_follows_the_line_and_the_layers(window: Any, profile: Any, qt
 
 
 def test_a_profile_is_exported_whole(
-    profile: Any, qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: list[str]
+    profile: Any, qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, messages: list[str]
 ) -> None:
     profile.export.click()
-    assert len(told) == 1
-    assert "no profile" in told[0]
+    assert len(messages) == 1
+    assert "no profile" in messages[0]
     profile.lines.layer.add_lines(np.array([[10.0, 5.0], [10.0, 45.0]]))
     qtbot.waitUntil(lambda: bool(profile.profiles), timeout=PATIENCE)
     path = tmp_path / "line.csv"
@@ -397,11 +401,11 @@ def test_a_profile_is_exported_whole(
         QFileDialog, "getSaveFileName", lambda *_, **__: (str(tmp_path / "line"), "")
     )
     profile.export.click()
-    assert "exists" in told[-1]
+    assert "exists" in messages[-1]
 
 
-def test_a_line_needs_an_image(window: Any, open_widget: Any, told: list[str]) -> None:
+def test_a_line_needs_an_image(window: Any, open_widget: Any, messages: list[str]) -> None:
     tool = open_widget("Line profile")
     tool._draw()
-    assert len(told) == 1
-    assert "no image" in told[0]
+    assert len(messages) == 1
+    assert "no image" in messages[0]

@@ -1,4 +1,4 @@
-"""*Invert stack* with a folder that is watched: its layers grow as shots arrive."""
+"""*Invert stack* with a watched folder: its layers grow as shots arrive."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from napari_shadowinv._napari.layer_metadata import mark_of, role_of
+from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -45,22 +45,24 @@ def tool(open_widget: Any, folder: Path, out: Path) -> Any:
 
 
 def layer_of(viewer: Any, role: str) -> Any:
-    (found,) = [one for one in viewer.layers if role_of(one) == role]
-    return found
+    (match,) = [layer for layer in viewer.layers if role_of(layer) == role]
+    return match
 
 
 def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
-    window: Any, tool: Any, folder: Path, out: Path, qtbot: Any, told: list[str]
+    window: Any, tool: Any, folder: Path, out: Path, qtbot: Any, messages: list[str]
 ) -> None:
     def shown(count: int) -> Any:
-        """The field, once it has so many shots."""
+        """Wait until the field has this many shots, and return it."""
 
         def is_there() -> bool:
-            roles = [role_of(one) for one in window.layers]
+            roles = [role_of(layer) for layer in window.layers]
             return "field" in roles and len(layer_of(window, "field").data) == count
 
         qtbot.waitUntil(is_there, timeout=PATIENCE)
-        qtbot.waitUntil(lambda: not (tool.results.busy or tool._soon.isActive()), timeout=PATIENCE)
+        qtbot.waitUntil(
+            lambda: not (tool.results.busy or tool._refresh_timer.isActive()), timeout=PATIENCE
+        )
         return layer_of(window, "field")
 
     assert not tool.engine.isVisible()
@@ -86,13 +88,13 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     assert field.contrast_limits[1] > limits
     assert np.isfinite(np.asarray(layer_of(window, "field").data[3])).all()
     assert list(tool.failures.texts()) == ["shot_2.npy"]
-    assert mark_of(field)["shots"] == [f"shot_{index}.npy" for index in range(4)]
+    assert metadata_of(field)["shots"] == [f"shot_{index}.npy" for index in range(4)]
     status = tool.panel.status
     qtbot.waitUntil(lambda: "3 done, 1 failed" in status.text(), timeout=PATIENCE)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
     assert tool.panel.status.text() == "3 done, 1 failed, in live.shadowinv.zarr"
-    assert told == []
+    assert messages == []
     # Run again: it goes on in the same layers.
     tool.panel.button.click()
     window.dims.set_current_step(0, 3)
@@ -105,15 +107,15 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
 
 
 def test_it_fits_and_a_folder_that_is_not_there_is_a_mistake(
-    tool: Any, qtbot: Any, told: list[str], assert_it_fits: Any, tmp_path: Path
+    tool: Any, qtbot: Any, messages: list[str], assert_it_fits: Any, tmp_path: Path
 ) -> None:
     assert_it_fits(tool)
     tool.shots.folder.folder.edit.setText(str(tmp_path / "nowhere"))
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(told), timeout=PATIENCE)
-    assert "does not exist: expected a folder to watch" in told[0]
-    told.clear()
+    qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
+    assert "does not exist: expected a folder to watch" in messages[0]
+    messages.clear()
     tool.shots.folder.folder.edit.setText("")
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(told), timeout=PATIENCE)
-    assert "o folder is selected" in told[0]
+    qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
+    assert "o folder is selected" in messages[0]

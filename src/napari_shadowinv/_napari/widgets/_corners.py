@@ -1,4 +1,4 @@
-"""The corners of a pack's films, shown on their scans and dragged: `CornerEditor`."""
+"""Correction of the corners of a pack's films on their scans: `CornerEditor`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 from qtpy.QtCore import QObject
 
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.layer_metadata import mark
-from napari_shadowinv._napari.packs import film_texts
+from napari_shadowinv._napari.layer_metadata import metadata_for
+from napari_shadowinv._napari.packs import film_labels
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._qt import notify_errors, timer, while_alive
 from napari_shadowinv._typing import AnyArray, FloatArray
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from napari_shadowinv.film import Pack
 
 _COLOUR = "#00c8ff"
-_SETTLE = 60  # ms
-_LEAST = 0.01  # px
+_SETTLE_MS = 60
+_MIN_MOVE_PX = 0.01  # napari rounds coordinates
 
 
 class CornerEditor(QObject):
-    """Two layers with the scan of the film in view, and a polygon of its corners."""
+    """Layers with the scan of the displayed film and a polygon of its corners."""
 
     def __init__(self, viewer: Any, parent: QObject) -> None:
         super().__init__(parent)
         self._viewer = viewer
-        self._films: Any = None  # the layer of fluences
+        self._films: Any = None  # the fluence layer
         self._dataset: Any = None
         self._pack: Any = None
         self._plane = 0
@@ -43,7 +43,7 @@ class CornerEditor(QObject):
         self._read: tuple[Path | None, Scan | None] = None, None
         self.scan: Any = None
         self.polygon: Any = None
-        self._soon = timer(self, _SETTLE, self._follow, once=True)
+        self._settle_timer = timer(self, _SETTLE_MS, self._follow, once=True)
         while_alive(self, viewer.dims.events.current_step, self._on_step)
 
     @property
@@ -51,14 +51,14 @@ class CornerEditor(QObject):
         return self.polygon is not None and self.polygon in self._viewer.layers
 
     def show(self, films: Any, dataset: xarray.Dataset, pack: Pack) -> None:
-        """Show the film that is in view in a layer of a pack; corners of another pack are lost."""
+        """Show the displayed film of a pack's layer; changes to another pack are discarded."""
         if dataset is not self._dataset:
             self.close()
         self._films, self._dataset, self._pack = films, dataset, pack
         self._show(plane_in_view(self._viewer, films))
 
     def close(self) -> None:
-        """Take the layers away, and forget what was moved."""
+        """Remove the layers and discard the changes."""
         for layer in (self.polygon, self.scan):
             if layer is not None and layer in self._viewer.layers:
                 self._viewer.layers.remove(layer)
@@ -66,79 +66,83 @@ class CornerEditor(QObject):
         self._moved = {}
 
     def corners(self, dataset: xarray.Dataset) -> dict[str, FloatArray] | None:
-        """Return the corners of all films by number, None if none of this pack was moved."""
+        """Return the corners of all films by number; None if the user moved none."""
         if dataset is not self._dataset:
             return None
-        self._keep()
+        self._store_changes()
         if not self._moved:
             return None
-        known = dataset["corners"].values
         numbers = dataset["layer"].values
-        found = {int(k): known[k] for k in range(len(known)) if np.isfinite(known[k]).all()}
+        corners = {
+            k: film for k, film in enumerate(dataset["corners"].values) if np.isfinite(film).all()
+        }
         try:
             return {
-                str(numbers[k]): checked_corners(one) for k, one in (found | self._moved).items()
+                str(numbers[k]): checked_corners(film)
+                for k, film in (corners | self._moved).items()
             }
         except InputError as error:
-            raise InputError(f"{error}; show the corners again to start anew") from None
+            raise InputError(f"{error}; press Show corners to reset them") from None
 
-    def _keep(self) -> None:
-        """Remember the polygon of the film that is shown, if somebody moved it."""
+    def _store_changes(self) -> None:
+        """Store the polygon of the shown film if the user moved it."""
         if not self.shown:
             return
-        found = [np.asarray(one, np.float64)[:, -2:] for one in self.polygon.data]
-        if len(found) != 1 or len(found[0]) != 4:
+        shapes = [np.asarray(vertices, np.float64)[:, -2:] for vertices in self.polygon.data]
+        if len(shapes) != 1 or len(shapes[0]) != 4:
             raise InputError(
-                f"'{self.polygon.name}' has {len(found)} shapes with "
-                f"{', '.join(str(len(one)) for one in found)} corners: expected one polygon with "
-                "the four corners of the film"
+                f"'{self.polygon.name}' has {len(shapes)} shapes with "
+                f"{', '.join(str(len(vertices)) for vertices in shapes)} corners: expected one "
+                "polygon with the four corners of the film"
             )
-        known = self._moved.get(self._plane, self._dataset["corners"].values[self._plane])
-        if np.abs(found[0] - known).max() > _LEAST:  # napari rounds
-            self._moved[self._plane] = found[0]
+        old_corners = self._moved.get(self._plane, self._dataset["corners"].values[self._plane])
+        if np.abs(shapes[0] - old_corners).max() > _MIN_MOVE_PX:
+            self._moved[self._plane] = shapes[0]
 
     def _show(self, plane: int) -> None:
-        known = self._moved.get(plane, self._dataset["corners"].values[plane])
-        text = film_texts(self._dataset)[plane]
-        if not np.isfinite(known).all():
-            raise InputError(f"{text}: the layer is excluded and shows no film; choose another one")
+        corners = self._moved.get(plane, self._dataset["corners"].values[plane])
+        text = film_labels(self._dataset)[plane]
+        if not np.isfinite(corners).all():
+            raise InputError(
+                f"{text}: the layer is excluded and shows no film; choose another film"
+            )
         pixels = self._scan_of(plane)
         self._plane = plane
         title = text.partition(":")[0]
-        # One pixel of the scan is as large as one of the film, and the film lies on the others.
+        # The scan has the pixel size of the films, and its film lies over them.
         frame = frame_of(self._films)
         size = np.array(self._films.data.shape[-2:])
-        middle = np.asarray(frame.translate) + (size - 1) / 2 * frame.scale
-        place = frame.keywords()
-        place["translate"] = tuple(middle - known.mean(axis=0) * frame.scale)
+        centre = np.asarray(frame.translate) + (size - 1) / 2 * frame.scale
+        placement = frame.keywords()
+        placement["translate"] = tuple(centre - corners.mean(axis=0) * frame.scale)
         if self.shown and self.scan in self._viewer.layers:
             self.scan.data, self.scan.name = pixels, f"scan of {title}"
-            self.polygon.data, self.polygon.name = [known], f"corners of {title}"
+            self.polygon.data, self.polygon.name = [corners], f"corners of {title}"
             for layer in (self.scan, self.polygon):
-                layer.translate = place["translate"]
+                layer.translate = placement["translate"]
             self.polygon.mode = "direct"
             return
         from napari.layers import Image, Shapes
 
-        self.scan = Image(pixels, rgb=True, name=f"scan of {title}", **place)
+        self.scan = Image(pixels, rgb=True, name=f"scan of {title}", **placement)
         self.polygon = Shapes(
-            [known],
+            [corners],
             shape_type="polygon",
             name=f"corners of {title}",
             face_color="transparent",
             edge_color=_COLOUR,
             edge_width=max(1.0, max(size) / 200),
-            **place,
+            **placement,
         )
         for layer, role in ((self.scan, "scan"), (self.polygon, "corners")):
-            layer.metadata = mark(role, "")
+            layer.metadata = metadata_for(role, "")
             self._viewer.layers.append(layer)
         self._viewer.layers.selection.active = self.polygon
         self.polygon.mode = "direct"
         self._viewer.reset_view()
 
     def _scan_of(self, plane: int) -> AnyArray:
-        """Its pixels in eight bits."""
+        """Return the pixels of a film's scan with eight bits."""
         path = self._pack.layers[plane].file or self._pack.scan
         if path != self._read[0] or self._read[1] is None:
             self._read = path, read_scan(path)
@@ -149,7 +153,7 @@ class CornerEditor(QObject):
 
     def _on_step(self, _: Any = None) -> None:
         if self.shown and self._films in self._viewer.layers:
-            self._soon.start()
+            self._settle_timer.start()
 
     @notify_errors
     def _follow(self) -> None:
@@ -157,5 +161,5 @@ class CornerEditor(QObject):
             return
         plane = plane_in_view(self._viewer, self._films)
         if plane != self._plane:
-            self._keep()
+            self._store_changes()
             self._show(plane)

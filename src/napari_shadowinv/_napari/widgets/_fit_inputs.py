@@ -1,4 +1,4 @@
-"""What a fit of several images is given beside them: `BeamPicker`, `ChoiceBox`, `fields_of`."""
+"""Inputs of a fit other than its images: `BeamPicker`, `ChoiceBox`, `fields_of`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.shots import source_of_shot
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._fields import SteadyComboBox
+from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import FIELDS
 from napari_shadowinv.physics.setup import SETUPS
@@ -27,13 +27,13 @@ _TITLES = {
 BOTH = " and "
 NOISES = {
     "": "estimated from each image",
-    "poisson": "of counts (Poisson)",
-    "proportional": "a share of each pixel (film)",
+    "poisson": "Poisson counts",
+    "proportional": "proportional to each pixel (film)",
 }
 
 
 class BeamPicker(forms.RowPicker):
-    """The undisturbed beam: uniform, a layer, or to be fitted, too."""
+    """The undisturbed beam: uniform, a layer, or unknown."""
 
     def __init__(self, viewer: Any) -> None:
         tip = "Image layer of the undisturbed beam, or a stack with one for each image."
@@ -45,39 +45,40 @@ class BeamPicker(forms.RowPicker):
             {
                 _UNIFORM: ("uniform", None),
                 _LAYER: ("a layer", None),
-                UNKNOWN: ("unknown: fit it, too", None),
+                UNKNOWN: ("unknown (fit it)", None),
             },
-            "The beam without the object. An unknown one is fitted as a smooth beam that is the "
-            "same in all images but for gains.",
+            "The beam without the object. An unknown beam is fitted as a smooth beam, the same in "
+            "all images except for the gains.",
             {_LAYER: forms.labelled("", self.layers)},
         )
         self.layers.picked.connect(self.changed)
 
     @property
     def layer(self) -> Any | None:
-        """The chosen layer; None where another kind of source is chosen."""
+        """The selected layer; None for another kind of source."""
         return self.layers.layer if self.picker.kind == _LAYER else None
 
     @property
-    def described(self) -> str:
+    def summary(self) -> str:
         if self.layer is not None:
             return f"layer '{self.layer.name}'"
         return "fitted" if self.picker.kind == UNKNOWN else "uniform"
 
     def chosen(self) -> UniformEstimate | MeasuredSource | None:
-        """What a recipe says of the source; None if it is to be fitted."""
+        """Return the source as a recipe describes it; None if it is fitted."""
         if self.picker.kind == UNKNOWN:
             return None
         return MeasuredSource() if self.picker.kind == _LAYER else UniformEstimate()
 
     def measured(self, shots: Sequence[Radiograph]) -> list[Radiograph | None]:
-        """The measured source of each image, or an `InputError`."""
+        """Return the measured source of each image, or raise an `InputError`."""
         if self.picker.kind != _LAYER:
             return [None] * len(shots)
         layer = self.layer
         if layer is None:
             raise InputError(
-                "no source layer is selected: choose one below 'a layer', or choose another source"
+                "no source layer is selected: choose a layer below 'a layer', or another kind of "
+                "source"
             )
         if layer.ndim != 3:
             image = layers.image_of(layer, "source")
@@ -86,7 +87,7 @@ class BeamPicker(forms.RowPicker):
         if len(planes) != len(shots):
             raise InputError(
                 f"'{layer.name}' has {len(planes)} sources for {len(shots)} images: expected one "
-                "for each, or one for all"
+                "source for each image, or one for all"
             )
         return [
             source_of_shot(layer, plane, shot, k)
@@ -99,7 +100,7 @@ class BeamPicker(forms.RowPicker):
         self.picker.set_kind(UNKNOWN if beam == "unknown" else kind)
 
     def state(self) -> str:
-        """What is kept: layers belong to a session."""
+        """Return the kind; layers belong to a session."""
         kind = self.picker.kind
         return _UNIFORM if kind == _LAYER else kind
 
@@ -108,41 +109,41 @@ class BeamPicker(forms.RowPicker):
 
 
 class ChoiceBox(SteadyComboBox):
-    """A choice that is kept between sessions."""
+    """A choice that is saved between sessions."""
 
     def __init__(self, choices: dict[str, str], tip: str) -> None:
         super().__init__()
-        self._wanted: Any = None
+        self._selected: Any = None
         self.setToolTip(f"<qt>{tip}</qt>")
         self.offer(choices)
         self.activated.connect(self._on_choice)
 
     def offer(self, choices: dict[str, str]) -> None:
-        """Replace the choices, titles by key; what was chosen stays if it is among them."""
+        """Replace the choices, titles by key; the selected key stays if it is offered."""
         with QSignalBlocker(self):
             self.clear()
             for key, title in choices.items():
                 self.addItem(title, key)
-            self.setCurrentIndex(max(self.findData(self._wanted), 0))
+            self.setCurrentIndex(max(self.findData(self._selected), 0))
 
     def state(self) -> str:
         return str(self.currentData())
 
     def restore(self, state: Any) -> None:
-        """Choose a key, at once or as soon as it is offered."""
-        self._wanted = state
+        """Select a key, now or once it is offered."""
+        self._selected = state
         index = self.findData(state)
         if index >= 0:
             self.setCurrentIndex(index)
 
     def _on_choice(self) -> None:
-        self._wanted = self.currentData()
+        self._selected = self.currentData()
 
 
 def fields_of(kind: str) -> dict[str, str]:
-    """What can deflect in a kind of setup, titles by key."""
+    """Return the fields that can deflect in a kind of setup, titles by key."""
     if kind not in SETUPS:
-        return {"B": "one, in pixels"}
+        return {"B": "one field, in pixels"}
     keys = [key for key, deflector in FIELDS.items() if deflector in SETUPS[kind].deflectors]
     choices = {key: _TITLES[key] for key in keys}
     return choices | ({BOTH.join(keys): BOTH.join(keys)} if len(keys) > 1 else {})

@@ -1,4 +1,4 @@
-"""Forms made from pydantic models: there is no second list of fields and defaults."""
+"""Forms generated from pydantic models, the only list of fields and defaults."""
 
 from __future__ import annotations
 
@@ -11,39 +11,39 @@ from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
 from superqt import QCollapsible
 
-from napari_shadowinv._napari.widgets._fields import (
+from napari_shadowinv._napari.widgets._editors import (
     Editor,
     SteadyComboBox,
     editor_for,
     unit_of_title,
 )
-from napari_shadowinv._napari.widgets._qt import beside, column, notify_errors
+from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 
-# For each key the title to show, and the model's class, if there is one.
+# For each key a title, and the model's class, if any.
 Kinds = dict[str, tuple[str, type[BaseModel] | None]]
 
 PROBLEM_STYLE = "color: #d9822b;"
-_LABEL_WIDTH = 54
+_LABEL_WIDTH_PX = 54
 INDENT = 12
 TOML = "TOML (*.toml)"
-# Of these optional fields only one may be given: checking one unchecks the other.
+# Optional fields that exclude each other: checking one unchecks the other.
 _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
 
 
 def labelled(text: str, widget: QtWidgets.QWidget) -> QtWidgets.QWidget:
-    """A widget with a label before it; all of them line up."""
+    """Put a label of the common width before a widget."""
     label = QtWidgets.QLabel(text)
-    label.setMinimumWidth(_LABEL_WIDTH)
-    return beside((label, 0), (widget, 1))
+    label.setMinimumWidth(_LABEL_WIDTH_PX)
+    return side_by_side((label, 0), (widget, 1))
 
 
 def with_button(
     widget: QtWidgets.QWidget, text: str, tip: str, action: Callable[[], Any]
 ) -> QtWidgets.QWidget:
-    """A widget with a small button on its right."""
-    return beside((widget, 1), (small_button(text, tip, action), 0))
+    """Put a small button on the right of a widget."""
+    return side_by_side((widget, 1), (small_button(text, tip, action), 0))
 
 
 def small_button(text: str, tip: str, action: Callable[[], Any]) -> QtWidgets.QToolButton:
@@ -55,7 +55,7 @@ def small_button(text: str, tip: str, action: Callable[[], Any]) -> QtWidgets.QT
 
 
 def section(title: str, *widgets: QtWidgets.QWidget) -> QCollapsible:
-    """Widgets under a title that folds them away; folded to begin with."""
+    """Put widgets under a title that folds them; initially folded."""
     folded = QCollapsible(title, expandedIcon="▾", collapsedIcon="▸")
     folded.setDuration(0)
     folded.layout().setContentsMargins(0, 0, 0, 0)
@@ -67,7 +67,7 @@ def section(title: str, *widgets: QtWidgets.QWidget) -> QCollapsible:
 
 
 def titled_section(*widgets: QtWidgets.QWidget) -> QCollapsible:
-    """A section whose title tells what is in it; a long one does not widen the window."""
+    """Create a section for a title that summarises it; a long title does not widen the window."""
     folded = section("", *widgets)
     policy = QtWidgets.QSizePolicy.Policy
     folded.toggleButton().setSizePolicy(policy.Ignored, policy.Fixed)
@@ -75,7 +75,7 @@ def titled_section(*widgets: QtWidgets.QWidget) -> QCollapsible:
 
 
 def wrapping_label(text: str = "", style: str = "") -> QtWidgets.QLabel:
-    """Text that wraps at the width there is, instead of asking for more."""
+    """Create a label that wraps at the available width."""
     label = QtWidgets.QLabel(text)
     label.setWordWrap(True)
     label.setMinimumWidth(0)
@@ -95,7 +95,7 @@ class PathEdit(QtWidgets.QWidget):
         self.edit = QtWidgets.QLineEdit()
         self.edit.setPlaceholderText(example)
         self.edit.setMinimumWidth(60)
-        beside((with_button(self.edit, "…", title, self._choose), 0), holder=self)
+        side_by_side((with_button(self.edit, "…", title, self._choose), 0), holder=self)
         self.edit.editingFinished.connect(self.changed)
 
     @property
@@ -103,7 +103,7 @@ class PathEdit(QtWidgets.QWidget):
         return str(self.edit.text()).strip()
 
     def ask(self) -> str:
-        """Let the user choose in a dialog; empty if he does not."""
+        """Open a dialog and return the chosen path, or an empty string."""
         path, _ = QtWidgets.QFileDialog.getOpenFileName(self, self._title)
         return str(path)
 
@@ -115,12 +115,12 @@ class PathEdit(QtWidgets.QWidget):
 
 
 class ModelForm(QtWidgets.QWidget):
-    """Editors for a model's fields; optional ones start with what `first` holds."""
+    """Editors for a model's fields; `initial` holds the first values of optional fields."""
 
     changed = Signal()
 
     def __init__(
-        self, model_class: type[BaseModel], first: Mapping[str, Any] | None = None
+        self, model_class: type[BaseModel], initial: Mapping[str, Any] | None = None
     ) -> None:
         super().__init__()
         self._model_class = model_class
@@ -131,30 +131,30 @@ class ModelForm(QtWidgets.QWidget):
         rows.setRowWrapPolicy(QtWidgets.QFormLayout.RowWrapPolicy.WrapLongRows)
         rows.setFieldGrowthPolicy(QtWidgets.QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
-        whole = column(self)
-        whole.addLayout(rows)
+        layout = column(self)
+        layout.addLayout(rows)
         for name, field in model_class.model_fields.items():
             if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1:
                 self._fixed[name] = get_args(field.annotation)[0]
                 continue
-            editor = editor_for(field, (first or {}).get(name))
+            editor = editor_for(field, (initial or {}).get(name))
             title = field.title or name
             label = QtWidgets.QLabel(unit_of_title(title)[0] if editor.shows_unit else title)
             for widget in (label, editor):
-                # As rich text, so that Qt breaks it into lines.
+                # Qt wraps rich text only.
                 widget.setToolTip(f"<qt>{field.description}</qt>" if field.description else "")
             rows.addRow(label, editor)
             editor.changed.connect(self._on_change)
             self.editors[name] = editor
         self._problem = wrapping_label(style=PROBLEM_STYLE)
-        whole.addWidget(self._problem)
+        layout.addWidget(self._problem)
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing is filled in of what has no default."""
+        """Whether all required fields are empty."""
         fields = self._model_class.model_fields
-        needed = [name for name in self.editors if fields[name].is_required()]
-        return all(self.editors[name].value() in (None, "") for name in needed)
+        required = [name for name in self.editors if fields[name].is_required()]
+        return all(self.editors[name].value() in (None, "") for name in required)
 
     @property
     def _is_blank(self) -> bool:
@@ -163,12 +163,12 @@ class ModelForm(QtWidgets.QWidget):
         return has_required and self.is_empty
 
     def values(self) -> dict[str, Any]:
-        """What the form holds, as a TOML file does: what is not given is left out."""
-        edited = {name: editor.value() for name, editor in self.editors.items()}
-        return self._fixed | {name: value for name, value in edited.items() if value is not None}
+        """Return the values as in a TOML file, without unset fields."""
+        values = {name: editor.value() for name, editor in self.editors.items()}
+        return self._fixed | {name: value for name, value in values.items() if value is not None}
 
     def set_values(self, values: Mapping[str, Any]) -> None:
-        """Show other values; fields that are not among them go back to their defaults."""
+        """Show values; missing fields get their defaults."""
         with QSignalBlocker(self):
             for name, editor in self.editors.items():
                 field = self._model_class.model_fields[name]
@@ -179,15 +179,15 @@ class ModelForm(QtWidgets.QWidget):
                 try:
                     editor.set_value(value)
                 except (TypeError, ValueError, OverflowError):
-                    # What an older version has kept may be of another kind by now.
+                    # The state of an older version may have another type.
                     editor.set_value(default)
         self._on_change()
 
-    # What is kept between sessions
+    # State that is saved between sessions
     state, restore = values, set_values
 
     def model(self) -> BaseModel:
-        """The validated model, or an `InputError`."""
+        """Return the validated model, or raise an `InputError`."""
         name = self._model_class.__name__.removesuffix("Options").removesuffix("Setup").lower()
         return validated(self._model_class, self.values(), name)
 
@@ -197,7 +197,7 @@ class ModelForm(QtWidgets.QWidget):
             self.model()
         except InputError as error:
             self._problem.setText(str(error))
-            # A form in which nothing has been typed is no mistake yet, whatever its defaults.
+            # A form without any entries is not an error yet.
             self._problem.setVisible(not self._is_blank)
         else:
             self._problem.setVisible(False)
@@ -205,20 +205,20 @@ class ModelForm(QtWidgets.QWidget):
 
     def _keep_one_alternative(self) -> None:
         editors = [self.editors[name] for name in _ALTERNATIVES if name in self.editors]
-        given = [editor for editor in editors if editor.checked]
-        if len(given) == 2:
-            other = given[0] if self.sender() is given[1] else given[1]
-            with QSignalBlocker(other):
-                other.set_value(None)
+        checked = [editor for editor in editors if editor.checked]
+        if len(checked) == 2:
+            unchecked = checked[0] if self.sender() is checked[1] else checked[1]
+            with QSignalBlocker(unchecked):
+                unchecked.set_value(None)
 
 
 def kinds_of(models: Mapping[str, Any], prefix: str = "") -> Kinds:
-    """Kinds for a `ModelPicker`, from model classes that have a title."""
+    """Return the kinds of a `ModelPicker` from model classes with titles."""
     return {name: (f"{prefix}{model.title}", model) for name, model in models.items()}
 
 
 class ModelPicker(QtWidgets.QWidget):
-    """A choice between kinds of things, each with a form of its own or with none."""
+    """A choice between kinds, each with its form or with none."""
 
     changed = Signal()
 
@@ -238,7 +238,7 @@ class ModelPicker(QtWidgets.QWidget):
         return str(self.choice.currentData())
 
     def set_kind(self, kind: str) -> None:
-        """Choose a kind; an unknown one changes nothing."""
+        """Select a kind; ignore an unknown one."""
         index = self.choice.findData(kind)
         if index >= 0:
             self.choice.setCurrentIndex(index)
@@ -248,7 +248,7 @@ class ModelPicker(QtWidgets.QWidget):
         return self._forms.get(self.kind)
 
     def model(self) -> BaseModel | None:
-        """The validated model of the chosen kind, None if it has none, or an `InputError`."""
+        """Return the validated model of the selected kind; None without a form."""
         return None if self.form is None else self.form.model()
 
     def state(self) -> dict[str, Any]:
@@ -257,17 +257,17 @@ class ModelPicker(QtWidgets.QWidget):
 
     def restore(self, state: Mapping[str, Any]) -> None:
         values = state.get("values", {})
-        for kind, held in values.items() if isinstance(values, Mapping) else ():
-            if kind in self._kinds and isinstance(held, Mapping):
+        for kind, form_values in values.items() if isinstance(values, Mapping) else ():
+            if kind in self._kinds and isinstance(form_values, Mapping):
                 form = self._form_of(kind)
                 if form is not None:
-                    form.set_values(held)
+                    form.set_values(form_values)
         self.set_kind(str(state.get("kind", self.kind)))
 
     def _on_choice(self) -> None:
-        chosen = self._form_of(self.kind)
+        selected = self._form_of(self.kind)
         for form in self._forms.values():
-            form.setVisible(form is chosen)
+            form.setVisible(form is selected)
         self.changed.emit()
 
     def _form_of(self, kind: str) -> ModelForm | None:
@@ -283,7 +283,7 @@ class ModelPicker(QtWidgets.QWidget):
 
 
 class RowPicker(QtWidgets.QWidget):
-    """A choice between kinds of things, some with a control of their own in a row below."""
+    """A choice between kinds, some with a control in a row below."""
 
     changed = Signal()
 
@@ -311,34 +311,36 @@ def dump_toml(values: dict[str, object], path: str | Path) -> Path:
 
 
 def save_text(text: str, name: str | Path, suffix: str) -> Path:
-    """Write a file; a name without suffix gets one, which no dialog asked to replace."""
+    """Write a file; a name without a suffix gets one, and then replaces no file."""
     from napari_shadowinv.io import replacing
 
-    named = Path(name)
-    path = named if named.suffix else named.with_suffix(suffix)
-    with replacing(path, overwrite=path == named) as unfinished:
+    entered = Path(name)
+    path = entered if entered.suffix else entered.with_suffix(suffix)
+    with replacing(path, overwrite=path == entered) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
     return path
 
 
 class TomlButtons(QtWidgets.QWidget):
-    """Load and Save buttons; `take` gets the content of a file and its path, `values` gives it."""
+    """Buttons for TOML files; `load` gets entries and path, `values` returns entries to save."""
 
     def __init__(
         self,
-        what: str,
+        subject: str,
         values: Callable[[], dict[str, object]],
-        take: Callable[[dict[str, object], str], None],
+        load: Callable[[dict[str, object], str], None],
     ) -> None:
         super().__init__()
-        self._what, self._values, self._take = what, values, take
-        self.load_button = QtWidgets.QPushButton(f"Load {what}…")
+        self._subject, self._values, self._load_values = subject, values, load
+        self.load_button = QtWidgets.QPushButton(f"Load {subject}…")
         self.save_button = QtWidgets.QPushButton("Save…")
-        self.load_button.setToolTip(f"Read {what} from a TOML file.")
+        self.load_button.setToolTip(f"Read {subject} from a TOML file.")
         self.save_button.setToolTip(
-            f"Write {what} to a TOML file, to reuse here or on the command line."
+            f"Write {subject} to a TOML file, for use here or on the command line."
         )
-        beside((self.load_button, 0), (self.save_button, 0), holder=self).layout().addStretch(1)
+        side_by_side((self.load_button, 0), (self.save_button, 0), holder=self).layout().addStretch(
+            1
+        )
         self.load_button.clicked.connect(lambda: self._load())
         self.save_button.clicked.connect(lambda: self._save())
 
@@ -346,17 +348,17 @@ class TomlButtons(QtWidgets.QWidget):
     def _load(self) -> None:
         from napari_shadowinv.io import read_toml
 
-        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, f"Load {self._what}", "", TOML)
+        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, f"Load {self._subject}", "", TOML)
         if path:
-            self._take(read_toml(path), path)
+            self._load_values(read_toml(path), path)
 
     @notify_errors
     def _save(self) -> None:
         values = self._values()
         if not values:
-            raise InputError(f"there is no {self._what} to save: choose one first")
+            raise InputError(f"there is no {self._subject} to save: select one first")
         path, _ = QtWidgets.QFileDialog.getSaveFileName(
-            self, f"Save {self._what}", f"{self._what}.toml", TOML
+            self, f"Save {self._subject}", f"{self._subject}.toml", TOML
         )
         if path:
             dump_toml(values, path)

@@ -1,4 +1,4 @@
-"""The images of a fit in a table, a row each, with what is known of each: `ImageTable`."""
+"""The images of a fit in a table, with beam, gain and blur of each: `ImageTable`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from qtpy.QtCore import QSignalBlocker, Qt, Signal
 from qtpy.QtWidgets import QSizePolicy, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.widgets._fields import parsed, unit_of_title
+from napari_shadowinv._napari.widgets._editors import parse_number, unit_of_title
 from napari_shadowinv._napari.widgets._forms import labelled
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
 from napari_shadowinv._napari.widgets._number_table import NumberTable
@@ -19,7 +19,7 @@ from napari_shadowinv._napari.widgets._qt import column, while_alive
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import SETUPS, Setup
 
-_KEPT = "fit"  # what a layer's metadata keep of its rows
+_METADATA_KEY = "fit"  # entries of the rows in a layer's metadata
 _NAME, _BEAM, _GAIN, _PSF = range(4)
 _COLUMNS = {_GAIN: ("gain", "Gain", 1.0), _PSF: ("psf", "PSF σ (px)", 0.0)}
 _WIDTHS = {_BEAM: 90, _GAIN: 44, _PSF: 72}
@@ -28,7 +28,7 @@ _BEAM_FIELDS = {"proton": "energy", "optical": "wavelength"}
 
 @dataclass(frozen=True)
 class BeamColumn:
-    """What tells one image's beam from another's."""
+    """The column with the quantity that differs between the images' beams."""
 
     name: str
     title: str
@@ -37,15 +37,15 @@ class BeamColumn:
 
 
 def beam_column(kind: str) -> BeamColumn:
-    """The column for a kind of setup; without one, how strong the images are displaced."""
+    """Return the column for a kind of setup; without a setup, the relative displacement."""
     if kind not in _BEAM_FIELDS:
-        tip = "Displacement in this image relative to the first one, such as 0.6."
+        tip = "Displacement in this image relative to the first image, such as 0.6."
         return BeamColumn("strength", "Strength", "", tip)
     name = _BEAM_FIELDS[kind]
     field = SETUPS[kind].model_fields[name]
     title, unit = unit_of_title(field.title or name)
-    short = title.split()[-1].capitalize()
-    return BeamColumn(name, short, unit, str(field.description))
+    last_word = title.split()[-1].capitalize()
+    return BeamColumn(name, last_word, unit, str(field.description))
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class ImageRow:
 
     @property
     def data(self) -> Any:
-        """Its pixels, not read yet if they are lazy; or an `InputError`."""
+        """The pixels, lazy if the layer is; or an `InputError`."""
         if self.plane is None:
             return image_of(self.layer)
         return stack_of(self.layer)[self.plane]
@@ -70,29 +70,29 @@ class ImageRow:
     def setup(self) -> Setup | None:
         return about.setup_of(self.layer)
 
-    def kept(self) -> dict[str, Any]:
-        """What the user gave in this row."""
-        rows = about.mark_of(self.layer).get(_KEPT, {})
+    def entries(self) -> dict[str, Any]:
+        """Return what the user entered in this row."""
+        rows = about.metadata_of(self.layer).get(_METADATA_KEY, {})
         return dict(rows.get(self.plane or 0, {}))
 
-    def keep(self, **values: Any) -> None:
+    def store(self, **values: Any) -> None:
         # New dicts: a duplicate of the layer may share the old ones.
-        mark = about.mark_of(self.layer)
-        rows = {**mark.get(_KEPT, {}), self.plane or 0: {**self.kept(), **values}}
-        self.layer.metadata[about.KEY] = {**mark, _KEPT: rows}
+        metadata = about.metadata_of(self.layer)
+        rows = {**metadata.get(_METADATA_KEY, {}), self.plane or 0: {**self.entries(), **values}}
+        self.layer.metadata[about.KEY] = {**metadata, _METADATA_KEY: rows}
 
 
 class ImageTable(QWidget):
-    """The 2-D images of a viewer, or the planes of a stack; the first used is the reference."""
+    """The 2-D images of a viewer, or the planes of a stack; the first in use is the reference."""
 
-    changed = Signal()  # something in it
-    first_changed = Signal()  # another image is the reference
-    first_beam = Signal(float)  # the user has given the reference's energy or wavelength
+    changed = Signal()  # an entry or the selection
+    reference_changed = Signal()
+    reference_beam_entered = Signal(float)  # energy or wavelength of the reference
 
     def __init__(self, viewer: Any, suits: Callable[[Any], bool]) -> None:
         super().__init__()
         self._viewer, self._suits = viewer, suits
-        self._first: ImageRow | None = None
+        self._reference: ImageRow | None = None
         self.beam = beam_column("")
         self.rows: list[ImageRow] = []
         self.stacks = LayerPicker(
@@ -116,57 +116,58 @@ class ImageTable(QWidget):
 
     @property
     def used(self) -> list[ImageRow]:
-        """The rows that are checked, the reference first."""
+        """The checked rows, the reference first."""
         return [row for number, row in enumerate(self.rows) if self.table.is_checked(number)]
 
     @property
     def reference(self) -> ImageRow | None:
-        """The first image in use, in whose pixels and units the fields are told."""
-        return self._first
+        """The first image in use, whose pixels and units the fields have."""
+        return self._reference
 
     def fill(self, event: Any = None) -> None:
-        """Show what the viewer has now."""
+        """Show the viewer's current images."""
         stack = self.stacks.layer
         if stack is not None:
             self.rows = [ImageRow(stack, plane) for plane in range(stack.data.shape[0])]
         else:
             self.rows = [ImageRow(layer) for layer in self._viewer.layers if self._is_image(layer)]
         shapes = Counter(row.layer.data.shape for row in self.rows)
-        usual = max(shapes, key=lambda shape: shapes[shape], default=None)
+        common_shape = max(shapes, key=lambda shape: shapes[shape], default=None)
         with QSignalBlocker(self.table):
             self.table.setRowCount(len(self.rows))
             for number, row in enumerate(self.rows):
-                use = row.kept().get("use", row.layer.data.shape == usual)
-                tip = f"{row.name}: {_setup_in_words(row)}."
+                use = row.entries().get("use", row.layer.data.shape == common_shape)
+                tip = f"{row.name}: {_setup_summary(row)}."
                 self.table.fill_row(number, row.name, tip, checked=use)
         self.table.fit_height()
         self._on_use()
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
-        # Only now the rows have the heights of napari's style, and another widget may have
-        # changed a layer's setup.
+        # The rows get the heights of napari's style only now, and another widget may have changed
+        # a layer's setup.
         self.fill()
 
     def show_beams(self, kind: str, value: Any, gains_known: bool) -> None:
-        """Fill the cells; the reference has the energy `value` of the setup that is shown."""
+        """Fill the cells; `value` is the reference's energy or wavelength in the shown setup."""
         self.beam = beam_column(kind)
-        first = self._first
-        if first is not None and first.plane is not None and isinstance(value, float):
-            first.keep(**{self.beam.name: value})  # a stack has one setup for all its planes
+        reference = self._reference
+        if reference is not None and reference.plane is not None and isinstance(value, float):
+            reference.store(**{self.beam.name: value})  # the planes of a stack share a setup
         with QSignalBlocker(self.table):
             titles = ["Image", self.beam.title, *(title for _, title, _ in _COLUMNS.values())]
             unit = f" ({self.beam.unit})" if self.beam.unit == "MeV" else ""
             titles[_BEAM] = f"{self.beam.title}{unit}"
             self.table.setHorizontalHeaderLabels(titles)
             for number, row in enumerate(self.rows):
-                at_first = row == self._first
-                beam = value if at_first and kind in _BEAM_FIELDS else self._beam_of(row)
-                if at_first and kind not in _BEAM_FIELDS:
+                is_reference = row == self._reference
+                beam = value if is_reference and kind in _BEAM_FIELDS else self._beam_of(row)
+                if is_reference and kind not in _BEAM_FIELDS:
                     beam = 1.0
                 self.table.write(number, _BEAM, beam, self.beam.unit, self.beam.tip)
-                for at, (name, _, usual) in _COLUMNS.items():
-                    self.table.write(number, at, row.kept().get(name, usual), "", _TIPS[name])
+                for column, (name, _, default) in _COLUMNS.items():
+                    entry = row.entries().get(name, default)
+                    self.table.write(number, column, entry, "", _TIPS[name])
                 gain = self.table.item(number, _GAIN)
                 editable = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsEditable
                 gain.setFlags(editable if gains_known else Qt.ItemFlag.NoItemFlags)
@@ -174,11 +175,13 @@ class ImageTable(QWidget):
                     gain.setText("free")
 
     def beam_value(self, row: ImageRow) -> float:
-        """Energy, wavelength or strength of a row, or an `InputError`."""
+        """Return energy, wavelength or strength of a row, or raise an `InputError`."""
         value = self._value(row, _BEAM, self.beam.unit)
         if value is None:
-            what = self.beam.title.lower()
-            raise InputError(f"'{row.name}' has no {what}: type it in the table, or uncheck it")
+            quantity = self.beam.title.lower()
+            raise InputError(
+                f"'{row.name}' has no {quantity}: enter it in the table, or uncheck the image"
+            )
         return value
 
     def gain(self, row: ImageRow) -> float:
@@ -188,50 +191,54 @@ class ImageTable(QWidget):
     def psf(self, row: ImageRow) -> float:
         return self._value(row, _PSF, "px") or 0.0
 
-    def _value(self, row: ImageRow, at: int, unit: str) -> float | None:
+    def _value(self, row: ImageRow, column: int, unit: str) -> float | None:
         try:
-            return self.table.number(self.rows.index(row), at, unit)
+            return self.table.number(self.rows.index(row), column, unit)
         except InputError as error:
             raise InputError(f"'{row.name}': {error}") from error
 
     def _beam_of(self, row: ImageRow) -> Any:
-        """What the user gave, or what the layer's own setup tells."""
-        given = row.kept().get(self.beam.name)
-        if given is not None or row.plane is not None:
-            return given
-        if self.beam.name == "strength" and self._first is not None:
-            own, first = (about.mark_of(one.layer).get("strength") for one in (row, self._first))
-            return own / first if own and first else None
+        """Return the user's entry, or else the value in the layer's setup."""
+        entry = row.entries().get(self.beam.name)
+        if entry is not None or row.plane is not None:
+            return entry
+        if self.beam.name == "strength" and self._reference is not None:
+            own_strength, first_strength = (
+                about.metadata_of(image.layer).get("strength") for image in (row, self._reference)
+            )
+            return own_strength / first_strength if own_strength and first_strength else None
         return getattr(row.setup, self.beam.name, None)
 
     def _on_edit(self, item: Any) -> None:
-        row, at = self.rows[item.row()], item.column()
-        if at == _NAME:
-            row.keep(use=self.table.is_checked(item.row()))
+        row, column = self.rows[item.row()], item.column()
+        if column == _NAME:
+            row.store(use=self.table.is_checked(item.row()))
             self._on_use()
             return
-        name = self.beam.name if at == _BEAM else _COLUMNS[at][0]
-        unit = self.beam.unit if at == _BEAM else ""
+        name = self.beam.name if column == _BEAM else _COLUMNS[column][0]
+        unit = self.beam.unit if column == _BEAM else ""
         text = item.text().strip()
         try:
-            value: Any = parsed(text, unit) if text else None
+            value: Any = parse_number(text, unit) if text else None
         except InputError:
-            value = text  # stays to be mended
-        if at == _BEAM and row == self._first and isinstance(value, float) and name != "strength":
-            self.first_beam.emit(value)
+            value = text  # stays for correction
+        is_beam = column == _BEAM
+        is_number = isinstance(value, float)
+        if is_beam and row == self._reference and is_number and name != "strength":
+            self.reference_beam_entered.emit(value)
         else:
-            row.keep(**{name: value})
+            row.store(**{name: value})
         with QSignalBlocker(self.table):
-            tip = self.beam.tip if at == _BEAM else _TIPS[name]
-            self.table.write(item.row(), at, value, unit, tip)
+            tip = self.beam.tip if is_beam else _TIPS[name]
+            self.table.write(item.row(), column, value, unit, tip)
         self.changed.emit()
 
     def _on_use(self) -> None:
         used = self.used
-        before = self._first
-        self._first = used[0] if used else None
-        if self._first != before:
-            self.first_changed.emit()
+        old_reference = self._reference
+        self._reference = used[0] if used else None
+        if self._reference != old_reference:
+            self.reference_changed.emit()
         self.changed.emit()
 
     def _on_insertion(self, event: Any) -> None:
@@ -239,19 +246,19 @@ class ImageTable(QWidget):
         self.fill()
 
     def _is_image(self, layer: Any) -> bool:
-        grey = kind_of(layer) == "image" and not getattr(layer, "rgb", False)
-        return grey and layer.ndim == 2 and self._suits(layer)
+        is_grey = kind_of(layer) == "image" and not getattr(layer, "rgb", False)
+        return is_grey and layer.ndim == 2 and self._suits(layer)
 
 
-def _setup_in_words(row: ImageRow) -> str:
-    """Where the distances of its experiment come from."""
+def _setup_summary(row: ImageRow) -> str:
+    """Return the origin of an image's setup, for the tooltip."""
     if row.setup is None or row.plane is not None:
         return "with the setup below"
     origin = about.setup_origin_of(row.layer)
-    return f"with a setup of its own ({row.setup.probe}{f', {origin}' if origin else ''})"
+    return f"with its own setup ({row.setup.probe}{f', {origin}' if origin else ''})"
 
 
 _TIPS = {
-    "gain": "By how much the image is brighter than the source; 1 if it is as bright.",
-    "psf": "Standard deviation of the image's blur, in pixels after the steps; 0 for none.",
+    "gain": "Brightness of the image relative to the source; 1 if they are equally bright.",
+    "psf": "Standard deviation of the image's blur, in pixels after the steps; 0 without blur.",
 }

@@ -1,4 +1,4 @@
-"""What an inversion is given, beside the shots: source, masks, setup, steps and options."""
+"""Inputs of an inversion other than the shots: source, masks, setup, steps and options."""
 
 from __future__ import annotations
 
@@ -31,38 +31,40 @@ from napari_shadowinv.pipeline._run import PREVIEW_SITES
 _NONE = "none"
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
-_OWN, _LAYER, _FILE = "own", "layer", "file"
+_SUPPLIED, _LAYER, _FILE = "own", "layer", "file"
 
 
 @dataclass(frozen=True)
-class _Given:
+class _Entry:
+    """Values of a setup's form, and where they come from."""
+
     values: dict[str, Any]
     origin: str
 
 
 class SetupPicker(QWidget):
-    """A setup, kept with its image; what the user typed or loaded is offered to the next image."""
+    """A setup, stored with its image; the user's setups are offered to the next image."""
 
     changed = Signal()
 
     def __init__(self) -> None:
         super().__init__()
         self._layer: Any = None
-        self._name, self._keeps = "", True
-        self._own: dict[str, _Given] = {}
-        self._shown: dict[str, _Given] = {}
+        self._name, self._stores = "", True
+        self._entered: dict[str, _Entry] = {}
+        self._shown: dict[str, _Entry] = {}
         self.picker = forms.ModelPicker(
             "Setup", {_NONE: ("none: results in pixels", None), **forms.kinds_of(SETUPS)}
         )
         self.picker.choice.setToolTip(
-            "<qt>With a setup the results are in SI units; lengths can be entered as 1.3 mm or "
+            "<qt>With a setup, results are in SI units. Lengths can be entered as 1.3 mm or "
             "0.0013.</qt>"
         )
         self.geometry_label = forms.wrapping_label()
-        self.doubts = forms.wrapping_label(style=forms.PROBLEM_STYLE)
+        self.warning_label = forms.wrapping_label(style=forms.PROBLEM_STYLE)
         self.note = forms.wrapping_label()
         self.files = forms.TomlButtons("setup", self._to_save, self.load)
-        column(self, self.picker, self.geometry_label, self.doubts, self.note, self.files)
+        column(self, self.picker, self.geometry_label, self.warning_label, self.note, self.files)
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
 
@@ -71,114 +73,114 @@ class SetupPicker(QWidget):
 
     @property
     def origin(self) -> str:
-        """Where the setup comes from, such as ``"typed for 'shot'"``; empty for none."""
+        """Where the setup comes from, such as ``"typed for 'shot'"``; empty without a setup."""
         if self.picker.kind == _NONE:
             return ""
-        given = self._shown.get(self.picker.kind)
-        return self._typed() if given is None else given.origin
+        entry = self._shown.get(self.picker.kind)
+        return self._typed_origin() if entry is None else entry.origin
 
     @property
-    def described(self) -> str:
+    def summary(self) -> str:
         kind = self.picker.choice.currentText()
         return f"{kind}, {self.origin}" if self.origin else kind
 
     def state(self) -> dict[str, Any]:
-        """What is kept: what the user gave. Whether it is chosen is a matter of the image."""
-        return {"own": {kind: asdict(given) for kind, given in self._own.items()}}
+        """Return the setups that the user entered; the selection depends on the image."""
+        return {"own": {kind: asdict(entry) for kind, entry in self._entered.items()}}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Have ready what `state` has returned; none is chosen."""
-        own = state.get("own")
-        for kind, given in own.items() if isinstance(own, Mapping) else ():
-            origin = str(given["origin"]).removesuffix(_EARLIER) + _EARLIER
-            self._own[kind] = _Given(dict(given["values"]), origin)
+        """Restore the entered setups, without selecting one."""
+        saved = state.get("own")
+        for kind, entry in saved.items() if isinstance(saved, Mapping) else ():
+            origin = str(entry["origin"]).removesuffix(_EARLIER) + _EARLIER
+            self._entered[kind] = _Entry(dict(entry["values"]), origin)
         self._show(_NONE)
 
-    def follow(self, layer: Any, name: str = "", *, keep: bool = True) -> None:
-        """Show the setup of another image, or of files; with `keep`, changes stay with it."""
+    def follow(self, layer: Any, name: str = "", *, store: bool = True) -> None:
+        """Show the setup of another image, or of files; with `store`, the image stores changes."""
         if layer == self._layer and name == self._name:
             return
-        # Files may be named after their setup is typed.
-        stays = layer is None and self._layer is None and not self._name
-        self._layer, self._name, self._keeps = layer, name, keep
+        # The setup may be typed before the files are chosen.
+        is_typed_before = layer is None and self._layer is None and not self._name
+        self._layer, self._name, self._stores = layer, name, store
         setup = None if layer is None else about.setup_of(layer)
         if setup is not None:
             self.suggest(setup, about.setup_origin_of(layer) or f"{about.CAME_WITH} '{layer.name}'")
-        elif not stays:
+        elif not is_typed_before:
             self._show(_NONE)
             self.changed.emit()
 
     def suggest(self, setup: Setup, origin: str) -> None:
-        """Show a setup that is not the user's own, until he changes it."""
-        self._show(setup.kind, _Given(setup.model_dump(), origin))
+        """Show a setup that the user did not enter; editing it makes it the user's."""
+        self._show(setup.kind, _Entry(setup.model_dump(), origin))
         self.changed.emit()
 
     def show_setup(self, values: Mapping[str, Any], origin: str = "") -> None:
-        """Fill in a setup that the user gives; without an origin he has typed it."""
+        """Show a setup from the user: loaded from `origin`, or typed if that is empty."""
         kind = str(values["kind"])
-        given = _Given(dict(values), origin or self._typed())
-        self._show(kind, given)
-        self._remember(kind, given)
-        self._keep_with_image()
+        entry = _Entry(dict(values), origin or self._typed_origin())
+        self._show(kind, entry)
+        self._remember(kind, entry)
+        self._store_with_image()
         self.changed.emit()
 
-    def _show(self, kind: str, given: _Given | None = None) -> None:
-        """Fill in one setup, or none, and for the other kinds what the user gave last."""
-        self._shown = {**self._own} | ({} if given is None else {kind: given})
-        blank: dict[str, Any] = {known: {} for known in self.picker.state()["values"]}
-        values = blank | {known: held.values for known, held in self._shown.items()}
+    def _show(self, kind: str, entry: _Entry | None = None) -> None:
+        """Show a setup or none; the forms of other kinds show what the user entered last."""
+        self._shown = {**self._entered} | ({} if entry is None else {kind: entry})
+        blank: dict[str, Any] = {name: {} for name in self.picker.state()["values"]}
+        values = blank | {name: state.values for name, state in self._shown.items()}
         with QSignalBlocker(self.picker):
             self.picker.restore({"kind": kind, "values": values})
-        self._tell()
+        self._show_origin()
 
     def _on_edit(self) -> None:
         kind, before = self.picker.kind, self._state
         values = self.picker.state()["values"].get(kind, {})
-        # To look at another form, or to leave a field as it was, is no change of values.
+        # Selecting another form, or leaving a field as it was, changes no values.
         if kind == before["kind"] and values != before["values"].get(kind):
-            shown = self._shown.get(kind)
-            if shown is None or shown.origin.startswith("typed"):
-                origin = self._typed()
+            old_entry = self._shown.get(kind)
+            if old_entry is None or old_entry.origin.startswith("typed"):
+                origin = self._typed_origin()
             else:
-                origin = shown.origin.removesuffix(_CHANGED) + _CHANGED
-            self._remember(kind, _Given(values, origin))
-        self._tell()
-        self._keep_with_image()
+                origin = old_entry.origin.removesuffix(_CHANGED) + _CHANGED
+            self._remember(kind, _Entry(values, origin))
+        self._show_origin()
+        self._store_with_image()
         self.changed.emit()
 
-    def _remember(self, kind: str, given: _Given) -> None:
-        """Keep what is shown for other images, if it is the user's own."""
-        self._shown[kind] = given
-        if not given.origin.startswith(about.CAME_WITH):
-            self._own[kind] = given
+    def _remember(self, kind: str, entry: _Entry) -> None:
+        """Offer a setup that the user entered to other images, too."""
+        self._shown[kind] = entry
+        if not entry.origin.startswith(about.CAME_WITH):
+            self._entered[kind] = entry
 
-    def _keep_with_image(self) -> None:
-        if self._layer is None or not self._keeps:
+    def _store_with_image(self) -> None:
+        if self._layer is None or not self._stores:
             return
         try:
             setup = self.setup()
         except InputError:
-            return  # half a setup: the image keeps the one it has
+            return  # incomplete: the image keeps its setup
         if setup != about.setup_of(self._layer) or self.origin != about.setup_origin_of(
             self._layer
         ):
-            about.keep_setup(self._layer, setup, self.origin)
+            about.store_setup(self._layer, setup, self.origin)
 
-    def _typed(self) -> str:
+    def _typed_origin(self) -> str:
         name = self._name if self._layer is None else self._layer.name
         return f"typed for '{name}'" if name else "typed"
 
-    def _tell(self) -> None:
-        """Say beside the fields where they come from, unless there is nothing in them."""
+    def _show_origin(self) -> None:
+        """Show where the values come from, unless the form is empty."""
         self._state = self.picker.state()
         form = self.picker.form
-        filled = form is not None and not form.is_empty
-        self.note.setText(f"{self.origin[:1].upper()}{self.origin[1:]}." if filled else "")
-        self.note.setVisible(filled)
+        is_filled = form is not None and not form.is_empty
+        self.note.setText(f"{self.origin[:1].upper()}{self.origin[1:]}." if is_filled else "")
+        self.note.setVisible(is_filled)
         self._show_geometry()
 
     def _show_geometry(self) -> None:
-        """Show field of view and magnification under the fields, and what is doubtful of them."""
+        """Show field of view, magnification and warnings below the form."""
         try:
             setup = self.setup()
         except InputError:
@@ -188,8 +190,12 @@ class SetupPicker(QWidget):
             height, width = self._layer.data.shape[-2:]
             shape = height, width
         line = "" if setup is None else geometry_text(setup, shape)
-        doubts = [] if setup is None else [each.text for each in setup_warnings(setup, shape)]
-        for label, text in ((self.geometry_label, line), (self.doubts, "\n".join(doubts))):
+        cautions = () if setup is None else setup_warnings(setup, shape)
+        warnings = [caution.text for caution in cautions]
+        for label, text in (
+            (self.geometry_label, line),
+            (self.warning_label, "\n".join(warnings)),
+        ):
             label.setText(text)
             label.setVisible(bool(text))
 
@@ -197,22 +203,22 @@ class SetupPicker(QWidget):
         setup = self.setup()
         return {} if setup is None else setup.model_dump()
 
-    def load(self, loaded: dict[str, Any], path: str) -> None:
-        """Show a setup that a file holds."""
+    def load(self, entries: dict[str, Any], path: str) -> None:
+        """Show a setup from the entries of a file."""
         from napari_shadowinv.physics.setup import setup_from_dict
 
-        values = setup_from_dict(loaded, path).model_dump()
-        whom = self._typed().removeprefix("typed")
-        self.show_setup(values, f"loaded from {Path(path).name}{whom}")
+        values = setup_from_dict(entries, path).model_dump()
+        owner = self._typed_origin().removeprefix("typed")
+        self.show_setup(values, f"loaded from {Path(path).name}{owner}")
 
 
 class SourcePicker(forms.RowPicker):
-    """Uniform, a layer, a file, what came with the shot, or an estimate from it."""
+    """The source: uniform, a layer, a file, supplied with the shot, or estimated from it."""
 
     def __init__(self, viewer: Any) -> None:
         self._image: Any = None
-        self._before_own = "uniform"
-        self._loaded = preprocessing.MeasuredSource()
+        self._kind_before_supplied = "uniform"
+        self._recipe_source = preprocessing.MeasuredSource()
         tip = "Image layer of the undisturbed beam."
         self.layers = layers.LayerPicker(viewer, ("image",), tip, "choose a layer", self._offers)
         self.file = forms.PathEdit("Image of the undisturbed beam")
@@ -224,52 +230,52 @@ class SourcePicker(forms.RowPicker):
                 "uniform": ("uniform", uniform),
                 _LAYER: ("a layer", None),
                 _FILE: ("a file", None),
-                _OWN: ("the one supplied with the shot", None),
+                _SUPPLIED: ("supplied with the shot", None),
                 **kinds,
             },
             "The beam without the object: ideally a measured reference image, otherwise uniform "
-            "or estimated from the shot itself.",
+            "or estimated from the shot.",
             {_LAYER: forms.labelled("", self.layers), _FILE: forms.labelled("", self.file)},
         )
         self.layers.picked.connect(self.changed)
         self.file.changed.connect(self.changed)
 
     @property
-    def is_guessed(self) -> bool:
-        """Whether it is an estimate from the shot, which a mask can keep from the object."""
+    def is_estimated(self) -> bool:
+        """Whether it is estimated from the shot, where a mask can exclude the object."""
         estimate = preprocessing.ESTIMATES.get(self.picker.kind)
         return estimate is not None and estimate.uses_mask
 
     @property
-    def is_own(self) -> bool:
-        """Whether it is the one that came with the shot."""
-        return self.picker.kind == _OWN
+    def is_supplied(self) -> bool:
+        """Whether it came with the shot."""
+        return self.picker.kind == _SUPPLIED
 
     @property
-    def described(self) -> str:
+    def summary(self) -> str:
         kind = self.picker.kind
         if kind == _LAYER and self.layers.layer is not None:
             return f"layer '{self.layers.layer.name}'"
         if kind == _FILE:
             return f"file {Path(self.file.path).name}"
-        if kind == _OWN:
+        if kind == _SUPPLIED:
             return "came with the shot"
         model = self.picker.model()
         assert isinstance(model, preprocessing.Estimate)
-        return f"estimate: {model.described}" if self.is_guessed else model.described
+        return f"estimate: {model.described}" if self.is_estimated else model.described
 
     @property
     def short_name(self) -> str:
-        """The source in the name of a result; empty for a uniform one and for the shot's."""
+        """The source in the name of a result; empty if uniform or supplied with the shot."""
         kind = self.picker.kind
-        if kind in (_OWN, "uniform"):
+        if kind in (_SUPPLIED, "uniform"):
             return ""
         if kind == _LAYER:
             return "" if self.layers.layer is None else str(self.layers.layer.name)
         return Path(self.file.path).name if kind == _FILE else f"{kind} source"
 
     def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource:
-        """What a recipe says of the source, or an `InputError`."""
+        """Return the source as a recipe describes it, or raise an `InputError`."""
         model = self.picker.model()
         if isinstance(model, preprocessing.Estimate):
             return model
@@ -277,8 +283,10 @@ class SourcePicker(forms.RowPicker):
             return preprocessing.MeasuredSource()
         if not self.file.path:
             raise InputError("no source file is selected: choose one, or choose another source")
-        if self._loaded.file is not None and str(self._loaded.file) == self.file.path:
-            return self._loaded  # the form has no name for what is in the file
+        if self._recipe_source.file is not None and str(self._recipe_source.file) == self.file.path:
+            return (
+                self._recipe_source
+            )  # with the variable in the file, which the form does not show
         return preprocessing.MeasuredSource(file=Path(self.file.path))
 
     def show(self, source: Any) -> None:
@@ -289,67 +297,68 @@ class SourcePicker(forms.RowPicker):
         elif source is None:
             self.picker.set_kind("uniform")
         elif source.file is None:
-            self.picker.set_kind(_OWN)
+            self.picker.set_kind(_SUPPLIED)
         else:
-            self._loaded = source
+            self._recipe_source = source
             self.file.edit.setText(str(source.file))
             self.picker.set_kind(_FILE)
             self.changed.emit()
 
     def measured(self, image_layer: Any) -> preprocessing.Radiograph | None:
-        """The measured source of an image layer unless it is a file, or an `InputError`."""
+        """Return the measured source of an image layer; None for estimates and files."""
         kind = self.picker.kind
         if kind == _LAYER:
             if self.layers.layer is None:
                 raise InputError(
-                    "no source layer is selected: choose one below 'a layer', or choose another "
-                    "source"
+                    "no source layer is selected: choose a layer below 'a layer', or another kind "
+                    "of source"
                 )
-            chosen = self.layers.layer
-            data = layers.image_of(chosen, "source image")
+            layer = self.layers.layer
+            data = layers.image_of(layer, "source image")
             shot = preprocessing.Radiograph(data)
             if image_layer is not None:
                 shot = radiograph_of(image_layer, image_layer.data)
-            beam = source_of_shot(chosen, data, shot)
-            return replace(beam, warnings=layers.warnings_of(chosen))
-        if kind == _OWN:
-            own = about.source_of(image_layer)
-            if own is None:
+            beam = source_of_shot(layer, data, shot)
+            return replace(beam, warnings=layers.warnings_of(layer))
+        if kind == _SUPPLIED:
+            supplied = about.source_of(image_layer)
+            if supplied is None:
                 raise InputError(
-                    f"'{image_layer.name}' has no source of its own: choose another kind of source"
+                    f"no source was supplied with '{image_layer.name}': choose another kind of "
+                    "source"
                 )
-            return radiograph_of(image_layer, own)
+            return radiograph_of(image_layer, supplied)
         return None
 
     def check(self, mask: BoolArray | None) -> None:
-        """Refuse a mask over what the chosen layer was estimated without: the object."""
+        """Refuse a mask over the object that the source layer's estimate excluded."""
         layer = self.layers.layer if self.picker.kind == _LAYER else None
-        bare = None if layer is None else about.mark_of(layer).get("source_mask")
-        if bare is not None and mask is not None and bare.shape == mask.shape:
-            preprocessing.check_masks(mask, bare)
+        beyond_object = None if layer is None else about.metadata_of(layer).get("source_mask")
+        if beyond_object is not None and mask is not None and beyond_object.shape == mask.shape:
+            preprocessing.check_masks(mask, beyond_object)
 
     def state(self) -> dict[str, Any]:
-        """What is kept: layers and files belong to a session."""
-        kept = self.picker.state()
-        kind = self._before_own if kept["kind"] == _OWN else kept["kind"]
-        return {**kept, "kind": "uniform" if kind in (_LAYER, _FILE) else kind}
+        """Return the choice without layers and files, which belong to a session."""
+        state = self.picker.state()
+        kind = self._kind_before_supplied if state["kind"] == _SUPPLIED else state["kind"]
+        return {**state, "kind": "uniform" if kind in (_LAYER, _FILE) else kind}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self.picker.restore(state)
 
     def follow(self, image_layer: Any) -> None:
-        """Take the source that came with an image, or leave that of another image."""
+        """Select the source supplied with an image; without one, deselect the last image's."""
         self._image = image_layer
         self.layers.fill()
         if image_layer is not None and about.source_of(image_layer) is not None:
-            if self.picker.kind != _OWN:
-                self._before_own = self.picker.kind
-            self.picker.set_kind(_OWN)
-        elif self.picker.kind == _OWN:
-            self.picker.set_kind(self._before_own)
+            if self.picker.kind != _SUPPLIED:
+                self._kind_before_supplied = self.picker.kind
+            self.picker.set_kind(_SUPPLIED)
+        elif self.picker.kind == _SUPPLIED:
+            self.picker.set_kind(self._kind_before_supplied)
 
     def _offers(self, layer: Any) -> bool:
-        # An image is not its own source: it would differ from it nowhere.
+        # An image cannot be its own source.
         return layer != self._image and about.may_be_source(layer)
 
     def _on_kind(self) -> None:
@@ -358,40 +367,40 @@ class SourcePicker(forms.RowPicker):
         super()._on_kind()
 
     def _only_source(self) -> Any | None:
-        """The one layer, no result's, that is known to be a source and fits the image, or None."""
+        """Return the source layer that fits the image, if there is exactly one, outside results."""
         shape = None if self._image is None else tuple(self._image.data.shape[-2:])
-        known = [
+        sources = [
             layer
             for layer in self.layers.offered
             if about.role_of(layer) == about.SOURCE and about.result_of(layer) is None
         ]
-        fitting = [layer for layer in known if tuple(layer.data.shape[-2:]) == shape]
+        fitting = [layer for layer in sources if tuple(layer.data.shape[-2:]) == shape]
         return fitting[0] if len(fitting) == 1 else None
 
 
 class OptionsForm(forms.ModelForm):
-    """The form of options, with buttons that load and save them."""
+    """A form of options, with buttons to load and save them."""
 
     def __init__(
         self,
         model_class: type[BaseModel] = InversionOptions,
-        first: Mapping[str, Any] = MappingProxyType({"n_sites": PREVIEW_SITES}),
+        initial: Mapping[str, Any] = MappingProxyType({"n_sites": PREVIEW_SITES}),
     ) -> None:
-        super().__init__(model_class, first=first)
-        self.files = forms.TomlButtons("options", self._to_save, self._take)
+        super().__init__(model_class, initial=initial)
+        self.files = forms.TomlButtons("options", self._to_save, self._load)
         self.layout().addWidget(self.files)
 
     def _to_save(self) -> dict[str, object]:
         self.model()
         return self.values()
 
-    def _take(self, loaded: dict[str, object], path: str) -> None:
-        validated(self._model_class, loaded, path)
-        self.set_values(loaded)
+    def _load(self, values: dict[str, object], path: str) -> None:
+        validated(self._model_class, values, path)
+        self.set_values(values)
 
 
 class InversionInputs:
-    """The controls that panels for a shot and for a stack have in common."""
+    """The controls that the panels for a shot and for a stack share."""
 
     viewer: Any
     crop: Any = None  # a picker, where a rectangle can be drawn
@@ -399,7 +408,7 @@ class InversionInputs:
     def make_inputs(
         self, image: Callable[[], Any], kinds: tuple[str, ...], mask_tip: str, source_mask_tip: str
     ) -> None:
-        """Make them, in rows `beam` and `how`; masks are layers of these kinds for the image."""
+        """Make the controls, in rows `beam` and `settings`; masks are layers of these kinds."""
         self.source = SourcePicker(self.viewer)
         self.masks = layers.MaskPicker(self.viewer, image, kinds, mask_tip)
         self.source_masks = layers.MaskPicker(
@@ -412,13 +421,13 @@ class InversionInputs:
         self.chosen_image = image
         self.beam = (self.source, self.source_masks, self.masks)
         options = forms.section("Options", self.options)
-        self.how = (self.setup, self.steps, options, self.recipes)
+        self.settings = (self.setup, self.steps, options, self.recipes)
         self.inputs = (*self.beam, self.setup, self.steps, self.options)
         self.source.changed.connect(self._show_source_mask)
         self._show_source_mask()
 
     def _show_source_mask(self) -> None:
-        self.source_masks.setVisible(self.source.is_guessed)
+        self.source_masks.setVisible(self.source.is_estimated)
 
     def parts(self) -> dict[str, Any]:
         return {
@@ -431,20 +440,20 @@ class InversionInputs:
         }
 
     def all_steps(self) -> tuple[preprocessing.Step, ...]:
-        """What is done to an image first; or an `InputError`."""
-        part = None if self.crop is None else layers.crop_of(self.crop.layer, self.chosen_image())
-        if part is None:
+        """Return the preprocessing steps, the crop first, or raise an `InputError`."""
+        region = None if self.crop is None else layers.crop_of(self.crop.layer, self.chosen_image())
+        if region is None:
             return self.steps.steps()
-        rows, columns = part
+        rows, columns = region
         crop = preprocessing.Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
         return (crop, *self.steps.steps())
 
     def hidden_from_source(self, image: Any) -> BoolArray | None:
-        """False where the object is, as far as the source is estimated without it."""
-        return self.source_masks.usable(image) if self.source.is_guessed else None
+        """Return the source mask, False on the object; None without one or an estimate."""
+        return self.source_masks.usable(image) if self.source.is_estimated else None
 
     def recipe(self) -> preprocessing.Recipe:
-        """What the controls ask for, but for masks and layers; or an `InputError`."""
+        """Return the recipe of the controls, without masks and layers; or raise an `InputError`."""
         return preprocessing.Recipe(
             steps=self.all_steps(),
             source=self.source.chosen(),
@@ -453,17 +462,17 @@ class InversionInputs:
         )
 
     def companions(self, image: Any, *others: Any) -> tuple[Any, ...]:
-        """Layers that lie on an image: masks and source, and others if there are any."""
+        """Return the layers that lie on an image: masks, source and others, if chosen."""
         chosen = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
-        return tuple(one for one in chosen if one is not None and one is not image)
+        return tuple(layer for layer in chosen if layer is not None and layer is not image)
 
     def origins(self, layer: Any, name: str) -> Origins:
-        """Where all of it comes from, for an image or the images of that name."""
+        """Return the origins of all inputs, for an image or for files of that name."""
         return Origins(
             name,
-            self.source.described,
-            self.masks.described(layer),
-            self.source_masks.described(layer) if self.source.is_guessed else "",
-            self.setup.described,
+            self.source.summary,
+            self.masks.summary(layer),
+            self.source_masks.summary(layer) if self.source.is_estimated else "",
+            self.setup.summary,
             self.setup.origin,
         )

@@ -1,4 +1,4 @@
-"""Layers: which ones a widget works on, what is in them, new ones to draw on."""
+"""Layers of a widget: pickers, their pixels, masks and crops, and new layers to draw on."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.widgets._fields import SteadyComboBox
+from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import labelled, with_button
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_alive
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -23,12 +23,12 @@ from napari_shadowinv.io.formats import SCAN_SUFFIXES
 
 def kind_of(layer: Any) -> str:
     """Return a layer's type, such as ``"image"`` or ``"labels"``."""
-    # Not by type(): a widget may be handed a proxy, which tells its content's class only here.
+    # Not by type(): a widget may get a proxy, whose class is its content's only here.
     return str(layer.__class__.__name__).lower()
 
 
 def image_of(layer: Any | None, role: str = "image") -> Any:
-    """The 2-D array of a grey image, not read yet if it is lazy; `role` is for the message."""
+    """Return the 2-D array of a grey image, lazy if the layer is; errors mention `role`."""
     data = _grey(layer, role)
     assert layer is not None
     if data.ndim != 2:
@@ -40,7 +40,7 @@ def image_of(layer: Any | None, role: str = "image") -> Any:
 
 
 def stack_of(layer: Any | None) -> Any:
-    """The 3-D array (shot, y, x) of grey images, not read yet if it is lazy."""
+    """Return the 3-D array (shot, y, x) of grey images, lazy if the layer is."""
     data = _grey(layer, "stack of shots")
     assert layer is not None
     if data.ndim != 3:
@@ -53,13 +53,13 @@ def stack_of(layer: Any | None) -> Any:
         return data
     from dask import array
 
-    # Whatever reads from a disk stays there until a shot is needed.
-    whole = array.asanyarray(data)  # type: ignore[no-untyped-call]
-    return whole
+    # Data on disk are read when a shot is needed.
+    stack = array.asanyarray(data)  # type: ignore[no-untyped-call]
+    return stack
 
 
 def shown_plane(layer: Any, point: Any) -> Any:
-    """The plane of an image, or of a stack of them, shown at a viewer's ``dims.point``."""
+    """Return the plane of an image or stack at a viewer's ``dims.point``."""
     data = _data_of(layer)
     if data.ndim == 2:
         return data
@@ -80,29 +80,29 @@ def _grey(layer: Any | None, role: str) -> Any:
     if getattr(layer, "rgb", False):
         raise InputError(
             f"'{layer.name}' is a colour image, expected a greyscale one: if it is a scan of "
-            "film, which darkens with dose, convert it to dose first "
-            "(napari_shadowinv.film); if it is linear in fluence, "
-            "split it (right click on the layer → Split RGB) and choose one channel"
+            "film, which darkens with dose, convert it to dose first (Plugins → Film pack); if it "
+            "is linear in fluence, split it (right click on the layer → Split RGB) and choose one "
+            "channel"
         )
     return _data_of(layer)
 
 
 def warnings_of(layer: Any) -> tuple[Caution, ...]:
-    """What the reader of a grey image said against it, or that it looks like scanned film."""
-    known = about.mark_of(layer)
+    """Return the warnings of a grey image's reader, or that it looks like scanned film."""
+    metadata = about.metadata_of(layer)
     path = str(layer.source.path or "").lower()
-    # What else is known of a layer, such as a setup, may be the user's.
+    # Other metadata, such as a setup, may come from the user.
     if (
         about.role_of(layer)
         or not path.endswith(tuple(SCAN_SUFFIXES))
         or not isinstance(layer.data, np.ndarray)
     ):
-        return tuple(known.get("warnings", ()))
+        return tuple(metadata.get("warnings", ()))
     return film_warnings(layer.data, None)
 
 
 def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArray | None:
-    """Usable pixels of an image (None for files) by labels or shapes; None if all are."""
+    """Return the usable pixels of an image (None for files) by labels or shapes; None for all."""
     if layer is None:
         return None
     shape = None if image is None else tuple(_grey(image, "image").shape[-2:])
@@ -115,18 +115,18 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArr
             )
     else:
         assert shape is not None
-        painted = _drawn(layer, image, shape)
+        painted = _rasterise(layer, image, shape)
     if not painted.any():
         return None
     return ~painted if painted_is_unusable else painted
 
 
 def crop_of(layer: Any | None, image: Any) -> tuple[slice, slice] | None:
-    """Rows and columns of an image in the selected, or else the last, of the drawn shapes."""
+    """Return rows and columns of an image inside the selected shape, or else the last one."""
     if layer is None or not len(layer.data):
         return None
-    chosen = max(layer.selected_data, default=len(layer.data) - 1)
-    corners = _in_pixels(layer, image)[chosen]
+    selected = max(layer.selected_data, default=len(layer.data) - 1)
+    corners = _corners_in_pixels(layer, image)[selected]
     least = np.ceil(corners.min(axis=0)).astype(int)
     most = np.floor(corners.max(axis=0)).astype(int) + 1
     rows, columns = (
@@ -136,18 +136,18 @@ def crop_of(layer: Any | None, image: Any) -> tuple[slice, slice] | None:
     return rows, columns
 
 
-def _drawn(layer: Any, image: Any, shape: tuple[int, ...]) -> BoolArray:
+def _rasterise(layer: Any, image: Any, shape: tuple[int, ...]) -> BoolArray:
     if not len(layer.data):
         return np.zeros(shape, bool)
     from napari.layers import Shapes
 
-    on_pixels = Shapes(_in_pixels(layer, image), shape_type=list(layer.shape_type))
+    on_pixels = Shapes(_corners_in_pixels(layer, image), shape_type=list(layer.shape_type))
     masks: BoolArray = np.asarray(on_pixels.to_masks(mask_shape=shape), dtype=np.bool_)
     return np.asarray(masks.any(axis=0))
 
 
-def _in_pixels(layer: Any, image: Any) -> list[FloatArray]:
-    """Corners of shapes in the pixels of an image that may be scaled differently."""
+def _corners_in_pixels(layer: Any, image: Any) -> list[FloatArray]:
+    """Return the corners of shapes in the pixels of an image, which may have another scale."""
     return [
         np.array([image.world_to_data(layer.data_to_world(corner))[-2:] for corner in shape])
         for shape in layer.data
@@ -155,29 +155,30 @@ def _in_pixels(layer: Any, image: Any) -> list[FloatArray]:
 
 
 def new_mask(viewer: Any, image: Any, title: str, painted: BoolArray | None = None) -> Any:
-    """Add labels of an image's or a stack's size, painted or ready to be; named with `title`."""
+    """Add labels of an image's or stack's size, painted or empty; their name ends with `title`."""
     if painted is not None:
-        labels = _added(viewer, image, "labels", painted.astype(np.uint8), title)
+        labels = _add_layer(viewer, image, "labels", painted.astype(np.uint8), title)
     else:
         is_stack = image is not None and image.ndim == 3
         shape = (stack_of(image) if is_stack else image_of(image)).shape[-2:]
-        labels = _added(viewer, image, "labels", np.zeros(shape, np.uint8), title)
+        labels = _add_layer(viewer, image, "labels", np.zeros(shape, np.uint8), title)
         labels.mode = "paint"
-    labels.metadata = about.mark(about.MASK, "")
+    labels.metadata = about.metadata_for(about.MASK, "")
     return labels
 
 
-def new_crop(viewer: Any, image: Any, part: tuple[slice, slice]) -> Any:
+def new_crop(viewer: Any, image: Any, region: tuple[slice, slice]) -> Any:
     """Add shapes with a rectangle around rows and columns of an image."""
     shapes = new_shapes(viewer, image, "crop", "pan_zoom")
-    (top, bottom), (left, right) = ((one.start - 0.5, one.stop - 0.5) for one in part)
-    shapes.add_rectangles(np.array([[top, left], [top, right], [bottom, right], [bottom, left]]))
+    (top, bottom), (x_low, x_high) = ((axis.start - 0.5, axis.stop - 0.5) for axis in region)
+    corners = [[top, x_low], [top, x_high], [bottom, x_high], [bottom, x_low]]
+    shapes.add_rectangles(np.array(corners))
     return shapes
 
 
 def new_shapes(viewer: Any, image: Any, title: str, mode: str) -> Any:
-    """Add empty shapes with a tool such as ``"add_rectangle"``; their name ends with `title`."""
-    shapes = _added(viewer, image, "shapes", None, title, ndim=2)
+    """Add empty shapes in a mode such as ``"add_rectangle"``; their name ends with `title`."""
+    shapes = _add_layer(viewer, image, "shapes", None, title, ndim=2)
     shapes.current_face_color = "transparent"
     shapes.current_edge_color = "yellow"
     shapes.current_edge_width = max(image.data.shape[-2:]) / 200
@@ -185,11 +186,11 @@ def new_shapes(viewer: Any, image: Any, title: str, mode: str) -> Any:
     return shapes
 
 
-def _added(viewer: Any, image: Any, kind: str, data: Any, title: str, **keywords: Any) -> Any:
+def _add_layer(viewer: Any, image: Any, kind: str, data: Any, title: str, **keywords: Any) -> Any:
     from napari.layers import Layer
 
     keywords["name"] = title
-    if image is not None:  # files, whose images are no layers
+    if image is not None:  # None for files
         keywords |= {"name": f"{image.name} {title}", **frame_of(image).keywords()}
     layer = Layer.create(data, keywords, kind)
     viewer.layers.append(layer)
@@ -198,11 +199,11 @@ def _added(viewer: Any, image: Any, kind: str, data: Any, title: str, **keywords
 
 
 _BLOCK_PX = 8
-_MORE_STRUCTURE = 2.0  # as a ratio
+_MIN_STRUCTURE_RATIO = 2.0
 
 
 class LayerPicker(SteadyComboBox):
-    """A combo box of layers; `none` stands for no layer, without it the latest is chosen."""
+    """A combo box of layers; `none` is the entry for no layer, else the latest is selected."""
 
     picked = Signal()
 
@@ -242,7 +243,7 @@ class LayerPicker(SteadyComboBox):
         while_alive(self, event.value.events.name, self.fill)
 
     def fill(self, event: Any = None) -> None:
-        """Offer what the viewer has now; what is chosen stays while it is there."""
+        """Offer the viewer's current layers; the selection stays while its layer exists."""
         before = self.layer
         offered = [
             layer
@@ -265,16 +266,16 @@ class LayerPicker(SteadyComboBox):
 
 
 class ShotPicker(LayerPicker):
-    """A picker of the layer that is a shot.
+    """A picker of the shot's layer.
 
-    Until the user chooses one, it prefers an image with structure to one without: a reference
-    that was opened first is no shot.
+    Until the user selects a layer, it prefers images with structure: a reference that was opened
+    first is not the shot.
     """
 
     def __init__(self, viewer: Any) -> None:
         self.is_chosen = False
         super().__init__(
-            viewer, ("image",), "The shot: a greyscale image layer.", suits=about.may_be_shot
+            viewer, ("image",), "Layer of the shot, a greyscale image.", suits=about.may_be_shot
         )
         self.activated.connect(self._choose)
 
@@ -283,10 +284,10 @@ class ShotPicker(LayerPicker):
 
     def _on_insertion(self, event: Any) -> None:
         super()._on_insertion(event)
-        chosen, new = self.layer, event.value
-        if self.is_chosen or chosen is None or new is chosen or new not in self.offered:
+        current, new = self.layer, event.value
+        if self.is_chosen or current is None or new is current or new not in self.offered:
             return
-        if _structure(new) > _MORE_STRUCTURE * _structure(chosen) > 0:
+        if _structure(new) > _MIN_STRUCTURE_RATIO * _structure(current) > 0:
             self.layer = new
 
 
@@ -303,27 +304,27 @@ def _structure(layer: Any) -> float:
         return 0.0
     y, x = np.mgrid[-1 : 1 : means.shape[0] * 1j, -1 : 1 : means.shape[1] * 1j].reshape(2, -1)
     beam = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    fitted = beam @ np.linalg.lstsq(beam, means.ravel(), rcond=None)[0]
-    return float(np.std(means.ravel() - fitted) / mean)
+    smooth = beam @ np.linalg.lstsq(beam, means.ravel(), rcond=None)[0]
+    return float(np.std(means.ravel() - smooth) / mean)
 
 
-# By the mask's title: what paint marks, and what that means.
+# By the mask's title: the meaning of painted pixels, and its tooltip.
 _PAINT = {
     "Mask": (
         "unusable",
         "Checked: painted pixels are excluded (handwriting, dead pixels). Unchecked: only painted "
-        "pixels are used. Set opaque obstacles to zero in the source instead.",
+        "pixels are used. For opaque obstacles, set the source to zero instead.",
     ),
     "Source mask": (
         "object",
-        "Checked: the source is estimated from the pixels that are not painted. Unchecked: from "
-        "those that are.",
+        "Checked: the source is estimated from the unpainted pixels. Unchecked: from the painted "
+        "ones.",
     ),
 }
 
 
 class MaskPicker(QWidget):
-    """A layer that is painted on, and what the paint means; it is for what `image` returns."""
+    """A layer of painted pixels, and their meaning, for the image that `image` returns."""
 
     picked = Signal()
     changed = Signal()
@@ -339,8 +340,8 @@ class MaskPicker(QWidget):
         super().__init__()
         self._viewer, self._image, self.title = viewer, image, title
         self.layers = LayerPicker(viewer, kinds, f"<qt>{tip}</qt>", "none", about.may_be_mask)
-        hides, meaning = _PAINT[title]
-        self.painted_is_unusable = QCheckBox(f"painted = {hides}")
+        target, meaning = _PAINT[title]
+        self.painted_is_unusable = QCheckBox(f"painted = {target}")
         self.painted_is_unusable.setChecked(True)
         self.painted_is_unusable.setToolTip(f"<qt>{meaning}</qt>")
         column(
@@ -361,37 +362,37 @@ class MaskPicker(QWidget):
         self.layers.layer = layer
 
     def usable(self, image: Any) -> BoolArray | None:
-        """Usable pixels of an image layer, or of each image of a stack or of files (None)."""
+        """Return the usable pixels of an image layer, of a stack's planes, or of files (None)."""
         painted = mask_of(self.layer, image, self.painted_is_unusable.isChecked())
-        own = None if image is None else about.usable_of(image)
-        if painted is None or own is None:
-            return own if painted is None else painted
-        return painted & own
+        supplied = None if image is None else about.usable_of(image)
+        if painted is None or supplied is None:
+            return supplied if painted is None else painted
+        return painted & supplied
 
-    def described(self, image: Any) -> str:
-        """Which layer it is, and how much it leaves out; empty for none, or nothing painted."""
+    def summary(self, image: Any) -> str:
+        """Return the layer's name and the share of excluded pixels; empty if there are none."""
         usable = self.usable(image)
         if usable is None:
             return ""
-        own = image is not None and about.usable_of(image) is not None
+        is_supplied = image is not None and about.usable_of(image) is not None
         names = [] if self.layer is None else [f"layer '{self.layer.name}'"]
-        names += ["the film's own"] if own else []
+        names += ["the film's mask"] if is_supplied else []
         return f"{' and '.join(names)}, excludes {1 - usable.mean():.1%} of the pixels"
 
     def follow(self, image: Any) -> None:
-        """Choose the mask that came with an image's file, if one did."""
-        path = about.mark_of(image).get("path")
+        """Select the mask that came with an image's file, if there is one."""
+        path = about.metadata_of(image).get("path")
         for layer in self._viewer.layers:
             if (
                 path
                 and about.role_of(layer) == about.MASK
-                and about.mark_of(layer).get("path") == path
+                and about.metadata_of(layer).get("path") == path
             ):
                 self.layer = layer
                 self.painted_is_unusable.setChecked(True)
 
     def state(self) -> bool:
-        """What is kept: layers belong to a session."""
+        """Return the check box; layers belong to a session."""
         return bool(self.painted_is_unusable.isChecked())
 
     def restore(self, state: Any) -> None:
@@ -403,7 +404,7 @@ class MaskPicker(QWidget):
 
 
 class LayerWatch(QObject):
-    """Tells when something is painted, drawn or replaced in the layers that are chosen."""
+    """Emit a signal when the data of the selected layers change."""
 
     edited = Signal()
 
@@ -417,7 +418,7 @@ class LayerWatch(QObject):
 
     def _watch(self) -> None:
         for layer in [picker.layer for picker in self._pickers]:
-            if layer is None or any(layer is known for known in self._watched):
+            if layer is None or any(layer is watched for watched in self._watched):
                 continue
             self._watched.append(layer)
             for name in ("data", "paint"):

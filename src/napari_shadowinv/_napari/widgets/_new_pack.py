@@ -1,4 +1,4 @@
-"""A form for a film pack from a folder of scans: `NewPackDialog`."""
+"""A form that creates a pack file from a folder of scans: `NewPackDialog`."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from napari_shadowinv.pipeline.new_pack import (
     write_new_pack,
 )
 
-_COLUMNS = ("Scan", "Film", "Filters in front of it")
+_COLUMNS = ("Scan", "Film", "Filters in front of the film")
 _MIN_SIZE_PX = (620, 560)
 
 
 class NewPackDialog(QtWidgets.QDialog):
-    """Scans of a folder in the order of the pack, with the facts that scans do not show.
+    """The scans of a folder in pack order, and entries that the scans do not contain.
 
     Attributes
     ----------
     written : Path or None
-        The pack file, once it is written.
+        Path of the pack file after saving.
     """
 
     def __init__(self, folder: Path, parent: QtWidgets.QWidget | None = None) -> None:
@@ -43,8 +43,8 @@ class NewPackDialog(QtWidgets.QDialog):
         self.table.setHorizontalHeaderLabels(_COLUMNS)
         self.table.horizontalHeader().setStretchLastSection(True)
         self.table.setToolTip(
-            "<qt>The film that is hit first at the top. Filters as thickness, unit and material, "
-            "such as 13 um Al; 25 um Fe.</qt>"
+            "<qt>Films in the order in which the beam passes them. Filters as thickness, unit and "
+            "material, such as 13 um Al; 25 um Fe.</qt>"
         )
         self._problem = wrapping_label()
         choices = QtWidgets.QDialogButtonBox.StandardButton
@@ -76,12 +76,12 @@ class NewPackDialog(QtWidgets.QDialog):
         return draft_pack(self._folder, facts, layers)
 
     def missing_text(self) -> str:
-        """Return what is still missing in the pack, as a sentence; empty if nothing is."""
+        """Return a sentence on entries still missing in the pack file, or the next action."""
         missing = missing_entries(self.entries())
-        return f"Still to add there: {'; '.join(missing)}." if missing else "Press Run."
+        return f"Add to this file: {'; '.join(missing)}." if missing else "Press Run."
 
     def accept(self) -> None:
-        """Write the pack file, or show what is wrong."""
+        """Write the pack file, or show the problem."""
         try:
             path = self._folder / PACK_FILE
             self.written = write_new_pack(
@@ -94,7 +94,7 @@ class NewPackDialog(QtWidgets.QDialog):
 
     def _may_replace(self, path: Path) -> bool:
         button = QtWidgets.QMessageBox.question(
-            self, "New film pack", f"{path} exists. Replace it?"
+            self, "New film pack", f"{path} already exists. Replace it?"
         )
         return bool(button == QtWidgets.QMessageBox.StandardButton.Yes)
 
@@ -111,7 +111,7 @@ class NewPackDialog(QtWidgets.QDialog):
             self.table.setItem(row, 2, QtWidgets.QTableWidgetItem(""))
 
     def _on_film(self) -> None:
-        """Show the chosen type for all films whose names contain none."""
+        """Show the selected type for all films whose file names contain no type."""
         facts = NewPack(film=self.form.editors["film"].value())
         for row, layer in enumerate(draft_pack(self._folder, facts)["layers"]):
             self.table.cellWidget(row, 1).setCurrentText(layer["film"])

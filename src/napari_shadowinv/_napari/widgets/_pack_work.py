@@ -1,4 +1,4 @@
-"""A film pack to be evaluated, with what was corrected in the window: `PackJob`, `edits_beside`."""
+"""Evaluation of a film pack with the user's corrections: `PackJob`, `copy_edits`."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     import xarray
 
 
-class PackAnswer(NamedTuple):
-    """What `run_film` found, and the painted pixels on the pixels of that."""
+class FinishedPack(NamedTuple):
+    """The dataset of a film pack, and the painted pixels on its grid."""
 
     dataset: xarray.Dataset
     by_hand: BoolArray | None
@@ -31,23 +31,23 @@ class PackAnswer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PackJob:
-    """What `run_film` is given; corrections become files of a folder, which a failed run removes.
+    """Arguments of `run_film`; corrections are written to a folder, which a failed run removes.
 
     Attributes
     ----------
     pack : Pack
-        As it was before any correction.
+        The pack before any correction.
     path : str
-        Of the file that describes it.
+        Path of the pack file.
     name : str
     folder : Path
-        To be made.
+        Folder to create.
     corners : mapping of str to ndarray, optional
-        Of all films, by number.
+        Corners of all films by number.
     by_hand : ndarray of bool, shape (n, H, W), optional
-        Unusable pixels that were painted.
+        Painted pixels, which are not used.
     scales : ndarray, shape (n,), optional
-        Side of the upright films' pixels in those of each film's scan; needed with corners.
+        Pixel side of the upright films in pixels of each film's scan; required with corners.
     plane : int
         The film in view.
     """
@@ -61,34 +61,34 @@ class PackJob:
     scales: FloatArray | None = None
     plane: int = 0
 
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> PackAnswer:
-        """Write the corrections and evaluate the pack, beside the window."""
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FinishedPack:
+        """Write the corrections and evaluate the pack."""
         try:
-            corrected, by_hand = self._corrected()
-            dataset = run_film(corrected, on_progress=on_progress, should_stop=should_stop)
-            return PackAnswer(dataset, by_hand)
+            pack, by_hand = self._write_corrections()
+            dataset = run_film(pack, on_progress=on_progress, should_stop=should_stop)
+            return FinishedPack(dataset, by_hand)
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
 
-    def _corrected(self) -> tuple[Pack, BoolArray | None]:
+    def _write_corrections(self) -> tuple[Pack, BoolArray | None]:
         changes: dict[str, Any] = {}
         by_hand = self.by_hand
         if self.corners is not None:
             changes["corners"] = self._file("corners.csv")
             write_corners(changes["corners"], dict(self.corners))
             if by_hand is not None:
-                by_hand = _centred(by_hand, self._shape(changes["corners"]))
+                by_hand = _resize(by_hand, self._shape(changes["corners"]))
         if by_hand is not None and by_hand.any():
             layers = list(self.pack.layers)
             for k in np.flatnonzero(by_hand.any(axis=(1, 2))):
                 usable = ~by_hand[k]
-                given = layers[k].mask
-                if given is not None:
-                    before = read_radiograph(given).image > 0
-                    if before.shape != usable.shape:
-                        continue  # `run_film` tells
-                    usable &= before
+                mask_file = layers[k].mask
+                if mask_file is not None:
+                    mask = read_radiograph(mask_file).image > 0
+                    if mask.shape != usable.shape:
+                        continue  # `run_film` reports it
+                    usable &= mask
                 file = write(
                     self._file(f"mask_{k + 1:02d}{TIFF.suffix}"), usable.astype(np.float32)
                 )
@@ -97,39 +97,39 @@ class PackJob:
         return self.pack.model_copy(update=changes), by_hand
 
     def _shape(self, corners: Path) -> tuple[int, int]:
-        """Of the upright films, with other corners."""
+        """Return the shape of the upright films with the new corners."""
         assert self.scales is not None
-        places = read_corners(corners)
-        return common_shape([upright(places[n])[2] / self.scales[int(n) - 1] for n in places])
+        films = read_corners(corners)
+        return common_shape([upright(films[n])[2] / self.scales[int(n) - 1] for n in films])
 
     def _file(self, name: str) -> Path:
         self.folder.mkdir(parents=True, exist_ok=True)
         return self.folder / name
 
 
-def _centred(planes: BoolArray, shape: tuple[int, int]) -> BoolArray:
-    """Cut planes or add a rim, so that their middles stay in the middle."""
+def _resize(planes: BoolArray, shape: tuple[int, int]) -> BoolArray:
+    """Crop or pad planes around their centres."""
     sides = planes.shape[1:]
     y, x = (np.arange(new) + (old - new) // 2 for new, old in zip(shape, sides, strict=True))
     inside = ((y >= 0) & (y < sides[0]))[:, None] & (x >= 0) & (x < sides[1])
-    rows, columns = (np.clip(at, 0, old - 1) for at, old in zip((y, x), sides, strict=True))
+    rows, columns = (np.clip(index, 0, old - 1) for index, old in zip((y, x), sides, strict=True))
     return planes[:, rows[:, None], columns] & inside
 
 
-def edits_beside(dataset: xarray.Dataset, pack: Pack, scratch: Path, path: Path) -> xarray.Dataset:
-    """Copy corrections from the folder `scratch` to beside a result that is to be written.
+def copy_edits(dataset: xarray.Dataset, pack: Pack, scratch: Path, path: Path) -> xarray.Dataset:
+    """Copy corrections from the folder `scratch` next to the result's file at `path`.
 
-    The dataset then names the copies, ``result_corners.csv`` and the like.
+    The returned dataset names the copies, such as ``result_corners.csv``.
     """
-    overwrite = path.exists()  # then it has been asked
+    overwrite = path.exists()  # the dialog has asked
 
-    def kept(file: Path | None) -> Path | None:
+    def copy(file: Path | None) -> Path | None:
         if file is None or scratch not in file.parents:
             return file
         with replacing(path.with_name(f"{path.stem}_{file.name}"), overwrite) as temporary:
             shutil.copyfile(file, temporary)
         return path.with_name(f"{path.stem}_{file.name}")
 
-    layers = tuple(one.model_copy(update={"mask": kept(one.mask)}) for one in pack.layers)
-    moved = pack.model_copy(update={"corners": kept(pack.corners), "layers": layers})
-    return dataset.assign_attrs(pack=moved.model_dump_json(exclude_defaults=True))
+    layers = tuple(layer.model_copy(update={"mask": copy(layer.mask)}) for layer in pack.layers)
+    saved_pack = pack.model_copy(update={"corners": copy(pack.corners), "layers": layers})
+    return dataset.assign_attrs(pack=saved_pack.model_dump_json(exclude_defaults=True))

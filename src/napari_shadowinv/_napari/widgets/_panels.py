@@ -1,4 +1,4 @@
-"""The frame of a widget: controls in a column, the run button, progress, the report."""
+"""The frame of a widget: controls in a column, run button, progress and report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from qtpy import QtWidgets
 from qtpy.QtCore import QSize, Qt
 
 from napari_shadowinv._napari.kinds import main_layers
-from napari_shadowinv._napari.notifications import MISTAKES, window_text
+from napari_shadowinv._napari.notifications import USER_ERRORS, window_text
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, section, wrapping_label
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
@@ -44,14 +44,14 @@ _STAGES = {
     "register": "Aligning the films",
     "unfold": "Unfolding the spectra",
 }
-_LOOK_EVERY = 500  # ms
-_SHOW_SECONDS_FROM = 2.0
+_POLL_MS = 500
+_MIN_SHOWN_TIME_S = 2.0
 _LEVEL_STYLES = {
     Level.SOUND: "color: #4caf72;",
     Level.DOUBTFUL: PROBLEM_STYLE,
     Level.FAILED: "color: #e05252;",
 }
-_SETTLE = 10  # ms; a few changes at once are one
+_SETTLE_MS = 10  # merges simultaneous changes
 
 
 class _Activity:
@@ -61,14 +61,15 @@ class _Activity:
         self._bar: activity | None = None
         self._stage = ""
 
-    def show(self, what: str, news: Progress) -> None:
-        if self._bar is None or news.stage != self._stage or (news.total or 0) != self._bar.total:
+    def show(self, task: str, progress: Progress) -> None:
+        total = progress.total or 0
+        if self._bar is None or progress.stage != self._stage or total != self._bar.total:
             self.close()
-            stage = _STAGES.get(news.stage, news.stage)
-            self._bar = activity(total=news.total or 0, desc=f"{what}: {stage}")
-            self._stage = news.stage
-        if news.total and news.step > self._bar.n:
-            self._bar.update(news.step - self._bar.n)
+            stage = _STAGES.get(progress.stage, progress.stage)
+            self._bar = activity(total=total, desc=f"{task}: {stage}")
+            self._stage = progress.stage
+        if progress.total and progress.step > self._bar.n:
+            self._bar.update(progress.step - self._bar.n)
 
     def close(self) -> None:
         if self._bar is not None:
@@ -77,15 +78,15 @@ class _Activity:
 
 
 class RunPanel(QtWidgets.QWidget):
-    """A button that runs and cancels, with a progress bar and a line of text."""
+    """A button to run and cancel, with a progress bar and a line of text."""
 
-    # A change beside the canvas redraws the whole window. Without a graphics card, an animated bar
-    # takes the processor that the work needs: the bar stands still between two looks, and napari's
-    # animated activity dock is used only while the panel cannot be seen.
+    # A change outside the canvas redraws the whole window. Without a graphics card, an animated bar
+    # would slow the work down: this bar changes once a poll, and napari's animated activity dock is
+    # used only while the panel is hidden.
 
-    def __init__(self, what: str, run_text: str, run_tip: str, **keywords: float) -> None:
+    def __init__(self, task: str, run_text: str, run_tip: str, **keywords: float) -> None:
         super().__init__()
-        self._what, self._run_text = what, run_text
+        self._task, self._run_text = task, run_text
         self.runner = Runner(self, **keywords)
         self.button = QtWidgets.QPushButton(run_text)
         self.button.setToolTip(run_tip)
@@ -93,22 +94,22 @@ class RunPanel(QtWidgets.QWidget):
         self.bar.setTextVisible(False)
         self.bar.setFixedHeight(8)
         self.bar.setVisible(False)
-        # Nothing of napari's or of the system's style animates a bar that has a range.
+        # A bar with a range is not animated by the style of napari or the system.
         self.bar.setRange(0, 1)
         self.status = wrapping_label()
         qt.column(self, self.button, self.bar, self.status)
         self._activity = _Activity()
-        self._quiet, self._said = False, ("", False)
-        self._news: Progress | None = None
+        self._quiet, self._status = False, ("", False)
+        self._progress: Progress | None = None
         self._start = 0.0
-        self._looking = qt.timer(self, _LOOK_EVERY, self._look)
+        self._poll_timer = qt.timer(self, _POLL_MS, self._show_progress)
         self.runner.started.connect(self._on_start)
         self.runner.progressed.connect(self._on_progress)
         self.runner.ended.connect(self._on_end)
         qt.when_destroyed(self, self._activity.close)
 
     def run(self, work: Work, tag: object = None, *, quiet: bool = False) -> None:
-        """Begin some work; if quiet, it neither shows its progress nor sends notifications."""
+        """Start some work; if `quiet`, without progress and notifications."""
         self._quiet = quiet
         self.runner.start(work, tag)
 
@@ -120,50 +121,50 @@ class RunPanel(QtWidgets.QWidget):
             self.say("")
 
     def say(self, text: str, problem: bool = False) -> None:
-        # To draw a window with a canvas in it takes time: only if there is something new.
-        if (text, problem) == self._said:
+        # Redrawing a window with a canvas takes time: only for new text.
+        if (text, problem) == self._status:
             return
-        self._said = (text, problem)
+        self._status = (text, problem)
         self.status.setText(text)
         self.status.setStyleSheet(PROBLEM_STYLE if problem else "")
         self.status.setVisible(bool(text))
 
     def refuse(self, error: BaseException) -> None:
-        """Tell a mistake of the user's; it stands here when the notification is gone."""
-        qt.tell_error(error)
+        """Report an error of the user; the text stays when the notification is gone."""
+        qt.report_error(error)
         self.say(qt.error_text(error), problem=True)
 
     def _on_start(self) -> None:
         if self._quiet:
             return
-        self._news, self._start = None, time.monotonic()
+        self._progress, self._start = None, time.monotonic()
         self.button.setText("Cancel")
         self.bar.setRange(0, 1)
         self.bar.setValue(0)
         self.bar.setVisible(True)
         self.say("Starting…")
-        self._looking.start()
+        self._poll_timer.start()
 
-    def _on_progress(self, news: Progress) -> None:
-        self._news = news
+    def _on_progress(self, progress: Progress) -> None:
+        self._progress = progress
 
-    def _look(self) -> None:
-        news = self._news
-        if news is None or self.runner.cancelling:
+    def _show_progress(self) -> None:
+        progress = self._progress
+        if progress is None or self.runner.cancelling:
             return
         if self.isVisible():
             self._activity.close()
         else:
-            self._activity.show(self._what, news)
-        self.bar.setRange(0, news.total or 1)
-        self.bar.setValue(news.step if news.total else 0)
-        stage = _STAGES.get(news.stage, news.stage)
-        text = f"{stage}: {news.text}" if news.text else f"{stage}…"
+            self._activity.show(self._task, progress)
+        self.bar.setRange(0, progress.total or 1)
+        self.bar.setValue(progress.step if progress.total else 0)
+        stage = _STAGES.get(progress.stage, progress.stage)
+        text = f"{stage}: {progress.text}" if progress.text else f"{stage}…"
         seconds = time.monotonic() - self._start
-        self.say(f"{text} ({seconds:.0f} s)" if seconds >= _SHOW_SECONDS_FROM else text)
+        self.say(f"{text} ({seconds:.0f} s)" if seconds >= _MIN_SHOWN_TIME_S else text)
 
     def _on_end(self, outcome: Outcome) -> None:
-        self._looking.stop()
+        self._poll_timer.stop()
         self._activity.close()
         self.bar.setVisible(False)
         if self.button.text() != self._run_text:
@@ -172,19 +173,19 @@ class RunPanel(QtWidgets.QWidget):
         self.say("Cancelled." if outcome.cancelled and not self._quiet else "")
         if outcome.error is None:
             return
-        # A notification is gone after seconds: what is wrong stays here until the next run.
+        # A notification disappears after seconds: the error stays here until the next run.
         self.say(qt.error_text(outcome.error), problem=True)
-        if not isinstance(outcome.error, MISTAKES):
+        if not isinstance(outcome.error, USER_ERRORS):
             from napari.utils.notifications import notification_manager
 
             error = outcome.error
             notification_manager.receive_error(type(error), error, error.__traceback__)
         elif not self._quiet:
-            qt.tell_error(outcome.error)
+            qt.report_error(outcome.error)
 
 
 def report_rows(inversion: Inversion) -> list[tuple[str, str]]:
-    """Describe an inversion in two columns of text; its warnings stand in the headline."""
+    """Return the report of an inversion as rows; the headline shows the warnings."""
     report = inversion.report
     return [
         ("Converged", "yes" if report.converged else "NO"),
@@ -199,7 +200,7 @@ def image_residual_text(inversion: Inversion) -> str:
 
 
 def solver_rows(inversion: Inversion) -> list[tuple[str, str]]:
-    """Describe the solver's work and its time, in two columns of text."""
+    """Return the report of the solver and its timing as rows."""
     report = inversion.report
     stages = [(f"  {stage}", f"{seconds:.2f} s") for stage, seconds in report.seconds.items()]
     return [
@@ -216,12 +217,12 @@ def _error_rows(inversion: Inversion) -> list[tuple[str, str]]:
     if errors is None:
         return []
     (field,) = shown_fields([inversion.displacement], inversion.setup, mask=inversion.mask)
-    told = [(name.capitalize(), text) for name, text in inversion.error_rows]
-    return [("Field", field.peak_text(errors.of_peak)), *told]
+    rows = [(name.capitalize(), text) for name, text in inversion.error_rows]
+    return [("Field", field.peak_text(errors.of_peak)), *rows]
 
 
 class ReportTable(QtWidgets.QTableWidget):
-    """Rows of names and values, as high as they need."""
+    """A table of names and values, as high as its rows."""
 
     def __init__(self) -> None:
         super().__init__(0, 2)
@@ -241,11 +242,11 @@ class ReportTable(QtWidgets.QTableWidget):
     def show_rows(self, rows: list[tuple[str, str]]) -> None:
         self.setRowCount(len(rows))
         for row, texts in enumerate(rows):
-            for place, text in enumerate(texts):
+            for column, text in enumerate(texts):
                 item = QtWidgets.QTableWidgetItem(text)
                 item.setTextAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignTop)
                 item.setToolTip(text)
-                self.setItem(row, place, item)
+                self.setItem(row, column, item)
         self.setVisible(True)
         self._fit()
 
@@ -267,7 +268,7 @@ class ReportTable(QtWidgets.QTableWidget):
 
 
 class FoldedReport(QtWidgets.QWidget):
-    """A report whose last rows, on the solver and its time, are folded away."""
+    """A report with a folded section on the solver and its timing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -295,7 +296,7 @@ class FoldedReport(QtWidgets.QWidget):
 
 
 class VerdictLine(QtWidgets.QLabel):
-    """A coloured line under Run with the level of trust, the warnings, and the peak."""
+    """A coloured line below Run with the level of trust, the warnings and the peak."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -306,11 +307,11 @@ class VerdictLine(QtWidgets.QLabel):
         self.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.empty()
 
-    def show_headline(self, headline: Headline, before: str = "") -> None:
-        """Show a headline; `before` says whose it is, such as a preview's."""
+    def show_headline(self, headline: Headline, prefix: str = "") -> None:
+        """Show a headline after a prefix, such as ``"Preview: "``."""
         level = headline.level.value.capitalize()
         text = html.escape(window_text(headline.text))
-        self.setText(f"<b>{html.escape(before)}{level}</b><br>{text[:1].upper()}{text[1:]}")
+        self.setText(f"<b>{html.escape(prefix)}{level}</b><br>{text[:1].upper()}{text[1:]}")
         self.setStyleSheet(_LEVEL_STYLES[headline.level])
         self.setVisible(True)
 
@@ -320,7 +321,7 @@ class VerdictLine(QtWidgets.QLabel):
 
 
 class ToolPanel(qt.Docked):
-    """A column of controls that scrolls down only; its button runs what `request` describes."""
+    """A column of controls that scrolls vertically; its button runs the `request`."""
 
     def __init__(self, viewer: Any, name: str, panel: RunPanel) -> None:
         super().__init__()
@@ -342,12 +343,12 @@ class ToolPanel(qt.Docked):
         )
         self._keeper = qt.StateKeeper(self, name, self.state)
         self._revealed: QtWidgets.QWidget | None = None
-        self._revealing = qt.timer(self, _SETTLE, self._reveal, once=True)
+        self._revealing = qt.timer(self, _SETTLE_MS, self._reveal, once=True)
         panel.button.clicked.connect(lambda: self._run_or_cancel())
         panel.runner.ended.connect(self._on_end)
 
     def reveal(self, widget: QtWidgets.QWidget) -> None:
-        """Scroll to a widget once the column has its new heights."""
+        """Scroll to a widget once the column has been laid out."""
         self._revealed = widget
         self._revealing.start()
 
@@ -359,32 +360,32 @@ class ToolPanel(qt.Docked):
         return QSize(WIDTH + 30, 600)
 
     def show_problem(self, text: str) -> None:
-        """Show what is wrong, where it can be read until the next run."""
+        """Show a problem until the next run."""
         self.panel.say(text, problem=True)
 
     def add(self, *rows: QtWidgets.QWidget) -> None:
         for row in rows:
             self.column.addWidget(row)
 
-    # What is kept between sessions, made of what JSON knows
+    # State that is saved between sessions, as JSON values
 
     def parts(self) -> dict[str, Any]:
-        """The controls whose states are kept, by name: with methods `state` and `restore`."""
+        """Return the controls with a saved state, by name; they have `state` and `restore`."""
         return {}
 
     def state(self) -> dict[str, Any]:
         return {name: part.state() for name, part in self.parts().items()}
 
-    def restore(self, kept: Mapping[str, Any]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         for name, part in self.parts().items():
-            if name in kept:
-                part.restore(kept[name])
+            if name in state:
+                part.restore(state[name])
 
     def restore_last(self) -> None:
         self.restore(self._keeper.load())
 
     def keep(self) -> None:
-        """The state has changed: write it soon."""
+        """Save the changed state soon."""
         if self._ready:
             self._keeper.changed()
 
@@ -396,11 +397,11 @@ class ToolPanel(qt.Docked):
     # A run
 
     def request(self) -> Any:
-        """What the controls ask for, with a method `run`; or an `InputError`."""
+        """Return the job of the controls, with a method `run`, or raise an `InputError`."""
         raise NotImplementedError
 
     def forget(self) -> None:
-        """Take away what was said of the last run."""
+        """Clear the report of the last run."""
 
     def show_result(self, value: Any, request: Any) -> None:
         raise NotImplementedError
@@ -412,7 +413,7 @@ class ToolPanel(qt.Docked):
         self.forget()
         try:
             request = self.request()
-        except MISTAKES as error:
+        except USER_ERRORS as error:
             self.panel.refuse(error)
             return
         self._running_preview = False
@@ -425,7 +426,7 @@ class ToolPanel(qt.Docked):
 
 
 class LivePanel(ToolPanel):
-    """A panel that also shows a preview after each change; a run of its button goes before."""
+    """A panel that can also show a preview after each change; the button's run has priority."""
 
     def __init__(self, viewer: Any, name: str, panel: RunPanel) -> None:
         super().__init__(viewer, name, panel)
@@ -433,42 +434,42 @@ class LivePanel(ToolPanel):
         self.previewed = ResultLayers(viewer, self)
         self._last = LastResults(viewer, self)
         self.keep_earlier = self._last.keep_earlier
-        self._settle = qt.timer(self, _SETTLE, self._preview, once=True)
+        self._preview_timer = qt.timer(self, _SETTLE_MS, self._preview, once=True)
         self.live.toggled.connect(self.on_change)
 
     def request(self, preview: bool = False) -> Any:
         raise NotImplementedError
 
     def show_layers(
-        self, shot: Any, described: Sequence[FullLayerData], preview: bool, fit: bool = False
+        self, shot: Any, layer_data: Sequence[FullLayerData], preview: bool, fit: bool = False
     ) -> None:
-        """Show layers of a preview, or instead of them those of what the button has run."""
+        """Show the layers of a preview, or hide them and show the layers of a run."""
         if preview:
-            self.previewed.show(described, select=False, fit=fit)
+            self.previewed.show(layer_data, select=False, fit=fit)
             return
         self.previewed.hide()
-        self.results = self._last.next_of(shot)
-        self.results.show(main_layers(described, also=self.results.slots), fit=fit)
+        self.results = self._last.layers_for_next(shot)
+        self.results.show(main_layers(layer_data, also=self.results.layer_keys), fit=fit)
 
     def on_change(self) -> None:
-        """Something that the result depends on has changed."""
+        """Save the state and update the preview after a change of the inputs."""
         self.keep()
         if self._ready and self.live.isChecked():
-            self._settle.start()
+            self._preview_timer.start()
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
         if self._ready and self.live.isChecked():
-            self._settle.start()
+            self._preview_timer.start()
 
     def _preview(self) -> None:
-        busy = self.panel.runner.running and not self._running_preview
-        if busy or not self.isVisible():
+        is_busy = self.panel.runner.running and not self._running_preview
+        if is_busy or not self.isVisible():
             return
         try:
             request = self.request(preview=True)
-        except MISTAKES as error:
-            # Half a rectangle, half a number: no reason for a notification.
+        except USER_ERRORS as error:
+            # An unfinished rectangle or number is no reason for a notification.
             self.panel.say(str(error), problem=True)
             return
         self._running_preview = True

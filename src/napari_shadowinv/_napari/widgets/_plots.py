@@ -1,4 +1,4 @@
-"""Plots beside the controls, in the colours of napari's theme: `Plot`, `ObjectiveCurve`."""
+"""Plots in the colours of napari's theme: `Plot`, `ObjectiveCurve`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from napari_shadowinv._napari.widgets import _qt as qt
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 
 
-_CURVE_HEIGHT = 210
-_LEVEL = ("samples",)  # stages that leave the objective as it is
+_CURVE_HEIGHT_PX = 210
+_CONSTANT_STAGES = ("samples",)  # do not change the objective
 
 
 class Plot(QtWidgets.QWidget):
-    """A figure that is made when there is something to draw."""
+    """A figure, created at the first drawing."""
 
     def __init__(self, height: int) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class Plot(QtWidgets.QWidget):
         self._canvas: Any = None
 
     def fresh_axes(self, rows: int = 1) -> list[Any]:
-        """Empty axes, one above the other, with x in common."""
+        """Return empty axes in a column with a common x axis."""
         if self._canvas is None:
             self._make_canvas()
         self.ink, self.paper = self._colours()
@@ -41,7 +41,7 @@ class Plot(QtWidgets.QWidget):
         self.figure.set_facecolor(self.paper)
         axes = list(self.figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
         for axis in axes:
-            self._dress(axis)
+            self._style_axis(axis)
         return axes
 
     def add_legend(self, holder: Any, size: int = 8, **keywords: Any) -> None:
@@ -52,12 +52,12 @@ class Plot(QtWidgets.QWidget):
         self._canvas.draw_idle()
 
     def _make_canvas(self) -> None:
-        # Half a second to import: not before there is something to draw.
+        # Importing matplotlib takes half a second.
         from matplotlib.backends.backend_qtagg import FigureCanvasQTAgg
         from matplotlib.figure import Figure
 
         self.figure = Figure(layout="constrained")
-        # It comes without types.
+        # matplotlib's class is untyped.
         canvas: Any = FigureCanvasQTAgg
         self._canvas = canvas(self.figure)
         self._canvas.setMinimumSize(100, 100)
@@ -74,7 +74,7 @@ class Plot(QtWidgets.QWidget):
             palette = self.palette()
             return palette.windowText().color().name(), palette.window().color().name()
 
-    def _dress(self, axis: Any) -> None:
+    def _style_axis(self, axis: Any) -> None:
         axis.set_facecolor(self.paper)
         axis.tick_params(colors=self.ink, which="both", labelsize=8)
         for spine in axis.spines.values():
@@ -83,11 +83,11 @@ class Plot(QtWidgets.QWidget):
 
 
 class ObjectiveCurve(Plot):
-    """How the objective of a fit falls, step by step, with a colour for each stage."""
+    """The objective of a fit at each step, with a colour for each stage."""
 
     def __init__(self) -> None:
-        super().__init__(_CURVE_HEIGHT)
-        self.setMaximumHeight(_CURVE_HEIGHT)
+        super().__init__(_CURVE_HEIGHT_PX)
+        self.setMaximumHeight(_CURVE_HEIGHT_PX)
         self._shown = 0
         self.setVisible(False)
 
@@ -96,8 +96,8 @@ class ObjectiveCurve(Plot):
         self.setVisible(False)
 
     def show_steps(self, history: Sequence[tuple[str, float]]) -> None:
-        """Draw stages and objectives, unless they are drawn already."""
-        steps = [step for step in history if step[0] not in _LEVEL]
+        """Draw the objective at each step; do nothing without new steps."""
+        steps = [step for step in history if step[0] not in _CONSTANT_STAGES]
         if len(steps) == self._shown:
             return
         self._shown = len(steps)
@@ -111,13 +111,13 @@ class ObjectiveCurve(Plot):
         begin = 0
         for stage, group in groupby(steps, key=lambda step: step[0]):
             end = begin + len(list(group))
-            numbers, reached = np.arange(begin, end) + 1, drawable[begin:end]
+            numbers, objectives = np.arange(begin, end) + 1, drawable[begin:end]
             begin = end
-            if np.isnan(reached).all():
+            if np.isnan(objectives).all():
                 continue
             label = "" if stage in colours else stage
             colour = colours.setdefault(stage, COLOURS[len(colours) % len(COLOURS)])
-            axis.plot(numbers, reached, "-", color=colour, label=label)
+            axis.plot(numbers, objectives, "-", color=colour, label=label)
         axis.set_yscale("log")
         axis.set_ylabel("objective", color=self.ink, fontsize=8)
         axis.set_xlabel("step", color=self.ink, fontsize=8)

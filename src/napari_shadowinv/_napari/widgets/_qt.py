@@ -1,4 +1,4 @@
-"""What all widgets need of Qt and napari."""
+"""Qt helpers of all widgets: layouts, timers, error messages, docks, saved state."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from napari.utils.notifications import show_error
 from qtpy.QtCore import QObject, QSettings, Qt, QTimer
 from qtpy.QtWidgets import QDockWidget, QHBoxLayout, QMainWindow, QVBoxLayout, QWidget
 
-from napari_shadowinv._napari.notifications import MISTAKES, window_text
+from napari_shadowinv._napari.notifications import USER_ERRORS, window_text
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
-_WRITE_AFTER = 300  # ms; a slider on the move is not worth writing
-# napari's own docks, which users expect to see beside a plugin's.
-_ALWAYS_SEEN = {"layer list", "layer controls", "console"}
-# Held here, because a garbage collection that takes a widget away would first empty a function
-# that only the widget holds, and then have Qt call it.
+_WRITE_DELAY_MS = 300  # a moving slider is written once
+# napari's docks, which users expect to see next to a plugin's.
+_NAPARI_DOCKS = {"layer list", "layer controls", "console"}
+# Garbage collection of a widget would clear a function that only the widget holds before Qt
+# calls it.
 _callbacks: set[Callable[..., None]] = set()
 
 
 def column(holder: QWidget, *widgets: QWidget, margin: int = 0) -> QVBoxLayout:
-    """Put widgets into another one, one below the other."""
+    """Lay out widgets in a column of `holder`."""
     layout = QVBoxLayout(holder)
     layout.setContentsMargins(margin, margin, margin, margin)
     for widget in widgets:
@@ -33,8 +33,8 @@ def column(holder: QWidget, *widgets: QWidget, margin: int = 0) -> QVBoxLayout:
     return layout
 
 
-def beside(*widgets: tuple[QWidget, int], holder: QWidget | None = None) -> QWidget:
-    """Put widgets beside each other, each with its share of the width to spare."""
+def side_by_side(*widgets: tuple[QWidget, int], holder: QWidget | None = None) -> QWidget:
+    """Lay out widgets in a row, each with its share of the spare width."""
     holder = holder or QWidget()
     layout = QHBoxLayout(holder)
     layout.setContentsMargins(0, 0, 0, 0)
@@ -44,62 +44,62 @@ def beside(*widgets: tuple[QWidget, int], holder: QWidget | None = None) -> QWid
 
 
 def timer(parent: QObject, interval: int, action: Callable[[], Any], once: bool = False) -> QTimer:
-    """A timer that is not started yet; `interval` in ms."""
-    made = QTimer(parent)
-    made.setSingleShot(once)
-    made.setInterval(interval)
-    made.timeout.connect(action)
-    return made
+    """Create a timer without starting it; `interval` in ms."""
+    qt_timer = QTimer(parent)
+    qt_timer.setSingleShot(once)
+    qt_timer.setInterval(interval)
+    qt_timer.timeout.connect(action)
+    return qt_timer
 
 
-def when_destroyed(thing: QObject, action: Callable[[], Any]) -> None:
-    """Call a function, which must not hold the object itself, when a Qt object is destroyed."""
+def when_destroyed(owner: QObject, action: Callable[[], Any]) -> None:
+    """Call a function when a Qt object is destroyed; it must not hold a reference to the object."""
 
     def once(*_: object) -> None:
         _callbacks.discard(once)
         action()
 
     _callbacks.add(once)
-    thing.destroyed.connect(once)
+    owner.destroyed.connect(once)
 
 
-def while_alive(thing: QObject, emitter: Any, method: Callable[..., Any]) -> None:
-    """Connect a method to an event of a layer or viewer for as long as a Qt object lives."""
+def while_alive(owner: QObject, emitter: Any, method: Callable[..., Any]) -> None:
+    """Connect a method to an event of a layer or viewer during the life of a Qt object."""
     emitter.connect(method)
     reference = weakref.WeakMethod(method)
 
     def disconnect() -> None:
-        alive = reference()
-        if alive is not None:
-            emitter.disconnect(alive)
+        living_method = reference()
+        if living_method is not None:
+            emitter.disconnect(living_method)
 
-    when_destroyed(thing, disconnect)
+    when_destroyed(owner, disconnect)
 
 
 def error_text(error: BaseException | str) -> str:
-    """What is wrong and what to do; of a fault of the program's, at least its name."""
+    """Return the message of an error for the user; for a bug, its type and first line."""
     text = window_text(str(error))
     if isinstance(error, MemoryError) and not text:
         text = "there is not enough memory for this"
-    elif not isinstance(error, (str, *MISTAKES)):
-        first = text.partition("\n")[0]
-        text = f"internal error: {type(error).__name__}: {first} (see the notification)"
+    elif not isinstance(error, (str, *USER_ERRORS)):
+        first_line = text.partition("\n")[0]
+        text = f"internal error: {type(error).__name__}: {first_line} (see the notification)"
     return text[:1].upper() + text[1:]
 
 
-def tell_error(error: BaseException | str) -> None:
+def report_error(error: BaseException | str) -> None:
     show_error(error_text(error))
 
 
 def notify_errors(method: Method) -> Method:
-    """Turn a mistake into one notification; the nearest widget with `show_problem` shows it."""
+    """Turn a user's error into a notification; the nearest widget with `show_problem` shows it."""
 
     @functools.wraps(method)
-    def told(*args: Any, **kwargs: Any) -> Any:
+    def guarded(*args: Any, **kwargs: Any) -> Any:
         try:
             return method(*args, **kwargs)
-        except MISTAKES as error:
-            tell_error(error)
+        except USER_ERRORS as error:
+            report_error(error)
             widget = args[0]
             while widget is not None and not hasattr(widget, "show_problem"):
                 widget = widget.parent()
@@ -107,14 +107,14 @@ def notify_errors(method: Method) -> Method:
                 widget.show_problem(error_text(error))
             return None
 
-    return told  # type: ignore[return-value]
+    return guarded  # type: ignore[return-value]
 
 
 class Docked(QWidget):
-    """A widget that joins the docks on its side as a tab; napari would squeeze it below them.
+    """A widget that opens as a tab of the docks on its side, where napari would squeeze it below.
 
-    Choosing it again in the menu while it is a tab in the background brings it to the front,
-    where napari would hide it.
+    Choosing a tab in the background again in the menu brings it to the front, where napari would
+    hide it.
     """
 
     _dock: QDockWidget | None = None
@@ -123,7 +123,7 @@ class Docked(QWidget):
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
         if self._dock is None:
-            # Now napari is still about to lay out the docks.
+            # napari lays out the docks after this event.
             QTimer.singleShot(0, self._join)
 
     def hideEvent(self, event: Any) -> None:
@@ -156,31 +156,33 @@ class Docked(QWidget):
             return
         if window.tabifiedDockWidgets(dock):
             return
-        for other in window.findChildren(QDockWidget):
-            here = other is not dock and window.dockWidgetArea(other) == side and other.isVisible()
-            if here and not other.isFloating() and other.objectName() not in _ALWAYS_SEEN:
-                window.tabifyDockWidget(other, dock)
+        for neighbour in window.findChildren(QDockWidget):
+            is_on_side = neighbour is not dock and window.dockWidgetArea(neighbour) == side
+            if not is_on_side or not neighbour.isVisible() or neighbour.isFloating():
+                continue
+            if neighbour.objectName() not in _NAPARI_DOCKS:
+                window.tabifyDockWidget(neighbour, dock)
                 dock.raise_()
                 return
 
 
 class StateKeeper(QObject):
-    """Writes a widget's state, made of what JSON knows, to the settings soon after a change."""
+    """Saves a widget's state, of JSON values, in the settings soon after a change."""
 
     def __init__(self, parent: QObject, name: str, state: Callable[[], dict[str, Any]]) -> None:
         super().__init__(parent)
         self._name = name
         self._state = state
-        self._timer = timer(self, _WRITE_AFTER, self.write, once=True)
+        self._timer = timer(self, _WRITE_DELAY_MS, self.write, once=True)
 
     def load(self) -> Mapping[str, Any]:
-        """Return what was kept; nothing if there is none or it is damaged."""
+        """Return the saved state; empty if there is none or it is damaged."""
         text = _settings().value(self._name, "{}")
         try:
-            kept = json.loads(str(text))
+            state = json.loads(str(text))
         except ValueError:
             return {}
-        return kept if isinstance(kept, dict) else {}
+        return state if isinstance(state, dict) else {}
 
     def changed(self) -> None:
         self._timer.start()
@@ -193,7 +195,7 @@ class StateKeeper(QObject):
 
 
 def _settings() -> QSettings:
-    # Text that can be read and mended, on every system; Qt locks it and renames it into place.
+    # A readable text file on every system; Qt locks it and replaces it atomically.
     return QSettings(
         QSettings.Format.IniFormat, QSettings.Scope.UserScope, "napari-shadowinv", "widgets"
     )

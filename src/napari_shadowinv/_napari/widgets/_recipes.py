@@ -1,6 +1,6 @@
-"""What the controls ask for as a file, the same as the command's.
+"""Recipes of the controls as files, as for the commands.
 
-- of tools that invert: `RecipeButton`; of the one that fits: `FitRecipeButton`
+- for tools that invert: `RecipeButton`; for the tool that fits: `FitRecipeButton`
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
-from napari_shadowinv._napari.layer_metadata import mark_of, source_of
+from napari_shadowinv._napari.layer_metadata import metadata_of, source_of
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.shots import radiograph_layers
 from napari_shadowinv._napari.widgets._forms import TOML
@@ -35,7 +35,7 @@ from napari_shadowinv.preprocessing import (
 
 
 class RecipeButton(QPushButton):
-    """A menu to load what a tool with `InversionInputs` is to do, or to save it, as TOML."""
+    """A menu to load and save the recipe of a tool with `InversionInputs`, as TOML."""
 
     command = "invert"
 
@@ -43,8 +43,8 @@ class RecipeButton(QPushButton):
         super().__init__("Recipe")
         self._tool = tool
         self.setToolTip(
-            "<qt>Steps, source, masks, setup and options as one TOML file, for here or "
-            f"<code>shadowinv {self.command} --recipe</code>.</qt>"
+            "<qt>Load or save steps, source, masks, setup and options as one TOML file, which also "
+            f"works with <code>shadowinv {self.command} --recipe</code>.</qt>"
         )
         self.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Fixed)
         menu = QMenu(self)
@@ -64,7 +64,7 @@ class RecipeButton(QPushButton):
 
     @notify_errors
     def load(self, path: Path) -> None:
-        """Show a recipe; nothing changes unless all of it can be used."""
+        """Show a recipe; change nothing unless all of it is usable."""
         tool, image = self._tool, self._tool.chosen_image()
         recipe = read_recipe(path)
         shape = None if image is None else tuple(image.data.shape[-2:])
@@ -88,40 +88,40 @@ class RecipeButton(QPushButton):
 
     @notify_errors
     def save(self, path: Path) -> None:
-        """Write a recipe, with masks and a source that are no files beside it."""
+        """Write a recipe, with drawn masks and a source layer as files next to it."""
         image = self._tool.chosen_image()
-        # The dialog has asked about the name that was given, and about no other.
+        # The dialog asks about replacing the entered name only.
         overwrite = bool(path.suffix) and path.exists()
         path = path if path.suffix else path.with_suffix(".toml")
         recipe = self._recipe()
-        drawn, beam = self._drawn(image), self._beam(recipe, image)
+        masks, beam = self._masks(image), self._beam(recipe, image)
         pictures = {
             path.with_name(f"{path.stem}_{name}{PNG.suffix}"): (name, pixels)
-            for name, pixels in drawn.items()
+            for name, pixels in masks.items()
             if pixels is not None
         }
-        beside = path.with_name(f"{path.stem}_source{NPY.suffix}")
-        for file in (path, *pictures, *(() if beam is None else (beside,))):
+        source_file = path.with_name(f"{path.stem}_source{NPY.suffix}")
+        for file in (path, *pictures, *(() if beam is None else (source_file,))):
             check_output(file, overwrite)
         changes: dict[str, Any] = {}
         for file, (name, pixels) in pictures.items():
             changes[name] = write(file, pixels.astype(float), overwrite=overwrite)
         if beam is not None:
-            write(beside, plane_of(beam.image, "the source"), overwrite=overwrite)
-            changes["source"] = MeasuredSource(file=beside)
+            write(source_file, plane_of(beam.image, "the source"), overwrite=overwrite)
+            changes["source"] = MeasuredSource(file=source_file)
         write_recipe(path, recipe.model_copy(update=changes), overwrite=overwrite)
 
     def _recipe(self) -> Recipe:
         recipe: Recipe = self._tool.recipe()
         return recipe
 
-    def _drawn(self, image: Any) -> dict[str, BoolArray | None]:
-        """Masks that are no files, by what a recipe calls them."""
+    def _masks(self, image: Any) -> dict[str, BoolArray | None]:
+        """Return the masks of layers, by their keys in a recipe."""
         tool = self._tool
         return {"mask": tool.masks.usable(image), "source_mask": tool.hidden_from_source(image)}
 
     def _beam(self, recipe: Recipe, image: Any) -> Radiograph | None:
-        """A measured source that a command would not find."""
+        """Return a measured source that a command would not find, else None."""
         if _is_in_file(recipe, image, self._tool.source):
             return None
         beam: Radiograph | None = self._tool.source.measured(image)
@@ -129,13 +129,13 @@ class RecipeButton(QPushButton):
 
 
 class FitRecipeButton(RecipeButton):
-    """A menu to load what `FitImages` is to do, or to save it, but for what its table says."""
+    """A menu to load and save the recipe of `FitImages`, without its table."""
 
     command = "fit"
 
     @notify_errors
     def load(self, path: Path) -> None:
-        """Show a recipe; nothing changes unless all of it can be used."""
+        """Show a recipe; change nothing unless all of it is usable."""
         tool, image = self._tool, self._tool.chosen_image()
         recipe = read_recipe(path)
         check_fit(recipe)
@@ -161,27 +161,26 @@ class FitRecipeButton(RecipeButton):
         choices = recipe.fit.model_copy(update={"psf": self._tool.common_psf()})
         return recipe.model_copy(update={"fit": choices})
 
-    def _drawn(self, image: Any) -> dict[str, BoolArray | None]:
+    def _masks(self, image: Any) -> dict[str, BoolArray | None]:
         return {"mask": self._tool.masks.usable(image)}
 
     def _beam(self, recipe: Recipe, image: Any) -> Radiograph | None:
         source = self._tool.source
         if source.layer is not None and source.layer.ndim == 3:
             raise InputError(
-                f"'{source.layer.name}' has a source for each image, and a recipe has one for all: "
-                "choose one plane (right click on the layer → Split Stack)"
+                f"'{source.layer.name}' has a source for each image, but a recipe has one source "
+                "for all: choose one plane (right click on the layer → Split Stack)"
             )
-        (beam,) = source.measured([Radiograph(image.data)])
-        found: Radiograph | None = beam
-        return found
+        beams: list[Radiograph | None] = source.measured([Radiograph(image.data)])
+        return beams[0]
 
 
 def _refuse_estimates(recipe: Recipe, path: Path) -> None:
     if recipe.estimate is not None and not isinstance(recipe.estimate, UniformEstimate):
         raise InputError(
-            f"{path} estimates the source ({recipe.estimate.described}), which is done here by the "
-            "widget 'Estimate source': make a layer by it and choose that, and leave the estimate "
-            "out of the recipe"
+            f"{path} estimates the source ({recipe.estimate.described}), which a fit here does not "
+            "do: create a source layer with the widget 'Estimate source', select it, and remove "
+            "the estimate from the recipe"
         )
 
 
@@ -202,25 +201,25 @@ def _read_mask(file: Path | None, shape: tuple[int, ...] | None) -> BoolArray | 
 
 
 def _usable_source(recipe: Recipe, image: Any, path: Path) -> Any:
-    """The source of a recipe as the controls know it; None for uniform."""
+    """Return the source of a recipe for the controls; None for uniform."""
     source = recipe.source
-    own = image is not None and source_of(image) is not None
+    is_supplied = image is not None and source_of(image) is not None
     if source is None:
-        return MeasuredSource() if own else None
+        return MeasuredSource() if is_supplied else None
     if not isinstance(source, MeasuredSource) or source.file is not None:
         return source
-    if source.variable is not None and image is not None and mark_of(image).get("path"):
-        return MeasuredSource(file=mark_of(image)["path"], variable=source.variable)
-    if not own:
+    if source.variable is not None and image is not None and metadata_of(image).get("path"):
+        return MeasuredSource(file=metadata_of(image)["path"], variable=source.variable)
+    if not is_supplied:
         raise InputError(
-            f"{path} asks for the source in the shot's own file, but there is none in this image: "
-            "choose an image with a source"
+            f"{path} uses the source in the shot's file, but this image has none: choose an image "
+            "with a source"
         )
     return source
 
 
 def _is_in_file(recipe: Recipe, image: Any, source: Any) -> bool:
-    """Whether a command finds the source without the window: estimated, a file, or the shot's."""
+    """Whether a command finds the source: an estimate, a file, or supplied with the shot."""
     if not isinstance(recipe.source, MeasuredSource) or recipe.source.file is not None:
         return True
-    return source.is_own and bool(mark_of(image).get("path"))
+    return source.is_own and bool(metadata_of(image).get("path"))

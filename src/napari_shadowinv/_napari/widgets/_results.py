@@ -1,4 +1,4 @@
-"""Results as layers that stay where they are when the next result comes."""
+"""Results as layers, which the next result of the same shot updates in place."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from qtpy.QtCore import QObject, Signal
 from qtpy.QtWidgets import QCheckBox
 
-from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, place
-from napari_shadowinv._napari.layer_metadata import slot_of
+from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, place_image
+from napari_shadowinv._napari.layer_metadata import layer_key
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.preprocessing import Recipe
 
-_VISIBLE = 0.02  # of what limits span
+_MIN_LIMITS_CHANGE = 0.02  # relative to their range
 
 
 def result_frame(image: Any, recipe: Recipe) -> Frame:
-    """Frame of a result, so that it lies on its image once that is placed by the setup."""
+    """Return the frame of a result on its image, with the setup's pixels."""
     frame = frame_of(image)
     if recipe.setup is not None:
         upright = frame_for(image.data.shape, recipe.setup)
@@ -33,19 +33,19 @@ def result_frame(image: Any, recipe: Recipe) -> Frame:
 
 
 def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> bool:
-    """Give an image, and what lies on it, the setup's pixels; return whether that moved it."""
-    # Pixels and lengths side by side would make napari warn at each layer.
-    before = frame_of(image)
-    others = [
+    """Place an image and the layers on it with the setup's pixels; return whether it moved."""
+    # napari warns about each layer while pixels and lengths are mixed.
+    old_frame = frame_of(image)
+    same_size = [
         layer
         for layer in viewer.layers
         if layer is not image
         and kind_of(layer) in ("image", "labels")
         and tuple(layer.data.shape[-2:]) == tuple(image.data.shape[-2:])
     ]
-    followers = [layer for layer in (*companions, *others) if frame_of(layer) == before]
-    place(image, setup)
-    if frame_of(image) == before:
+    followers = [layer for layer in (*companions, *same_size) if frame_of(layer) == old_frame]
+    place_image(image, setup)
+    if frame_of(image) == old_frame:
         return False
     for layer in followers:
         layer.scale = (*layer.scale[:-2], *image.scale[-2:])
@@ -55,9 +55,9 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
 
 
 class ResultLayers(QObject):
-    """Layers of a result that may be computed again and again."""
+    """Layers of a result, which later results update."""
 
-    complete = Signal()  # all layers of the last result are there
+    complete = Signal()  # all layers of the last result have been added
 
     def __init__(self, viewer: Any, parent: QObject) -> None:
         super().__init__(parent)
@@ -70,7 +70,7 @@ class ResultLayers(QObject):
 
     @property
     def layers(self) -> list[Any]:
-        """Those that are still in the viewer."""
+        """The layers that are still in the viewer."""
         return [layer for layer in self._layers.values() if layer in self._viewer.layers]
 
     @property
@@ -78,22 +78,22 @@ class ResultLayers(QObject):
         return bool(self._timer.isActive())
 
     def show(
-        self, described: Sequence[FullLayerData], *, select: bool = True, fit: bool = False
+        self, layer_data: Sequence[FullLayerData], *, select: bool = True, fit: bool = False
     ) -> None:
-        """Replace the data of the layers, the lowest first; add those that are not there.
+        """Update the layers, the lowest first, and add missing ones.
 
-        The camera is then fitted to all layers if that is asked for.
+        With `fit`, the camera is then fitted to all layers.
         """
-        # Adding a layer takes napari some tenths of a second: one by one, the window stays alive.
+        # Adding a layer takes napari some tenths of a second: one at a time, the window responds.
         self._select, self._fit = select, fit
         self._before = self._viewer.layers.selection.active
-        here = self.layers
-        self._order = [slot_of(keywords) for _, keywords, _ in described]
+        present = self.layers
+        self._order = [layer_key(keywords) for _, keywords, _ in layer_data]
         self._remove_all_but(set(self._order))
         waiting = []
-        for data, keywords, kind in described:
-            layer = self._layers.get(slot_of(keywords))
-            if layer is None or layer not in here:
+        for data, keywords, kind in layer_data:
+            layer = self._layers.get(layer_key(keywords))
+            if layer is None or layer not in present:
                 waiting.append((data, keywords, kind))
             elif kind_of(layer) == kind and _can_be_updated(layer, keywords):
                 _update(layer, data, keywords)
@@ -107,27 +107,27 @@ class ResultLayers(QObject):
         else:
             self._finish()
 
-    def extend(self, described: Sequence[FullLayerData]) -> None:
-        """Add layers of the same result below the others, without a change of the selection."""
+    def extend(self, layer_data: Sequence[FullLayerData]) -> None:
+        """Add layers of the same result below the others, keeping the selection."""
         self._select, self._before = False, self._viewer.layers.selection.active
-        self._order = [slot_of(keywords) for _, keywords, _ in described] + self._order
-        self._waiting += described
+        self._order = [layer_key(keywords) for _, keywords, _ in layer_data] + self._order
+        self._waiting += layer_data
         self._timer.start()
 
     @property
-    def slots(self) -> set[str]:
-        """Roles and parts of the layers that are still in the viewer."""
-        return {slot for slot, layer in self._layers.items() if layer in self._viewer.layers}
+    def layer_keys(self) -> set[str]:
+        """Keys of the layers that are still in the viewer."""
+        return {key for key, layer in self._layers.items() if layer in self._viewer.layers}
 
     def take_over(self, earlier: ResultLayers) -> None:
-        """Show the next result in the layers of another one, which shows nothing any more."""
+        """Take the layers of an earlier result, to update them with the next one."""
         earlier._timer.stop()
         self._layers, earlier._layers = earlier._layers, {}
 
-    def _remove_all_but(self, slots: set[str]) -> None:
-        for slot, layer in list(self._layers.items()):
-            if slot not in slots:
-                del self._layers[slot]
+    def _remove_all_but(self, keys: set[str]) -> None:
+        for key, layer in list(self._layers.items()):
+            if key not in keys:
+                del self._layers[key]
                 if layer in self._viewer.layers:
                     self._viewer.layers.remove(layer)
 
@@ -139,12 +139,10 @@ class ResultLayers(QObject):
         from napari_shadowinv._napari.layers import add_layers
 
         if self._waiting:
-            described = self._waiting.pop(0)
-            slot = slot_of(described[1])
-            (self._layers[slot],) = add_layers(
-                self._viewer, [described], below=self._next_above(slot)
-            )
-            # Layers that nobody sees yet must not take the selection.
+            layer = self._waiting.pop(0)
+            key = layer_key(layer[1])
+            (self._layers[key],) = add_layers(self._viewer, [layer], below=self._next_above(key))
+            # Hidden layers must not take the selection.
             main = self._layers.get("field") or self._layers.get("fluence")
             active = main if self._select else self._before
             if active is not None and active in self._viewer.layers:
@@ -155,55 +153,55 @@ class ResultLayers(QObject):
 
     def _finish(self) -> None:
         if self._fit:
-            # Layers of an earlier result have the new units only now.
+            # Only now all layers of an earlier result have the new units.
             self._fit = False
             self._viewer.reset_view()
         self.complete.emit()
 
-    def _next_above(self, slot: str) -> Any | None:
-        """The lowest layer of the result that lies above this one and is there already."""
-        higher = self._order[self._order.index(slot) + 1 :]
-        layers = (self._layers.get(one) for one in higher)
+    def _next_above(self, key: str) -> Any | None:
+        """Return the lowest present layer of the result that belongs above this one."""
+        higher = self._order[self._order.index(key) + 1 :]
+        layers = map(self._layers.get, higher)
         return next((layer for layer in layers if layer in self._viewer.layers), None)
 
 
 class LastResults:
-    """The last result of each shot, which the next one of the same shot replaces or leaves."""
+    """The last result of each shot, which the next one replaces unless earlier ones are kept."""
 
     def __init__(self, viewer: Any, parent: QObject) -> None:
         self._viewer, self._parent = viewer, parent
         self._last: list[tuple[Any, ResultLayers]] = []
         self.keep_earlier = QCheckBox("Keep earlier results")
         self.keep_earlier.setToolTip(
-            "<qt>Keep the layers of earlier runs. Otherwise the next result replaces the previous "
-            "one of the same shot.</qt>"
+            "<qt>Keep the layers of earlier runs. Otherwise each new result replaces the previous "
+            "result of the same shot.</qt>"
         )
 
-    def of(self, shot: Any) -> list[Any]:
-        """The layers of the last result of a shot that are still in the viewer."""
-        return [layer for known, last in self._last if known == shot for layer in last.layers]
+    def layers_of(self, shot: Any) -> list[Any]:
+        """Return the layers of a shot's last result that are still in the viewer."""
+        return [layer for image, last in self._last if image == shot for layer in last.layers]
 
     def shot_of(self, layer: Any) -> Any | None:
-        """The image of whose last result a layer is a part; None if it is not one of them."""
+        """Return the shot to whose last result a layer belongs, or None."""
         for shot, last in self._last:
             if layer in last.layers and shot in self._viewer.layers:
                 return shot
         return None
 
-    def next_of(self, shot: Any) -> ResultLayers:
-        """Return what shows the next result of a shot: an image layer, or a name."""
+    def layers_for_next(self, shot: Any) -> ResultLayers:
+        """Return the layers for the next result of a shot, which is an image layer or a name."""
         results = ResultLayers(self._viewer, self._parent)
-        for known, last in self._last:
-            if known == shot and not self.keep_earlier.isChecked():
+        for image, last in self._last:
+            if image == shot and not self.keep_earlier.isChecked():
                 results.take_over(last)
-        self._last = [(known, last) for known, last in self._last if known != shot]
+        self._last = [(image, last) for image, last in self._last if image != shot]
         self._last.append((shot, results))
         return results
 
 
 @dataclass(frozen=True)
 class Origins:
-    """What an inversion was given, in words; empty where there is no mask or setup."""
+    """Origins of an inversion's inputs, in words; empty without a mask or setup."""
 
     image: str
     source: str
@@ -213,37 +211,37 @@ class Origins:
     setup_origin: str
 
     def attributes(self) -> dict[str, str]:
-        """What a result keeps of it, beside the names of files."""
-        told = {
+        """Return the origins that are saved with a result, without the names of files."""
+        texts = {
             "source_origin": self.source,
             "mask_origin": self.mask,
             "source_mask_origin": self.source_mask,
             "setup_origin": self.setup_origin,
         }
-        return {name: text for name, text in told.items() if text}
+        return {name: text for name, text in texts.items() if text}
 
     def rows(self) -> list[tuple[str, str]]:
-        """The report of an inversion, in two columns of text."""
-        told = [
+        """Return the origins as rows of a report."""
+        rows = [
             ("Image", self.image),
             ("Source", self.source),
             ("Source mask", self.source_mask),
             ("Mask", self.mask),
             ("Setup", self.setup),
         ]
-        return [(name, text) for name, text in told if text]
+        return [(name, text) for name, text in rows if text]
 
 
 def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:
-    """Whether nothing has to change that is easier to make anew."""
+    """Whether a layer can be updated; a new type or rotation needs a new layer."""
     if kind_of(layer) not in ("image", "labels", "vectors"):
         return False
-    now, upright = frame_of(layer), Frame()
+    frame, upright = frame_of(layer), Frame()
     rotate = np.asarray(keywords.get("rotate", upright.rotate))[-2:, -2:]
     shear = np.ravel(keywords.get("shear", upright.shear))[-1]
     affine = np.asarray(keywords.get("affine", upright.affine))[-3:, -3:]
-    pairs = ((now.rotate, rotate), (now.shear, shear), (now.affine, affine))
-    return all(np.allclose(one, other) for one, other in pairs)
+    pairs = ((frame.rotate, rotate), (frame.shear, shear), (frame.affine, affine))
+    return all(np.allclose(old, new) for old, new in pairs)
 
 
 def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
@@ -258,9 +256,9 @@ def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:
         layer.units = keywords["units"]
     limits = keywords.get("contrast_limits")
     if limits is not None:
-        # Only a difference that can be seen: to set limits takes as long as data.
-        least = _VISIBLE * np.ptp(limits)
-        if not np.allclose(layer.contrast_limits, limits, rtol=0, atol=least):
+        # Only visible changes: setting limits takes as long as setting data.
+        tolerance = _MIN_LIMITS_CHANGE * np.ptp(limits)
+        if not np.allclose(layer.contrast_limits, limits, rtol=0, atol=tolerance):
             layer.contrast_limits = limits
     for name in ("features", "length", "edge_width"):
         if name in keywords and kind_of(layer) == "vectors":

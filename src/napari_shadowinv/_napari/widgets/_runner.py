@@ -1,7 +1,7 @@
-"""Long work beside a responsive window: `Runner`, `Outcome`."""
+"""Long work in a thread, while the window stays responsive: `Runner`, `Outcome`."""
 
-# The thread leaves progress and outcome in a letter box that a timer of the window looks into:
-# no signal crosses threads, nothing reaches a closed window, and all Qt bindings behave alike.
+# The thread leaves progress and outcome in a mailbox that a timer of the window polls: no signal
+# crosses threads, nothing reaches a closed window, and all Qt bindings behave alike.
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from napari_shadowinv.errors import InversionCancelled
 
 Work = Callable[[OnProgress, ShouldStop], Any]
 
-_LOOK_EVERY = 10  # ms
-_SHORT_TURN = 1e-3  # s
-_PATIENCE = 0.5  # s
+_POLL_MS = 10
+_SWITCH_INTERVAL_S = 1e-3
+_PATIENCE_S = 0.5
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How some work ended; `tag` is what `Runner.start` was given to remember."""
+    """The end of some work; `tag` is the argument of `Runner.start`."""
 
     value: Any = None
     error: Exception | None = None
@@ -38,30 +38,30 @@ class Outcome:
 
 
 @dataclass
-class _LetterBox:
+class _Mailbox:
     tag: Any = None
-    give_up_at: float = math.inf
+    detach_at: float = math.inf
     stop: threading.Event = field(default_factory=threading.Event)
     progress: Progress | None = None
     outcome: Outcome | None = None
 
 
 class Runner(QObject):
-    """One piece of work at a time in a thread; it has `patience` (s) to stop when cancelled."""
+    """Runs one task at a time in a thread; cancelled tasks are detached after `patience` (s)."""
 
     started = Signal()
     progressed = Signal(object)
     ended = Signal(object)
 
-    def __init__(self, parent: QObject, patience: float = _PATIENCE) -> None:
+    def __init__(self, parent: QObject, patience: float = _PATIENCE_S) -> None:
         super().__init__(parent)
         self._patience = patience
-        self._box: _LetterBox | None = None
+        self._box: _Mailbox | None = None
         self._pending: tuple[Work, Any] | None = None
-        self._to_stop: list[_LetterBox] = []
-        # A window that is closed takes its work with it; the runner is gone by then.
+        self._to_stop: list[_Mailbox] = []
+        # Closing a window stops its work; the runner no longer exists then.
         when_destroyed(self, partial(_stop, self._to_stop))
-        self._timer = timer(self, _LOOK_EVERY, self._look)
+        self._timer = timer(self, _POLL_MS, self._poll)
 
     @property
     def running(self) -> bool:
@@ -69,45 +69,45 @@ class Runner(QObject):
 
     @property
     def tag(self) -> Any:
-        """What came with the work that is being done; None without any."""
+        """The tag of the running work, or None."""
         return None if self._box is None else self._box.tag
 
     @property
     def cancelling(self) -> bool:
-        """Whether the work has been asked to stop, and nothing waits to follow it."""
+        """Whether the work has been asked to stop, with no other work waiting."""
         return self._box is not None and self._box.stop.is_set() and self._pending is None
 
     def start(self, work: Work, tag: Any = None) -> None:
-        """Begin some work; what is running is asked to stop first, and only the latest waits."""
+        """Start some work once the running work has stopped; only the latest request waits."""
         if self._box is not None:
             self._pending = (work, tag)
             self._box.stop.set()
             return
-        box = self._box = _LetterBox(tag)
+        box = self._box = _Mailbox(tag)
         self._to_stop.append(box)
         threading.Thread(target=_run, args=(work, box), name="shadowinv", daemon=False).start()
         self._timer.start()
         self.started.emit()
 
     def cancel(self) -> None:
-        """Ask the work to stop, and forget what waits."""
+        """Ask the work to stop, and drop the waiting work."""
         self._pending = None
         box = self._box
         if box is not None:
             box.stop.set()
-            box.give_up_at = min(box.give_up_at, time.monotonic() + self._patience)
+            box.detach_at = min(box.detach_at, time.monotonic() + self._patience)
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         box = self._box
         if box is None:
             return
-        outcome, news = box.outcome, box.progress
-        if news is not None:
+        outcome, progress = box.outcome, box.progress
+        if progress is not None:
             box.progress = None
             if not box.stop.is_set():
-                self.progressed.emit(news)
+                self.progressed.emit(progress)
         if outcome is None:
-            if time.monotonic() < box.give_up_at:
+            if time.monotonic() < box.detach_at:
                 return
             outcome = Outcome(cancelled=True, tag=box.tag)
         self._timer.stop()
@@ -119,44 +119,44 @@ class Runner(QObject):
             self.start(*pending)
 
 
-class _Courtesy:
-    """While entered, a thread hands over the interpreter after 1 ms instead of 5."""
+class _FastSwitching:
+    """Makes threads hand over the interpreter after 1 ms instead of 5."""
 
-    # Only the kernels do without it, and a window's event may ask for it a dozen times.
+    # Handling an event of the window may need the interpreter a dozen times.
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._entered = 0
-        self._usual = 0.0
+        self._default_interval = 0.0
 
     def __enter__(self) -> None:
         with self._lock:
             if self._entered == 0:
-                self._usual = sys.getswitchinterval()
-                sys.setswitchinterval(min(self._usual, _SHORT_TURN))
+                self._default_interval = sys.getswitchinterval()
+                sys.setswitchinterval(min(self._default_interval, _SWITCH_INTERVAL_S))
             self._entered += 1
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
             self._entered -= 1
             if self._entered == 0:
-                sys.setswitchinterval(self._usual)
+                sys.setswitchinterval(self._default_interval)
 
 
-_courtesy = _Courtesy()
+_fast_switching = _FastSwitching()
 
 
-def _stop(boxes: list[_LetterBox]) -> None:
+def _stop(boxes: list[_Mailbox]) -> None:
     for box in boxes:
         box.stop.set()
 
 
-def _run(work: Work, box: _LetterBox) -> None:
+def _run(work: Work, box: _Mailbox) -> None:
     def on_progress(progress: Progress) -> None:
         box.progress = progress
 
     try:
-        with _courtesy:
+        with _fast_switching:
             outcome = Outcome(work(on_progress, box.stop.is_set), tag=box.tag)
     except InversionCancelled:
         outcome = Outcome(cancelled=True, tag=box.tag)

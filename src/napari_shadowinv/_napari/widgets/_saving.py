@@ -1,4 +1,4 @@
-"""Buttons below Run: `SaveButton` writes a result, `MoreLayersButton` shows all of it."""
+"""Buttons below Run: `SaveButton` saves a result, `MoreLayersButton` shows its hidden layers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from napari.utils.notifications import show_info
 from qtpy.QtWidgets import QFileDialog, QMessageBox, QPushButton
 
-from napari_shadowinv._napari.layer_metadata import mark_of, result_of, role_of
+from napari_shadowinv._napari.layer_metadata import metadata_of, result_of, role_of
 from napari_shadowinv._napari.layer_state import missing_layers
 from napari_shadowinv._napari.stores import shot_of_store
 from napari_shadowinv._napari.viewer_sync import plane_in_view
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 _TITLES = {
-    RESULT: "All of the result",
+    RESULT: "Complete result",
     PRADFORMAT: "Potential and deflection, pradformat",
-    SITES: "Table of the sites",
+    SITES: "Table of sites",
     TIFF: "Image, float32 TIFF",
     NPY: "Image, NumPy array",
     PNG: "Image, 16-bit PNG",
@@ -39,7 +39,7 @@ RESULT_FORMATS, IMAGE_FORMATS = (RESULT, PRADFORMAT, SITES), (TIFF, NPY, PNG)
 
 @dataclass(frozen=True, eq=False)
 class Savable:
-    """Content to write, its name, and the formats to choose from, the usual one first."""
+    """Content to save, its name, and the available formats, the default first."""
 
     name: str
     content: Any
@@ -48,48 +48,48 @@ class Savable:
 
 
 def shown_result(viewer: Any, preferred: Iterable[Any] = ()) -> Any:
-    """Return a layer of the result that is meant, or an `InputError` if there is none.
+    """Return a layer of the shown result, or raise an `InputError` without one.
 
-    That is the selected one, else one of the preferred layers, else the uppermost visible one.
+    The selected layer comes first, then the preferred layers, then the topmost visible one.
     """
     visible = [layer for layer in reversed(viewer.layers) if layer.visible]
     for layer in (viewer.layers.selection.active, *preferred, *visible):
-        marks = {} if layer is None else mark_of(layer)
-        if marks.get("result") is not None or marks.get("store") is not None:
+        metadata = {} if layer is None else metadata_of(layer)
+        if metadata.get("result") is not None or metadata.get("store") is not None:
             return layer
     raise InputError("there is no result yet: press Run first, or select a layer of a result")
 
 
 def result_to_save(viewer: Any, layer: Any) -> Savable:
-    """Collect the result that a layer shows a part of, with the look of all of its layers."""
+    """Collect the result that a layer belongs to, with the appearance of its layers."""
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
 
     result = result_of(layer)
     if result is None:
-        raise InputError(f"'{layer.name}' shows no result: select a layer of one")
-    shown = [one.as_layer_data_tuple() for one in viewer.layers if result_of(one) is result]
+        raise InputError(f"'{layer.name}' shows no result: select a layer of a result")
+    layer_data = [each.as_layer_data_tuple() for each in viewer.layers if result_of(each) is result]
     formats: tuple[Format, ...] = (RESULT,)
     if isinstance(result.content, Inversion):
         formats = RESULT_FORMATS if _has_particles(result.setup) else (RESULT, SITES)
     elif isinstance(result.content, Fit) and _has_particles(result.setup):
         formats = (RESULT, PRADFORMAT)
-    name = str(mark_of(layer).get("name") or layer.name)
-    return Savable(name, dataset_to_save(shown), formats)
+    name = str(metadata_of(layer).get("name") or layer.name)
+    return Savable(name, dataset_to_save(layer_data), formats)
 
 
 def shot_to_save(viewer: Any, layer: Any) -> Savable:
-    """Collect the shot in view of a store that a layer shows."""
-    store = mark_of(layer).get("store")
+    """Collect the displayed shot of a store."""
+    store = metadata_of(layer).get("store")
     if store is None:
         return result_to_save(viewer, layer)
     index = plane_in_view(viewer, layer)
-    shots = mark_of(layer).get("shots", ())
+    shots = metadata_of(layer).get("shots", ())
     name = Path(shots[index]).stem if index < len(shots) else str(index)
     dataset = shot_of_store(Path(store), index)
     particles = _has_particles(setup_from_dataset(dataset))
     formats = (RESULT, PRADFORMAT) if particles else (RESULT,)
-    return Savable(f"{mark_of(layer).get('name', '')} {name}", dataset, formats)
+    return Savable(f"{metadata_of(layer).get('name', '')} {name}", dataset, formats)
 
 
 def _has_particles(setup: Setup | None) -> bool:
@@ -97,7 +97,7 @@ def _has_particles(setup: Setup | None) -> bool:
 
 
 class SaveButton(QPushButton):
-    """Ask for a file, write what `savable` returns, and say what was written where."""
+    """Asks for a file, saves what `savable` returns, and reports the path."""
 
     def __init__(self, tool: ToolPanel, savable: Callable[[], Savable], tip: str) -> None:
         super().__init__("Save result…")
@@ -107,16 +107,16 @@ class SaveButton(QPushButton):
 
     @notify_errors
     def ask_and_save(self) -> None:
-        """Let the user choose a file; nothing is written if he does not."""
+        """Ask for a file and save the content, unless the user cancels."""
         content = self._savable()
         path = self._ask(content)
         if path is not None and self._may_replace(path):
             self._write(content, path)
 
     def _ask(self, content: Savable) -> Path | None:
-        filters = {f"{_TITLES[each]} (*{each.suffix})": each for each in content.formats}
-        # Whether a file may be replaced is asked about the name with its ending.
-        text, chosen = QFileDialog.getSaveFileName(
+        filters = {f"{_TITLES[form]} (*{form.suffix})": form for form in content.formats}
+        # _may_replace asks about the complete name, with its suffix.
+        text, selected_filter = QFileDialog.getSaveFileName(
             self,
             "Save result",
             _file_name(content.name) + content.formats[0].suffix,
@@ -126,23 +126,26 @@ class SaveButton(QPushButton):
         if not text:
             return None
         path = Path(text).expanduser()
-        suffixes = [suffix for each in content.formats for suffix in each.suffixes]
+        suffixes = [suffix for form in content.formats for suffix in form.suffixes]
         if path.suffix.lower() in suffixes:
             return path
-        return path.with_name(path.name + filters.get(chosen, content.formats[0]).suffix)
+        return path.with_name(path.name + filters.get(selected_filter, content.formats[0]).suffix)
 
     def _may_replace(self, path: Path) -> bool:
         if not path.exists():
             return True
         buttons = QMessageBox.StandardButton
         answer = QMessageBox.question(
-            self, "Save result", f"{path.name} exists. Replace it?", buttons.Yes | buttons.No
+            self,
+            "Save result",
+            f"{path.name} already exists. Replace it?",
+            buttons.Yes | buttons.No,
         )
         return bool(answer == buttons.Yes)
 
     def _write(self, content: Savable, path: Path) -> None:
         write(path, content.content, setup=content.setup, overwrite=True)
-        kind = next(each for each in content.formats if path.suffix.lower() in each.suffixes)
+        kind = next(form for form in content.formats if path.suffix.lower() in form.suffixes)
         title = _TITLES[kind]
         text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"
         self._tool.panel.say(text)
@@ -150,28 +153,28 @@ class SaveButton(QPushButton):
 
 
 class MoreLayersButton(QPushButton):
-    """Add the layers of a result that are not shown by default; `preferred` are the tool's own."""
+    """Adds the hidden layers of a result."""
 
     def __init__(self, tool: ToolPanel, results: Callable[[], ResultLayers | None]) -> None:
         super().__init__("More layers")
         self._tool, self._results = tool, results
         self._others = ResultLayers(tool.viewer, self)
         self.setToolTip(
-            "<qt>Add the hidden layers of the result: potential, components of the field, "
-            "re-projection, sites and more.</qt>"
+            "<qt>Add further layers of the result: potential, components of the field, "
+            "re-projection, sites and others.</qt>"
         )
         self.clicked.connect(lambda: self.add())
 
     @notify_errors
     def add(self) -> None:
-        """Add them, hidden; the next result of the same shot then has them, too."""
+        """Add the layers, hidden, to this result and to later results of the same shot."""
         results = self._results()
-        own = [] if results is None else results.layers
-        layer = shown_result(self._tool.viewer, own)
+        tool_layers = [] if results is None else results.layers
+        layer = shown_result(self._tool.viewer, tool_layers)
         missing = missing_layers(self._tool.viewer, layer)
         if not missing:
-            show_info("All layers of the result are there")
-        elif results is not None and layer in own:
+            show_info("All layers of the result are in the layer list")
+        elif results is not None and layer in tool_layers:
             results.extend(missing)
         else:
             self._others = ResultLayers(self._tool.viewer, self)

@@ -1,4 +1,4 @@
-"""Shots of a table (CSV), a row each with its energy, gain and mask: `ShotTable`."""
+"""The shots of a table (CSV), with energy, gain and mask of each: `ShotTable`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QFileDialog, QSizePolicy, QWidget
 
-from napari_shadowinv._napari.widgets._fields import parsed
+from napari_shadowinv._napari.widgets._editors import parse_number
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled, small_button
 from napari_shadowinv._napari.widgets._number_table import NumberTable
-from napari_shadowinv._napari.widgets._qt import beside, column, notify_errors
+from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SITES
@@ -19,26 +19,25 @@ from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_tabl
 
 _ENERGY, _GAIN, _MASK = 1, 2, 3
 _NUMBERS = {_ENERGY: ("energy", "MeV"), _GAIN: ("gain", "")}
-_WIDTHS = {_ENERGY: 92, _GAIN: 44, _MASK: 90}
+_WIDTHS_PX = {_ENERGY: 92, _GAIN: 44, _MASK: 90}
 _TITLES = ["Shot", "Energy (MeV)", "Gain", "Mask"]
 _TIPS = {
-    _ENERGY: "Energy of the particles; empty for that of the setup.",
-    _GAIN: "By how much the image is brighter than the source, by which it is divided; empty for "
-    "1.",
-    _MASK: "Image of the same size, 0 at unusable pixels, in the table's folder or with its own; "
-    "empty for the mask of all shots.",
+    _ENERGY: "Energy of the particles; empty for the setup's energy.",
+    _GAIN: "Brightness of the image relative to the source, by which it is divided; empty for 1.",
+    _MASK: "Image of the same size, 0 at unusable pixels, with a path relative to the table; empty "
+    "for the common mask.",
 }
-_SUFFIX = "tables (*.csv)"
+_FILE_FILTER = "tables (*.csv)"
 
 
 class _TableEdit(PathEdit):
     def ask(self) -> str:
-        path, _ = QFileDialog.getOpenFileName(self, self._title, "", _SUFFIX)
+        path, _ = QFileDialog.getOpenFileName(self, self._title, "", _FILE_FILTER)
         return str(path)
 
 
 class ShotTable(QWidget):
-    """The rows of a table of shots; what is changed here stays here until it is saved."""
+    """The rows of a table of shots; changes are written to the file only by Save."""
 
     changed = Signal()
 
@@ -48,20 +47,20 @@ class ShotTable(QWidget):
         self._loaded = ""
         self.file = _TableEdit("Table of the shots", "shots.csv")
         self.file.edit.setToolTip(
-            "<qt>A table (.csv) with a row for each shot: file, energy, setup, gain, mask, source, "
-            "exclude.</qt>"
+            "<qt>A table (.csv) with a row for each shot and the columns file, energy, setup, "
+            "gain, mask, source, exclude.</qt>"
         )
-        self.save_button = small_button("Save…", "Write the rows to a table (.csv).", self._save)
-        self.table = NumberTable(len(_TITLES), _WIDTHS)
+        self.save_button = small_button("Save…", "Save the rows as a table (.csv).", self._save)
+        self.table = NumberTable(len(_TITLES), _WIDTHS_PX)
         self.table.setHorizontalHeaderLabels(_TITLES)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
-        column(self, labelled("", beside((self.file, 1), (self.save_button, 0))), self.table)
+        column(self, labelled("", side_by_side((self.file, 1), (self.save_button, 0))), self.table)
         self.file.changed.connect(self._load)
         self.table.itemChanged.connect(self._on_edit)
         self._fill()
 
     def shots(self) -> list[ShotRow]:
-        """The rows as they are shown, those that are not checked excluded; or an `InputError`."""
+        """Return the shown rows, unchecked ones as excluded; or raise an `InputError`."""
         if self.file.path != self._loaded:
             self._read()
         if not self._rows:
@@ -69,22 +68,22 @@ class ShotTable(QWidget):
                 "no table is selected: choose a .csv file with a row for each shot, with the "
                 "columns file and energy"
             )
-        return [self._shown(number) for number in range(len(self._rows))]
+        return [self._row(number) for number in range(len(self._rows))]
 
-    def _shown(self, number: int) -> ShotRow:
+    def _row(self, number: int) -> ShotRow:
         row = self._rows[number]
         changes: dict[str, Any] = {"exclude": not self.table.is_checked(number)}
         try:
-            for at, (name, unit) in _NUMBERS.items():
-                changes[name] = self.table.number(number, at, unit)
+            for column, (name, unit) in _NUMBERS.items():
+                changes[name] = self.table.number(number, column, unit)
         except InputError as error:
             raise InputError(f"'{row.file.name}': {error}") from error
         mask = self.table.item(number, _MASK).text().strip()
         if not mask or row.mask is None or mask != row.mask.name:
             changes["mask"] = self._folder / mask if mask else None
-        known = row.model_dump(exclude={"strength"})  # which is written otherwise
-        changed = validated(ShotRow, {**known, **changes}, f"'{row.file.name}'")
-        return changed.model_copy(update={"strength": row.strength})
+        entries = row.model_dump(exclude={"strength"})  # tables have another form of it
+        edited = validated(ShotRow, {**entries, **changes}, f"'{row.file.name}'")
+        return edited.model_copy(update={"strength": row.strength})
 
     @property
     def _folder(self) -> Path:
@@ -108,9 +107,9 @@ class ShotTable(QWidget):
         with QSignalBlocker(self.table):
             self.table.setRowCount(len(self._rows))
             for number, row in enumerate(self._rows):
-                self.table.fill_row(number, row.file.name, _more(row), checked=not row.exclude)
-                for at, (name, unit) in _NUMBERS.items():
-                    self.table.write(number, at, getattr(row, name), unit, _TIPS[at])
+                self.table.fill_row(number, row.file.name, _tip(row), checked=not row.exclude)
+                for column, (name, unit) in _NUMBERS.items():
+                    self.table.write(number, column, getattr(row, name), unit, _TIPS[column])
                 self._show_mask(number, "" if row.mask is None else row.mask.name)
         self.table.setVisible(bool(self._rows))
         self.save_button.setEnabled(bool(self._rows))
@@ -123,34 +122,34 @@ class ShotTable(QWidget):
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
-        # Only now the rows have the heights of napari's style.
+        # The rows get the heights of napari's style only now.
         self.table.fit_height()
 
     def _on_edit(self, item: Any) -> None:
-        at = item.column()
-        if at in _NUMBERS:
-            unit, text = _NUMBERS[at][1], item.text().strip()
+        column = item.column()
+        if column in _NUMBERS:
+            unit, text = _NUMBERS[column][1], item.text().strip()
             try:
-                value: Any = parsed(text, unit) if text else None
+                value: Any = parse_number(text, unit) if text else None
             except InputError:
-                value = text  # stays to be mended
+                value = text  # stays for correction
             with QSignalBlocker(self.table):
-                self.table.write(item.row(), at, value, unit, _TIPS[at])
+                self.table.write(item.row(), column, value, unit, _TIPS[column])
         self.changed.emit()
 
     @notify_errors
     def _save(self) -> None:
         rows = self.shots()
         path, _ = QFileDialog.getSaveFileName(
-            self, "Save the table", self._loaded or "shots.csv", _SUFFIX
+            self, "Save the table", self._loaded or "shots.csv", _FILE_FILTER
         )
         if path:
-            named = Path(path)
-            write_table(named if named.suffix else named.with_suffix(SITES.suffix), rows)
+            target = Path(path)
+            write_table(target if target.suffix else target.with_suffix(SITES.suffix), rows)
 
 
-def _more(row: ShotRow) -> str:
-    """What a row says that has no cell of its own."""
-    told = {"setup": row.setup, "source": row.source}
-    own = [f"with its own {name} ({one})" for name, one in told.items() if one is not None]
-    return f"{row.file}{', ' if own else ''}{', '.join(own)}. Uncheck it to leave it out."
+def _tip(row: ShotRow) -> str:
+    """Return a row's file and its entries without a cell."""
+    files = {"setup": row.setup, "source": row.source}
+    entries = [f"with its own {name} ({file})" for name, file in files.items() if file is not None]
+    return f"{', '.join([str(row.file), *entries])}. Uncheck the shot to exclude it."

@@ -24,75 +24,76 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class RunBooks:
-    """What is known of a run. Its thread writes, the window reads."""
+class RunStatus:
+    """Progress of a run: its thread writes it, the window reads it."""
 
-    # Shots of the stack, with those of earlier runs
+    # Shots of the stack, including shots of earlier runs
     total: int = 0
     done: int = 0
     failed: int = 0
     ended: int = 0  # in this run
-    failures: list[tuple[str, str]] = field(default_factory=list)  # names, and why
+    failures: list[tuple[str, str]] = field(default_factory=list)  # name and reason
 
     @property
     def text(self) -> str:
         failed = f", {self.failed} failed" if self.failed else ""
         return f"{self.done} of {self.total} done{failed}"
 
-    def take(self, news: RunProgress) -> None:
-        if news.outcome is not None:
+    def update(self, progress: RunProgress) -> None:
+        if progress.outcome is not None:
             self.ended += 1
-            if news.outcome.reason:
-                self.failures.append((news.name, news.outcome.reason))
-        self.total, self.done, self.failed = news.total, news.done, news.failed
+            if progress.outcome.reason:
+                self.failures.append((progress.name, progress.outcome.reason))
+        self.total, self.done, self.failed = progress.total, progress.done, progress.failed
 
 
 @dataclass(frozen=True, eq=False)
 class StackJob:
-    """Many shots to invert into a store: the arguments of `stack.run_stack`, and its books."""
+    """Shots to invert into a store: the arguments of `stack.run_stack`, and the run's status."""
 
     shots: Any  # an array (shot, y, x), also a lazy one, files, or rows of a table
     out: Path
     recipe: Recipe = field(default_factory=Recipe)
-    source: ArrayLike | None = None  # measured; also one for each shot
+    source: ArrayLike | None = None  # measured; for all shots, or one for each
     mask: BoolArray | None = None
     source_mask: BoolArray | None = None
     scheduler: str = "threads"
     workers: int | None = None
     overwrite: bool = False
     redo_failed: bool = False
-    books: RunBooks = field(default_factory=RunBooks)
+    status: RunStatus = field(default_factory=RunStatus)
 
     def run(
         self,
         on_progress: OnProgress,
         should_stop: ShouldStop,
         on_done: Callable[[int | None], None] = lambda _: None,
-    ) -> RunBooks:
-        """Invert what is not done; `on_done` gets a shot that ended well before the window does."""
+    ) -> RunStatus:
+        """Invert the pending shots; `on_done` gets each finished shot before the window does."""
         from napari_shadowinv.stack import run_stack
 
-        def tell(news: RunProgress) -> None:
-            if news.preparing:
-                on_progress(Progress("prepare", 0, None, news.preparing))
+        def update(progress: RunProgress) -> None:
+            if progress.preparing:
+                on_progress(Progress("prepare", 0, None, progress.preparing))
                 return
-            if news.outcome is None:
-                self._recall()
-            # The window looks into the books at any time: what they tell of must be seen to.
-            if news.done:
-                ended = news.outcome
-                on_done(None if ended is None or ended.reason else ended.index)
-            self.books.take(news)
-            step = news.done + news.failed
-            on_progress(Progress("shots", step, news.total, self.books.text))
+            if progress.outcome is None:
+                self._collect_earlier_failures()
+            # The window reads the status at any time: the layers must be ready before it changes.
+            if progress.done:
+                outcome = progress.outcome
+                on_done(None if outcome is None or outcome.reason else outcome.index)
+            self.status.update(progress)
+            step = progress.done + progress.failed
+            on_progress(Progress("shots", step, progress.total, self.status.text))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
-        told = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "books"}
-        run_stack(**told, on_progress=tell, should_stop=should_stop)
-        return self.books
+        names = [attribute.name for attribute in fields(self) if attribute.name != "status"]
+        arguments = {name: getattr(self, name) for name in names}
+        run_stack(**arguments, on_progress=update, should_stop=should_stop)
+        return self.status
 
-    def _recall(self) -> None:
-        """Enter the failures of earlier runs that are not tried again."""
+    def _collect_earlier_failures(self) -> None:
+        """List the failures of earlier runs that are not retried."""
         from napari_shadowinv.io.store import FAILED, StackStore
 
         if self.redo_failed:
@@ -100,99 +101,103 @@ class StackJob:
         store = StackStore(self.out)
         for index in np.flatnonzero(store.statuses() == FAILED):
             reason = str(store.report(int(index)).get("reason", "unknown"))
-            self.books.failures.append((store.names[index], reason))
+            self.status.failures.append((store.names[index], reason))
 
 
 @dataclass(frozen=True, eq=False)
 class StackRequest:
-    """A run, and all that it takes to show its results in layers over its store."""
+    """A run, and everything needed to show its results as layers over its store."""
 
     job: StackJob
     image: Any
     companions: tuple[Any, ...]
-    place: dict[str, Any]
+    placement: dict[str, Any]
     origins: Origins
     # Empty until a shot is finished.
-    described: list[FullLayerData] = field(default_factory=list)
-    # Written by the run's thread, so that the window only reads them.
+    layer_data: list[FullLayerData] = field(default_factory=list)
+    # Written by the run's thread; the window only reads them.
     _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     _earlier: dict[str, tuple[float, float]] = field(default_factory=dict)
-    _given: set[tuple[float, float]] = field(default_factory=set)
+    _applied: set[tuple[float, float]] = field(default_factory=set)
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
-        """Invert the shots, and describe the layers once one is done, beside the window."""
-        return self.job.run(on_progress, should_stop, self._look)
+        """Invert the shots in a thread, and describe the layers once one shot is done."""
+        return self.job.run(on_progress, should_stop, self._update)
 
-    def follow(self, layers: Sequence[Any]) -> None:
-        """Let layers whose limits the user left alone reach to the strongest shot so far."""
+    def update_limits(self, layers: Sequence[Any]) -> None:
+        """Extend limits that the user has not changed to the strongest shot so far."""
         for layer in filter(_is_image, layers):
             role = str(role_of(layer))
             if role not in self._limits:
                 continue
-            wanted = self._wanted(role)
-            if wanted == tuple(layer.contrast_limits):
+            limits = self._run_limits(role)
+            if limits == tuple(layer.contrast_limits):
                 continue
-            if tuple(layer.contrast_limits) in self._given:
-                self._given.add(wanted)
-                layer.contrast_limits = wanted
+            if tuple(layer.contrast_limits) in self._applied:
+                self._applied.add(limits)
+                layer.contrast_limits = limits
 
-    def go_on_from(self, earlier: StackRequest, layers: Sequence[Any]) -> None:
-        """Take over the colours of an earlier run into the same store."""
-        self._given.update(earlier._given)
-        now = {role_of(one): tuple(one.contrast_limits) for one in layers if _is_image(one)}
-        for _, keywords, kind in self.described:
+    def continue_from(self, earlier: StackRequest, layers: Sequence[Any]) -> None:
+        """Take over the contrast of an earlier run into the same store."""
+        self._applied.update(earlier._applied)
+        current = {
+            role_of(layer): tuple(layer.contrast_limits) for layer in filter(_is_image, layers)
+        }
+        for _, keywords, kind in self.layer_data:
             role = str(role_of(keywords))
             if kind == "image" and role in earlier._limits:
-                self._earlier[role] = earlier._wanted(role)
-                limits = self._wanted(role)
-                self._given.add(limits)
-                keywords["contrast_limits"] = now.get(role, limits)
+                self._earlier[role] = earlier._run_limits(role)
+                limits = self._run_limits(role)
+                self._applied.add(limits)
+                keywords["contrast_limits"] = current.get(role, limits)
 
-    def _wanted(self, role: str) -> tuple[float, float]:
-        """Limits that hold all shots of this run, and of earlier ones into the same store."""
+    def _run_limits(self, role: str) -> tuple[float, float]:
+        """Limits over all shots of this run and of earlier runs into the same store."""
         limits = self._limits[role]
         earlier = self._earlier.get(role)
-        return limits if earlier is None else _widened(limits, np.array(earlier))
+        return limits if earlier is None else _widen_limits(limits, np.array(earlier))
 
-    def _look(self, index: int | None) -> None:
-        """Describe the layers once a shot is done, and look how strong each one is."""
-        if not self.described:
+    def _update(self, index: int | None) -> None:
+        """Describe the layers once a shot is done, and include each shot in the limits."""
+        if not self.layer_data:
             self._describe()
         if index is None:
             return
-        self._widen(self.described, index)
+        self._include_shot(self.layer_data, index)
 
-    def _widen(self, described: Sequence[FullLayerData], index: int) -> None:
-        """Let the limits hold one more shot."""
-        for data, keywords, kind in described:
+    def _include_shot(self, layer_data: Sequence[FullLayerData], index: int) -> None:
+        """Extend the limits to one more shot."""
+        for data, keywords, kind in layer_data:
             if kind == "image":
                 role = str(role_of(keywords))
-                self._limits[role] = _widened(self._limits[role], np.asarray(data[index]))
+                self._limits[role] = _widen_limits(self._limits[role], np.asarray(data[index]))
 
-    def _describe(self, first: int | None = None) -> None:
+    def _describe(self, shot: int | None = None) -> None:
         from napari_shadowinv._napari.stores import store_layers
 
         try:
-            layers = store_layers(self.job.out, first=first)
+            layers = store_layers(self.job.out, shot=shot)
         except (InputError, OSError):
-            return  # the next shot may do, and the run goes on without
-        # What napari remembers of a pending shot would hide that it is done.
-        more = {"cache": False, **self.place}
+            return  # try again after the next shot
+        # napari's cache of a pending shot would hide that it is done.
+        placement = {"cache": False, **self.placement}
         for _, keywords, kind in layers:
             keywords["metadata"][KEY]["made_from"] = self.origins.attributes()
             if kind == "image":
                 limits = keywords["contrast_limits"]
                 self._limits[str(role_of(keywords))] = limits
-                self._given.add(limits)
-        self.described.extend((data, keywords | more, kind) for data, keywords, kind in layers)
+                self._applied.add(limits)
+        self.layer_data.extend(
+            (data, keywords | placement, kind) for data, keywords, kind in layers
+        )
 
 
 def _is_image(layer: Any) -> bool:
     return kind_of(layer) == "image"
 
 
-def _widened(limits: tuple[float, float], plane: AnyArray) -> tuple[float, float]:
-    """Limits that hold a plane, too; around zero if they were."""
+def _widen_limits(limits: tuple[float, float], plane: AnyArray) -> tuple[float, float]:
+    """Extend limits to the values of a plane; limits around zero stay symmetric."""
     finite = plane[np.isfinite(plane)]
     low = min(limits[0], float(finite.min(initial=np.inf)))
     high = max(limits[1], float(finite.max(initial=-np.inf)))
@@ -201,10 +206,10 @@ def _widened(limits: tuple[float, float], plane: AnyArray) -> tuple[float, float
     return low, high
 
 
-def place_on(layer: Any, recipe: Recipe) -> dict[str, Any]:
-    """Keywords that lay results on their stack, once that is placed by the setup."""
+def placement_on(layer: Any, recipe: Recipe) -> dict[str, Any]:
+    """Return the keywords that place results on their stack, with the setup's pixels."""
     keywords = result_frame(layer, recipe).keywords(stacked=True)
-    first = {"scale": layer.scale, "translate": layer.translate, "units": layer.units}
-    for name, values in first.items():
+    of_layer = {"scale": layer.scale, "translate": layer.translate, "units": layer.units}
+    for name, values in of_layer.items():
         keywords[name] = (values[0], *keywords[name][1:])
     return keywords

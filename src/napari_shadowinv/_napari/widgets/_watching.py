@@ -1,4 +1,4 @@
-"""A folder that is watched, and the layers over its store, which grow: `WatchRequest`."""
+"""A watched folder, and the growing layers over its store: `WatchRequest`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from napari_shadowinv._napari.layer_metadata import KEY, role_of
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import column
-from napari_shadowinv._napari.widgets._stacking import RunBooks, StackJob, StackRequest
+from napari_shadowinv._napari.widgets._stacking import RunStatus, StackJob, StackRequest
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import NEW_SHOTS
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.stack import RunProgress, WatchProgress
 
-_LOOK_AFTER = 0.5  # seconds between two looks at a store that falls behind its folder
+_UPDATE_INTERVAL_S = 0.5  # while the inversion falls behind the folder
 
 
 class _FolderEdit(PathEdit):
@@ -34,7 +34,7 @@ class _FolderEdit(PathEdit):
 
 
 class FolderEdit(QtWidgets.QWidget):
-    """The folder in which shots appear, and what their names look like."""
+    """The folder in which shots appear, and the pattern of their names."""
 
     changed = Signal()
 
@@ -42,11 +42,11 @@ class FolderEdit(QtWidgets.QWidget):
         super().__init__()
         self.folder = _FolderEdit("Folder to watch", "folder")
         self.folder.edit.setToolTip(
-            "<qt>Each file that appears here is inverted as soon as it is complete, until you "
+            "<qt>Each new file in this folder is inverted as soon as it is complete, until you "
             "press Cancel.</qt>"
         )
         self.pattern = QtWidgets.QLineEdit(NEW_SHOTS)
-        self.pattern.setToolTip("Names of the shots.")
+        self.pattern.setToolTip("Pattern of the shots' file names, such as *.tif.")
         self.pattern.setMinimumWidth(60)
         column(self, labelled("", self.folder), labelled("Names", self.pattern))
         self.folder.changed.connect(self.changed)
@@ -55,13 +55,13 @@ class FolderEdit(QtWidgets.QWidget):
     @property
     def path(self) -> Path:
         if not self.folder.path:
-            raise InputError("no folder is selected: choose the one in which the shots appear")
+            raise InputError("no folder is selected: choose the folder in which the shots appear")
         return Path(self.folder.path).expanduser()
 
 
 @dataclass
-class WatchBooks(RunBooks):
-    """What is known of a folder that is watched."""
+class WatchStatus(RunStatus):
+    """Progress of a watched folder."""
 
     waiting: int = 0
     note: str = ""
@@ -73,45 +73,45 @@ class WatchBooks(RunBooks):
         note = f" ({self.note})" if self.note else ""
         return f"{self.done} done{failed}{waiting}{note}"
 
-    def take(self, news: RunProgress) -> None:
-        told: WatchProgress = news  # type: ignore[assignment]
-        # A shot that failed before may have been written anew.
-        if any(name == news.name for name, _ in self.failures):
-            self.failures = [one for one in self.failures if one[0] != news.name]
-        super().take(news)
-        self.waiting, self.note = told.waiting, told.note or self.note
+    def update(self, progress: RunProgress) -> None:
+        watch: WatchProgress = progress  # type: ignore[assignment]
+        # A shot that failed before may have been rewritten.
+        if any(name == progress.name for name, _ in self.failures):
+            self.failures = [failure for failure in self.failures if failure[0] != progress.name]
+        super().update(progress)
+        self.waiting, self.note = watch.waiting, watch.note or self.note
 
 
 @dataclass(frozen=True, eq=False)
 class WatchJob(StackJob):
-    """A folder to watch, as `shots`: arguments of `stack.watch_stack`, and the books."""
+    """A folder to watch, as `shots`: the arguments of `stack.watch_stack`, and the status."""
 
     pattern: str = NEW_SHOTS
-    books: RunBooks = field(default_factory=WatchBooks)
+    status: RunStatus = field(default_factory=WatchStatus)
 
     def run(
         self,
         on_progress: OnProgress,
         should_stop: ShouldStop,
         on_done: Callable[[int | None], None] = lambda _: None,
-    ) -> RunBooks:
-        """Watch until it is stopped; `on_done` gets a shot that ended well, as in a run."""
+    ) -> RunStatus:
+        """Watch until stopped; `on_done` gets each finished shot, as in a run."""
         from napari_shadowinv.stack import watch_stack
 
-        books = self.books
-        assert isinstance(books, WatchBooks)
+        status = self.status
+        assert isinstance(status, WatchStatus)
 
-        def tell(news: WatchProgress) -> None:
-            if news.preparing:
-                on_progress(Progress("prepare", 0, None, news.preparing))
+        def update(progress: WatchProgress) -> None:
+            if progress.preparing:
+                on_progress(Progress("prepare", 0, None, progress.preparing))
                 return
-            books.waiting = news.waiting
-            ended = news.outcome
-            if news.done and (ended is not None or not books.total):
-                on_done(None if ended is None or ended.reason else ended.index)
-            books.take(news)
-            stage = "shots" if books.ended and books.waiting else "wait"
-            on_progress(Progress(stage, books.ended, None, books.text))
+            status.waiting = progress.waiting
+            outcome = progress.outcome
+            if progress.done and (outcome is not None or not status.total):
+                on_done(None if outcome is None or outcome.reason else outcome.index)
+            status.update(progress)
+            stage = "shots" if status.ended and status.waiting else "wait"
+            on_progress(Progress(stage, status.ended, None, status.text))
 
         watch_stack(
             self.shots,
@@ -123,34 +123,34 @@ class WatchJob(StackJob):
             source_mask=self.source_mask,
             overwrite=self.overwrite,
             redo_failed=self.redo_failed,
-            on_progress=tell,
+            on_progress=update,
             should_stop=should_stop,
         )
-        return books
+        return status
 
 
 @dataclass
 class _Growth:
-    """How far the layers have followed the store; the run's thread writes, the window reads."""
+    """New shots for the layers: the run's thread writes them, the window reads them."""
 
-    first: int = 0  # the shot that decides on units
-    unseen: list[int] = field(default_factory=list)
-    looked: float = 0.0
-    described: list[FullLayerData] | None = None  # longer than what the layers show
+    reference_shot: int = 0  # decides on units and contrast
+    new_shots: list[int] = field(default_factory=list)  # not in the limits yet
+    updated_at: float = 0.0  # s
+    layer_data: list[FullLayerData] | None = None  # with shots that the layers do not show yet
 
 
 @dataclass(frozen=True, eq=False)
 class WatchRequest(StackRequest):
-    """A folder that is watched; the layers get longer as shots arrive."""
+    """A watched folder; the layers grow as shots arrive."""
 
     growth: _Growth = field(default_factory=_Growth)
 
-    def renew(self, layers: Sequence[Any]) -> int | None:
-        """Give layers the shots that have arrived since; return the newest if there are any."""
-        described, self.growth.described = self.growth.described, None
-        if described is None:
+    def add_new_shots(self, layers: Sequence[Any]) -> int | None:
+        """Add the shots that have arrived to the layers; return the newest, or None."""
+        layer_data, self.growth.layer_data = self.growth.layer_data, None
+        if layer_data is None:
             return None
-        content = {role_of(keywords): (data, keywords) for data, keywords, _ in described}
+        content = {role_of(keywords): (data, keywords) for data, keywords, _ in layer_data}
         length = 0
         for layer in layers:
             if role_of(layer) not in content:
@@ -162,49 +162,49 @@ class WatchRequest(StackRequest):
                 length = len(data)
         return length - 1 if length else None
 
-    def _look(self, index: int | None) -> None:
-        """Describe the layers anew now and then, so that a window that is slow holds up nothing."""
+    def _update(self, index: int | None) -> None:
+        """Describe the longer layers from time to time, so that the shots need not wait."""
         growth = self.growth
         if index is not None:
-            growth.unseen.append(index)
-        if not self.described:
+            growth.new_shots.append(index)
+        if not self.layer_data:
             self._begin(index)
         elif index is not None and not self._is_due():
             return
         else:
-            growth.described = self._longer()
-        current = growth.described or self.described
-        for number in growth.unseen if current else ():
-            self._widen(current, number)
-        growth.unseen.clear()
-        growth.looked = time.monotonic()
+            growth.layer_data = self._describe_longer()
+        current = growth.layer_data or self.layer_data
+        for number in growth.new_shots if current else ():
+            self._include_shot(current, number)
+        growth.new_shots.clear()
+        growth.updated_at = time.monotonic()
 
     def _begin(self, index: int | None) -> None:
         from napari_shadowinv._napari.stores import first_shot
 
         with suppress(InputError, OSError):
-            self.growth.first = first_shot(self.job.out) if index is None else index
-            self._describe(self.growth.first)
+            self.growth.reference_shot = first_shot(self.job.out) if index is None else index
+            self._describe(self.growth.reference_shot)
 
     def _is_due(self) -> bool:
-        books = self.job.books
-        behind = isinstance(books, WatchBooks) and books.waiting > 1
-        return not behind or time.monotonic() > self.growth.looked + _LOOK_AFTER
+        status = self.job.status
+        is_behind = isinstance(status, WatchStatus) and status.waiting > 1
+        return not is_behind or time.monotonic() > self.growth.updated_at + _UPDATE_INTERVAL_S
 
-    def _longer(self) -> list[FullLayerData] | None:
+    def _describe_longer(self) -> list[FullLayerData] | None:
         from napari_shadowinv._napari.stores import store_layers
 
         try:
-            described = store_layers(self.job.out, first=self.growth.first)
+            layer_data = store_layers(self.job.out, shot=self.growth.reference_shot)
         except (InputError, OSError):
-            return None  # the next shot may do
-        for _, keywords, _kind in described:
+            return None  # try again after the next shot
+        for _, keywords, _kind in layer_data:
             keywords["metadata"][KEY]["made_from"] = self.origins.attributes()
-        return described
+        return layer_data
 
 
-def last_in_view(viewer: Any, layers: Sequence[Any]) -> bool:
-    """Whether the viewer shows the newest shot of these layers."""
+def is_newest_in_view(viewer: Any, layers: Sequence[Any]) -> bool:
+    """Whether the viewer shows the newest shot of the layers."""
     lengths = [len(layer.data) for layer in layers if kind_of(layer) == "image"]
     axis = viewer.dims.ndim - 3
     return bool(lengths) and viewer.dims.current_step[axis] >= max(lengths) - 1
@@ -215,6 +215,6 @@ def show_shot(viewer: Any, shot: int) -> None:
     viewer.dims.set_current_step(viewer.dims.ndim - 3, shot)
 
 
-def newest_of(layers: Sequence[Any]) -> int:
-    """Return the number of the last shot of layers."""
-    return max((len(one.data) - 1 for one in layers if kind_of(one) == "image"), default=0)
+def newest_shot(layers: Sequence[Any]) -> int:
+    """Return the index of the last shot of the layers."""
+    return max((len(layer.data) - 1 for layer in layers if kind_of(layer) == "image"), default=0)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.shots import loaded
+from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._layers import LayerWatch, MaskPicker, ShotPicker, image_of
 from napari_shadowinv._napari.widgets._panels import LivePanel, RunPanel
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, eq=False)
 class SourceRequest:
     estimate: Estimate
-    shot: Radiograph  # its image may be not read yet
+    shot: Radiograph  # its image may be lazy
     image: Any
     made_from: dict[str, str]
     preview: bool
@@ -33,26 +33,26 @@ class SourceRequest:
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FloatArray:
         report = Reporter(on_progress, should_stop)
         report("source", 0, None, self.estimate.title)
-        shot = loaded(self.shot, "the image")
-        most_pixels = PREVIEW_PIXELS if self.preview else None
-        by = partial(Cache().source, self.estimate, most_pixels=most_pixels)
+        shot = load_radiograph(self.shot, "the image")
+        max_pixels = PREVIEW_PIXELS if self.preview else None
+        by = partial(Cache().source, self.estimate, most_pixels=max_pixels)
         source = estimated_source(self.estimate, shot, should_stop, by=by)
         report("source", 1, 1)
         return source
 
 
 class EstimateSource(LivePanel):
-    """Choose a shot and a method; the estimate becomes an image layer."""
+    """Choose a shot and a method, and add the estimated source as an image layer."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        tip = "Create an image layer with the estimated beam."
+        tip = "Estimate the beam and add it as an image layer."
         super().__init__(viewer, "estimate-source", RunPanel("Estimate source", "Estimate", tip))
         self.image = ShotPicker(viewer)
-        tip = "Labels or shapes marking pixels that the estimate ignores."
+        tip = "Labels or shapes on pixels that the estimate ignores."
         self.masks = MaskPicker(viewer, lambda: self.image.layer, ("labels", "shapes"), tip)
         self.method = ModelPicker("Method", kinds_of(ESTIMATES))
         self.method.set_kind("total-variation")
-        self.live.setToolTip("Update the estimate after every change.")
+        self.live.setToolTip("Update the estimate after each change.")
         self.add(labelled("Image", self.image), self.masks, self.method)
         self.add(self.live, self.keep_earlier, self.panel)
         edits = LayerWatch(self, (self.image, self.masks))
@@ -72,18 +72,18 @@ class EstimateSource(LivePanel):
         estimate = model.placed(about.setup_of(layer), image.shape)
         made_from = {"image": layer.name, "estimate": estimate.described}
         if mask is not None:
-            made_from["source_mask"] = self.masks.described(layer)
+            made_from["source_mask"] = self.masks.summary(layer)
         return SourceRequest(
             estimate, Radiograph(image, source_mask=mask), layer, made_from, preview
         )
 
     def show_result(self, value: Any, request: SourceRequest) -> None:
         layer, preview = request.image, request.preview
-        described = (
+        layer_data = (
             value,
             {
                 "name": f"{layer.name} source{' preview' if preview else ''}",
-                "metadata": about.mark(
+                "metadata": about.metadata_for(
                     about.SOURCE,
                     "",
                     about.setup_of(layer),
@@ -97,4 +97,4 @@ class EstimateSource(LivePanel):
             },
             "image",
         )
-        self.show_layers(layer, [described], preview)
+        self.show_layers(layer, [layer_data], preview)

@@ -1,4 +1,4 @@
-"""The widget that finds the fields that explain several images of one object: `FitImages`."""
+"""The widget that fits fields to several images of one object: `FitImages`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.fit_course import PACE, forecast_of
-from napari_shadowinv._napari.fit_jobs import FitAnswer, FitJob
+from napari_shadowinv._napari.fit_jobs import FinishedFit, FitJob
+from napari_shadowinv._napari.fit_progress import PACE, estimate_fit_time
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
@@ -26,7 +26,7 @@ from napari_shadowinv._napari.widgets._fitting import FitView
 from napari_shadowinv._napari.widgets._image_table import ImageRow, ImageTable, beam_column
 from napari_shadowinv._napari.widgets._inputs import OptionsForm, SetupPicker
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
-from napari_shadowinv._napari.widgets._qt import beside, while_alive
+from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
 from napari_shadowinv._napari.widgets._recipes import FitRecipeButton
 from napari_shadowinv._napari.widgets._results import LastResults, result_frame
 from napari_shadowinv._napari.widgets._saving import (
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     import napari
 
 
-def _beam_in_words(shot: FitShot) -> str:
+def _beam_summary(shot: FitShot) -> str:
     if shot.setup is not None:
         return shot.setup.probe
     (strength,) = shot.strength or (1.0,)
@@ -57,7 +57,7 @@ def _beam_in_words(shot: FitShot) -> str:
 
 
 def _warnings_of(rows: list[ImageRow]) -> list[tuple[str, str]]:
-    """What the readers of the images said against them, a line each."""
+    """Return the warnings of the images' readers as rows of the report."""
     unique = {id(row.layer): row.layer for row in rows}.values()
     return [
         ("Warning", f"'{layer.name}': {caution.text}")
@@ -67,10 +67,10 @@ def _warnings_of(rows: list[ImageRow]) -> list[tuple[str, str]]:
 
 
 class FitImages(ToolPanel):
-    """Choose images of one object at several energies, press Run."""
+    """Choose images of one object at several energies, then press Run."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        tip = "Fit the fields, and the beam if it is unknown, to all images together."
+        tip = "Fit the fields, and an unknown beam, to all images together."
         super().__init__(
             viewer, "fit-images", RunPanel("Fit several images", "Run", tip, patience=0.4)
         )
@@ -85,22 +85,24 @@ class FitImages(ToolPanel):
     def _build(self) -> None:
         self.source = BeamPicker(self.viewer)
         self.images = ImageTable(self.viewer, self._may_be_image)
-        self.fields = ChoiceBox({}, "What deflects. Two fields need images of two energies.")
+        self.fields = ChoiceBox(
+            {}, "Field that deflects the beam. Two fields require images at two energies."
+        )
         self.masks = layers.MaskPicker(
             self.viewer,
             self._reference_layer,
             ("labels", "shapes"),
-            "Labels or shapes marking detector pixels of all images. The fit ignores masked "
+            "Labels or shapes on bad detector pixels, for all images. The fit ignores masked "
             "pixels.",
         )
         self.gains = ChoiceBox(
-            {"known": "known, as in the table", "free": "free: fitted"},
-            "Whether it is known how much brighter than the source each image is. Those of an "
-            "unknown source are always fitted.",
+            {"known": "known (in the table)", "free": "unknown (fit them)"},
+            "Brightness of each image relative to the source: known, or fitted. With an unknown "
+            "source, gains are always fitted.",
         )
         self.noise = ChoiceBox(
             NOISES,
-            "What χ² and error bars are measured by. 'Of counts': the images are numbers of "
+            "Noise model for χ² and error bars. Poisson counts: the images are numbers of "
             "particles or photons.",
         )
         self.setup = SetupPicker()
@@ -113,7 +115,7 @@ class FitImages(ToolPanel):
         self.save_result = SaveButton(
             self,
             lambda: result_to_save(self.viewer, shown_result(self.viewer, self._fields_shown())),
-            "Write the selected or last fit: all of it with its layers (.shadowinv), or its field "
+            "Save the selected or last fit: complete with its layers (.shadowinv), or its field "
             "for other programs (.h5).",
         )
         self.more_layers = MoreLayersButton(self, lambda: self.view.results)
@@ -127,17 +129,17 @@ class FitImages(ToolPanel):
             self.setup_section,
             self.steps,
             forms.section("Options", self.options),
-            beside((self._last.keep_earlier, 1), (self.recipes, 0)),
+            side_by_side((self._last.keep_earlier, 1), (self.recipes, 0)),
             self.cost,
             self.panel,
             self.view,
-            beside((self.save_result, 1), (self.more_layers, 1)),
+            side_by_side((self.save_result, 1), (self.more_layers, 1)),
         )
 
     def _connect(self) -> None:
         while_alive(self, self.viewer.layers.selection.events.active, self._on_active)
-        self.images.first_changed.connect(self._on_reference)
-        self.images.first_beam.connect(self._take_beam)
+        self.images.reference_changed.connect(self._on_reference)
+        self.images.reference_beam_entered.connect(self._set_beam)
         self.images.changed.connect(self._show_beams)
         self.source.changed.connect(self.images.fill)
         self.setup.changed.connect(self._on_setup)
@@ -153,9 +155,9 @@ class FitImages(ToolPanel):
             self.noise.currentIndexChanged,
         ):
             signal.connect(lambda *_: self.keep())
-            signal.connect(lambda *_: self._tell_cost())
-        for signal in (self.images.changed, self.images.first_changed):
-            signal.connect(self._tell_cost)
+            signal.connect(lambda *_: self._show_cost())
+        for signal in (self.images.changed, self.images.reference_changed):
+            signal.connect(self._show_cost)
 
     def parts(self) -> dict[str, Any]:
         return {
@@ -172,7 +174,7 @@ class FitImages(ToolPanel):
     # A run
 
     def recipe(self) -> Recipe:
-        """What the controls ask for, but for what the table says and layers; or an `InputError`."""
+        """Return the recipe of the controls, without table and layers; or raise an `InputError`."""
         fields = tuple(self.fields.state().split(BOTH))
         beam = "unknown" if self.source.picker.kind == UNKNOWN else "known"
         choices = FitChoices(
@@ -189,35 +191,35 @@ class FitImages(ToolPanel):
             fit=choices,
         )
 
-    # What a recipe says
+    # Recipes
 
     def chosen_image(self) -> Any | None:
-        """The layer that masks and source of a recipe belong to."""
+        """Return the layer to which masks and source of a recipe belong."""
         return self._reference_layer()
 
     def common_psf(self) -> float | None:
-        """The point spread of all images; None if they differ, which no recipe tells."""
+        """Return the common point spread of all images; None if they differ."""
         widths = {self.images.psf(row) for row in self.images.used}
         return widths.pop() if len(widths) == 1 else None
 
     def check_choices(self, choices: FitChoices, setup: Setup | None, path: Path) -> None:
-        """Refuse what does not fit to a setup, or else to the one that is shown."""
+        """Refuse choices that do not match a setup, or else the shown setup."""
         fields = choices.fields
-        offered = fields_of(self.setup.picker.kind if setup is None else setup.kind)
+        available = fields_of(self.setup.picker.kind if setup is None else setup.kind)
         in_metres = choices.source_size is not None or choices.resolution is not None
         if in_metres and setup is None and self._shown_setup() is None:
             raise InputError(
-                f"{path} gives source size or resolution in m, which need a setup: choose the "
+                f"{path} gives source size or resolution in m, which require a setup: select the "
                 "setup first, or give the point spread in px (psf)"
             )
-        if fields is not None and field_key(fields) not in offered:
+        if fields is not None and field_key(fields) not in available:
             raise InputError(
-                f"{path} asks for the fields {', '.join(fields)}: with this setup expected one of "
-                f"{', '.join(offered)}; choose another kind of setup first"
+                f"{path} fits the fields {', '.join(fields)}: with this setup expected one of "
+                f"{', '.join(available)}; select another kind of setup first"
             )
 
     def show_choices(self, choices: FitChoices) -> None:
-        """Show what a recipe says of the fit."""
+        """Show the choices of a recipe."""
         if choices.fields is not None:
             self.fields.restore(field_key(choices.fields))
         self.gains.restore(choices.gains)
@@ -228,56 +230,60 @@ class FitImages(ToolPanel):
         for row in self.images.used:
             width = self._spread(choices, row)
             if width is not None:
-                row.keep(psf=width)
+                row.store(psf=width)
         self._show_beams()
 
     def _spread(self, choices: FitChoices, row: ImageRow) -> float | None:
-        """The point spread of an image in px after the steps, as a recipe tells it."""
+        """Return the point spread of an image in px after the steps, by a recipe."""
         setup = self._shown_setup()
         if setup is None or (choices.source_size is None and choices.resolution is None):
             return choices.psf
         shot = Radiograph(np.zeros(row.data.shape), setup=self._base_setup(row, setup))
-        after = Recipe(steps=self.steps.steps()).moved(shot).setup
-        assert after is not None
-        return point_spread(after, choices.source_size or 0.0, choices.resolution or 0.0)
+        processed = Recipe(steps=self.steps.steps()).moved(shot).setup
+        assert processed is not None
+        return point_spread(processed, choices.source_size or 0.0, choices.resolution or 0.0)
 
     def request(self) -> FitJob:
         rows = self._rows()
         first = rows[0]
         recipe = self.recipe()
         shots = self._shots(rows, recipe.setup)
-        told = [_beam_in_words(shot) for shot in shots]
-        words = {
-            "images": "; ".join(f"{row.name}: {one}" for row, one in zip(rows, told, strict=True)),
-            "source_origin": self.source.described,
-            "mask_origin": self.masks.described(first.layer),
+        images = [
+            f"{row.name}: {_beam_summary(shot)}" for row, shot in zip(rows, shots, strict=True)
+        ]
+        origins = {
+            "images": "; ".join(images),
+            "source_origin": self.source.summary,
+            "mask_origin": self.masks.summary(first.layer),
             "setup_origin": self.setup.origin,
             "steps": "; ".join(step.described for step in recipe.steps),
         }
-        given = [
-            ("Source", self.source.described),
-            ("Mask", words["mask_origin"]),
-            ("Setup", self.setup.described),
-            ("Steps", words["steps"]),
+        input_rows = [
+            ("Source", self.source.summary),
+            ("Mask", origins["mask_origin"]),
+            ("Setup", self.setup.summary),
+            ("Steps", origins["steps"]),
         ]
-        chosen = (*(row.layer for row in rows), self.masks.layer, self.source.layer)
+        used_layers = (*(row.layer for row in rows), self.masks.layer, self.source.layer)
         return FitJob(
             recipe=recipe,
             shots=shots,
             names=tuple(row.name for row in rows),
             name=f"{first.layer.name} fit",
             frame=result_frame(first.layer, recipe),
-            given=[(name, text) for name, text in (*given, *_warnings_of(rows)) if text],
-            attributes={name: text for name, text in words.items() if text},
+            inputs=[(name, text) for name, text in (*input_rows, *_warnings_of(rows)) if text],
+            attributes={name: text for name, text in origins.items() if text},
             layer=first.layer,
-            companions=tuple(one for one in chosen if one is not None and one is not first.layer),
+            companions=tuple(
+                layer for layer in used_layers if layer is not None and layer is not first.layer
+            ),
         )
 
     def _shots(self, rows: list[ImageRow], setup: Setup | None) -> tuple[FitShot, ...]:
-        """The images with all that the controls say of each, not read yet if they are lazy."""
+        """Return the images, lazy if their layers are, with all their settings."""
         images = [radiograph_of(row.layer, row.data, row.plane) for row in rows]
         sources = self.source.measured(images)
-        gains = self._chosen_gains(rows)
+        gains = self._known_gains(rows)
         return tuple(
             FitShot(
                 image,
@@ -291,27 +297,27 @@ class FitImages(ToolPanel):
             for row, image, source, gain in zip(rows, images, sources, gains, strict=True)
         )
 
-    def show_result(self, value: FitAnswer, request: FitJob) -> None:
+    def show_result(self, value: FinishedFit, request: FitJob) -> None:
         self.results = self.view.show_result(request, value, self._last)
         self.reveal(self.view.verdict)
-        self._tell_cost()
+        self._show_cost()
 
     def _fields_shown(self) -> list[Any]:
         return [] if self.view.results is None else field_of(self.view.results.layers)
 
-    def _tell_cost(self) -> None:
-        """Say how long it will take."""
+    def _show_cost(self) -> None:
+        """Show the estimated time."""
         try:
             rows = self._rows()
             shape = Recipe(steps=self.steps.steps()).shape_after(rows[0].data.shape)
             options = self.options.model()
         except InputError:
-            self.cost.setVisible(False)  # Run tells what is wrong
+            self.cost.setVisible(False)  # Run reports the problem
             return
         source = UNKNOWN if self.source.picker.kind == UNKNOWN else None
         fields = len(self.fields.state().split(BOTH))
-        forecast = forecast_of(shape, len(rows), fields, source, options)  # type: ignore[arg-type]
-        self.cost.setText(forecast.text(PACE))
+        estimate = estimate_fit_time(shape, len(rows), fields, source, options)  # type: ignore[arg-type]
+        self.cost.setText(estimate.text(PACE))
         self.cost.setVisible(True)
 
     def _rows(self) -> list[ImageRow]:
@@ -319,42 +325,42 @@ class FitImages(ToolPanel):
         if len(rows) < 2:
             raise InputError(
                 f"{len(rows) or 'no'} image{'s are' if not rows else ' is'} checked, expected two "
-                "or more of one object: open them, or use 'Refine' of Invert shot for a single one"
+                "or more of one object: open them, or use 'Refine' in Invert shot for one image"
             )
         shape = tuple(rows[0].data.shape)
         for row in rows[1:]:
             if tuple(row.data.shape) != shape:
                 raise InputError(
                     f"'{row.name}' has shape {tuple(row.data.shape)}, '{rows[0].name}' {shape}: "
-                    "all images must have the same; uncheck or crop the one that does not fit"
+                    "all images must have the same shape; crop or uncheck the image that differs"
                 )
         return rows
 
-    def _chosen_gains(self, rows: list[ImageRow]) -> list[float] | list[None]:
-        """The factors in the table, unless all are 1 or they are fitted."""
+    def _known_gains(self, rows: list[ImageRow]) -> list[float] | list[None]:
+        """Return the gains in the table, or None for each if they are fitted or all are 1."""
         if self.gains.state() == "free":
             return [None] * len(rows)
         gains = [self.images.gain(row) for row in rows]
         return [None] * len(rows) if gains == [1.0] * len(rows) else gains
 
     def _setup_of(self, row: ImageRow, setup: Setup) -> Setup:
-        """The setup of an image: its own, or else that of the first, with the beam in its row."""
+        """Return the setup of an image, its own or the reference's, with the beam of its row."""
         base = self._base_setup(row, setup)
         values = {**base.model_dump(), self.images.beam.name: self.images.beam_value(row)}
         return validated(SETUPS[setup.kind], values, f"the setup of '{row.name}'")
 
     def _base_setup(self, row: ImageRow, setup: Setup) -> Setup:
-        own = row.setup if row.plane is None and row != self.images.reference else None
-        return own if own is not None and own.kind == setup.kind else setup
+        row_setup = row.setup if row.plane is None and row != self.images.reference else None
+        return row_setup if row_setup is not None and row_setup.kind == setup.kind else setup
 
-    # Controls that follow each other
+    # Controls that depend on each other
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
-        # Another widget may have changed the setup of the first image.
+        # Another widget may have changed the setup of the reference.
         row = self.images.reference
-        shown = self._shown_setup()
-        if self._ready and row is not None and row.setup not in (None, shown):
+        setup = self._shown_setup()
+        if self._ready and row is not None and row.setup not in (None, setup):
             self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
 
     def _on_active(self, event: Any = None) -> None:
@@ -368,30 +374,30 @@ class FitImages(ToolPanel):
         return about.may_be_shot(layer) and layer is not self.source.layer
 
     def _on_reference(self) -> None:
-        """Show the setup of another first image; without one of its own it takes the last one."""
+        """Show the setup of a new reference; without a setup it gets the last one."""
         row = self.images.reference
-        before = self._shown_setup()
+        old_setup = self._shown_setup()
         self.setup.follow(None if row is None else row.layer)
         if row is not None:
             self.masks.follow(row.layer)
-            base = row.setup or before
+            base = row.setup or old_setup
             if base is not None:
-                self._take_over(row, base)
+                self._apply_setup(row, base)
         self.view.empty()
         self._on_setup()
-        # It is known, and what is below it should be seen.
+        # A complete setup is folded to show the controls below.
         if self._shown_setup() is None:
             self.setup_section.expand(animate=False)
         else:
             self.setup_section.collapse(animate=False)
 
-    def _take_over(self, row: ImageRow, base: Setup) -> None:
+    def _apply_setup(self, row: ImageRow, base: Setup) -> None:
         values, beam = base.model_dump(), beam_column(base.kind).name
-        given = row.kept().get(beam)
-        if isinstance(given, float) and (row.plane is not None or row.setup is None):
-            values[beam] = given
-        shown = self._shown_setup()
-        if shown is None or values != shown.model_dump():
+        entry = row.entries().get(beam)
+        if isinstance(entry, float) and (row.plane is not None or row.setup is None):
+            values[beam] = entry
+        setup = self._shown_setup()
+        if setup is None or values != setup.model_dump():
             self.setup.show_setup(values)
 
     def _shown_setup(self) -> Setup | None:
@@ -400,18 +406,18 @@ class FitImages(ToolPanel):
         except InputError:
             return None
 
-    def _take_beam(self, value: float) -> None:
-        """The energy of the first image is that of the setup that is shown."""
+    def _set_beam(self, value: float) -> None:
+        """Set the energy or wavelength of the shown setup from the reference's row."""
         form = self.setup.picker.form
         if form is not None:
             self.setup.show_setup({**form.values(), self.images.beam.name: value})
 
     def _on_setup(self) -> None:
         self.fields.offer(fields_of(self.setup.picker.kind))
-        shown = self._shown_setup()
-        known = "none" if shown is None else f"{shown.probe}, {self.setup.origin}"
-        self.setup_section.setText(f"Setup: {known}")
-        self.setup_section.setToolTip(f"Setup: {known}")
+        setup = self._shown_setup()
+        summary = "none" if setup is None else f"{setup.probe}, {self.setup.origin}"
+        self.setup_section.setText(f"Setup: {summary}")
+        self.setup_section.setToolTip(f"Setup: {summary}")
         self._show_beams()
 
     def _show_beams(self) -> None:

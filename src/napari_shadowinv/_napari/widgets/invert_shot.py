@@ -1,4 +1,4 @@
-"""The widget that turns a shot into a field: `InvertShot`."""
+"""The widget that inverts a shot: `InvertShot`."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING, Any
 
 from napari.utils.notifications import show_warning
 
-from napari_shadowinv._napari.fit_course import duration_in_words
-from napari_shadowinv._napari.fit_jobs import FitAnswer, FitJob, name_of_result, refinement
+from napari_shadowinv._napari.fit_jobs import FinishedFit, FitJob, name_of_result, refinement
+from napari_shadowinv._napari.fit_progress import duration_in_words
 from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
     SOURCE,
     Result,
-    mark_of,
+    metadata_of,
     result_of,
     role_of,
 )
 from napari_shadowinv._napari.notifications import show_caution
-from napari_shadowinv._napari.shots import loaded, radiograph_of
+from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._fitting import FitView, Refining
+from napari_shadowinv._napari.widgets._fitting import FitView, RefineSection
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._panels import (
     FoldedReport,
@@ -33,7 +33,7 @@ from napari_shadowinv._napari.widgets._panels import (
     report_rows,
     solver_rows,
 )
-from napari_shadowinv._napari.widgets._qt import beside, notify_errors, while_alive
+from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, while_alive
 from napari_shadowinv._napari.widgets._results import (
     Origins,
     ResultLayers,
@@ -64,16 +64,16 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 _PREVIEW_ROLES = ("field", "caustic")
-# Measured on two cores, images of 0.25 to 4 Mpx with 5,000 to 1,000,000 sites; a window's layers
-# of the result are counted with the pixels.
+# Measured on two cores with images of 0.25 to 4 Mpx and 5,000 to 1,000,000 sites, including the
+# layers of the result.
 _SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
 _BYTES, _BYTES_PER_PIXEL, _BYTES_PER_SITE = 200e6, 280.0, 1700.0
-_WORTH_TELLING = 1_000_000  # pixels
+_MIN_PIXELS_FOR_ESTIMATE = 1_000_000
 
 
 @dataclass(frozen=True)
-class Cost:
-    """About how long an inversion takes (s), and its memory at most (bytes)."""
+class CostEstimate:
+    """Estimated time (s) and peak memory (bytes) of an inversion."""
 
     pixels: int
     sites: int
@@ -81,20 +81,20 @@ class Cost:
     memory: float
 
     @property
-    def is_too_much(self) -> bool:
-        there_is = physical_memory()
-        return there_is is not None and self.memory > there_is
+    def exceeds_memory(self) -> bool:
+        available = physical_memory()
+        return available is not None and self.memory > available
 
     @property
     def text(self) -> str:
-        """In a sentence; empty for an image that takes no time to speak of."""
-        if self.pixels < _WORTH_TELLING and not self.is_too_much:
+        """The estimate as a sentence; empty for small images."""
+        if self.pixels < _MIN_PIXELS_FOR_ESTIMATE and not self.exceeds_memory:
             return ""
         text = (
             f"{self.pixels / 1e6:.3g} Mpx with {self.sites:,} sites: about "
             f"{duration_in_words(self.seconds)} and up to {self.memory / 1e9:.1f} GB"
         )
-        if not self.is_too_much:
+        if not self.exceeds_memory:
             return f"{text}."
         return (
             f"{text}, more than this machine's {(physical_memory() or 0) / 1e9:.1f} GB: crop or "
@@ -102,11 +102,13 @@ class Cost:
         )
 
 
-def cost_of(shape: tuple[int, ...], options: InversionOptions, pace: float = 1.0) -> Cost:
-    """Forecast an inversion, with `pace` times the usual time on this machine."""
+def estimate_cost(
+    shape: tuple[int, ...], options: InversionOptions, pace: float = 1.0
+) -> CostEstimate:
+    """Estimate an inversion that takes `pace` times the reference time on this machine."""
     pixels = shape[0] * shape[1]
     sites = options.n_sites or min(pixels, MAX_DEFAULT_SITES)
-    return Cost(
+    return CostEstimate(
         pixels,
         sites,
         pace * (_SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites),
@@ -115,15 +117,15 @@ def cost_of(shape: tuple[int, ...], options: InversionOptions, pace: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Answer:
+class _FinishedInversion:
     inversion: Inversion
-    described: list[FullLayerData]
+    layer_data: list[FullLayerData]
 
 
 @dataclass(frozen=True, eq=False)
 class _Request:
     recipe: Recipe
-    shot: Radiograph  # with masks, its image and that of the source not read yet
+    shot: Radiograph  # with masks; its image and the source may be lazy
     source: Radiograph | None
     cache: Cache
     image: Any
@@ -136,10 +138,10 @@ class _Request:
     def inversion(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Inversion:
-        source = None if self.source is None else loaded(self.source, "the source")
+        source = None if self.source is None else load_radiograph(self.source, "the source")
         return run(
             self.recipe,
-            loaded(self.shot, "the image"),
+            load_radiograph(self.shot, "the image"),
             source=source,
             on_progress=on_progress,
             should_stop=should_stop,
@@ -147,26 +149,26 @@ class _Request:
             preview=self.preview,
         )
 
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> _Answer:
-        """Invert the shot and describe its layers, all of it beside the window."""
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> _FinishedInversion:
+        """Invert the shot and describe its layers."""
         inversion = self.inversion(on_progress, should_stop)
         from napari_shadowinv._napari.layers import result_layers
 
         name = f"{self.name} preview" if self.preview else self.name
         result = Result(inversion, inversion.setup, self.origins.attributes())
-        described = result_layers(result, self.frame, name)
-        bare = self.shot.source_mask
-        for _, keywords, _ in described:
-            if role_of(keywords) == SOURCE and bare is not None:
-                hidden = Radiograph(bare.astype(float), source_mask=bare)
-                keywords["metadata"][KEY]["source_mask"] = self.recipe.moved(hidden).source_mask
+        layer_data = result_layers(result, self.frame, name)
+        mask = self.shot.source_mask
+        for _, keywords, _ in layer_data:
+            if role_of(keywords) == SOURCE and mask is not None:
+                masked = Radiograph(mask.astype(float), source_mask=mask)
+                keywords["metadata"][KEY]["source_mask"] = self.recipe.moved(masked).source_mask
         if self.preview:
-            described = [layer for layer in described if role_of(layer[1]) in _PREVIEW_ROLES]
-        return _Answer(inversion, described)
+            layer_data = [layer for layer in layer_data if role_of(layer[1]) in _PREVIEW_ROLES]
+        return _FinishedInversion(inversion, layer_data)
 
 
 class InvertShot(InversionInputs, LivePanel):
-    """Choose an image, press Run; all else has a default."""
+    """Choose an image, then press Run; everything else has a default."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         panel = RunPanel("Invert shot", "Run", "Invert the image and show the result as layers.")
@@ -184,18 +186,18 @@ class InvertShot(InversionInputs, LivePanel):
         self.make_inputs(
             lambda: self.image.layer,
             ("labels", "shapes"),
-            "Labels or shapes marking detector pixels. The inversion ignores masked pixels, so "
-            "do not mask the object.",
-            "Labels or shapes that hide the object from the source estimate only; the "
-            "inversion still uses it.",
+            "Labels or shapes on bad detector pixels. The inversion ignores masked pixels, so do "
+            "not mask the object.",
+            "Labels or shapes that exclude the object from the source estimate only; the "
+            "inversion still uses these pixels.",
         )
-        tip = "<qt>A rectangle in a shapes layer; only the part inside is inverted.</qt>"
+        tip = "<qt>Shapes layer with a rectangle; only the image inside is inverted.</qt>"
         self.crop = layers.LayerPicker(self.viewer, ("shapes",), tip, none="none")
         self.live.setToolTip(
-            f"<qt>Update the field after every change, with at most {PREVIEW_SITES:,} sites.</qt>"
+            f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
         self.cost, self._pace = forms.wrapping_label(), 1.0
-        self.refining = Refining(self.refine)
+        self.refine_section = RefineSection(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
         self._refined = ResultLayers(self.viewer, self)
         self.verdict, self.report = VerdictLine(), FoldedReport()
@@ -203,16 +205,16 @@ class InvertShot(InversionInputs, LivePanel):
         save = SaveButton(
             self,
             lambda: result_to_save(self.viewer, shown_result(self.viewer, self._result_layers())),
-            "Write the selected or last result: all of it with its layers (.shadowinv), for "
-            "other programs (.h5), or its sites (.csv).",
+            "Save the selected or last result: complete with its layers (.shadowinv), for other "
+            "programs (.h5), or its sites (.csv).",
         )
         self.save_result = save
         self.more_layers = MoreLayersButton(self, self._last_results)
         crop = forms.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
         self.add(forms.labelled("Image", self.image), *self.beam, forms.labelled("Crop", crop))
-        self.add(*self.how, self.live, self.keep_earlier, self.cost, self.panel)
-        self.add(self.verdict, beside((save, 1), (self.more_layers, 1)), self.report)
-        self.add(self.refining, self.fit_view)
+        self.add(*self.settings, self.live, self.keep_earlier, self.cost, self.panel)
+        self.add(self.verdict, side_by_side((save, 1), (self.more_layers, 1)), self.report)
+        self.add(self.refine_section, self.fit_view)
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
@@ -220,11 +222,11 @@ class InvertShot(InversionInputs, LivePanel):
             self, (self.image, self.masks, self.source_masks, self.crop, self.source.layers)
         )
         layers.LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
-        # Also for a run that is cancelled, or refused before it starts.
+        # Also for runs that are cancelled, or refused before they start.
         self.panel.button.clicked.connect(self._empty_report)
         self.panel.runner.started.connect(self._on_start)
         while_alive(self, self.viewer.layers.selection.events.active, self._follow_result)
-        changes = [one.changed for one in self.inputs]
+        changes = [control.changed for control in self.inputs]
         for signal in (*changes, self.crop.picked, edits.edited):
             signal.connect(self.on_change)
 
@@ -254,8 +256,8 @@ class InvertShot(InversionInputs, LivePanel):
         )
 
     def _result_name(self, layer: Any) -> str:
-        """Name the result of an image, which may be that of a saved result, by its source, too."""
-        name = mark_of(layer).get("name") or layer.name
+        """Return the name of a result: of its image, or of that image's result, and its source."""
+        name = metadata_of(layer).get("name") or layer.name
         return ", ".join(filter(None, (name, self.source.short_name)))
 
     @notify_errors
@@ -264,23 +266,25 @@ class InvertShot(InversionInputs, LivePanel):
         if self.panel.runner.running and not self._running_preview:
             return
         image: Any = self.image.layer
-        shown = [one for one in self._last.of(image) if role_of(one) == "field"]
-        if not shown:
+        fields = field_of(self._last.layers_of(image))
+        if not fields:
             raise InputError(
                 "there is no inversion of this image to refine: press Run first, then Refine"
             )
-        self._begin(refinement(shown[0], image, str(image.name), psf))
+        self._begin(refinement(fields[0], image, str(image.name), psf))
 
     @notify_errors
     def refine_layer(self, layer: Any) -> None:
-        """Refine the inversion that a layer shows a part of, such as one of a file."""
-        self.refining.folded.expand()
+        """Refine the inversion that a layer belongs to, such as a result from a file."""
+        self.refine_section.folded.expand()
         image = self._last.shot_of(layer)
         name = name_of_result(layer) if image is None else str(image.name)
-        job = refinement(layer, layer if image is None else image, name, self.refining.psf.value())
+        job = refinement(
+            layer, layer if image is None else image, name, self.refine_section.psf.value()
+        )
         if self.panel.runner.running and not self._running_preview:
             raise InputError(
-                "Invert shot is at work: wait until it is done, or press Cancel, then refine"
+                "Invert shot is running: wait until it finishes, or press Cancel, then refine"
             )
         self._begin(job)
 
@@ -288,18 +292,20 @@ class InvertShot(InversionInputs, LivePanel):
         self._running_preview = False
         self.panel.run(job.run, job)
 
-    def show_result(self, value: _Answer | FitAnswer, request: _Request | FitJob) -> None:
+    def show_result(
+        self, value: _FinishedInversion | FinishedFit, request: _Request | FitJob
+    ) -> None:
         if isinstance(request, FitJob):
-            assert isinstance(value, FitAnswer)
+            assert isinstance(value, FinishedFit)
             self.previewed.hide()
             self._refined = self.fit_view.show_result(request, value, self._last)
             self.reveal(self.fit_view.verdict)
         else:
-            assert isinstance(value, _Answer)
+            assert isinstance(value, _FinishedInversion)
             self._show_inversion(value, request)
 
     def _on_start(self) -> None:
-        # The verdict on a preview stays until the next one's.
+        # The verdict of a preview stays until the next preview.
         if not self._running_preview:
             self._empty_report()
 
@@ -309,7 +315,7 @@ class InvertShot(InversionInputs, LivePanel):
         self.report.empty()
 
     def _last_results(self) -> ResultLayers | None:
-        """The layers that show the last result, of a refinement or of an inversion."""
+        """Return the layers of the last refinement or inversion."""
         return self._refined if self._refined.layers else getattr(self, "results", None)
 
     def _result_layers(self) -> list[Any]:
@@ -317,7 +323,7 @@ class InvertShot(InversionInputs, LivePanel):
         return [] if results is None else field_of(results.layers)
 
     def _follow_result(self, event: Any = None) -> None:
-        """Report on the inversion whose layer is selected, such as one from a file."""
+        """Show the report of the inversion whose layer is selected, such as a layer from a file."""
         layer = self.viewer.layers.selection.active
         result = None if layer is None else result_of(layer)
         if result is None or result is self._reported or self.panel.runner.running:
@@ -332,12 +338,12 @@ class InvertShot(InversionInputs, LivePanel):
             self.reveal(self.verdict)
 
     def _report(
-        self, inversion: Inversion, setup: Setup | None, given: list[tuple[str, str]]
+        self, inversion: Inversion, setup: Setup | None, input_rows: list[tuple[str, str]]
     ) -> None:
         self.verdict.show_headline(inversion.headline_in(setup))
-        self.report.show_rows([*given, *report_rows(inversion)], solver_rows(inversion))
+        self.report.show_rows([*input_rows, *report_rows(inversion)], solver_rows(inversion))
 
-    def _show_inversion(self, value: _Answer, request: _Request) -> None:
+    def _show_inversion(self, value: _FinishedInversion, request: _Request) -> None:
         headline = value.inversion.headline
         image = request.image
         if image not in self.viewer.layers and not request.preview:
@@ -349,44 +355,44 @@ class InvertShot(InversionInputs, LivePanel):
             moved = place_together(self.viewer, image, request.recipe.setup, request.companions)
         if request.preview:
             self.verdict.show_headline(headline, "Preview: ")
-            self._reported = result_of(value.described[0][1])
-            self.show_layers(image, value.described, preview=True, fit=moved)
+            self._reported = result_of(value.layer_data[0][1])
+            self.show_layers(image, value.layer_data, preview=True, fit=moved)
             self.panel.say(f"Image residual {image_residual_text(value.inversion)}")
             return
         self._report(value.inversion, value.inversion.setup, request.origins.rows())
-        self._reported = result_of(value.described[0][1])
+        self._reported = result_of(value.layer_data[0][1])
         if headline.level is not Level.SOUND:
             show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
         self.reveal(self.verdict)
         self._learn_pace(value.inversion)
-        # They refine an earlier result, and lie above the new one.
+        # They refine an earlier result and would cover the new one.
         self._refined.hide()
-        self.show_layers(image, value.described, preview=False, fit=moved)
+        self.show_layers(image, value.layer_data, preview=False, fit=moved)
 
     def on_change(self) -> None:
         super().on_change()
-        self._tell_cost()
+        self._show_cost()
 
-    def _tell_cost(self) -> None:
-        """Say how long it will take, once the image is large."""
+    def _show_cost(self) -> None:
+        """Show the estimated time and memory for large images."""
         try:
             recipe = Recipe(steps=self.all_steps())
             shape = recipe.shape_after(layers.image_of(self.image.layer).shape)
-            cost = cost_of(shape, self.options.model(), self._pace)  # type: ignore[arg-type]
+            cost = estimate_cost(shape, self.options.model(), self._pace)  # type: ignore[arg-type]
         except InputError:
-            self.cost.setVisible(False)  # Run tells what is wrong
+            self.cost.setVisible(False)  # Run reports the problem
             return
         self.cost.setText(cost.text)
-        self.cost.setStyleSheet(forms.PROBLEM_STYLE if cost.is_too_much else "")
+        self.cost.setStyleSheet(forms.PROBLEM_STYLE if cost.exceeds_memory else "")
         self.cost.setVisible(bool(cost.text))
 
     def _learn_pace(self, inversion: Inversion) -> None:
         seconds = inversion.report.seconds
-        forecast = cost_of(inversion.potential.shape, inversion.options).seconds
-        # The sites may have been there already, and small images tell little.
-        if forecast > 1 and seconds.get("sites", 0) > 0.1:
-            self._pace = sum(seconds.values()) / forecast
-            self._tell_cost()
+        estimated_s = estimate_cost(inversion.potential.shape, inversion.options).seconds
+        # Cached sites and small images would give a wrong pace.
+        if estimated_s > 1 and seconds.get("sites", 0) > 0.1:
+            self._pace = sum(seconds.values()) / estimated_s
+            self._show_cost()
 
     # Layers
 
@@ -400,7 +406,7 @@ class InvertShot(InversionInputs, LivePanel):
         self.on_change()
 
     def _forget_report(self) -> None:
-        """Take away the report: that of one image does not hold for another."""
+        """Clear the report, which does not apply to another image."""
         self._empty_report()
         self.fit_view.empty()
         if not self.panel.runner.running:

@@ -1,4 +1,4 @@
-"""The widget that turns a run of shots into a store of fields: `InvertStack`."""
+"""The widget that inverts a run of shots into a store: `InvertStack`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelle
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
-from napari_shadowinv._napari.widgets._qt import beside, notify_errors, timer
+from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._runner import Outcome
 from napari_shadowinv._napari.widgets._saving import (
@@ -30,13 +30,13 @@ from napari_shadowinv._napari.widgets._saving import (
     shown_result,
 )
 from napari_shadowinv._napari.widgets._shot_table import ShotTable
-from napari_shadowinv._napari.widgets._stacking import StackJob, StackRequest, place_on
+from napari_shadowinv._napari.widgets._stacking import StackJob, StackRequest, placement_on
 from napari_shadowinv._napari.widgets._watching import (
     FolderEdit,
     WatchJob,
     WatchRequest,
-    last_in_view,
-    newest_of,
+    is_newest_in_view,
+    newest_shot,
     show_shot,
 )
 from napari_shadowinv._system.progress import Progress
@@ -48,27 +48,28 @@ if TYPE_CHECKING:
     from napari_shadowinv._typing import BoolArray
     from napari_shadowinv.preprocessing import Recipe
 
-_REFRESH_AFTER = 200  # ms; many small shots may end in a second
-_MOST_FAILURES = 100
-_NAME_WIDTH = 110
+_REFRESH_INTERVAL_MS = 200  # many small shots may finish within a second
+_MAX_FAILURES = 100
+_NAME_WIDTH_PX = 110
 _LAYER, _FILES, _TABLE, _FOLDER = "layer", "files", "table", "folder"
-_HERE, _SCHEDULER = "threads", "scheduler"
-_BETWEEN = "; "
+_LOCAL, _SCHEDULER = "threads", "scheduler"
+_SEPARATOR = "; "
 
 
 class _FilesEdit(PathEdit):
     def ask(self) -> str:
         paths, _ = QFileDialog.getOpenFileNames(self, self._title)
-        return _BETWEEN.join(paths)
+        return _SEPARATOR.join(paths)
 
 
 class StoreEdit(PathEdit):
-    """The folder that shots are written to, new or begun."""
+    """The folder to which results are written, new or to be resumed."""
 
     def __init__(self) -> None:
         super().__init__("Store of the results", f"results{STORE_SUFFIX}")
         self.edit.setToolTip(
-            f"<qt>A folder named …{STORE_SUFFIX}. If it exists, the run is resumed.</qt>"
+            f"<qt>Folder for the results, named …{STORE_SUFFIX}. If it exists, the run is "
+            "resumed.</qt>"
         )
 
     @property
@@ -81,7 +82,7 @@ class StoreEdit(PathEdit):
         return Path(self.path).expanduser()
 
     def ask(self) -> str:
-        # To go on with what is there is no danger: nothing is replaced without its box.
+        # Choosing an existing store is safe: it is resumed unless 'overwrite' is checked.
         path, _ = QFileDialog.getSaveFileName(
             self,
             self._title,
@@ -91,9 +92,9 @@ class StoreEdit(PathEdit):
         )
         if not path:
             return ""
-        chosen = Path(path)
-        # A store is a folder, which a dialog steps into.
-        for folder in (chosen, *chosen.parents):
+        selected = Path(path)
+        # A store is a folder, which the dialog enters.
+        for folder in (selected, *selected.parents):
             if folder.name.endswith(STORE_SUFFIX):
                 return str(folder)
         return path + STORE_SUFFIX
@@ -101,7 +102,7 @@ class StoreEdit(PathEdit):
 
 class ShotsPicker(RowPicker):
     def __init__(self, viewer: Any) -> None:
-        tip = "Image layer (shot, y, x); data on disk are read one shot at a time."
+        tip = "Stack of images (shot, y, x); data on disk are read one shot at a time."
         self.layers = LayerPicker(viewer, ("image",), tip, suits=may_be_shot)
         self.files = _FilesEdit("Files of the shots", "shots/*.tif")
         self.files.edit.setToolTip(
@@ -115,9 +116,9 @@ class ShotsPicker(RowPicker):
                 _LAYER: ("a stack layer", None),
                 _FILES: ("files", None),
                 _TABLE: ("a table (.csv)", None),
-                _FOLDER: ("a folder, watched", None),
+                _FOLDER: ("a watched folder", None),
             },
-            "Location of the shots.",
+            "Where the shots come from.",
             {
                 _LAYER: labelled("", self.layers),
                 _FILES: labelled("", self.files),
@@ -132,17 +133,17 @@ class ShotsPicker(RowPicker):
 
     @property
     def layer(self) -> Any | None:
-        """The chosen layer; None where files are chosen."""
+        """The chosen layer; None for files."""
         return self.layers.layer if self.picker.kind == _LAYER else None
 
     @property
     def is_watched(self) -> bool:
-        """Whether the shots are still to arrive."""
+        """Whether the shots come from a watched folder."""
         return bool(self.picker.kind == _FOLDER)
 
     @property
     def name(self) -> str:
-        """What to call the shots."""
+        """The name of the shots, such as a path."""
         if self.is_watched:
             return self.folder.folder.path
         if self.picker.kind == _FILES:
@@ -156,47 +157,47 @@ class ShotsPicker(RowPicker):
             return stack_of(self.layers.layer)
         if self.picker.kind == _TABLE:
             return self.table.shots()
-        parts = [part.strip() for part in self.files.path.split(_BETWEEN.strip())]
+        parts = [part.strip() for part in self.files.path.split(_SEPARATOR.strip())]
         paths = [os.path.expanduser(part) for part in parts if part]
         if not paths:
             raise InputError(
-                "no files are selected: enter a pattern such as shots/*.tif, or choose"
+                "no files are selected: enter a pattern such as shots/*.tif, or choose files"
             )
         return paths[0] if len(paths) == 1 else paths
 
 
 class EnginePicker(RowPicker):
-    """The computer in front of the user, or a scheduler of dask."""
+    """The computer of the run: this one, or a dask cluster."""
 
     def __init__(self) -> None:
         self.workers = QSpinBox()
         self.workers.setRange(0, 1024)
         self.workers.setSuffix(" at once")
         self.workers.setSpecialValueText("one per core")
-        self.workers.setToolTip("Number of shots inverted at the same time.")
+        self.workers.setToolTip("Number of shots to invert at the same time.")
         self.address = QLineEdit()
         self.address.setPlaceholderText("tcp://host:8786")
-        self.address.setToolTip("Address printed by 'dask scheduler' when it starts.")
+        self.address.setToolTip("Address that 'dask scheduler' prints when it starts.")
         self.address.setMinimumWidth(60)
         super().__init__(
             "Run on",
-            {_HERE: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
-            "This does not affect the results. Cluster workers must be able to access the shots "
-            "and the store at the same paths.",
-            {_HERE: labelled("Jobs", self.workers), _SCHEDULER: labelled("Address", self.address)},
+            {_LOCAL: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
+            "Where to run the inversions. The results are the same. Cluster workers need access to "
+            "the shots and the store at the same paths.",
+            {_LOCAL: labelled("Jobs", self.workers), _SCHEDULER: labelled("Address", self.address)},
         )
         self.workers.valueChanged.connect(lambda _: self.changed.emit())
         self.address.editingFinished.connect(self.changed)
 
     def engine(self) -> tuple[str, int | None]:
-        """Scheduler and number of workers, as `run_stack` takes them, or an `InputError`."""
-        if self.picker.kind == _HERE:
+        """Return scheduler and number of workers for `run_stack`, or raise an `InputError`."""
+        if self.picker.kind == _LOCAL:
             return "threads", self.workers.value() or None
         address = self.address.text().strip()
         if "://" not in address:
             raise InputError(
-                f"the scheduler's address is '{address}': expected one such as tcp://host:8786, "
-                "as printed by 'dask scheduler'"
+                f"the scheduler's address is '{address}': expected an address such as "
+                "tcp://host:8786, as printed by 'dask scheduler'"
             )
         return address, None
 
@@ -205,7 +206,7 @@ class EnginePicker(RowPicker):
         return {"kind": self.picker.kind, "workers": workers, "address": address}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        self.picker.set_kind(str(state.get("kind", _HERE)))
+        self.picker.set_kind(str(state.get("kind", _LOCAL)))
         self.workers.setValue(int(state.get("workers", 0)))
         self.address.setText(str(state.get("address", "")))
 
@@ -214,34 +215,36 @@ class FailureTable(ReportTable):
     def __init__(self) -> None:
         super().__init__()
         self.count = 0
-        # Names of files have no spaces to wrap at: their ends tell them apart.
+        # File names have no spaces to wrap at, and differ at their ends.
         self.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Fixed)
-        self.horizontalHeader().resizeSection(0, _NAME_WIDTH)
+        self.horizontalHeader().resizeSection(0, _NAME_WIDTH_PX)
 
     def show_failures(self, failures: list[tuple[str, str]]) -> None:
-        """Replace what is shown, by no more than can be looked through."""
+        """Show the first failures, and the number of further ones."""
         self.count = len(failures)
-        more = self.count - _MOST_FAILURES
-        rows = failures[:_MOST_FAILURES] + ([("…", f"and {more} more")] if more > 0 else [])
+        n_hidden = self.count - _MAX_FAILURES
+        rows = failures[:_MAX_FAILURES]
+        if n_hidden > 0:
+            rows = [*rows, ("…", f"and {n_hidden} more")]
         self.show_rows(rows)
         self.setVisible(bool(rows))
 
 
 class InvertStack(InversionInputs, ToolPanel):
-    """Choose shots and a store, press Run; again to go on after an interruption."""
+    """Choose shots and a store, then press Run; press it again to resume after an interruption."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        tip = "Invert all shots not yet in the store."
-        # A cancelled run has all the time that it needs to leave the store.
+        tip = "Invert all shots that are not in the store yet."
+        # A cancelled run may take as long as it needs to finish writing to the store.
         panel = RunPanel("Invert stack", "Run", tip, patience=math.inf)
         super().__init__(viewer, "invert-stack", panel)
         self.results = ResultLayers(viewer, self)
         self._shown: StackRequest | None = None
-        self._heard, self._look_at = 0, False
+        self._ended, self._resets_view = 0, False
         self._arrows: Any = None
         self._read_arrows: Callable[[], None] | None = None
-        self._soon = timer(self, _REFRESH_AFTER, self._refresh, once=True)
+        self._refresh_timer = timer(self, _REFRESH_INTERVAL_MS, self._refresh, once=True)
         self._build()
         self._connect()
         self.restore_last()
@@ -253,22 +256,24 @@ class InvertStack(InversionInputs, ToolPanel):
         self.make_inputs(
             lambda: self.shots.layer,
             ("labels",),
-            "Labels marking detector pixels in all shots. The inversion ignores masked pixels, "
-            "so do not mask the object.",
-            "Labels that hide the object from the source estimates only; the inversion still "
-            "uses it.",
+            "Labels on bad detector pixels, for all shots. The inversion ignores masked pixels, so "
+            "do not mask the object.",
+            "Labels that exclude the object from the source estimates only; the inversion still "
+            "uses these pixels.",
         )
         self.store = StoreEdit()
         self.overwrite = QCheckBox("overwrite the store")
-        self.overwrite.setToolTip("<qt>Start from scratch. Otherwise the run is resumed.</qt>")
-        self.redo_failed = QCheckBox("redo failed shots")
-        self.redo_failed.setToolTip("<qt>Retry shots that failed in an earlier run.</qt>")
+        self.overwrite.setToolTip(
+            "<qt>Delete the results in the store first. Otherwise the run is resumed.</qt>"
+        )
+        self.redo_failed = QCheckBox("retry failed shots")
+        self.redo_failed.setToolTip("<qt>Retry the shots that failed in an earlier run.</qt>")
         self.engine = EnginePicker()
         self.report = ReportTable()
         self.save_result = SaveButton(
             self,
             lambda: shot_to_save(self.viewer, shown_result(self.viewer, self._fields_shown())),
-            "Write the shot in view to a file of its own. The store holds all shots already.",
+            "Save the displayed shot to a separate file. The store already contains all shots.",
         )
         self.more_layers = MoreLayersButton(self, lambda: self.results)
         self.failures_title = QLabel("Failed shots")
@@ -276,7 +281,7 @@ class InvertStack(InversionInputs, ToolPanel):
         self.failures = FailureTable()
         self.add(self.shots, *self.beam, *self.how, labelled("Store", self.store))
         self.add(labelled("", self.overwrite), labelled("", self.redo_failed), self.engine)
-        self.add(self.panel, beside((self.save_result, 1), (self.more_layers, 1)))
+        self.add(self.panel, side_by_side((self.save_result, 1), (self.more_layers, 1)))
         self.add(self.report, self.failures_title, self.failures)
 
     def _connect(self) -> None:
@@ -312,7 +317,7 @@ class InvertStack(InversionInputs, ToolPanel):
             job,
             layer,
             self.companions(layer),
-            {} if layer is None else place_on(layer, recipe),
+            {} if layer is None else placement_on(layer, recipe),
             self.origins(layer, self.shots.name),
         )
 
@@ -335,82 +340,86 @@ class InvertStack(InversionInputs, ToolPanel):
         return WatchRequest(job, None, self.companions(None), {}, origins)
 
     def _source(self, layer: Any) -> ArrayLike | None:
-        # A run may have a source for each shot.
-        chosen = self.source.layers.layer
-        if self.source.picker.kind == "layer" and chosen is not None and chosen.ndim == 3:
-            return stack_of(chosen)
+        # A stack of sources has one for each shot.
+        layer_of_source = self.source.layers.layer
+        if (
+            self.source.picker.kind == "layer"
+            and layer_of_source is not None
+            and layer_of_source.ndim == 3
+        ):
+            return stack_of(layer_of_source)
         beam = self.source.measured(layer)
         return None if beam is None else beam.image
 
     # A run
 
-    def _on_progress(self, news: Progress) -> None:
-        if news.stage == "shots" or (news.stage == "wait" and news.step):
+    def _on_progress(self, progress: Progress) -> None:
+        if progress.stage == "shots" or (progress.stage == "wait" and progress.step):
             self._show(self.panel.runner.tag)
 
     def _show(self, request: StackRequest) -> None:
-        # Once it is done: to press Run again must not throw these shots away.
+        # Once only: pressing Run again must not discard these shots.
         self.overwrite.setChecked(False)
         self.redo_failed.setChecked(False)
-        books = request.job.books
-        if len(books.failures) != self.failures.count:
-            self._show_failures(list(books.failures))
-        if request.described and request is not self._shown:
+        status = request.job.status
+        if len(status.failures) != self.failures.count:
+            self._show_failures(list(status.failures))
+        if request.layer_data and request is not self._shown:
             self._show_layers(request)
-        elif books.ended > self._heard and not self._soon.isActive():
-            self._soon.start()
-        self._heard = books.ended
+        elif status.ended > self._ended and not self._refresh_timer.isActive():
+            self._refresh_timer.start()
+        self._ended = status.ended
 
     def _show_layers(self, request: StackRequest) -> None:
         earlier, self._shown = self._shown, request
-        again = earlier is not None and earlier.job.out == request.job.out
+        is_resumed = earlier is not None and earlier.job.out == request.job.out
         setup = request.job.recipe.setup
         if request.image is not None and setup is not None:
             place_together(self.viewer, request.image, setup, request.companions)
-        if earlier is not None and again:
-            request.go_on_from(earlier, self.results.layers)
+        if earlier is not None and is_resumed:
+            request.continue_from(earlier, self.results.layers)
         else:
             self.results = ResultLayers(self.viewer, self)
             self.results.complete.connect(self._on_layers)
-        self._look_at = not again and request.image is None
-        described = main_layers(request.described, also=self.results.slots)
-        self.results.show(described, select=not again)
+        self._resets_view = not is_resumed and request.image is None
+        layer_data = main_layers(request.layer_data, also=self.results.layer_keys)
+        self.results.show(layer_data, select=not is_resumed)
 
     def _on_layers(self) -> None:
-        # Files lie where their setup puts them, which may be far from what is in view.
-        if self._look_at:
-            self._look_at = False
+        # The setup places the results of files, perhaps far outside the view.
+        if self._resets_view:
+            self._resets_view = False
             self.viewer.reset_view()
             if isinstance(self._shown, WatchRequest):
-                show_shot(self.viewer, newest_of(self.results.layers))
-        arrows = next((one for one in self.results.layers if role_of(one) == "arrows"), None)
+                show_shot(self.viewer, newest_shot(self.results.layers))
+        arrows = next(filter(_is_arrows, self.results.layers), None)
         if arrows is not self._arrows:
             self._arrows = arrows
             self._read_arrows = None if arrows is None else follow_shots(self.viewer, arrows)
-        self._soon.start()
+        self._refresh_timer.start()
 
     def _refresh(self) -> None:
         if isinstance(self._shown, WatchRequest):
             self._grow(self._shown)
         if self._shown is not None:
-            self._shown.follow(self.results.layers)
+            self._shown.update_limits(self.results.layers)
         for layer in self.results.layers:
             layer.refresh()
         if self._read_arrows is not None:
             self._read_arrows()
 
     def _grow(self, shown: WatchRequest) -> None:
-        """Show what has arrived; who has stepped back to an earlier shot is left there."""
+        """Add new shots to the layers; follow them only if the newest shot was in view."""
         if self.results.busy:
-            self._soon.start()
+            self._refresh_timer.start()
             return
-        at_end = last_in_view(self.viewer, self.results.layers)
-        newest = shown.renew(self.results.layers)
-        if at_end and newest is not None:
+        is_at_end = is_newest_in_view(self.viewer, self.results.layers)
+        newest = shown.add_new_shots(self.results.layers)
+        if is_at_end and newest is not None:
             show_shot(self.viewer, newest)
 
     def forget(self) -> None:
-        self._heard = 0
+        self._ended = 0
         self.report.empty()
         self._show_failures([])
         self.panel.say("")
@@ -422,29 +431,33 @@ class InvertStack(InversionInputs, ToolPanel):
     @notify_errors
     def _on_end(self, outcome: Outcome) -> None:
         request: StackRequest = outcome.tag
-        books = request.job.books
-        if not books.total:
+        status = request.job.status
+        if not status.total:
             if outcome.error is not None:
                 return  # the panel shows why
             if self.shots.is_watched:
-                self.panel.say("Ended: no shot has arrived.")
+                self.panel.say("Stopped: no shot has arrived.")
             return
         self._show(request)
         self.report.show_rows(request.origins.rows())
         if outcome.cancelled:
-            self.panel.say(f"Cancelled: {books.text}; press Run to resume.")
+            self.panel.say(f"Cancelled: {status.text}. Press Run to resume.")
         else:
-            self.panel.say(f"{books.text}, in {request.job.out.name}")
+            self.panel.say(f"{status.text}, in {request.job.out.name}")
         self.panel.status.setToolTip(str(request.job.out.absolute()))
 
     # Layers
 
     def _on_layer(self) -> None:
         layer = self.shots.layer
-        # In the order of their arrival there is nothing to distribute.
+        # Watched shots are inverted one by one, as they arrive.
         self.engine.setVisible(not self.shots.is_watched)
         self.source.follow(layer)
         self.setup.follow(layer, "" if layer is not None else self.shots.name)
         if not self.panel.runner.running:
             self.forget()
         self.keep()
+
+
+def _is_arrows(layer: Any) -> bool:
+    return role_of(layer) == "arrows"

@@ -1,4 +1,4 @@
-"""The widget that reads values off a line across layers: `LineProfile`."""
+"""The widget that plots values along a line across layers: `LineProfile`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from qtpy.QtCore import QSignalBlocker, QSize, Qt
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._fields import SteadyComboBox
+from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
 from napari_shadowinv._napari.widgets._panels import WIDTH
 from napari_shadowinv._napari.widgets._plots import COLOURS, Plot
@@ -27,13 +27,13 @@ from napari_shadowinv.errors import InputError
 if TYPE_CHECKING:
     import napari
 
-_FOLLOW = 40  # ms between two drawings while the line moves
+_REDRAW_MS = 40  # while the line moves
 _LAYER_ROLE = Qt.ItemDataRole.UserRole
-_STRAIGHT = ("line", "path")
+_LINE_SHAPES = ("line", "path")
 _PIXELS = "px"
-_WIDEST = 1e6
-_MOST_SAMPLES = 5000
-_LONGEST_NAME = 34
+_MAX_WIDTH = 1e6
+_MAX_SAMPLES = 5000
+_MAX_NAME_LENGTH = 34
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,19 +41,19 @@ class Profile:
     name: str
     unit: str
     values: FloatArray  # NaN where the line is outside the image
-    averaged: str = ""  # what the values are averaged over; empty for those on the line alone
+    averaging: str = ""  # in words; empty for values on the line
 
 
-def along(vertices: ArrayLike, step: float) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 2) at most a step apart along corners (k, 2), and their distances along it."""
-    corners, reached = _corners(vertices)
-    count = min(int(np.ceil(reached[-1] / step - 1e-9)) + 1, _MOST_SAMPLES)
-    distance = np.linspace(0, reached[-1], max(count, 2))
-    return _on_path(corners, reached, distance), distance
+def sample_path(vertices: ArrayLike, step: float) -> tuple[FloatArray, FloatArray]:
+    """Return points (n, 2) along a path, at most a step apart, and their distances along it."""
+    corners, cumulative_length = _corners(vertices)
+    count = min(int(np.ceil(cumulative_length[-1] / step - 1e-9)) + 1, _MAX_SAMPLES)
+    distance = np.linspace(0, cumulative_length[-1], max(count, 2))
+    return _points_at(corners, cumulative_length, distance), distance
 
 
 def _corners(vertices: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Corners of a path, no two of them in one place, and its length up to each."""
+    """Return the distinct corners of a path, and its length up to each corner."""
     corners = np.asarray(vertices, dtype=np.float64)
     lengths = np.hypot(*np.diff(corners, axis=0).T)
     moves = np.concatenate([[True], lengths > 0])
@@ -62,29 +62,37 @@ def _corners(vertices: ArrayLike) -> tuple[FloatArray, FloatArray]:
     return corners, np.concatenate([[0.0], np.cumsum(lengths)])
 
 
-def _on_path(corners: FloatArray, reached: FloatArray, distance: FloatArray) -> FloatArray:
-    return np.stack([np.interp(distance, reached, corners[:, axis]) for axis in (0, 1)], axis=1)
+def _points_at(
+    corners: FloatArray, cumulative_length: FloatArray, distance: FloatArray
+) -> FloatArray:
+    return np.stack(
+        [np.interp(distance, cumulative_length, corners[:, axis]) for axis in (0, 1)], axis=1
+    )
 
 
-def abreast(vertices: ArrayLike, distance: FloatArray, width: float, step: float) -> FloatArray:
-    """Points (m, n, 2) of a strip: n rows across a path, of m points at most a step apart."""
-    corners, reached = _corners(vertices)
-    points = _on_path(corners, reached, distance)
+def sample_strip(
+    vertices: ArrayLike, distance: FloatArray, width: float, step: float
+) -> FloatArray:
+    """Return points (m, n, 2) of a strip: at n distances, m points across the path."""
+    corners, cumulative_length = _corners(vertices)
+    points = _points_at(corners, cumulative_length, distance)
     edges = np.diff(corners, axis=0)
-    edge = np.clip(np.searchsorted(reached, distance, side="right") - 1, 0, len(edges) - 1)
+    edge = np.clip(
+        np.searchsorted(cumulative_length, distance, side="right") - 1, 0, len(edges) - 1
+    )
     lengths = np.maximum(np.hypot(*edges.T), np.finfo(float).tiny)
     along_y, along_x = (edges / lengths[:, None])[edge].T
     across = np.stack([along_x, -along_y], axis=1)
-    count = min(max(int(np.ceil(width / step - 1e-9)), 1), _MOST_SAMPLES)
+    count = min(max(int(np.ceil(width / step - 1e-9)), 1), _MAX_SAMPLES)
     offsets = width * ((np.arange(count) + 0.5) / count - 0.5)
     rows: FloatArray = points + offsets[:, None, None] * across
     return rows
 
 
-def sampled(
+def interpolate(
     image: ArrayLike, points: FloatArray, to_pixels: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
-    """Values at points (n, 2) of the world, or means over the m of (m, n, 2); NaN outside."""
+    """Return values at world points (n, 2), or means over m of (m, n, 2); NaN outside."""
     from scipy.ndimage import map_coordinates
 
     plane = np.asarray(image, dtype=np.float64)
@@ -134,7 +142,7 @@ def measure_peak(distance: FloatArray, values: FloatArray) -> PeakMeasures | Non
 
 
 def _half_maximum(distance: FloatArray, relative: FloatArray) -> float:
-    """Distance at which a flank, which begins at its peak of 1, falls to a half; NaN if never."""
+    """Return the distance at which a flank, starting at 1, falls to a half; NaN if it does not."""
     below = np.flatnonzero(relative < 0.5)
     if not below.size or below[0] == 0:
         return float("nan")
@@ -143,7 +151,7 @@ def _half_maximum(distance: FloatArray, relative: FloatArray) -> float:
 
 
 def table_text(distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> str:
-    """Return profiles as comma-separated values, a column each, with units in the first row."""
+    """Return profiles as comma-separated columns, with units in the first row."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([f"distance ({unit})", *(_heading(profile) for profile in profiles)])
@@ -153,21 +161,21 @@ def table_text(distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> 
 
 
 def _heading(profile: Profile) -> str:
-    """Its name, with the unit if the name does not tell it, and what it is averaged over."""
+    """Return the heading of a column: name, unit unless in the name, and averaging."""
     name = profile.name
     if profile.unit and f"({profile.unit})" not in name:
         name = f"{name} ({profile.unit})"
-    return f"{name}, {profile.averaged}" if profile.averaged else name
+    return f"{name}, {profile.averaging}" if profile.averaging else name
 
 
 class ProfilePlot(Plot):
-    """One plot for each unit, one above the other, with the distance in common."""
+    """A plot for each unit, in a column with a common distance axis."""
 
     def __init__(self) -> None:
         super().__init__(height=220)
 
     def show_profiles(self, distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> None:
-        """Draw profiles; none empties the plot."""
+        """Draw profiles; without profiles, empty the plot."""
         if self.figure is None and not profiles:
             return
         units = list(dict.fromkeys(profile.unit for profile in profiles))
@@ -177,31 +185,35 @@ class ProfilePlot(Plot):
             for number, profile in enumerate(profiles):
                 if profile.unit == of_unit:
                     colour, name = COLOURS[number % len(COLOURS)], profile.name
-                    name = name if len(name) <= _LONGEST_NAME else f"…{name[1 - _LONGEST_NAME :]}"
+                    name = (
+                        name
+                        if len(name) <= _MAX_NAME_LENGTH
+                        else f"…{name[1 - _MAX_NAME_LENGTH :]}"
+                    )
                     axis.plot(distance, profile.values, color=colour, label=name)
             if profiles:
                 self.add_legend(axis)
-        averaged = f", {profiles[0].averaged}" if profiles and profiles[0].averaged else ""
-        axes[-1].set_xlabel(f"distance ({unit}){averaged}", color=self.ink)
+        averaging = f", {profiles[0].averaging}" if profiles and profiles[0].averaging else ""
+        axes[-1].set_xlabel(f"distance ({unit}){averaging}", color=self.ink)
         self.draw()
 
 
 class LineProfile(qt.Docked):
-    """Draw a line; see the values of the checked layers along it, in their units."""
+    """Draw a line to plot the values of the checked layers along it, in their units."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__()
         self.viewer = viewer
         self._distance, self._unit = np.zeros(0), "px"
         self.profiles: list[Profile] = []
-        tip = "<qt>Shapes layer with the line; if it has several, the selected one is used.</qt>"
+        tip = "<qt>Shapes layer with the line. Of several lines, the selected one is used.</qt>"
         self.lines = LayerPicker(viewer, ("shapes",), tip, "none yet")
         self.layers = QtWidgets.QListWidget()
         self.layers.setToolTip("Layers to plot.")
         self.layers.setMaximumHeight(110)
         self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.width_edit = QtWidgets.QDoubleSpinBox()
-        self.width_edit.setRange(0.0, _WIDEST)
+        self.width_edit.setRange(0.0, _MAX_WIDTH)
         self.width_edit.setDecimals(2)
         self.width_edit.setSpecialValueText("0: line only")
         self.width_edit.setKeyboardTracking(False)
@@ -215,25 +227,25 @@ class LineProfile(qt.Docked):
         self.plot = ProfilePlot()
         self.measures = forms.wrapping_label()
         self.measures.setToolTip(
-            "<qt>Peak: the value of largest magnitude. Width: full width at half of the peak, "
-            "counted from zero. Area: integral along the line.</qt>"
+            "<qt>Peak: value of largest magnitude. Width: full width at half of the peak, relative "
+            "to zero. Area: integral along the line.</qt>"
         )
         self.hint = forms.wrapping_label("Press ✎ and draw a line on the image.")
         self.problem = forms.wrapping_label(style=forms.PROBLEM_STYLE)
         self.export = QtWidgets.QPushButton("Export CSV…")
         self.export.setToolTip("Save the profile as a table.")
         lines = forms.with_button(self.lines, "✎", "Draw a new line.", self._draw)
-        width = qt.beside((self.width_edit, 2), (self.width_unit, 1))
+        width = qt.side_by_side((self.width_edit, 2), (self.width_unit, 1))
         rows = (
             forms.labelled("Line", lines),
             self.layers,
             forms.labelled("Width", width),
             self.hint,
         )
-        whole = qt.column(self, *rows, margin=6)
-        whole.addWidget(self.plot, 1)
+        layout = qt.column(self, *rows, margin=6)
+        layout.addWidget(self.plot, 1)
         for widget in (self.measures, self.export, self.problem):
-            whole.addWidget(widget)
+            layout.addWidget(widget)
         self.setMinimumWidth(WIDTH)
         self.setSizePolicy(
             QtWidgets.QSizePolicy.Policy.Preferred, QtWidgets.QSizePolicy.Policy.Expanding
@@ -245,23 +257,23 @@ class LineProfile(qt.Docked):
         return QSize(WIDTH + 50, 600)
 
     def _connect(self) -> None:
-        self._timer = qt.timer(self, _FOLLOW, self.update_plot, once=True)
+        self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
         self._watched: list[Any] = []
         events = self.viewer.layers.events
         for emitter in (events.inserted, events.removed, events.reordered):
             qt.while_alive(self, emitter, self._fill)
-        qt.while_alive(self, self.viewer.dims.events.current_step, self._soon)
-        self.lines.picked.connect(self._soon)
+        qt.while_alive(self, self.viewer.dims.events.current_step, self._schedule_plot)
+        self.lines.picked.connect(self._schedule_plot)
         for signal in (
             self.layers.itemChanged,
             self.width_edit.valueChanged,
             self.width_unit.currentIndexChanged,
         ):
-            signal.connect(lambda _: self._soon())
+            signal.connect(lambda _: self._schedule_plot())
         self.export.clicked.connect(lambda: self._export())
 
     def _items(self) -> list[tuple[Any, Any]]:
-        """The rows of the list, each with its layer."""
+        """Return the items of the list with their layers."""
         items = [self.layers.item(row) for row in range(self.layers.count())]
         return [(item, item.data(_LAYER_ROLE)) for item in items]
 
@@ -270,8 +282,8 @@ class LineProfile(qt.Docked):
         return [layer for item, layer in self._items() if item.checkState() == on]
 
     def check(self, layer: Any, on: bool = True) -> None:
-        for item, known in self._items():
-            if known is layer:
+        for item, listed in self._items():
+            if listed is layer:
                 item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
 
     def update_plot(self) -> None:
@@ -280,18 +292,18 @@ class LineProfile(qt.Docked):
         self.profiles = []
         if vertices is not None and layers:
             step = min(float(np.min(np.abs(layer.scale[-2:]))) for layer in layers)
-            _, self._distance = along(vertices, step)
+            _, self._distance = sample_path(vertices, step)
             self._unit = f"{layers[0].units[-1]:~P}"
             self._offer_width_in(self._unit)
-            width, averaged = self._width(step)
-            points = abreast(vertices, self._distance, width, step)
-            now = self.viewer.dims.point
+            width, averaging = self._width(step)
+            points = sample_strip(vertices, self._distance, width, step)
+            position = self.viewer.dims.point
             self.profiles = [
                 Profile(
                     layer.name,
                     unit_of(layer),
-                    sampled(shown_plane(layer, now), points, _mapper(layer)),
-                    averaged,
+                    interpolate(shown_plane(layer, position), points, _mapper(layer)),
+                    averaging,
                 )
                 for layer in layers
             ]
@@ -311,23 +323,23 @@ class LineProfile(qt.Docked):
         self.measures.setVisible(bool(lines))
 
     def show_problem(self, text: str) -> None:
-        """Show what is wrong, where it can be read until there is another profile."""
+        """Show a problem until the next profile."""
         self.problem.setText(text)
         self.problem.setVisible(True)
 
     def _offer_width_in(self, unit: str) -> None:
-        """Let the width be told in pixels or in the unit of the world."""
+        """Offer the width in pixels and in the world's unit."""
         units = [_PIXELS] + ([] if unit in ("pixel", "pixels", _PIXELS) else [unit])
         if units == [self.width_unit.itemText(n) for n in range(self.width_unit.count())]:
             return
-        chosen = max(self.width_unit.currentIndex(), 0)
+        index = max(self.width_unit.currentIndex(), 0)
         with QSignalBlocker(self.width_unit):
             self.width_unit.clear()
             self.width_unit.addItems(units)
-            self.width_unit.setCurrentIndex(min(chosen, len(units) - 1))
+            self.width_unit.setCurrentIndex(min(index, len(units) - 1))
 
     def _width(self, pixel: float) -> tuple[float, str]:
-        """Width of the strip in the unit of the world, and in words."""
+        """Return the width of the strip in the world's unit, and the averaging in words."""
         number, unit = self.width_edit.value(), self.width_unit.currentText()
         if not number:
             return 0.0, ""
@@ -335,49 +347,49 @@ class LineProfile(qt.Docked):
         return width, f"mean over {number:g} {unit}"
 
     def table(self) -> str:
-        """What is shown, as comma-separated values; an `InputError` if that is nothing."""
+        """Return the profiles as comma-separated values, or raise an `InputError`."""
         if not self.profiles:
             raise InputError("there is no profile to export: draw a line and check a layer first")
         return table_text(self._distance, self._unit, self.profiles)
 
     def _vertices(self) -> Any | None:
-        """Corners of the chosen line, in the world."""
+        """Return the corners of the selected line in world coordinates."""
         shapes = self.lines.layer
         if shapes is None:
             return None
-        straight = [n for n, kind in enumerate(shapes.shape_type) if kind in _STRAIGHT]
-        chosen = [n for n in straight if n in shapes.selected_data] or straight
-        if not chosen:
+        lines = [n for n, kind in enumerate(shapes.shape_type) if kind in _LINE_SHAPES]
+        selected = [n for n in lines if n in shapes.selected_data] or lines
+        if not selected:
             return None
-        return np.array([shapes.data_to_world(corner)[-2:] for corner in shapes.data[chosen[-1]]])
+        return np.array([shapes.data_to_world(corner)[-2:] for corner in shapes.data[selected[-1]]])
 
-    def _soon(self, event: Any = None) -> None:
+    def _schedule_plot(self, event: Any = None) -> None:
         self._watch()
         if not self._timer.isActive():
             self._timer.start()
 
     def _watch(self) -> None:
         for layer in [self.lines.layer, *self.checked()]:
-            if layer is None or any(layer is known for known in self._watched):
+            if layer is None or any(layer is watched for watched in self._watched):
                 continue
             self._watched.append(layer)
             qt.while_alive(self, layer.events.set_data, self._on_layer)
 
     def _on_layer(self, event: Any) -> None:
-        if event.source is self.lines.layer or any(event.source is one for one in self.checked()):
-            self._soon()
+        if any(event.source is layer for layer in (self.lines.layer, *self.checked())):
+            self._schedule_plot()
 
     def _fill(self, event: Any = None) -> None:
-        """Offer all plane images, the ones that can be seen checked when they are new."""
-        known, checked = [layer for _, layer in self._items()], self.checked()
+        """List all grey images; new visible ones are checked."""
+        listed, checked = [layer for _, layer in self._items()], self.checked()
         self.layers.blockSignals(True)
         self.layers.clear()
         for layer in reversed(self.viewer.layers):
             if kind_of(layer) != "image" or layer.rgb or layer.ndim < 2:
                 continue
-            new = not any(layer is one for one in known)
-            on = any(layer is one for one in checked) or (
-                new and layer.visible and (role_of(layer) is not None or not known)
+            is_new = not any(layer is old for old in listed)
+            on = any(layer is old for old in checked) or (
+                is_new and layer.visible and (role_of(layer) is not None or not listed)
             )
             item = QtWidgets.QListWidgetItem(layer.name)
             item.setData(_LAYER_ROLE, layer)
@@ -385,11 +397,13 @@ class LineProfile(qt.Docked):
             item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
             self.layers.addItem(item)
         self.layers.blockSignals(False)
-        self._soon()
+        self._schedule_plot()
 
     @qt.notify_errors
     def _draw(self) -> None:
-        images = self.checked() or [one for one in self.viewer.layers if kind_of(one) == "image"]
+        images = self.checked() or [
+            layer for layer in self.viewer.layers if kind_of(layer) == "image"
+        ]
         if not images:
             raise InputError(
                 "there is no image to draw a line on: open one (File → Open) or use a sample "
@@ -410,11 +424,11 @@ class LineProfile(qt.Docked):
 
 
 def _mapper(layer: Any) -> Callable[[Any], Any]:
-    """What brings points of the world to pixels of a layer, also of one that was turned."""
+    """Return the function from world points to a layer's pixels, which may be rotated."""
     leading = np.zeros(layer.ndim - 2)
-    origin, one_down, one_right = (
+    origin, next_row, next_column = (
         np.asarray(layer.data_to_world((*leading, *pixel))[-2:])
         for pixel in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
     )
-    to_pixels = np.linalg.inv(np.stack([one_down - origin, one_right - origin], axis=1))
+    to_pixels = np.linalg.inv(np.stack([next_row - origin, next_column - origin], axis=1))
     return lambda points: (points - origin) @ to_pixels.T

@@ -1,11 +1,11 @@
-"""What a fit's user is told of its time: before it, and while it runs."""
+"""Time and progress of a fit: estimated before it, and shown while it runs."""
 
 from __future__ import annotations
 
 import pytest
 
 from napari_shadowinv import ProtonSetup, fit
-from napari_shadowinv._napari.fit_course import Course, Pace, forecast_of
+from napari_shadowinv._napari.fit_progress import FitProgress, Pace, estimate_fit_time
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.fitting import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -23,37 +23,37 @@ SETUPS = [
 @pytest.mark.parametrize(("options", "stages"), [(OPTIONS, 4), (FitOptions(samples=0, steps=3), 3)])
 def test_the_bar_never_goes_back_and_names_the_stages(options: FitOptions, stages: int) -> None:
     truth = gaussian_blob((48, 48), 15.0, 8.0).displacement
-    course = Course(forecast_of((48, 48), 2, 1, None, options))
-    heard: list[Progress] = []
+    progress = FitProgress(estimate_fit_time((48, 48), 2, 1, None, options))
+    reports: list[Progress] = []
     fit(
         [synthetic_image(truth), synthetic_image(0.6 * truth)],
         strengths=[1, 0.6],
         noise=0.02,
         options=options,
-        on_progress=lambda news: heard.append(course.heard(news)),
+        on_progress=lambda report: reports.append(progress.update(report)),
     )
-    heard = [news for news in heard if news.stage != "compile"]
-    shares = [news.step / news.total for news in heard if news.total]
-    assert len(shares) == len(heard)
+    reports = [report for report in reports if report.stage != "compile"]
+    shares = [report.step / report.total for report in reports if report.total]
+    assert len(shares) == len(reports)
     assert shares == sorted(shares)
     assert 0 < shares[0] < 0.05
     assert 0.8 < shares[-1] <= 1
-    words = [news.message.partition(",")[0] for news in heard]
+    words = [report.message.partition(",")[0] for report in reports]
     assert list(dict.fromkeys(words)) == [f"stage {k + 1} of {stages}" for k in range(stages)]
-    assert "starts (transport)" in heard[0].message
-    assert not any("nan" in news.text for news in heard)
+    assert "starts (transport)" in reports[0].message
+    assert not any("nan" in report.text for report in reports)
 
 
 def test_other_progress_is_passed_on() -> None:
-    course = Course(forecast_of((48, 48), 2, 1, None, OPTIONS))
+    progress = FitProgress(estimate_fit_time((48, 48), 2, 1, None, OPTIONS))
     compiling = Progress("compile", 1, None, "once")
-    assert course.heard(compiling) is compiling
-    assert course.history == []
+    assert progress.update(compiling) is compiling
+    assert progress.history == []
 
 
 def test_a_forecast_grows_with_what_is_asked_for() -> None:
     def seconds(side: int, count: int, fields: int = 1, source: str | None = None) -> float:
-        return forecast_of((side, side), count, fields, source, FitOptions()).seconds
+        return estimate_fit_time((side, side), count, fields, source, FitOptions()).seconds
 
     assert 4 < seconds(200, 2) < 8
     assert 1.5 < seconds(64, 2) < 4
@@ -61,16 +61,16 @@ def test_a_forecast_grows_with_what_is_asked_for() -> None:
     assert seconds(200, 4) > 1.5 * seconds(200, 2)
     assert seconds(200, 2, fields=2) > 1.3 * seconds(200, 2)
     assert seconds(200, 2, source="unknown") > 1.5 * seconds(200, 2)
-    none = forecast_of((200, 200), 2, 1, None, FitOptions(samples=0)).seconds
+    none = estimate_fit_time((200, 200), 2, 1, None, FitOptions(samples=0)).seconds
     assert none < seconds(200, 2)
 
 
 def test_the_next_forecast_follows_the_last_fit() -> None:
-    forecast = forecast_of((1000, 1000), 3, 2, None, FitOptions())
+    estimate = estimate_fit_time((1000, 1000), 3, 2, None, FitOptions())
     pace = Pace()
-    text = forecast.text(pace)
+    text = estimate.text(pace)
     assert text.startswith("3 images of 1000 × 1000 px, 2 fields: about 4 min, up to 16 min")
-    pace.learn(forecast, 3 * forecast.seconds)
-    assert "about 12 min, judging by the last fit" in forecast.text(pace)
-    one = forecast_of((200, 200), 1, 1, "unknown", FitOptions())
-    assert one.text(Pace()).startswith("one image of 200 × 200 px, unknown beam: about ")
+    pace.learn(estimate, 3 * estimate.seconds)
+    assert "about 12 min, based on the last fit" in estimate.text(pace)
+    single = estimate_fit_time((200, 200), 1, 1, "unknown", FitOptions())
+    assert single.text(Pace()).startswith("one image of 200 × 200 px, unknown beam: about ")

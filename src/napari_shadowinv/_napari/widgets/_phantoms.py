@@ -1,4 +1,4 @@
-"""The image that an object would make, as plain arrays: no napari, no Qt."""
+"""Simulated objects and the images that they cast, as plain arrays, without napari and Qt."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ if TYPE_CHECKING:
 
 
 class PhantomRecipe(CheckedModel):
-    """An object whose field is known."""
+    """A simulated object with parameters of its field."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     title: ClassVar[str]
-    # Kind of setup that the object needs; empty for any, or none.
+    # Kind of setup that the object requires; empty for any setup, or none.
     probe: ClassVar[str] = ""
 
     def phantom(self, shape: tuple[int, int], setup: Any) -> Phantom:
-        """Make it in the middle of an image, or raise an `InputError` if it needs another setup."""
+        """Create the object at the centre of an image; raise an `InputError` for a wrong setup."""
         if self.probe and getattr(setup, "kind", None) != self.probe:
-            raise InputError(_NEEDS[self.probe])
+            raise InputError(_SETUP_HINTS[self.probe])
         from napari_shadowinv.physics import phantoms
 
-        return self._made(phantoms, shape, setup)
+        return self._build(phantoms, shape, setup)
 
     def shadow(self, shape: tuple[int, int], setup: Any) -> BoolArray | None:
-        """Pixels where the object stops the beam; None if it is transparent."""
+        """Return the pixels where the object stops the beam; None if it is transparent."""
         return None
 
-    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+    def _build(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
         raise NotImplementedError
 
 
-_NEEDS = {
-    "proton": "a magnetic field deflects particles: choose the setup 'particles' for this object",
-    "optical": "a plasma wave is probed by light: choose the setup 'light' for this object",
+_SETUP_HINTS = {
+    "proton": "a magnetic field deflects particles: select the setup 'particles' for this object",
+    "optical": "a plasma wave is probed by light: select the setup 'light' for this object",
 }
 
 
@@ -60,7 +60,7 @@ def _peak(default: float, where: str) -> Any:
     return Field(
         default=default,
         title="Peak field (MG µm)",
-        description=f"Path-integrated field at {where}, in MG µm; negative values focus.",
+        description=f"Path-integrated field at {where}, in MG µm; negative for a focusing field.",
     )
 
 
@@ -70,7 +70,7 @@ class ToroidRecipe(PhantomRecipe):
     peak: float = _peak(97.0, "the radius")
     radius: float = _metres(30e-6, "Radius", "Radius σ of maximum field, in the object plane.")
 
-    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+    def _build(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
         return phantoms.toroid(shape, setup, self.peak, self.radius)
 
 
@@ -86,7 +86,7 @@ class FourToroidsRecipe(PhantomRecipe):
         json_schema_extra={"slider": [0.05, 3.0]},
     )
 
-    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+    def _build(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
         return phantoms.four_toroids(shape, setup, self.strength)
 
 
@@ -103,7 +103,7 @@ class CoaxialRecipe(PhantomRecipe):
     def shadow(self, shape: tuple[int, int], setup: Any) -> BoolArray:
         return self._line(shape, setup)[1]
 
-    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+    def _build(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
         return self._line(shape, setup)[0]
 
     def _line(self, shape: tuple[int, int], setup: Any) -> tuple[Phantom, BoolArray]:
@@ -140,7 +140,7 @@ class WakefieldRecipe(PhantomRecipe):
         ),
     )
 
-    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+    def _build(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
         return phantoms.wakefield(shape, setup, **self.model_dump())
 
 
@@ -149,7 +149,7 @@ class BlobRecipe(PhantomRecipe):
     amplitude: float = Field(
         default=50.0,
         title="Amplitude (px²)",
-        description="Peak of the normalised potential in px²; negative values focus.",
+        description="Peak of the normalised potential in px²; negative for a focusing object.",
     )
     sigma: float = Field(
         default=20.0,
@@ -158,7 +158,7 @@ class BlobRecipe(PhantomRecipe):
         description="Standard deviation in px of the object plane.",
     )
 
-    def _made(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
+    def _build(self, phantoms: ModuleType, shape: tuple[int, int], setup: Any) -> Phantom:
         return phantoms.gaussian_blob(shape, self.amplitude, self.sigma)
 
 
@@ -172,49 +172,51 @@ PHANTOMS: dict[str, type[PhantomRecipe]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Forecast:
+class Prediction:
+    """The image that an object casts, with its displacement and source."""
+
     image: FloatArray  # in the unit of the source
     displacement: FloatArray  # px
-    source: FloatArray | None  # the beam without what the object stops; None if it is uniform
-    caustic_share: float  # of the pixels, whose rays cross or nearly do
-    kept: float  # share of the flux that lands inside the image
-    assumed: str = ""  # what is taken to bend the beam in another experiment than its own
+    source: FloatArray | None  # the beam past opaque parts of the object; None if uniform
+    caustic_share: float  # of the pixels: rays cross or nearly cross there
+    flux_inside: float  # share of the flux that lands inside the image
+    assumption: str = ""  # about the deflecting field, for another setup than the field's
 
     @property
     def warning(self) -> str:
-        """What to know before planning with it; empty if there is nothing."""
-        texts = [self.assumed] if self.assumed else []
+        """Warnings about caustics, lost flux and assumptions; empty without any."""
+        texts = [self.assumption] if self.assumption else []
         if self.caustic_share > 0:
             texts.append(
                 f"Caustics: rays cross or nearly cross in {self.caustic_share:.2%} of the "
                 "pixels. Once rays cross, one image no longer determines the whole field."
             )
-        if self.kept < 0.99:
-            texts.append(f"Only {self.kept:.1%} of the flux lands inside the image.")
+        if self.flux_inside < 0.99:
+            texts.append(f"Only {self.flux_inside:.1%} of the flux lands inside the image.")
         return " ".join(texts)
 
 
 @dataclass(frozen=True, eq=False)
 class ForwardJob:
-    """An image to predict: of a potential, a displacement in px, or an object."""
+    """A prediction of the image of a potential, a displacement in px, or a simulated object."""
 
     field: ArrayLike | PhantomRecipe
-    shape: tuple[int, int] = (200, 200)  # of a phantom's image; a potential has its own
-    to_px2: float = 1.0  # brings the potential to px²
+    shape: tuple[int, int] = (200, 200)  # of a simulated object's image
+    to_px2: float = 1.0  # conversion factor of the potential to px²
     setup: Setup | None = None
-    made_with: Setup | None = None  # where the field was found
+    field_setup: Setup | None = None  # of the field's measurement
     deflector: Deflector | None = None
     source: ArrayLike | None = None  # None for a uniform beam
     caustic_jacobian: float = InversionOptions.model_fields["caustic_jacobian"].default
 
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
-    ) -> Forecast:
+    ) -> Prediction:
         from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 
         report = Reporter(on_progress, should_stop)
         report("field", 0, None)
-        displacement, assumed = self._seen(self._displacement())
+        displacement, assumption = self._transfer(self._displacement())
         source, shadow = self._source(displacement.shape[1:])
         image = synthetic_image(
             displacement, source, on_progress=on_progress, should_stop=should_stop
@@ -223,11 +225,13 @@ class ForwardJob:
         if shadow is not None:
             caustic &= ~shadow
         flux = image.size if source is None else source.sum()
-        kept = float(image.sum() / flux) if flux else 1.0
-        return Forecast(image, displacement, source, float(caustic.mean()), kept, assumed)
+        flux_inside = float(image.sum() / flux) if flux else 1.0
+        return Prediction(
+            image, displacement, source, float(caustic.mean()), flux_inside, assumption
+        )
 
     def _source(self, shape: tuple[int, ...]) -> tuple[FloatArray | None, BoolArray | None]:
-        """The beam that passes, and where the object stops it."""
+        """Return the beam that passes the object, and where the object stops it."""
         source = None if self.source is None else plane_of(self.source, "the source")
         if not isinstance(self.field, PhantomRecipe):
             return source, None
@@ -236,19 +240,22 @@ class ForwardJob:
             return source, None
         return np.where(shadow, 0.0, np.ones(shape) if source is None else source), shadow
 
-    def _seen(self, displacement: FloatArray) -> tuple[FloatArray, str]:
-        """The displacement in the experiment that is asked for, and what that assumes."""
+    def _transfer(self, displacement: FloatArray) -> tuple[FloatArray, str]:
+        """Return the displacement in the chosen setup, and the assumption behind it."""
         from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
 
-        made_with, setup = self.made_with, self.setup
-        if made_with is None or setup is None or made_with == setup:
+        field_setup, setup = self.field_setup, self.setup
+        if field_setup is None or setup is None or field_setup == setup:
             return displacement, ""
-        deflector = self.deflector or default_deflector(made_with, setup)
+        deflector = self.deflector or default_deflector(field_setup, setup)
         shape: Any = None if self.source is None else np.shape(self.source)
         moved = transferred_displacement(
-            displacement, made_with, setup, deflector=deflector, shape=shape
+            displacement, field_setup, setup, deflector=deflector, shape=shape
         )
-        return moved, f"For another setup, assuming that only a {deflector} deflects the beam."
+        return (
+            moved,
+            f"Converted to another setup, assuming that only a {deflector} deflects the beam.",
+        )
 
     def _displacement(self) -> FloatArray:
         from napari_shadowinv.physics.setup import displacement_from_potential

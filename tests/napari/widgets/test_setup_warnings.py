@@ -1,4 +1,4 @@
-"""The form of a setup shows field of view and magnification, and what is doubtful of them."""
+"""The form of a setup shows field of view, magnification and warnings."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ def test_setup_form_shows_geometry_and_doubts(qtbot):
     paper = ProtonSetup.example()
     picker.show_setup(paper.model_dump())
     assert picker.geometry_label.text().startswith("pixel 1.5 µm at the object, M = 16.4")
-    assert picker.doubts.text() == ""
+    assert picker.warning_label.text() == ""
     picker.show_setup({**paper.model_dump(), "energy": 147.0})
-    assert "147 MeV" in picker.doubts.text()
+    assert "147 MeV" in picker.warning_label.text()

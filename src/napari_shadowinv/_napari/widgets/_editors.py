@@ -1,4 +1,4 @@
-"""Editors for one field of a pydantic model each, and numbers with units."""
+"""Editors for the fields of pydantic models, and numbers with units."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from qtpy.QtWidgets import (
 )
 from superqt import QLabeledDoubleSlider, QLabeledSlider, QLargeIntSpinBox
 
-from napari_shadowinv._napari.widgets._qt import beside
+from napari_shadowinv._napari.widgets._qt import side_by_side
 from napari_shadowinv.errors import InputError
 
-_LARGEST_INTEGER = 2**63 - 1
-_NOT_GIVEN = "not given"
+_MAX_INTEGER = 2**63 - 1
+_UNSET = "not set"
 _TITLE = re.compile(r"^(?P<name>.*\S)\s*\((?P<unit>[^()]+)\)$")
 _NUMBER = re.compile(
     r"^\s*(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>\S*)\s*$"
 )
-# Units that come with prefixes; a kilopixel helps nobody.
-_PREFIXED = ("m", "eV", "MeV")
+# Units with prefixes; kilopixels are not in use.
+_UNITS_WITH_PREFIX = ("m", "eV", "MeV")
 
 
 def unit_of_title(title: str) -> tuple[str, str]:
@@ -40,8 +40,8 @@ def unit_of_title(title: str) -> tuple[str, str]:
     return (match["name"], match["unit"]) if match else (title, "")
 
 
-def parsed(text: str, unit: str) -> float:
-    """Read a number such as ``1.3 mm`` or ``inf``, in the unit if it names none."""
+def parse_number(text: str, unit: str) -> float:
+    """Parse a number such as ``1.3 mm`` or ``inf``; without a unit it is in `unit`."""
     if text.strip().lower() in ("inf", "infinite", "∞"):
         return math.inf
     match = _NUMBER.match(text)
@@ -50,14 +50,14 @@ def parsed(text: str, unit: str) -> float:
     number = float(match["number"])
     if match["unit"] in ("", unit):
         return number
-    return _converted(match["number"], match["unit"], unit)
+    return _convert(match["number"], match["unit"], unit)
 
 
-def shown(value: float, unit: str) -> str:
-    """Write a number with the prefix of its unit that makes it handy."""
+def format_number(value: float, unit: str) -> str:
+    """Format a number with a suitable prefix of its unit."""
     if math.isinf(value) or not unit:
         return f"{value:.12g}"
-    if unit not in _PREFIXED or value == 0:
+    if unit not in _UNITS_WITH_PREFIX or value == 0:
         return f"{value:.12g} {unit}"
     import pint
 
@@ -65,10 +65,10 @@ def shown(value: float, unit: str) -> str:
     return f"{compact.magnitude:.12g} {compact.units:~P}"
 
 
-def _converted(number: str, from_unit: str, to_unit: str) -> float:
+def _convert(number: str, from_unit: str, to_unit: str) -> float:
     import pint
 
-    # By the text of the number, so that 1.3 mm is 0.0013 m to the last digit.
+    # Convert the decimal text, so that 1.3 mm is exactly 0.0013 m.
     if not to_unit:
         raise InputError(f"{number} {from_unit} has a unit, expected a plain number")
     registry = pint.application_registry
@@ -91,7 +91,7 @@ def _example(unit: str) -> str:
 
 
 class _WheelGuard(QObject):
-    """Keeps the mouse wheel, meant to scroll the form, from changing what it passes over."""
+    """Keeps the mouse wheel from changing values while it scrolls the form."""
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
         if event.type() == QEvent.Type.Wheel and not watched.hasFocus():
@@ -100,37 +100,37 @@ class _WheelGuard(QObject):
         return False
 
 
-def _steady(widget: QWidget) -> None:
+def _ignore_wheel(widget: QWidget) -> None:
     widget.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
     widget.installEventFilter(_WheelGuard(widget))
 
 
 class SteadyComboBox(QComboBox):
-    """A combo box that is as narrow as it has to be, and does not follow the wheel."""
+    """A narrow combo box that ignores the mouse wheel."""
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
         self.setMinimumContentsLength(8)
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
-        _steady(self)
+        _ignore_wheel(self)
 
 
 class Editor(QWidget):
-    """A widget that holds the value of one field; None if it holds none."""
+    """A widget for the value of one field, None if it is unset."""
 
     changed = Signal()
-    # Whether the value is shown with its unit, so that the label need not tell it.
+    # Whether the value is shown with its unit, so that the label can omit it.
     shows_unit = False
 
     def __init__(self, inner: QWidget) -> None:
         super().__init__()
         self.inner = inner
-        beside((inner, 0), holder=self)
+        side_by_side((inner, 0), holder=self)
 
     @property
     def checked(self) -> bool:
-        """Whether the field is given; false only for an optional one whose box is empty."""
+        """Whether the field is set; False only for an unchecked optional field."""
         return True
 
     def value(self) -> Any:
@@ -169,15 +169,15 @@ class _Choice(Editor):
 
 
 class _Integer(Editor):
-    def __init__(self, least: int | None, most: int | None) -> None:
+    def __init__(self, low: int | None, high: int | None) -> None:
         super().__init__(QLargeIntSpinBox())
-        self.inner.setMinimum(-_LARGEST_INTEGER if least is None else least)
-        self.inner.setMaximum(_LARGEST_INTEGER if most is None else most)
-        # Each key of a long number is no change of its own.
+        self.inner.setMinimum(-_MAX_INTEGER if low is None else low)
+        self.inner.setMaximum(_MAX_INTEGER if high is None else high)
+        # Typing a long number is one change.
         self.inner.setKeyboardTracking(False)
         self.inner.setMinimumWidth(80)
         self.inner.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
-        _steady(self.inner)
+        _ignore_wheel(self.inner)
         self.inner.valueChanged.connect(lambda _: self.changed.emit())
 
     def value(self) -> int:
@@ -188,28 +188,28 @@ class _Integer(Editor):
 
 
 class _Slider(Editor):
-    """For a number with both bounds, that one tries out by eye."""
+    """A number with both bounds, to be adjusted by eye."""
 
-    def __init__(self, least: float, most: float, whole: bool) -> None:
-        slider = QLabeledSlider if whole else QLabeledDoubleSlider
+    def __init__(self, low: float, high: float, is_integer: bool) -> None:
+        slider = QLabeledSlider if is_integer else QLabeledDoubleSlider
         super().__init__(slider(Qt.Orientation.Horizontal))
-        self._whole = whole
-        if not whole:
+        self._is_integer = is_integer
+        if not is_integer:
             self.inner.setDecimals(2)
-        self.inner.setRange(least, most)
-        _steady(self.inner)
+        self.inner.setRange(low, high)
+        _ignore_wheel(self.inner)
         self.inner.valueChanged.connect(lambda _: self.changed.emit())
 
     def value(self) -> float:
         value = self.inner.value()
-        return int(value) if self._whole else float(value)
+        return int(value) if self._is_integer else float(value)
 
     def set_value(self, value: Any) -> None:
-        self.inner.setValue(int(value) if self._whole else float(value))
+        self.inner.setValue(int(value) if self._is_integer else float(value))
 
 
 class _Quantity(Editor):
-    """A number over many orders of magnitude, with its unit, as text."""
+    """A number of any magnitude with its unit, as text."""
 
     shows_unit = True
 
@@ -219,10 +219,10 @@ class _Quantity(Editor):
         self._value: float | None = None
         self.inner.setPlaceholderText(f"in {unit}" if unit else "a number")
         self.inner.setMinimumWidth(80)
-        self.inner.editingFinished.connect(self._take)
+        self.inner.editingFinished.connect(self._read_text)
 
     def value(self) -> float | str | None:
-        """The number; the text itself where it is none, for the model to refuse."""
+        """Return the number, or text that is not a number, which the model refuses."""
         return self.inner.text() if self._value is None and self.inner.text() else self._value
 
     def set_value(self, value: Any) -> None:
@@ -230,12 +230,12 @@ class _Quantity(Editor):
         self._show()
         self.changed.emit()
 
-    def _take(self) -> None:
+    def _read_text(self) -> None:
         text = self.inner.text().strip()
-        if self._value is not None and text == shown(self._value, self._unit):
+        if self._value is not None and text == format_number(self._value, self._unit):
             return
         try:
-            self._value = parsed(text, self._unit) if text else None
+            self._value = parse_number(text, self._unit) if text else None
         except InputError as error:
             self._value = None
             self.inner.setToolTip(str(error))
@@ -245,33 +245,33 @@ class _Quantity(Editor):
 
     def _show(self) -> None:
         self.inner.setToolTip("")
-        self.inner.setText("" if self._value is None else shown(self._value, self._unit))
+        self.inner.setText("" if self._value is None else format_number(self._value, self._unit))
         self.inner.setCursorPosition(0)
 
 
 class _Range(Editor):
-    """First pixel and the one after the last, as text; empty for all."""
+    """A pixel range ``first:end`` as text; empty for all pixels."""
 
     def __init__(self) -> None:
         super().__init__(QLineEdit())
-        self.inner.setPlaceholderText("all, or such as 10:200")
+        self.inner.setPlaceholderText("all, or a range such as 10:200")
         self.inner.setMinimumWidth(80)
         self.inner.editingFinished.connect(self.changed)
 
     def value(self) -> str | None:
-        """The text, for the model to understand or refuse."""
+        """Return the text, which the model validates."""
         return self.inner.text().strip() or None
 
     def set_value(self, value: Any) -> None:
         if not isinstance(value, str):
-            first, last = (0, None) if value is None else value
-            value = f"{first}:{'' if last is None else last}" if first or last else ""
+            start, stop = (0, None) if value is None else value
+            value = f"{start}:{'' if stop is None else stop}" if start or stop else ""
         self.inner.setText(value)
         self.changed.emit()
 
 
 class _NumberOrFile(Editor):
-    """A number or the name of a file, as text, with a button to choose the file."""
+    """A number or a file name, as text, with a button to choose the file."""
 
     def __init__(self, title: str) -> None:
         text, button = QLineEdit(), QToolButton()
@@ -279,13 +279,13 @@ class _NumberOrFile(Editor):
         text.setMinimumWidth(80)
         button.setText("…")
         button.setToolTip("Choose a file.")
-        super().__init__(beside((text, 1), (button, 0)))
+        super().__init__(side_by_side((text, 1), (button, 0)))
         self._text, self._title = text, title
         self._text.editingFinished.connect(self.changed)
         button.clicked.connect(lambda: self._choose())
 
     def value(self) -> str | None:
-        """The text, for the model to understand or refuse."""
+        """Return the text, which the model validates."""
         return self._text.text().strip() or None
 
     def set_value(self, value: Any) -> None:
@@ -301,10 +301,10 @@ class _NumberOrFile(Editor):
 
 
 class _Optional(Editor):
-    """Another editor behind a check box; None while it is not checked."""
+    """An editor behind a check box; the value is None while it is unchecked."""
 
     def __init__(self, editor: Editor) -> None:
-        super().__init__(QCheckBox(_NOT_GIVEN))
+        super().__init__(QCheckBox(_UNSET))
         self.editor = editor
         self.shows_unit = editor.shows_unit
         self.layout().addWidget(editor, 1)
@@ -326,19 +326,19 @@ class _Optional(Editor):
             self.inner.setChecked(value is not None)
         self.changed.emit()
 
-    def _on_toggle(self, given: bool) -> None:
-        self.inner.setText("" if given else _NOT_GIVEN)
-        self.editor.setVisible(given)
+    def _on_toggle(self, checked: bool) -> None:
+        self.inner.setText("" if checked else _UNSET)
+        self.editor.setVisible(checked)
         self.changed.emit()
 
 
-def editor_for(field: FieldInfo, first: Any = None) -> Editor:
-    """Make the editor for a field; an optional one starts with `first` when it is first checked."""
-    kind, optional = _without_none(field.annotation)
+def editor_for(field: FieldInfo, initial: Any = None) -> Editor:
+    """Create the editor of a field; `initial` is an optional field's value when first checked."""
+    kind, is_optional = _without_none(field.annotation)
     editor = _plain_editor(kind, field)
-    if optional:
-        if first is not None:
-            editor.set_value(first)
+    if is_optional:
+        if initial is not None:
+            editor.set_value(initial)
         editor = _Optional(editor)
     if not field.is_required():
         editor.set_value(field.get_default())
@@ -353,7 +353,7 @@ def _plain_editor(kind: Any, field: FieldInfo) -> Editor:
     extra = field.json_schema_extra
     slider = extra.get("slider") if isinstance(extra, dict) else None
     if isinstance(slider, (tuple, list)):
-        return _Slider(slider[0], slider[1], whole=kind is int)  # type: ignore[arg-type]
+        return _Slider(slider[0], slider[1], is_integer=kind is int)  # type: ignore[arg-type]
     if kind is int:
         return _Integer(*_integer_bounds(field))
     if kind is float:
@@ -374,14 +374,14 @@ def _without_none(annotation: Any) -> tuple[Any, bool]:
 
 
 def _integer_bounds(field: FieldInfo) -> tuple[int | None, int | None]:
-    least = most = None
+    low = high = None
     for bound in field.metadata:
         if hasattr(bound, "ge"):
-            least = bound.ge
+            low = bound.ge
         elif hasattr(bound, "gt"):
-            least = bound.gt + 1
+            low = bound.gt + 1
         elif hasattr(bound, "le"):
-            most = bound.le
+            high = bound.le
         elif hasattr(bound, "lt"):
-            most = bound.lt - 1
-    return least, most
+            high = bound.lt - 1
+    return low, high
