@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napari_shadowinv.cli._tables import inversion_rows
+from napari_shadowinv.cli._summary import inversion_rows
 from napari_shadowinv.inversion import Inversion, Report, invert
 from napari_shadowinv.inversion.edges import inner_sides, turned_back
 from napari_shadowinv.inversion.trust import image_residual, mark_caustics

@@ -15,7 +15,7 @@ import tomli_w
 from pydantic import TypeAdapter
 
 import napari_shadowinv
-from napari_shadowinv.cli._tables import setup_text
+from napari_shadowinv.cli._summary import setup_text
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import dataset_from_field
 from napari_shadowinv.io.pradformat import check_pradformat_setup

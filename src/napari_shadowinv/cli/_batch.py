@@ -21,7 +21,7 @@ from rich.table import Column, Table
 
 from napari_shadowinv._system.safety import refusing_damage
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.cli._tables import Rows, options_text, two_columns
+from napari_shadowinv.cli._summary import Rows, options_text, two_columns
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
     cancelled_code,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from napari_shadowinv.cli._tables import (
+from napari_shadowinv.cli._summary import (
     closing_rows,
     headline_row,
     inversion_rows,

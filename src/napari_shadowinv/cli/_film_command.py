@@ -11,7 +11,7 @@ import typer
 
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import _flags, _outputs
-from napari_shadowinv.cli._tables import Rows, two_columns
+from napari_shadowinv.cli._summary import Rows, two_columns
 from napari_shadowinv.cli._terminal import interrupted, notify_errors, progress_bars, say
 from napari_shadowinv.errors import InputError
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from napari_shadowinv.cli._tables import Rows, options_text, size_text, two_columns
+from napari_shadowinv.cli._summary import Rows, options_text, size_text, two_columns
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
     interrupted,
@@ -177,7 +177,7 @@ def _made_from(made: FitProvenance) -> Rows:
 
 def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
     """The verdict, how well each image is explained, and the fields; `names` are of the images."""
-    from napari_shadowinv.cli._tables import setup_text
+    from napari_shadowinv.cli._summary import setup_text
     from napari_shadowinv.fitting import Verdict
 
     determined = fit.verdict is Verdict.DETERMINED

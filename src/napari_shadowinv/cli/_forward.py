@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from napari_shadowinv._system.safety import refusing_damage
-from napari_shadowinv.cli._tables import setup_text
+from napari_shadowinv.cli._summary import setup_text
 from napari_shadowinv.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:

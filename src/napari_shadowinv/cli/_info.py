@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from napari_shadowinv import __version__
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import refusing_damage
-from napari_shadowinv.cli import _tables
+from napari_shadowinv.cli import _summary
 from napari_shadowinv.physics.setup import setup_warnings
 
 if TYPE_CHECKING:
@@ -33,10 +33,10 @@ QT_BINDINGS = ("PyQt6", "PySide6", "PySide6_Essentials", "PyQt5", "PySide2")
 @refusing_damage
 def described(path: Path, variable: str | None = None) -> Table:
     """Tell what a file is and what is in it."""
-    return _tables.two_columns(str(path), _rows(path, variable))
+    return _summary.two_columns(str(path), _rows(path, variable))
 
 
-def _rows(path: Path, variable: str | None) -> _tables.Rows:
+def _rows(path: Path, variable: str | None) -> _summary.Rows:
     from napari_shadowinv.cli._batch import store_rows
     from napari_shadowinv.io import Radiograph, is_stack, read
     from napari_shadowinv.io.formats import format_of
@@ -66,7 +66,7 @@ def _rows(path: Path, variable: str | None) -> _tables.Rows:
     return _result_rows(content)
 
 
-def _matlab_rows(path: Path, variable: str | None) -> _tables.Rows:
+def _matlab_rows(path: Path, variable: str | None) -> _summary.Rows:
     """The image of a MATLAB file, or a list to choose from."""
     from napari_shadowinv.io.matlab import mat_variables, read_mat
 
@@ -80,7 +80,7 @@ def _matlab_rows(path: Path, variable: str | None) -> _tables.Rows:
     return [*rows, ("image", metadata["variable"]), *_array_rows(array)]
 
 
-def _picture_rows(path: Path, found: Format) -> _tables.Rows:
+def _picture_rows(path: Path, found: Format) -> _summary.Rows:
     from napari_shadowinv.io.colours import film_warnings
 
     array, metadata = found.read(path)
@@ -92,7 +92,7 @@ def _picture_rows(path: Path, found: Format) -> _tables.Rows:
     return [*rows, *_array_rows(array), *[("warning", caution.text) for caution in warnings]]
 
 
-def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _tables.Rows:
+def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _summary.Rows:
     from napari_shadowinv.io import Radiograph
 
     assert isinstance(shot, Radiograph)
@@ -111,13 +111,13 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _tables.Rows:
         if isinstance(value, int | float):
             unit = "MeV" if name == "energy" else "m"
             rows.append((f"{name.replace('_', ' ')} ({unit})", f"{value:g}"))
-    rows.append(("setup", _tables.setup_text(shot.setup, shot, shot.shape)))
+    rows.append(("setup", _summary.setup_text(shot.setup, shot, shot.shape)))
     rows += [("note", text) for text in shot.notes]
     doubts = () if shot.setup is None else setup_warnings(shot.setup, shot.shape)
     return [*rows, *[("warning", caution.text) for caution in (*shot.warnings, *doubts)]]
 
 
-def _array_rows(array: AnyArray) -> _tables.Rows:
+def _array_rows(array: AnyArray) -> _summary.Rows:
     import numpy as np
 
     values = array.astype(np.float64)
@@ -131,7 +131,7 @@ def _array_rows(array: AnyArray) -> _tables.Rows:
     return rows
 
 
-def _result_rows(dataset: xarray.Dataset) -> _tables.Rows:
+def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
     from napari_shadowinv.cli._film_command import pack_rows
     from napari_shadowinv.cli._fit_result import fit_file_rows
     from napari_shadowinv.inversion import Inversion
@@ -147,36 +147,36 @@ def _result_rows(dataset: xarray.Dataset) -> _tables.Rows:
     setup = setup_from_dataset(dataset)
     displacement = dataset["displacement"].values
     experiment = [
-        ("image", _tables.size_text(displacement[0])),
-        ("setup", _tables.setup_text(setup, shape=displacement.shape[1:])),
+        ("image", _summary.size_text(displacement[0])),
+        ("setup", _summary.setup_text(setup, shape=displacement.shape[1:])),
     ]
     if "options" not in dataset.attrs:
         is_foreign = dataset.attrs.get("format") == "pradformat"
         kind = "pradformat inversion" if is_foreign else "field retrieved by another program"
-        return [("kind", kind), *experiment, *_tables.peak_rows(displacement, setup)]
+        return [("kind", kind), *experiment, *_summary.peak_rows(displacement, setup)]
     inversion = Inversion.from_dataset(dataset)
     return [
-        _tables.headline_row(inversion, setup),
+        _summary.headline_row(inversion, setup),
         ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
         *_origin_rows(inversion.provenance),
         *experiment,
-        *_tables.inversion_rows(inversion, setup),
-        *_tables.closing_rows(inversion.report),
-        ("options", _tables.options_text(inversion.options.model_dump())),
+        *_summary.inversion_rows(inversion, setup),
+        *_summary.closing_rows(inversion.report),
+        ("options", _summary.options_text(inversion.options.model_dump())),
     ]
 
 
-def _origin_rows(provenance: Provenance | None) -> _tables.Rows:
+def _origin_rows(provenance: Provenance | None) -> _summary.Rows:
     """Files that a result was made from, and what was done to them."""
     if provenance is None:
         return []
     origins = {"image": provenance.image, "source": provenance.source}
-    rows: _tables.Rows = []
+    rows: _summary.Rows = []
     for name, origin in origins.items():
         if origin is not None and origin.file:
             rows += [(f"{name} file", origin.file), (f"{name} sha256", origin.sha256)]
-    return rows + _tables.provenance_rows(provenance)
+    return rows + _summary.provenance_rows(provenance)
 
 
 def report_text() -> str:

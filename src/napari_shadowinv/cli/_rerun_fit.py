@@ -20,7 +20,7 @@ from napari_shadowinv.cli._rerun import (
     check_readable,
     inversion_again,
 )
-from napari_shadowinv.cli._tables import two_columns
+from napari_shadowinv.cli._summary import two_columns
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.io.files import sha256

@@ -95,7 +95,7 @@ def invert(
     Writes potential, displacement, re-projection, residual and all options to one file,
     and a figure next to it.
     """
-    from napari_shadowinv.cli._tables import summary
+    from napari_shadowinv.cli._summary import summary
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
     from napari_shadowinv.pipeline import write_recipe
     from napari_shadowinv.pipeline.files import read_part
@@ -162,7 +162,7 @@ def rerun(
     from napari_shadowinv.cli._film_command import pack_made_again, write_pack
     from napari_shadowinv.cli._rerun import Places, made_again
     from napari_shadowinv.cli._rerun_fit import fit_made_again, refit_table
-    from napari_shadowinv.cli._tables import rerun_table, two_columns
+    from napari_shadowinv.cli._summary import rerun_table, two_columns
     from napari_shadowinv.inversion.labels import is_fit, is_pack
     from napari_shadowinv.io import read_dataset
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, FIT_WRITERS, RESULT_WRITERS
@@ -234,7 +234,7 @@ def forward(
     the source is uniform.
     """
     from napari_shadowinv.cli._forward import experiments, field_from, predicted
-    from napari_shadowinv.cli._tables import size_text
+    from napari_shadowinv.cli._summary import size_text
     from napari_shadowinv.io import read_radiograph, write
     from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
     from napari_shadowinv.pipeline.files import setup_from

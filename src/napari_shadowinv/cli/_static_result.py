@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from napari_shadowinv.cli._tables import Rows
+from napari_shadowinv.cli._summary import Rows
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
     interrupted,
