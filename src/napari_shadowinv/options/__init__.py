@@ -1,10 +1,11 @@
-"""Every choice of an inversion and of a fit, as validated models.
+"""Choices of an inversion and of a fit, as validated models.
 
-The same model is the keyword of a function, a part of a recipe, the flags of a command, a form
-in a window, and is saved with each result: there is no second list of defaults.
+Each model is the keyword of a function, a part of a recipe, the flags of a command and a form in a
+window, and is saved with each result: there is no second list of defaults.
 
-- `InversionOptions`; `FitOptions`, and with what a fit is to find and to know: `FitChoices`
-- what can deflect a beam, by name: `FIELDS`
+- options of an inversion and of a fit: `InversionOptions`, `FitOptions`
+- unknowns of a fit and knowledge about its images: `FitChoices`
+- causes of a deflection, by name: `FIELDS`
 """
 
 from napari_shadowinv.options.fitting import (

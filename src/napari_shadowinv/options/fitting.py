@@ -1,4 +1,4 @@
-"""Every choice of a fit: `FitOptions`, and `FitChoices` for what it finds and what it knows."""
+"""Choices of a fit: `FitOptions` of its method, `FitChoices` of its unknowns and its data."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ FIELDS = {
     "plasma": "plasma",
     "phase": "refractive index",
 }
-"""What can deflect a beam, by the names that a fit takes."""
+"""Causes of a deflection, by the names that a fit takes."""
 
 
 MAX_STRENGTH = 1e4
-"""Largest displacement of an image, in those of the first."""
+"""Largest ratio of an image's displacement to the first one's."""
 
 
 class FitOptions(CheckedModel):
@@ -184,7 +184,7 @@ class FitOptions(CheckedModel):
     )
 
 
-def _noise(value: Any) -> Any:
+def _parse_noise(value: Any) -> Any:
     if value is None or value in KINDS_OF_NOISE:
         return value
     try:
@@ -198,12 +198,12 @@ def _noise(value: Any) -> Any:
 
 KindOfNoise = Literal["poisson", "proportional"]
 KINDS_OF_NOISE = get_args(KindOfNoise)
-Noise = Annotated[KindOfNoise | float, BeforeValidator(_noise)]
-"""The noise of an image: that of counts, a share of each pixel, or a standard deviation."""
+Noise = Annotated[KindOfNoise | float, BeforeValidator(_parse_noise)]
+"""The noise of an image: Poisson counts, a fraction of each pixel, or a standard deviation."""
 
 
 class FitChoices(CheckedModel):
-    """What a fit is to find, and what is known about the images.
+    """Unknowns of a fit, and knowledge about its images.
 
     Raises
     ------
@@ -277,19 +277,19 @@ class FitChoices(CheckedModel):
 
     @field_validator("fields", mode="before")
     @classmethod
-    def _separated(cls, value: Any) -> Any:
-        return [one.strip() for one in value.split(",")] if isinstance(value, str) else value
+    def _split_names(cls, value: Any) -> Any:
+        return [name.strip() for name in value.split(",")] if isinstance(value, str) else value
 
     @field_validator("fields")
     @classmethod
-    def _known(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        chosen = set(names or ())
-        if names is not None and (not chosen or chosen - FIELDS.keys() or len(chosen) < len(names)):
+    def _check_names(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        unique = set(names or ())
+        if names is not None and (not unique or unique - FIELDS.keys() or len(unique) < len(names)):
             raise ValueError(f"expected one or more of {', '.join(FIELDS)}, each once")
         return names
 
     @model_validator(mode="after")
-    def _one_point_spread(self) -> Self:
+    def _check_point_spread(self) -> Self:
         if self.psf is not None and (self.source_size, self.resolution) != (None, None):
             raise ValueError(
                 f"received a point spread of {self.psf:g} px, and a source size or resolution in "

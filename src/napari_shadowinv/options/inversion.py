@@ -1,4 +1,4 @@
-"""Every choice of an inversion, in one validated model: `InversionOptions`."""
+"""Choices of an inversion, in one validated model: `InversionOptions`."""
 
 from __future__ import annotations
 
@@ -248,7 +248,7 @@ class InversionOptions(CheckedModel):
     )
 
     @model_validator(mode="after")
-    def _boundary_fits_the_rest(self) -> Self:
+    def _check_combination(self) -> Self:
         if self.boundary == "closed" and self.flux != "conserve":
             raise ValueError(
                 f"flux is '{self.flux}' and boundary 'closed', expected 'conserve': a closed "
@@ -272,7 +272,7 @@ class InversionOptions(CheckedModel):
         return self.n_sites is None and self.stages == "multi" and self.solver == "newton"
 
     def site_key(self) -> str:
-        """Return what of the options determines where sites are placed."""
+        """Return the options that determine the positions of the sites, as text."""
         moving = {
             name
             for name, field in type(self).model_fields.items()
