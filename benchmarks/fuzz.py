@@ -231,7 +231,7 @@ def damage(path: Path, rng: random.Random) -> None:
 def read_whole(path: Path) -> None:
     """Read all that the package reads of a file."""
     from napari_shadowinv.cli._batch import status_tables
-    from napari_shadowinv.cli._info import described
+    from napari_shadowinv.cli._info import file_table
     from napari_shadowinv.film import Calibration
     from napari_shadowinv.io import read, read_toml
     from napari_shadowinv.physics.setup import setup_from_dict
@@ -242,7 +242,7 @@ def read_whole(path: Path) -> None:
     if path.name == "calibration.csv":
         Calibration.from_csv(path).curve()
         return
-    described(path)
+    file_table(path)
     content = read(path)
     if path.is_dir():
         status_tables(path, every=True)

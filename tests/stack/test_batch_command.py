@@ -332,7 +332,7 @@ def test_progress_of_a_batch_fits_80_columns():
     text = io.StringIO()
     console = Console(file=text, width=80, force_terminal=True, color_system=None)
     bars = progress.Progress(*progress_columns(), console=console, expand=True)
-    words = {"rate": "12.3 shots/min", "left": "3 min left", "failed": "2 failed"}
+    words = {"rate": "12.3 shots/min", "remaining": "3 min left", "failed": "2 failed"}
     last = "a_long_name_of_a_shot_of_the_night_0123.tif, 3.2 s"
     bars.add_task("4 threads", total=500, completed=123, last=last, **words)
     console.print(bars.get_renderable())

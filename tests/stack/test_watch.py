@@ -496,14 +496,14 @@ def test_ctrl_c_is_the_normal_end_unless_files_wait(
 ):
     np.save(tmp_path / "reference.npy", SOURCE)
     put(folder, *range(files))
-    show = _watch._Lines.show
+    update = _watch._WatchPrinter.update
 
-    def told(lines: Any, news: WatchProgress) -> None:
-        show(lines, news)
-        if news.outcome is not None:
+    def update_and_interrupt(printer: Any, progress: WatchProgress) -> None:
+        update(printer, progress)
+        if progress.outcome is not None:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(_watch._Lines, "show", told)
+    monkeypatch.setattr(_watch._WatchPrinter, "update", update_and_interrupt)
     result = shadowinv(
         "watch", folder, "--pattern", "*.npy", "--source", tmp_path / "reference.npy",
         "--n-sites", 100, "--out", out,

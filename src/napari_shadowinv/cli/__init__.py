@@ -1,7 +1,7 @@
 """The command `shadowinv`: invert one shot or many, fit several, predict, look at files.
 
-Every heavy import waits until a command needs it, so that ``--help`` and the refusal of a
-mistake answer at once.
+Every heavy import waits until a command needs it, so that ``--help`` and errors about bad input
+appear at once.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ app = typer.Typer(
 )
 
 
-def _show_version(asked: bool) -> None:
-    if asked:
+def _show_version(is_requested: bool) -> None:
+    if is_requested:
         typer.echo(f"shadowinv {__version__}")
         raise typer.Exit
 
 
 @notify_errors
 def _check_environment() -> None:
-    """Refuse variables with which numba cannot be imported; drop one that figures do not need."""
+    """Refuse variables that break the import of numba; drop one that figures do not need."""
     threads = os.environ.get("NUMBA_NUM_THREADS", "")
     if threads.strip().lstrip("-").isdecimal() and int(threads) < 1:
         raise InputError(
             f"the environment variable NUMBA_NUM_THREADS is {threads}: expected 1 or more; unset "
             "it, or use --threads"
         )
-    # Figures are drawn to files; matplotlib refuses to be imported with a backend unknown to it.
+    # Figures go to files; an unknown backend would break the import of matplotlib.
     os.environ.pop("MPLBACKEND", None)
 
 
@@ -73,7 +73,7 @@ def main(
         typer.echo(ctx.get_help())
         raise typer.Exit(EXIT_MISTAKE)
     for stream in (sys.stdout, sys.stderr):
-        # A terminal that knows no ∫ or µ is no reason to fail after the work is done.
+        # A terminal without ∫ or µ must not end a finished run with an error.
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")
 

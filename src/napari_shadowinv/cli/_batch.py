@@ -1,4 +1,4 @@
-"""`shadowinv batch` and `shadowinv status`: a run seen live, and what became of each shot."""
+"""Progress and summary of `shadowinv batch`, and the tables of `shadowinv status`."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._summary import Rows, options_text, two_columns
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
-    cancelled_code,
-    interrupted,
+    cancel_exit_code,
+    is_interrupted,
     plain,
     say,
     say_on_stderr,
@@ -45,23 +45,23 @@ if TYPE_CHECKING:
 
 EXIT_FAILED_SHOTS = 1
 _BAR_COLUMNS = 16
-_NAMED = 10  # failures that a table names
-_DETERMINED = "determined"  # the verdict on a fit that may be believed
+_MAX_LISTED = 10  # shots that a row lists
+_DETERMINED = "determined"  # the only verdict of a reliable fit
 
 
 @dataclass
-class _Ledger:
-    """What a run has reported so far."""
+class _RunStatus:
+    """Progress of a run, with its rate and the time that remains."""
 
     start: float = field(default_factory=time.monotonic)
-    now: RunProgress | None = None
+    progress: RunProgress | None = None
     ended: int = 0
 
-    def note(self, news: RunProgress) -> None:
-        if self.now is None:
-            self.start = time.monotonic()  # the workers are there
-        self.now = news
-        if news.outcome is not None:
+    def update(self, progress: RunProgress) -> None:
+        if self.progress is None:
+            self.start = time.monotonic()  # the workers are ready
+        self.progress = progress
+        if progress.outcome is not None:
             self.ended += 1
 
     @property
@@ -74,9 +74,9 @@ class _Ledger:
 
     @property
     def remaining_text(self) -> str:
-        if self.now is None or not self.ended:
+        if self.progress is None or not self.ended:
             return ""
-        pending = self.now.total - self.now.done - self.now.failed
+        pending = self.progress.total - self.progress.done - self.progress.failed
         seconds = round(pending * (time.monotonic() - self.start) / self.ended)
         return f"{timedelta(seconds=seconds)} left" if pending else "closing"
 
@@ -92,56 +92,56 @@ def run_batch(
     quiet: bool,
     **choices: Any,
 ) -> None:
-    """Invert all shots into a store, with `choices` of `run_stack`, and tell how it went."""
+    """Invert all shots into a store, with `choices` of `run_stack`, and print a summary."""
     from napari_shadowinv.stack import read_shot, run_stack
 
-    _check(out, resume or choices["redo_failed"], choices["overwrite"])
-    ledger = _Ledger()
-    part: dict[str, Any] = {"channel": channel}
+    _check_store(out, resume or choices["redo_failed"], choices["overwrite"])
+    status = _RunStatus()
+    selection: dict[str, Any] = {"channel": channel}
     if variable is not None:
-        part["variable"] = variable
+        selection["variable"] = variable
     try:
-        with _display(ledger, quiet) as show:
+        with _progress_bar(status, quiet) as show:
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
-                variables=None if variables is None else names_of(variables),
-                reader=functools.partial(read_shot, **part),
+                variables=None if variables is None else split_names(variables),
+                reader=functools.partial(read_shot, **selection),
                 on_progress=show,
-                should_stop=interrupted,
+                should_stop=is_interrupted,
                 **choices,
             )
     except (KeyboardInterrupt, InversionCancelled):
-        state = _counts_text(StackStore(out)) if out.exists() else "nothing written"
-        say_on_stderr(f"Cancelled: {state}. Repeat the command with --resume to continue.")
-        raise typer.Exit(cancelled_code()) from None
+        counts = _counts_text(StackStore(out)) if out.exists() else "nothing written"
+        say_on_stderr(f"Cancelled: {counts}. Repeat the command with --resume to continue.")
+        raise typer.Exit(cancel_exit_code()) from None
     store = StackStore(out)
     if not quiet:
-        say(_summary(store, ledger))
-    exit_unless_good(store)
+        say(_summary(store, status))
+    exit_unless_reliable(store)
 
 
-def exit_unless_good(store: StackStore) -> None:
-    """End with an exit code of its own if not all shots are done, or to be trusted."""
+def exit_unless_reliable(store: StackStore) -> None:
+    """Exit with an error code if a shot is not done, or its result is not reliable."""
     if (store.statuses() != DONE).any():
         raise typer.Exit(EXIT_FAILED_SHOTS)
-    if not all(_is_good(report) for report in store.reports()):
+    if not all(_is_reliable(report) for report in store.reports()):
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
-def names_of(text: str) -> tuple[str, ...]:
-    """Names that are separated by commas."""
+def split_names(text: str) -> tuple[str, ...]:
+    """Split a list of names at its commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-def _is_good(report: Mapping[str, Any]) -> bool:
-    """Whether a shot that is done may be believed, as far as that is known."""
+def _is_reliable(report: Mapping[str, Any]) -> bool:
+    """Whether the report of a finished shot casts no doubt on its result."""
     if "verdict" in report:
         return bool(report["verdict"] == _DETERMINED)
     return bool(report.get("converged"))
 
 
-def _check(out: Path, resume: bool, overwrite: bool) -> None:
+def _check_store(out: Path, resume: bool, overwrite: bool) -> None:
     if resume and overwrite:
         raise InputError("got --resume and --overwrite, expected one of them")
     if check_store_path(out).exists() and not (resume or overwrite):
@@ -152,50 +152,52 @@ def _check(out: Path, resume: bool, overwrite: bool) -> None:
 
 
 def progress_columns() -> tuple[progress.ProgressColumn, ...]:
-    """Columns of the progress line; in a narrow terminal the last shot's name is cut."""
-    cut = Column(ratio=1, no_wrap=True, overflow="ellipsis")
-    kept = Column(no_wrap=True)
+    """Return the columns of the progress line; a narrow terminal cuts the last shot's name."""
+    flexible = Column(ratio=1, no_wrap=True, overflow="ellipsis")
+    rigid = Column(no_wrap=True)
     return (
         progress.SpinnerColumn(),
-        progress.TextColumn("{task.description}", markup=False, table_column=kept),
+        progress.TextColumn("{task.description}", markup=False, table_column=rigid),
         progress.BarColumn(bar_width=_BAR_COLUMNS),
-        progress.MofNCompleteColumn(table_column=kept),
-        progress.TextColumn("{task.fields[rate]}", table_column=kept),
-        progress.TextColumn("{task.fields[left]}", table_column=kept),
-        progress.TextColumn("{task.fields[failed]}", style="red", table_column=kept),
-        progress.TextColumn("{task.fields[last]}", style="dim", markup=False, table_column=cut),
+        progress.MofNCompleteColumn(table_column=rigid),
+        progress.TextColumn("{task.fields[rate]}", table_column=rigid),
+        progress.TextColumn("{task.fields[remaining]}", table_column=rigid),
+        progress.TextColumn("{task.fields[failed]}", style="red", table_column=rigid),
+        progress.TextColumn(
+            "{task.fields[last]}", style="dim", markup=False, table_column=flexible
+        ),
     )
 
 
 @contextmanager
-def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], None]]:
-    """A bar with rate and time left, and above it each shot that failed."""
+def _progress_bar(status: _RunStatus, quiet: bool) -> Iterator[Callable[[RunProgress], None]]:
+    """Show a bar with the rate and the time that remains, and print each failure above it."""
     console = Console(stderr=True)
     hidden = quiet or not console.is_terminal
     with progress.Progress(
         *progress_columns(), console=console, disable=hidden, expand=True
     ) as bars:
-        task = bars.add_task("starting", total=None, rate="", left="", failed="", last="")
+        task = bars.add_task("starting", total=None, rate="", remaining="", failed="", last="")
 
-        def show(news: RunProgress) -> None:
-            if news.preparing:
-                bars.update(task, description=news.preparing)
+        def show(progress: RunProgress) -> None:
+            if progress.preparing:
+                bars.update(task, description=progress.preparing)
                 return
-            ledger.note(news)
-            outcome = news.outcome
-            last = "" if outcome is None else f"{news.name}, {outcome.seconds:.1f} s"
+            status.update(progress)
+            outcome = progress.outcome
+            last = "" if outcome is None else f"{progress.name}, {outcome.seconds:.1f} s"
             bars.update(
                 task,
-                description=news.engine,
-                total=news.total,
-                completed=news.done + news.failed,
-                rate=ledger.rate_text,
-                left=ledger.remaining_text,
-                failed=f"{news.failed} failed" if news.failed else "",
+                description=progress.engine,
+                total=progress.total,
+                completed=progress.done + progress.failed,
+                rate=status.rate_text,
+                remaining=status.remaining_text,
+                failed=f"{progress.failed} failed" if progress.failed else "",
                 last=plain(last).plain,
             )
             if outcome is not None and outcome.reason and not quiet:
-                line = plain(f"failed: {news.name}: {outcome.reason}", "red")
+                line = plain(f"failed: {progress.name}: {outcome.reason}", "red")
                 console.print(line, soft_wrap=True)
 
         yield show
@@ -204,16 +206,16 @@ def _display(ledger: _Ledger, quiet: bool) -> Iterator[Callable[[RunProgress], N
 def _counts_text(store: StackStore) -> str:
     statuses = store.statuses()
     counts = {name: np.sum(statuses == status) for status, name in enumerate(STATUS_NAMES)}
-    shown = ["done", "failed", "pending", *(["damaged"] if counts["damaged"] else [])]
-    return ", ".join(f"{counts[name]} {name}" for name in shown)
+    names = ["done", "failed", "pending", *(["damaged"] if counts["damaged"] else [])]
+    return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
-def _summary(store: StackStore, ledger: _Ledger) -> Table:
-    seconds = time.monotonic() - ledger.start
-    this_run = f"{ledger.ended} shots in {seconds:.1f} s, {ledger.rate_text}"
+def _summary(store: StackStore, status: _RunStatus) -> Table:
+    seconds = time.monotonic() - status.start
+    this_run = f"{status.ended} shots in {seconds:.1f} s, {status.rate_text}"
     rows = [
         ("shots", _counts_text(store)),
-        ("this run", this_run if ledger.ended else "nothing to do"),
+        ("this run", this_run if status.ended else "nothing to do"),
         *_site_rows(store),
         *_trouble_rows(store),
         ("written", str(store.path)),
@@ -222,34 +224,35 @@ def _summary(store: StackStore, ledger: _Ledger) -> Table:
 
 
 def _recipe_rows(store: StackStore) -> Rows:
-    """Where the source came from, and what was done to each shot."""
+    """Return the origin of the source and the steps before the inversion."""
     from napari_shadowinv.preprocessing import Provenance
 
     provenance = Provenance.of(store.attributes)
-    measured = None if provenance is None else provenance.source
-    source = measured.file if measured is not None else ""
-    # Rows of a table may have their own.
-    made = [report.get("provenance", {}).get("source", {}) for report in store.reports()]
-    own = list(dict.fromkeys(one["file"] for one in made if one.get("file")))
-    rows = [("source", _listed(own) or source or str(store.attributes["source_image"]))]
+    common = None if provenance is None else provenance.source
+    source = common.file if common is not None else ""
+    # Each row of a table may name another source.
+    origins = [report.get("provenance", {}).get("source", {}) for report in store.reports()]
+    files = list(dict.fromkeys(origin["file"] for origin in origins if origin.get("file")))
+    rows = [("source", _list_text(files) or source or str(store.attributes["source_image"]))]
     steps = () if provenance is None else provenance.recipe.steps
     return rows + [("step", step.described) for step in steps]
 
 
 def _energy_rows(store: StackStore) -> Rows:
-    """Energies of the shots that are done, where they are those of rows of a table."""
-    found = sorted({report["energy"] for report in store.reports() if "energy" in report})
-    return [("energies", f"{', '.join(f'{one:g}' for one in found)} MeV")] if found else []
+    """Return the energies of the finished shots, if they come from rows of a table."""
+    energies = sorted({report["energy"] for report in store.reports() if "energy" in report})
+    text = ", ".join(f"{energy:g}" for energy in energies)
+    return [("energies", f"{text} MeV")] if energies else []
 
 
 def _fit_rows(attributes: Mapping[str, Any]) -> Rows:
-    """What was fitted to each shot."""
+    """Return the choices of the fit."""
     choices = {**json.loads(attributes["fit"]), "fields": json.loads(attributes["fields"])}
     return [("fit", options_text(choices))]
 
 
 def _site_rows(store: StackStore) -> Rows:
-    """How many sites the shots have, and why; and what errors are typical."""
+    """Return the number of sites with its reason, and the typical errors."""
     reports = [report for report in store.reports() if "n_sites" in report]
     if not reports:
         return []
@@ -259,18 +262,18 @@ def _site_rows(store: StackStore) -> Rows:
     reason = next(iter(reasons)) if len(reasons) == 1 else "each for its own reason"
     rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
     errors = [report["errors"] for report in reports if report.get("errors")]
-    told = [
+    medians = [
         f"{name} {np.median(values):.2g} px"
         for name in ("noise", "discretisation")
-        if (values := [one[name][0] for one in errors if np.isfinite(one[name][0])])
+        if (values := [rms[name][0] for rms in errors if np.isfinite(rms[name][0])])
     ]
-    if told:
-        rows.append(("errors", f"{', '.join(told)} (r.m.s., median of the shots)"))
+    if medians:
+        rows.append(("errors", f"{', '.join(medians)} (r.m.s., median of the shots)"))
     return rows
 
 
 def _trouble_rows(store: StackStore) -> Rows:
-    """Shots that failed or are damaged, and those that are not to be trusted."""
+    """List the shots that failed, are damaged or have doubtful results."""
     statuses = store.statuses()
     rows = []
     for status in (FAILED, DAMAGED):
@@ -278,21 +281,22 @@ def _trouble_rows(store: StackStore) -> Rows:
         indices = [int(index) for index in np.flatnonzero(statuses == status)]
         rows += [
             (label, f"{store.names[i]}: {store.report(i).get('reason', 'its report is missing')}")
-            for i in indices[:_NAMED]
+            for i in indices[:_MAX_LISTED]
         ]
-        if len(indices) > _NAMED:
-            rest = len(indices) - _NAMED
-            rows.append((label, f"and {rest} more: shadowinv status {store.path} --all"))
-    rows += [(STATUS_NAMES[DAMAGED], problem) for problem in store.damage.files[:_NAMED]]
+        if len(indices) > _MAX_LISTED:
+            hidden = len(indices) - _MAX_LISTED
+            rows.append((label, f"and {hidden} more: shadowinv status {store.path} --all"))
+    rows += [(STATUS_NAMES[DAMAGED], problem) for problem in store.damage.files[:_MAX_LISTED]]
     if store.damage.shots or store.damage.files:
         rows.append(("warning", "repeat the run with --resume to repair what is damaged"))
-    rough = [
+    unconverged = [
         store.names[index]
         for index, report in enumerate(store.reports())
         if statuses[index] == DONE and not report.get("converged")
     ]
-    if rough:
-        rows.append(("warning", f"{len(rough)} shots did not converge: {_listed(rough)}"))
+    if unconverged:
+        text = f"{len(unconverged)} shots did not converge: {_list_text(unconverged)}"
+        rows.append(("warning", text))
     return [*rows, *_verdict_rows(store), *_level_rows(store)]
 
 
@@ -312,25 +316,26 @@ def _level_rows(store: StackStore) -> Rows:
     counts = ", ".join(f"{count} {level}" for level, count in levels.most_common())
     return [
         ("levels", counts),
-        *[("warning", f"{_listed(names)}: {warning}") for warning, names in warned.values()],
+        *[("warning", f"{_list_text(names)}: {warning}") for warning, names in warned.values()],
     ]
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
+def _list_text(names: Sequence[str]) -> str:
+    return ", ".join(names[:_MAX_LISTED]) + (", …" if len(names) > _MAX_LISTED else "")
 
 
 def _verdict_rows(store: StackStore) -> Rows:
-    """Which fits may be believed, and which not."""
-    found: dict[str, list[str]] = {}
+    """Count the fits that are determined, and list the others by their verdict."""
+    shots: dict[str, list[str]] = {}
     for name, report in zip(store.names, store.reports(), strict=True):
         if "verdict" in report:
-            found.setdefault(str(report["verdict"]), []).append(name)
-    good = found.pop(_DETERMINED, [])
-    told = f"{len(good)} {_DETERMINED}"
-    rows = [("verdicts", told)] if good or found else []
+            shots.setdefault(str(report["verdict"]), []).append(name)
+    determined = shots.pop(_DETERMINED, [])
+    counts = f"{len(determined)} {_DETERMINED}"
+    rows = [("verdicts", counts)] if determined or shots else []
     return rows + [
-        ("warning", f"{len(names)} {verdict}: {_listed(names)}") for verdict, names in found.items()
+        ("warning", f"{len(names)} {verdict}: {_list_text(names)}")
+        for verdict, names in shots.items()
     ]
 
 
@@ -349,9 +354,9 @@ _FIT_COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
 
 @refusing_damage
 def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[Table], bool]:
-    """Describe a store and what became of each shot, and return whether anything is damaged.
+    """Describe a store and each shot, and return whether anything is damaged.
 
-    With `verify`, all files are read and compared with their checksums.
+    With `verify`, read all files and compare them with their checksums.
     """
     store = StackStore(path, every_byte=verify)
     rows = store_rows(store, trouble=not every)
@@ -361,12 +366,13 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
     is_damaged = bool(store.damage.shots or store.damage.files)
     if not every:
         return tables, is_damaged
-    own = _ROW_COLUMNS if store.own_setups else _SHOT_COLUMNS
-    columns = own if store.field is None else _FIT_COLUMNS
+    columns = _ROW_COLUMNS if store.own_setups else _SHOT_COLUMNS
+    if store.field is not None:
+        columns = _FIT_COLUMNS
     headings = "shot", "name", "status", "seconds", *columns
     shots = Table(box=box.SIMPLE)
     for heading in headings:
-        # Wide enough for the words of a verdict.
+        # A verdict is not broken into letters.
         width = len(_DETERMINED) if heading == "verdict" else None
         shots.add_column(heading, overflow="fold", min_width=width)
     for index, (status, report) in enumerate(zip(store.statuses(), store.reports(), strict=True)):
@@ -375,17 +381,17 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
             plain(store.names[index]),
             STATUS_NAMES[status],
             f"{report['seconds']:.1f}" if "seconds" in report else "",
-            *(show(report[key]) if key in report else "" for key, show in columns.values()),
+            *(text(report[key]) if key in report else "" for key, text in columns.values()),
             style="red" if status in (FAILED, DAMAGED) else "",
         )
-    # In the table above they would be squeezed into a few letters a line.
+    # A column of the table above would leave them a few letters a line.
     notes = [(f"shot {index}", note) for index, note in _notes(store)]
     tables += [shots, *([two_columns("Reasons and warnings", notes)] if notes else [])]
     return tables, is_damaged
 
 
 def _notes(store: StackStore) -> Iterator[tuple[int, str]]:
-    """The reason of each failed shot, the warnings of the others."""
+    """Yield the reason of each failed shot and the warnings of the others."""
     for index, report in enumerate(store.reports()):
         if reason := report.get("reason"):
             yield index, reason
@@ -402,7 +408,7 @@ def _checksums_text(store: StackStore) -> str:
 
 
 def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
-    """Describe a store in names and texts."""
+    """Describe a store."""
     attributes = store.attributes
     seconds = [report["seconds"] for report in store.reports() if "stages" in report]
     rows = [

@@ -1,4 +1,4 @@
-"""The shot that `shadowinv demo` simulates, and how its inversion compares with the truth."""
+"""The shot that `shadowinv demo` simulates, and the comparison of its inversion with the truth."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     Fields = Mapping[str, FloatArray]
 
 
-def simulated_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatArray, FloatArray]:
-    """Image with noise, and the displacement that made it."""
+def simulate_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatArray, FloatArray]:
+    """Return an image with noise, and its true displacement."""
     import numpy as np
 
     from napari_shadowinv.physics.forward import synthetic_image
@@ -37,8 +37,8 @@ def simulated_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatAr
     return image + noise * image.mean() * grain, truth
 
 
-def compared_fields(image: FloatArray, truth: FloatArray, inversion: Inversion) -> Fields:
-    """Displacements by name: the truth, ours, and what linear inversion makes of the image."""
+def fields_to_compare(image: FloatArray, truth: FloatArray, inversion: Inversion) -> Fields:
+    """Return three displacements: the truth, the inversion, and a linear inversion."""
     from napari_shadowinv.physics.poisson import poisson_invert
     from napari_shadowinv.physics.setup import displacement_from_potential
 
@@ -55,7 +55,7 @@ def write_demo(
     from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
 
     caption = "Errors: " + "; ".join(
-        f"{which} {_errors_text(fields, which)}" for which in ("Retrieved", "Poisson")
+        f"{name} {_errors_text(fields, name)}" for name in ("Retrieved", "Poisson")
     )
     comparison = comparison_figure(fields, setup, title="True and retrieved", caption=caption)
     report = report_figure(inversion, setup, title=f"Demo {name}")
@@ -69,7 +69,7 @@ def write_demo(
 def demo_table(
     inversion: Inversion, setup: ProtonSetup, fields: Fields, written: list[Path]
 ) -> Table:
-    """Build the table of a demo: the quality of the inversion and its distance from the truth."""
+    """Build the table of a demo: the quality of the inversion and its true error."""
     rows = [
         headline_row(inversion, setup),
         ("setup", setup_text(setup)),
@@ -84,9 +84,9 @@ def demo_table(
 def _errors_text(fields: Fields, name: str) -> str:
     import numpy as np
 
-    truth, found = fields["True"], fields[name]
-    largest, strongest = (float(np.hypot(*field).max()) for field in (truth, found))
-    if not largest:
-        return f"peak {strongest:.3g} px where the truth is zero"
-    distance = float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
-    return f"peak {strongest / largest - 1:+.1%}, L2 {distance:.1%}"
+    truth, estimate = fields["True"], fields[name]
+    true_peak, peak = (float(np.hypot(*field).max()) for field in (truth, estimate))
+    if not true_peak:
+        return f"peak {peak:.3g} px where the truth is zero"
+    distance = float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
+    return f"peak {peak / true_peak - 1:+.1%}, L2 {distance:.1%}"

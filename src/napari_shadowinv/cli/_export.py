@@ -1,4 +1,4 @@
-"""`shadowinv export` and `shadowinv movie`: shots of a store to files and to a film."""
+"""Shots of a store as files (`shadowinv export`) and as a movie (`shadowinv movie`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv.cli._outputs import make_folder, protect_store
-from napari_shadowinv.cli._terminal import visible
+from napari_shadowinv.cli._terminal import escape_invisible
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import display_unit, setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _FORMULA_SIGNS = ("=", "+", "-", "@")
 FORMATS = ("tiff", "pradformat", "csv")
-# Columns of the table: what a shot's report says, and how it says it.
-_REPORTED = {
+# Headings of the table, and the keys of a shot's report.
+_INVERSION_COLUMNS = {
     "converged": "converged",
     "flux_residual": "residual",
     "image_residual": "image_residual",
@@ -37,44 +37,44 @@ _REPORTED = {
     "iterations": "iterations",
     "reason": "reason",
 }
-_ROW_REPORTED = {"energy (MeV)": "energy", **_REPORTED}
-_FIT_REPORTED = {
+_TABLE_ROW_COLUMNS = {"energy (MeV)": "energy", **_INVERSION_COLUMNS}
+_FIT_COLUMNS = {
     name: name
     for name in ("verdict", "chi2", "folded", "uncertainty", "converged", "iterations", "reason")
 }
 
 
-def _opened(path: Path, shots: str | None) -> xarray.Dataset:
-    """Open a store and choose shots from it; only those that are done."""
+def _open_shots(path: Path, shots: str | None) -> xarray.Dataset:
+    """Open a store and select shots from it; only finished ones."""
     dataset = read_stack(path)
     count = dataset.sizes["shot"]
-    chosen = dataset.assign_coords(index=("shot", np.arange(count)))
+    selection = dataset.assign_coords(index=("shot", np.arange(count)))
     if shots is not None:
-        chosen = chosen.isel(shot=_parsed_shots(shots, count))
-    for index in np.flatnonzero(chosen["status"].values == DAMAGED)[:1]:
-        number = int(chosen["index"].values[index])
+        selection = selection.isel(shot=_parse_shots(shots, count))
+    for index in np.flatnonzero(selection["status"].values == DAMAGED)[:1]:
+        number = int(selection["index"].values[index])
         store = StackStore(path)
         raise FileFormatError(
             f"{path} is damaged: shot {number} ({store.names[number]}): "
             f"{store.report(number)['reason']}; "
             "repeat the run with --resume to invert it again, or choose other shots with --shots"
         )
-    done = chosen.isel(shot=np.flatnonzero(chosen["status"].values == DONE))
+    done = selection.isel(shot=np.flatnonzero(selection["status"].values == DONE))
     if not done.sizes["shot"]:
         raise InputError(f"{path} has no finished shots in this selection: see shadowinv status")
     return done
 
 
-def _parsed_shots(text: str, count: int) -> list[int]:
-    """Turn 3, 3:20, :10, ::5 or several of these with commas into numbers of shots."""
-    chosen: list[int] = []
+def _parse_shots(text: str, count: int) -> list[int]:
+    """Convert 3, 3:20, :10, ::5 or a list of these to shot numbers."""
+    selection: list[int] = []
     for part in text.split(","):
         try:
             numbers = [int(piece) if piece.strip() else None for piece in part.split(":")]
             if len(numbers) == 1 and numbers[0] is not None:
-                chosen.append(range(count)[numbers[0]])
+                selection.append(range(count)[numbers[0]])
             elif 2 <= len(numbers) <= 3:
-                chosen.extend(range(count)[slice(*numbers)])
+                selection.extend(range(count)[slice(*numbers)])
             else:
                 raise ValueError(part)
         except (ValueError, IndexError):
@@ -82,7 +82,7 @@ def _parsed_shots(text: str, count: int) -> list[int]:
                 f"shots are {text!r}: expected numbers from 0 to {count - 1} such as 3, 3:20, or "
                 "3,5,10:20"
             ) from None
-    return chosen
+    return selection
 
 
 def export_shots(
@@ -99,7 +99,7 @@ def export_shots(
         raise InputError(
             f"{store} holds fits, expected inversions for pradformat: use --format tiff or csv"
         )
-    dataset = _opened(store, shots)
+    dataset = _open_shots(store, shots)
     jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
     make_folder(out)
     for name, *_ in jobs:
@@ -116,7 +116,7 @@ def _stem(shot: xarray.Dataset) -> str:
     return f"{int(shot['index']):04d}_{safe}"
 
 
-# The name of a file, what reads its content, and the setup, which gives the size of a pixel.
+# Name of a file, reader of its content, and setup, which gives the pixel size.
 _Job = tuple[str, Callable[[], Any], Any]
 
 
@@ -152,7 +152,7 @@ def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[_Job]:
 
 
 def _with_origin(shot: xarray.Dataset) -> xarray.Dataset:
-    """A shot of a store with its own provenance, or the store's but for its own image."""
+    """Return a shot with its provenance: its own, or that of the store with its image."""
     report = json.loads(str(shot["report"].values))
     if "provenance" in report:
         return shot.assign_attrs(provenance=json.dumps(report["provenance"]))
@@ -161,12 +161,12 @@ def _with_origin(shot: xarray.Dataset) -> xarray.Dataset:
         return shot
     origin = {"file": str(shot["name"].values), "sha256": report.get("sha256", "")}
     image = provenance.image.model_copy(update=origin)
-    own = provenance.model_copy(update={"image": image})
-    return shot.assign_attrs(provenance=own.model_dump_json(exclude_none=True))
+    completed = provenance.model_copy(update={"image": image})
+    return shot.assign_attrs(provenance=completed.model_dump_json(exclude_none=True))
 
 
 def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:
-    """One row for each shot, done or not, with the largest magnitude of each field."""
+    """Write one row per shot, done or not, with the peak magnitude of each field."""
     from napari_shadowinv.stack import stack_statistics
 
     content = StackStore(store)
@@ -175,27 +175,28 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
     columns = {name: np.asarray(peaks[name].values) for name in names}
     headings = [f"{name} ({display_unit(peaks[name].attrs['units'])})" for name in names]
     count = len(content.names)
-    chosen = range(count) if shots is None else _parsed_shots(shots, count)
+    indices = range(count) if shots is None else _parse_shots(shots, count)
     statuses, reports = content.statuses(), content.reports()
     with (
         replacing(out, overwrite) as temporary,
         temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as f,
     ):
         rows = csv.writer(f)
-        own = _ROW_REPORTED if content.own_setups else _REPORTED
-        reported = own if content.field is None else _FIT_REPORTED
-        rows.writerow(["shot", "name", "status", *reported, *headings])
-        for index in chosen:
-            report = (reports[index].get(name, "") for name in reported.values())
+        keys = _TABLE_ROW_COLUMNS if content.own_setups else _INVERSION_COLUMNS
+        if content.field is not None:
+            keys = _FIT_COLUMNS
+        rows.writerow(["shot", "name", "status", *keys, *headings])
+        for index in indices:
+            report = (reports[index].get(name, "") for name in keys.values())
             peak = (f"{columns[name][index]:.9g}" for name in names)
             status = STATUS_NAMES[statuses[index]]
-            rows.writerow([index, _cell(content.names[index]), status, *report, *peak])
+            rows.writerow([index, _escape_cell(content.names[index]), status, *report, *peak])
     return out
 
 
-def _cell(text: str) -> str:
-    """Text that neither a terminal nor a spreadsheet takes for a command."""
-    cell = visible(text)
+def _escape_cell(text: str) -> str:
+    """Escape text that a terminal or a spreadsheet would interpret as a command."""
+    cell = escape_invisible(text)
     return f"'{cell}" if cell.startswith(_FORMULA_SIGNS) else cell
 
 
@@ -208,7 +209,7 @@ def write_movie(
     limits: tuple[float, float] | None,
     overwrite: bool,
 ) -> int:
-    """Write a film of a store, all shots on one colour scale; return its number of frames."""
+    """Write a movie of a store on one colour scale; return its number of frames."""
     from napari_shadowinv.plotting import stack_frames, write_film
 
     check_output(out, overwrite, suffixes=(".mp4", ".gif"))
@@ -220,5 +221,5 @@ def write_movie(
         )
     if not 0 < rate <= 120:
         raise InputError(f"rate is {rate:g}: expected more than 0 and at most 120 frames a second")
-    frames = stack_frames(_opened(store, shots), variable, limits=limits)
+    frames = stack_frames(_open_shots(store, shots), variable, limits=limits)
     return write_film(out, frames, rate, overwrite=overwrite)

@@ -12,18 +12,18 @@ import typer
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import _flags, _outputs
 from napari_shadowinv.cli._summary import Rows, two_columns
-from napari_shadowinv.cli._terminal import interrupted, notify_errors, progress_bars, say
+from napari_shadowinv.cli._terminal import is_interrupted, notify_errors, progress_bars, say
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
     import xarray
     from rich.table import Table
 
-    from napari_shadowinv.cli._rerun import Places
+    from napari_shadowinv.cli._rerun import FileLocator
     from napari_shadowinv.film import Pack
 
 LayersFormat = Literal["tiff", "pradformat"]
-# Of options whose help is longer than a line.
+# Help of options, where it is longer than a line.
 HELP = {
     "pack": "TOML file: what the pack is made of, which scan shows which film.",
     "layers": "Folder for the fluence of each layer as an image, with a table of them for fit and "
@@ -101,18 +101,18 @@ def film(
     if layers is not None and (table := layers / LAYERS_TABLE).exists():
         outputs[table] = SITES.suffixes
     _outputs.check_outputs(outputs, overwrite)
-    described = read_pack(pack)
-    _outputs.protect(list(outputs), [pack, *described.files])
-    dataset = _made(described, quiet)
+    content = read_pack(pack)
+    _outputs.protect(list(outputs), [pack, *content.files])
+    dataset = _run_pack(content, quiet)
     written = [result, figure]
     write_pack(dataset, pack.name, result, figure, overwrite)
     if layers is not None:
         written.append(write_layers(dataset, layers, form=layers_format, overwrite=overwrite)[-1])
     if corners is not None:
-        layers_shown = dataset["corners"].dropna("layer")
-        places = {str(int(one["layer"])): one.values for one in layers_shown}
+        points = dataset["corners"].dropna("layer")
+        corners_by_film = {str(int(film["layer"])): film.values for film in points}
         with replacing(corners, overwrite) as temporary:
-            write_corners(temporary, places)
+            write_corners(temporary, corners_by_film)
         written.append(corners)
     if not quiet:
         say(layer_table(dataset))
@@ -121,7 +121,7 @@ def film(
 
 
 def _write_new(folder: Path, pack: Path | None, overwrite: bool) -> None:
-    """Write a pack file for a folder of scans, and list what is missing in it."""
+    """Write a pack file for a folder of scans, and list the entries to complete."""
     from napari_shadowinv.pipeline.new_pack import draft_pack, missing_entries, write_new_pack
 
     if pack is not None:
@@ -133,11 +133,11 @@ def _write_new(folder: Path, pack: Path | None, overwrite: bool) -> None:
     say(two_columns("New pack", [*rows, ("written", str(path))]))
 
 
-def _made(pack: Pack, quiet: bool) -> xarray.Dataset:
+def _run_pack(pack: Pack, quiet: bool) -> xarray.Dataset:
     from napari_shadowinv.pipeline import run_film
 
     with nullcontext() if quiet else progress_bars() as show:
-        return run_film(pack, on_progress=show, should_stop=interrupted)
+        return run_film(pack, on_progress=show, should_stop=is_interrupted)
 
 
 def write_pack(
@@ -150,33 +150,33 @@ def write_pack(
     _outputs.write_with_figures(dataset, figures, result, overwrite)
 
 
-def pack_made_again(
-    dataset: xarray.Dataset, places: Places, outputs: list[Path], quiet: bool
+def rerun_pack(
+    dataset: xarray.Dataset, files: FileLocator, outputs: list[Path], quiet: bool
 ) -> tuple[xarray.Dataset, Rows]:
-    """Make a pack's dataset again from the scans that it names, and tell what has changed."""
+    """Repeat a film pack from the scans that its dataset names, and list the changes."""
     import numpy as np
 
-    from napari_shadowinv.cli._rerun import SAME, changed_version
+    from napari_shadowinv.cli._rerun import UNCHANGED, version_changes
     from napari_shadowinv.film import Pack
 
     pack = Pack.model_validate_json(dataset.attrs["pack"])
     for file in pack.files:
-        places.check(file, "the file")
-    _outputs.protect(outputs, [places.result, *pack.files])
-    again = _made(pack, quiet)
-    changes = changed_version(str(dataset.attrs["package_version"]))
+        files.check(file, "the file")
+    _outputs.protect(outputs, [files.result, *pack.files])
+    again = _run_pack(pack, quiet)
+    changes = version_changes(str(dataset.attrs["package_version"]))
     rows = [("changed", change) for change in changes]
-    for before, now in zip(dataset["sha256"].values, again["sha256"].values, strict=True):
-        if before != now:
-            rows.append(("changed", f"a scan with the checksum {before[:12]}… is now {now[:12]}…"))
-    same = again["fluence"].shape == dataset["fluence"].shape and all(
+    for old, new in zip(dataset["sha256"].values, again["sha256"].values, strict=True):
+        if old != new:
+            rows.append(("changed", f"a scan with the checksum {old[:12]}… is now {new[:12]}…"))
+    is_equal = again["fluence"].shape == dataset["fluence"].shape and all(
         np.array_equal(again[name], dataset[name], equal_nan=True) for name in ("dose", "fluence")
     )
-    return again, [*rows, ("difference", SAME if same else "doses or fluences differ")]
+    return again, [*rows, ("difference", UNCHANGED if is_equal else "doses or fluences differ")]
 
 
 def layer_table(dataset: xarray.Dataset) -> Table:
-    """Tell the energy and the dose of each layer, and how well it lies on the others."""
+    """Build a table of the energy, dose and alignment of each layer."""
     import numpy as np
     from rich import box
     from rich.table import Table
@@ -189,9 +189,9 @@ def layer_table(dataset: xarray.Dataset) -> Table:
         table.add_column(name, justify="left" if name == "film" else "right")
     for k in range(dataset.sizes["layer"]):
         layer = dataset.isel(layer=k)
-        used = layer["usable"].values
-        seen = bool(used.any())
-        dose = f"{np.median(layer['dose'].values[used]):.3g}" if seen else "left out"
+        usable = layer["usable"].values
+        is_usable = bool(usable.any())
+        dose = f"{np.median(layer['dose'].values[usable]):.3g}" if is_usable else "left out"
         shift = ", ".join(f"{value:+.1f}" for value in layer["shift"].values)
         times = [float(layer["time_of_flight"])] if "time_of_flight" in layer.coords else []
         table.add_row(
@@ -200,15 +200,15 @@ def layer_table(dataset: xarray.Dataset) -> Table:
             f"{float(layer['energy']):.4g}",
             *(f"{1e9 * time:.4g}" for time in times),
             dose,
-            f"{used.mean():.0%}",
-            shift if seen else "",
-            f"{float(layer['shift_error']):.1f}" if seen else "",
+            f"{usable.mean():.0%}",
+            shift if is_usable else "",
+            f"{float(layer['shift_error']):.1f}" if is_usable else "",
         )
     return table
 
 
 def pack_rows(dataset: xarray.Dataset) -> Rows:
-    """What a pack's dataset tells about all layers."""
+    """Describe the layers of a pack's dataset."""
     sizes = dataset.sizes
     rows = [("images", f"{sizes['layer']} of {sizes['y']} × {sizes['x']} px, [y, x]")]
     if "scan_pixel_size" in dataset.attrs:

@@ -1,4 +1,4 @@
-"""`shadowinv fit`: fields, and the beam, from several images of one object."""
+"""The command `fit`: fields, and the beam, from several images of one object."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from napari_shadowinv.cli import _flags, _inputs, _outputs
 from napari_shadowinv.cli._terminal import notify_errors, say
 from napari_shadowinv.io.formats import IMAGE_TITLES
 
-# Of arguments whose help is longer than a line.
+# Help of arguments, where it is longer than a line.
 HELP = {
     "images": f"Images of one object ({IMAGE_TITLES}), or one table (.csv) with a row for each.",
     "energies": "Energy of each image in MeV, separated by commas, with --setup for the rest.",
@@ -115,35 +115,37 @@ def fit(
         lists["gain"], gains = gains, None
     rows = shot_rows(images, {"setup": setup}, lists)
     first = rows[0].file
-    named = Path(f"{first.stem}_fit{next(iter(FIT_WRITERS))}") if out is None else out
-    result, figure = _outputs.result_and_figure(first, named, report)
-    asked: dict[str, Any] = {"left_out": leave_one_out, "window": window}
-    _static_result.check_asked(len(rows), **asked, fiducials=fiducials, result=result)
-    figures = [figure, *_static_result.static_figures(figure, **asked)]
+    target = Path(f"{first.stem}_fit{next(iter(FIT_WRITERS))}") if out is None else out
+    result, figure = _outputs.result_and_figure(first, target, report)
+    checks: dict[str, Any] = {"left_out": leave_one_out, "window": window}
+    _static_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
+    figures = [figure, *_static_result.static_figures(figure, **checks)]
     outputs = {result: tuple(FIT_WRITERS), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
     _outputs.check_outputs(outputs, overwrite)
-    described = [file for row in rows for file in row.files.values()]
-    _outputs.protect(list(outputs), [*images, fiducials, options, recipe, *described])
+    row_files = [file for row in rows for file in row.files.values()]
+    _outputs.protect(list(outputs), [*images, fiducials, options, recipe, *row_files])
     chosen = _inputs.fit_recipe_from(flags, recipe, options, source=source, gains=gains, mask=mask)
     _outputs.protect_files_of(chosen, list(outputs))
     shots = read_rows(rows, chosen, channel=channel, variable=variable)
     _outputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
     names = [str(row.file) for row in rows]
     if compare:
-        found = _fit_result.compared(chosen, shots, fiducials, quiet, written=flags.get("fields"))
+        result_fit = _fit_result.compare_fields(
+            chosen, shots, fiducials, quiet, written=flags.get("fields")
+        )
     else:
-        found = _fit_result.fitted(chosen, shots, fiducials, quiet)
-    checked = _static_result.checked(chosen, shots, found, quiet, **asked)
-    _fit_result.write_fit(found, names, result, figure, overwrite, checked)
+        result_fit = _fit_result.fit_images(chosen, shots, fiducials, quiet)
+    static = _static_result.run_checks(chosen, shots, result_fit, quiet, **checks)
+    _fit_result.write_fit(result_fit, names, result, figure, overwrite, static)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
         write_recipe(save_recipe, chosen.model_copy(update={"setup": common}), overwrite=overwrite)
     if not quiet:
-        for table in checked.tables(found, names):
+        for table in static.tables(result_fit, names):
             say(table)
-        say(_fit_result.fit_table(found, names, list(outputs)))
-    checked.alarm_unless_static(result)
-    _fit_result.alarm_unless_determined(found, result)
+        say(_fit_result.fit_table(result_fit, names, list(outputs)))
+    static.exit_unless_static(result)
+    _fit_result.exit_unless_determined(result_fit, result)

@@ -1,4 +1,4 @@
-"""What `shadowinv fit` makes of images, and how it tells the answer."""
+"""Fits as the commands run, write and print them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 from napari_shadowinv.cli._summary import Rows, options_text, size_text, two_columns
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
-    interrupted,
+    is_interrupted,
     progress_bars,
     say,
     say_on_stderr,
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv._typing import FloatArray
-    from napari_shadowinv.cli._static_result import Checked
+    from napari_shadowinv.cli._static_result import StaticChecks
     from napari_shadowinv.fitting import Fit, FittedField
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.pipeline import FitShot
     from napari_shadowinv.preprocessing import FitProvenance, Recipe
 
 
-def fitted(
+def fit_images(
     recipe: Recipe, shots: Sequence[FitShot], fiducials: FloatArray | Path | None, quiet: bool
 ) -> Fit:
     """Fit fields to images, with a bar for each stage."""
@@ -39,26 +39,26 @@ def fitted(
 
     with nullcontext() if quiet else progress_bars() as show:
         return run_fit(
-            recipe, shots, fiducials=fiducials, on_progress=show, should_stop=interrupted
+            recipe, shots, fiducials=fiducials, on_progress=show, should_stop=is_interrupted
         )
 
 
-def refined(inversion: Inversion, made: FitProvenance, quiet: bool) -> Fit:
-    """Refine an inversion as a fit was made from it, with a bar for each stage."""
+def refine_inversion(inversion: Inversion, provenance: FitProvenance, quiet: bool) -> Fit:
+    """Refine an inversion as a provenance says, with a bar for each stage."""
     from napari_shadowinv.pipeline import run_refinement
 
-    assert made.recipe.fit is not None
+    assert provenance.recipe.fit is not None
     with nullcontext() if quiet else progress_bars() as show:
         return run_refinement(
             inversion,
-            made.images[0].setup,
-            made.recipe.fit,
+            provenance.images[0].setup,
+            provenance.recipe.fit,
             on_progress=show,
-            should_stop=interrupted,
+            should_stop=is_interrupted,
         )
 
 
-def compared(
+def compare_fields(
     recipe: Recipe,
     shots: Sequence[FitShot],
     fiducials: Path | None,
@@ -66,30 +66,30 @@ def compared(
     *,
     written: str | None,
 ) -> Fit:
-    """Fit several choices of fields and tell how likely each is; return the one to be written."""
+    """Fit several choices of fields and print how likely each is; return the one to write."""
     from napari_shadowinv.pipeline import run_comparison
     from napari_shadowinv.pipeline._fit import COMPARED
 
-    wanted = set(recipe.fit.fields or ()) if recipe.fit else set()
-    if written is not None and wanted not in map(set, COMPARED):
-        choices = "; ".join(",".join(one) for one in COMPARED)
+    names = set(recipe.fit.fields or ()) if recipe.fit else set()
+    if written is not None and names not in map(set, COMPARED):
+        choices = "; ".join(",".join(choice) for choice in COMPARED)
         raise InputError(
             f"received --fields {written} and --compare, which compares {choices}: write one of "
             "these, or leave out --fields to write the likeliest"
         )
     with nullcontext() if quiet else progress_bars() as show:
         fits = run_comparison(
-            recipe, shots, fiducials=fiducials, on_progress=show, should_stop=interrupted
+            recipe, shots, fiducials=fiducials, on_progress=show, should_stop=is_interrupted
         )
     if not quiet:
         say(comparison_table(fits))
     if written is None:
         return fits[0]
-    return next(one for one in fits if {field.name for field in one.fields} == wanted)
+    return next(fit for fit in fits if {field.name for field in fit.fields} == names)
 
 
 def comparison_table(fits: Sequence[Fit]) -> Table:
-    """Tell how well each choice of fields explains the images, the likeliest first."""
+    """Build a table of the choices of fields, the likeliest first."""
     from rich import box
     from rich.table import Table
 
@@ -97,11 +97,12 @@ def comparison_table(fits: Sequence[Fit]) -> Table:
     table = Table(*headings, title="Comparison", title_justify="left", box=box.SIMPLE)
     table.caption = "A difference of 10 decides."
     best = fits[0].report.log_evidence
-    for one in fits:
-        names = ", ".join(field.name for field in one.fields)
-        chi2 = ", ".join(f"{value:.3g}" for value in one.chi2)
-        worse = one.report.log_evidence - best
-        table.add_row(names, chi2, "likeliest" if one is fits[0] else f"{worse:+.1f}", one.verdict)
+    for fit in fits:
+        names = ", ".join(field.name for field in fit.fields)
+        chi2 = ", ".join(f"{value:.3g}" for value in fit.chi2)
+        difference = fit.report.log_evidence - best
+        evidence = "likeliest" if fit is fits[0] else f"{difference:+.1f}"
+        table.add_row(names, chi2, evidence, fit.verdict)
     return table
 
 
@@ -111,29 +112,29 @@ def write_fit(
     out: Path,
     report: Path,
     overwrite: bool,
-    checked: Checked | None = None,
+    static: StaticChecks | None = None,
 ) -> None:
-    """Write a fit and its figures, all or none of them; `names` are of the images."""
+    """Write a fit and its figures, all or none; `names` are the files of the images."""
     from napari_shadowinv.cli._outputs import write_with_figures
     from napari_shadowinv.io.files import text_of
     from napari_shadowinv.plotting import fit_figure
 
     title = ", ".join(text_of(Path(name).name) for name in names)
     dataset, figures = fit.to_dataset(), {report: fit_figure(fit, title=title)}
-    if checked is not None:
-        dataset = checked.added_to(dataset)
-        figures |= checked.figures(fit, report, title)
+    if static is not None:
+        dataset = static.add_to(dataset)
+        figures |= static.figures(fit, report, title)
     write_with_figures(dataset, figures, out, overwrite)
 
 
 def fit_table(fit: Fit, names: Sequence[str], written: Sequence[Path]) -> Table:
-    """Tell whether the answer may be believed, what it is, and where."""
+    """Build the table of a fit: its verdict, images, fields and files."""
     rows = [*fit_rows(fit, names), *[("written", str(path)) for path in written]]
     return two_columns("Fit", rows)
 
 
-def alarm_unless_determined(fit: Fit, out: Path) -> None:
-    """End with an exit code of its own if what was written may be another field."""
+def exit_unless_determined(fit: Fit, out: Path) -> None:
+    """Exit with an error code unless the verdict is 'determined'."""
     from napari_shadowinv.fitting import Verdict
 
     if fit.verdict is not Verdict.DETERMINED:
@@ -142,41 +143,44 @@ def alarm_unless_determined(fit: Fit, out: Path) -> None:
 
 
 def fit_file_rows(dataset: xarray.Dataset) -> Rows:
-    """Tell what the file of a fit holds."""
+    """Describe the file of a fit."""
     from napari_shadowinv.cli._static_result import static_file_rows
     from napari_shadowinv.fitting import Fit
 
     fit = Fit.from_dataset(dataset)
-    made = fit.provenance
+    provenance = fit.provenance
+    names = [] if provenance is None else [origin.image.file for origin in provenance.images]
     return [
         ("kind", f"fit of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
-        *fit_rows(fit, [] if made is None else [one.image.file for one in made.images]),
+        *fit_rows(fit, names),
         *static_file_rows(dataset),
-        *([] if made is None else _made_from(made)),
+        *([] if provenance is None else _provenance_rows(provenance)),
         ("options", options_text(fit.options.model_dump())),
     ]
 
 
-def _made_from(made: FitProvenance) -> Rows:
-    """What was done to the images and known about them, and the files."""
-    steps = [("step", step.described) for step in made.recipe.steps]
-    choices = made.recipe.fit
-    known = {} if choices is None else choices.model_dump(exclude_none=True, exclude={"options"})
-    rows = [*steps, ("fit", options_text(known))]
-    for number, one in enumerate(made.images, 1):
-        masks = [made.masks[place] for place in (one.mask, one.source_mask) if place is not None]
-        origins = [("image", one.image), ("source", one.source)]
+def _provenance_rows(provenance: FitProvenance) -> Rows:
+    """Return the steps before a fit, its choices, and the checksums of its files."""
+    steps = [("step", step.described) for step in provenance.recipe.steps]
+    fit = provenance.recipe.fit
+    choices = {} if fit is None else fit.model_dump(exclude_none=True, exclude={"options"})
+    rows = [*steps, ("fit", options_text(choices))]
+    for number, image in enumerate(provenance.images, 1):
+        indices = (image.mask, image.source_mask)
+        masks = [provenance.masks[index] for index in indices if index is not None]
+        origins = [("image", image.image), ("source", image.source)]
         for name, origin in [*origins, *(("mask", mask) for mask in masks)]:
             if origin is not None and origin.sha256:
                 rows.append((f"{name} {number} sha256", f"{origin.sha256} ({origin.file})"))
-    if made.fiducials is not None and made.fiducials.sha256:
-        rows.append(("fiducials sha256", f"{made.fiducials.sha256} ({made.fiducials.file})"))
+    table = provenance.fiducials
+    if table is not None and table.sha256:
+        rows.append(("fiducials sha256", f"{table.sha256} ({table.file})"))
     return rows
 
 
 def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
-    """The verdict, how well each image is explained, and the fields; `names` are of the images."""
+    """Return the verdict, the fit of each image, and the fields; `names` are of the images."""
     from napari_shadowinv.cli._summary import setup_text
     from napari_shadowinv.fitting import Verdict
 
@@ -191,14 +195,14 @@ def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
         *[(f"field {field.name}", _field_text(fit, field)) for field in fit.fields],
     ]
     rows += fit.error_rows
-    best, *others = fit.basins
+    best, *alternatives = fit.basins
     rows += [
         (
             "other start",
-            f"{one.start}: objective {one.objective / best.objective - 1:+.2%}, displacement "
-            f"{one.distance:.2%} away",
+            f"{solution.start}: objective {solution.objective / best.objective - 1:+.2%}, "
+            f"displacement {solution.distance:.2%} away",
         )
-        for one in others
+        for solution in alternatives
     ]
     if fit.folded:
         rows.append(("crossed rays", f"{fit.folded:.1%} of the pixels"))
@@ -213,7 +217,7 @@ def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
 def _image_text(fit: Fit, k: int, names: Sequence[str]) -> str:
     parts = [names[k]] if names and names[k] else []
     parts += [fit.setups[k].probe] if fit.setups else []
-    strengths = ", ".join(f"{one:.3g}" for one in fit.strengths[k])
+    strengths = ", ".join(f"{strength:.3g}" for strength in fit.strengths[k])
     parts += [f"χ² {fit.chi2[k]:.3g}", f"strength {strengths}", f"gain {fit.gains[k]:.4g}"]
     if k and fit.options.align != "none":
         dy, dx = fit.frames[k][[0, 3]]
@@ -230,5 +234,5 @@ def _field_text(fit: Fit, field: FittedField) -> str:
     peak = f"{fit.peak_text(field, pixels)}, at y = {row}, x = {column} px"
     if not fit.setups:
         return peak
-    (shown,) = shown_fields([field.displacement], fit.setups[0], FIELDS[field.name])
-    return f"{fit.peak_text(field, shown)}; {peak}"
+    (physical,) = shown_fields([field.displacement], fit.setups[0], FIELDS[field.name])
+    return f"{fit.peak_text(field, physical)}; {peak}"

@@ -1,7 +1,7 @@
-"""Arguments and options that commands share, each with its name and help.
+"""Arguments and flags that commands share, each with its name and help.
 
-Those of steps, estimates of the source and options are made from the models: `takes_recipe` gives
-them to a command, and `recipe_of` makes a recipe of those that were given. `takes_fit` and
+The flags of steps, source estimates and options follow from the models: `takes_recipe` adds them
+to a command, and `recipe_of` overrides a recipe with their values. `takes_fit` and
 `fit_recipe_of` do the same for a fit.
 """
 
@@ -112,7 +112,7 @@ QuietInversion = Annotated[bool, Option("--quiet", "-q", help="Print errors and 
 
 
 def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
-    """Type of a flag, and what stands for its value in the help."""
+    """Return the type of a flag, and the placeholder for its value in the help."""
     annotation: Any = field.annotation
     kinds = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
     if get_origin(annotation) is Literal:
@@ -125,12 +125,12 @@ def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
     return str, "FIRST:LAST" if kinds[0] is not str else None
 
 
-def _flag(flag: str, field: FieldInfo, panel: str, told: str) -> tuple[str, inspect.Parameter]:
+def _flag(flag: str, field: FieldInfo, panel: str, text: str) -> tuple[str, inspect.Parameter]:
     kind, metavar = _type_of(field)
     extra = field.json_schema_extra
     if isinstance(extra, dict):
         metavar = str(extra.get("metavar", metavar or "")) or None
-    option = Option(f"--{flag}", help=told, metavar=metavar, rich_help_panel=panel)
+    option = Option(f"--{flag}", help=text, metavar=metavar, rich_help_panel=panel)
     name = flag.replace("-", "_")
     annotation = Annotated[kind | None, option]  # type: ignore[valid-type]
     keyword = inspect.Parameter.KEYWORD_ONLY
@@ -152,90 +152,96 @@ def _step_flags(steps: Iterable[type[Step]], panel: str) -> Flags:
     ]
 
 
-def _option_flags(model: type[BaseModel], usual: str, without: Collection[str] = ()) -> Flags:
-    """Flags of a model's fields, in the panel that a field asks for or the usual one."""
+def _option_flags(
+    model: type[BaseModel], default_panel: str, without: Collection[str] = ()
+) -> Flags:
+    """Return the flags of a model's fields; a field may name its own panel."""
     flags = []
     for name, field in model.model_fields.items():
         if name in without:
             continue
         extra = field.json_schema_extra
-        panel = extra.get("panel", usual) if isinstance(extra, dict) else usual
-        flags.append(_flag(name.replace("_", "-"), field, str(panel), _with_default(field)))
+        panel = extra.get("panel", default_panel) if isinstance(extra, dict) else default_panel
+        flags.append(_flag(name.replace("_", "-"), field, str(panel), _field_help(field)))
     return flags
 
 
 def _recipe_flags() -> Flags:
     flags = _step_flags(STEPS.values(), _STEPS)
     method = FieldInfo(annotation=str | None, title="Source")
-    told = f"How to estimate the undisturbed beam: {', '.join(ESTIMATES)}."
-    flags.append(_flag("source-from", method, _ESTIMATES, told))
-    for name in dict.fromkeys(n for one in ESTIMATES.values() for n in one.parameters()):
-        users = {key: one.parameters()[name] for key, one in _users(name).items()}
-        told = " ".join(f"For {key}: {_lower(_with_default(one))}" for key, one in users.items())
-        field = next(iter(users.values()))
-        flags.append(_flag(f"source-{name.replace('_', '-')}", field, _ESTIMATES, told))
+    text = f"How to estimate the undisturbed beam: {', '.join(ESTIMATES)}."
+    flags.append(_flag("source-from", method, _ESTIMATES, text))
+    for name in dict.fromkeys(n for method in ESTIMATES.values() for n in method.parameters()):
+        fields = {key: method.parameters()[name] for key, method in _estimates_with(name).items()}
+        text = " ".join(f"For {key}: {_lower_first(_field_help(f))}" for key, f in fields.items())
+        field = next(iter(fields.values()))
+        flags.append(_flag(f"source-{name.replace('_', '-')}", field, _ESTIMATES, text))
     return flags + _option_flags(InversionOptions, _OPTIONS)
 
 
 def _fit_flags() -> Flags:
     return [
         *_step_flags(FIT_STEPS.values(), _FIT_STEPS),
-        # The command's own --source and --gains say more than these.
+        # The command has its own --source and --gains.
         *_option_flags(FitChoices, _FIT_CHOICES, without=("beam", "gains", "options")),
         *_option_flags(FitOptions, _FIT_OPTIONS),
     ]
 
 
-def _with_default(field: FieldInfo) -> str:
-    told = str(field.description)
+def _field_help(field: FieldInfo) -> str:
+    text = str(field.description)
     shows_default = field.default is not None and field.default is not False
-    return f"{told} Default: {_shown(field)}." if shows_default else told
+    return f"{text} Default: {_default_text(field)}." if shows_default else text
 
 
-def _users(parameter: str) -> dict[str, Any]:
-    """Estimates that have a parameter."""
-    return {key: one for key, one in ESTIMATES.items() if parameter in one.parameters()}
+def _estimates_with(parameter: str) -> dict[str, Any]:
+    """Return the estimates that have a parameter."""
+    return {key: method for key, method in ESTIMATES.items() if parameter in method.parameters()}
 
 
 def _step_help(step: type[Step], name: str, field: FieldInfo) -> str:
     title = f"{step.title[:1].upper()}{step.title[1:]}"
+    text = _lower_first(str(field.description))
     if not step.primary or name == step.primary:
-        return f"{title}: {_lower(str(field.description))}"
-    return f"For --{step.name()}: {_lower(str(field.description))} Default: {_shown(field)}."
+        return f"{title}: {text}"
+    return f"For --{step.name()}: {text} Default: {_default_text(field)}."
 
 
-def _shown(field: FieldInfo) -> str:
+def _default_text(field: FieldInfo) -> str:
     return f"{field.default:g}" if isinstance(field.default, float) else str(field.default)
 
 
-def _lower(text: str) -> str:
+def _lower_first(text: str) -> str:
     return text if text[1:2].isupper() else text[:1].lower() + text[1:]
 
 
 def takes_recipe(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command, which takes `flags`, one for each parameter of a recipe."""
+    """Add a flag for each parameter of a recipe to a command with the argument `flags`."""
     return _with_flags(command, dict(_recipe_flags()))
 
 
 def takes_fit(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command, which takes `flags`, one for each step and option of a fit."""
+    """Add a flag for each step and option of a fit to a command with the argument `flags`."""
     return _with_flags(command, dict(_fit_flags()))
 
 
 def _with_flags(
-    command: Callable[..., None], made: Mapping[str, inspect.Parameter]
+    command: Callable[..., None], additions: Mapping[str, inspect.Parameter]
 ) -> Callable[..., None]:
     signature = inspect.signature(command, eval_str=True)
-    own = [one for one in signature.parameters.values() if one.name != "flags"]
+    parameters = [
+        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for parameter in signature.parameters.values()
+        if parameter.name != "flags"
+    ]
 
     @functools.wraps(command)
-    def with_flags(**given: Any) -> None:
-        flags = {name: given.pop(name) for name in made}
-        command(**given, flags={name: one for name, one in flags.items() if one is not None})
+    def with_flags(**arguments: Any) -> None:
+        flags = {name: arguments.pop(name) for name in additions}
+        command(**arguments, flags={name: x for name, x in flags.items() if x is not None})
 
-    parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own]
     with_flags.__signature__ = signature.replace(  # type: ignore[attr-defined]
-        parameters=[*parameters, *made.values()]
+        parameters=[*parameters, *additions.values()]
     )
     with_flags.__annotations__ = {}
     return with_flags
@@ -244,78 +250,81 @@ def _with_flags(
 def recipe_of(
     flags: Mapping[str, Any], base: Recipe, options: Mapping[str, Any], where: str = "options"
 ) -> Recipe:
-    """Put flags on top of a recipe; `options` are those of an options file, named `where`."""
+    """Override a recipe with an options file, named `where`, and with flags."""
     chosen = {**base.options.model_dump(exclude_unset=True), **options}
     chosen |= {name: flags[name] for name in InversionOptions.model_fields if name in flags}
     if "margin" in flags and chosen.get("boundary") != "free":
         raise InputError("received --margin: it needs --boundary free")
     steps, source = _steps(flags, base.steps), _estimate(flags, base)
-    made = validated(InversionOptions, chosen, where)
-    return base.model_copy(update={"steps": steps, "source": source, "options": made})
+    inversion_options = validated(InversionOptions, chosen, where)
+    changes = {"steps": steps, "source": source, "options": inversion_options}
+    return base.model_copy(update=changes)
 
 
 def fit_recipe_of(
     flags: Mapping[str, Any], base: Recipe, options: Mapping[str, Any], where: str = "options"
 ) -> Recipe:
-    """Put flags of a fit on top of a recipe; `options` are those of a file, named `where`."""
+    """Override a recipe with an options file, named `where`, and with flags of a fit."""
     before = base.fit or FitChoices()
     chosen = {**before.options.model_dump(exclude_unset=True), **options}
     chosen |= {name: flags[name] for name in FitOptions.model_fields if name in flags}
-    made = validated(FitOptions, chosen, where)
-    own = {name: flags[name] for name in FitChoices.model_fields if name in flags}
-    kept = before.model_dump(exclude_none=True, exclude={"options"})
+    fit_options = validated(FitOptions, chosen, where)
+    changes = {name: flags[name] for name in FitChoices.model_fields if name in flags}
+    values = before.model_dump(exclude_none=True, exclude={"options"})
     in_metres = ("source_size", "resolution")
-    # A point spread is given in one way: that of the flags takes the place of the other.
-    replaced = in_metres if "psf" in own else ("psf",) if own.keys() & set(in_metres) else ()
-    kept = {name: value for name, value in kept.items() if name not in replaced}
-    choices = validated(FitChoices, {**kept, **own, "options": made}, "fit")
+    # A point spread in px replaces one in m, and the other way round.
+    replaced = (
+        in_metres if "psf" in changes else ("psf",) if changes.keys() & set(in_metres) else ()
+    )
+    values = {name: value for name, value in values.items() if name not in replaced}
+    choices = validated(FitChoices, {**values, **changes, "options": fit_options}, "fit")
     return base.model_copy(update={"steps": _steps(flags, base.steps), "fit": choices})
 
 
 def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Steps of a recipe with those that flags ask for in place, or where they belong."""
+    """Change the steps of a recipe as flags say, and insert new ones in the standard order."""
     order = list(STEPS)
-    found = list(steps)
-    for key, step in STEPS.items():
-        named = {name: _step_flag(step, name).replace("-", "_") for name in step.parameters()}
-        given = {name: flags[flag] for name, flag in named.items() if flag in flags}
-        if not given:
+    result = list(steps)
+    for key, kind in STEPS.items():
+        names = {name: _step_flag(kind, name).replace("-", "_") for name in kind.parameters()}
+        changes = {name: flags[flag] for name, flag in names.items() if flag in flags}
+        if not changes:
             continue
-        there = next((i for i, one in enumerate(found) if isinstance(one, step)), None)
-        if there is None and step.primary and step.primary not in given:
-            flag = _step_flag(step, next(iter(given)))
+        index = next((i for i, step in enumerate(result) if isinstance(step, kind)), None)
+        if index is None and kind.primary and kind.primary not in changes:
+            flag = _step_flag(kind, next(iter(changes)))
             raise InputError(f"received --{flag}: it needs --{key}")
-        before = {} if there is None else found[there].values()
-        made = validated(step, {**before, **given}, f"--{key}")
-        if there is None:
-            later = [i for i, one in enumerate(found) if order.index(one.name()) > order.index(key)]
-            found.insert(later[0] if later else len(found), made)
+        before = {} if index is None else result[index].values()
+        step = validated(kind, {**before, **changes}, f"--{key}")
+        if index is None:
+            later = [i for i, s in enumerate(result) if order.index(s.name()) > order.index(key)]
+            result.insert(later[0] if later else len(result), step)
         else:
-            found[there] = made
-    return tuple(found)
+            result[index] = step
+    return tuple(result)
 
 
 def _estimate(flags: Mapping[str, Any], base: Recipe) -> Any:
-    """Source that flags ask for, or that of the recipe with other parameters."""
-    given = {
+    """Return the source that flags ask for, or the recipe's with other parameters."""
+    changes = {
         name: flags[f"source_{name}"]
-        for one in ESTIMATES.values()
-        for name in one.parameters()
+        for estimate in ESTIMATES.values()
+        for name in estimate.parameters()
         if f"source_{name}" in flags
     }
     method = flags.get("source_from")
-    if method is None and not given:
+    if method is None and not changes:
         return base.source
     if method is None:
         method = "" if base.estimate is None else base.estimate.name()
     elif method not in ESTIMATES:
-        meant = nearest(method, list(ESTIMATES))
-        hint = f"did you mean '{meant}'?" if meant else f"expected one of {', '.join(ESTIMATES)}"
+        guess = nearest(method, list(ESTIMATES))
+        hint = f"did you mean '{guess}'?" if guess else f"expected one of {', '.join(ESTIMATES)}"
         raise InputError(f"--source-from is '{method}': {hint}")
-    for name in given:
-        users = _users(name)
-        if method not in users:
-            wanted = " or ".join(f"--source-from {user}" for user in users)
-            raise InputError(f"received --source-{name.replace('_', '-')}: it needs {wanted}")
-    kept = base.estimate.values() if base.estimate and base.estimate.name() == method else {}
-    return validated(ESTIMATES[method], {**kept, **given}, f"--source-from {method}")
+    for name in changes:
+        methods = _estimates_with(name)
+        if method not in methods:
+            choices = " or ".join(f"--source-from {key}" for key in methods)
+            raise InputError(f"received --source-{name.replace('_', '-')}: it needs {choices}")
+    before = base.estimate.values() if base.estimate and base.estimate.name() == method else {}
+    return validated(ESTIMATES[method], {**before, **changes}, f"--source-from {method}")

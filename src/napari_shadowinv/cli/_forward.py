@@ -1,4 +1,4 @@
-"""What `shadowinv forward` predicts: a field's image in its own or in another experiment."""
+"""The prediction of `shadowinv forward`: a field's image in its own or another setup."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Field:
-    """A displacement in px, and where the file has them the source and setup that made it."""
+    """A displacement in px, with its source and setup if the file contains them."""
 
     displacement: FloatArray
     source: FloatArray | None = None
@@ -27,7 +27,7 @@ class Field:
 
 
 def field_from(path: Path, variable: str | None = None) -> Field:
-    """Displacement from a result, or from an array of px or px²."""
+    """Read a displacement from a result, or from an array in px or px²."""
     from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
     from napari_shadowinv.io import read_dataset, read_radiograph
     from napari_shadowinv.io.dataset import require
@@ -43,7 +43,7 @@ def field_from(path: Path, variable: str | None = None) -> Field:
     if kind in ("hdf5", "shadowinv"):
         dataset = read_dataset(path)
         if is_fit(dataset.attrs):
-            return _fitted(path, dataset)
+            return _read_fit_field(path, dataset)
         if is_pack(dataset.attrs):
             raise _no_field(path, "a film pack")
         source = dataset["source"].values if "source" in dataset else None
@@ -56,8 +56,8 @@ def field_from(path: Path, variable: str | None = None) -> Field:
 
 
 @refusing_damage
-def _fitted(path: Path, dataset: xarray.Dataset) -> Field:
-    """The only field of a fit, with the beam of its first image."""
+def _read_fit_field(path: Path, dataset: xarray.Dataset) -> Field:
+    """Read the only field of a fit, with the beam of its first image."""
     from napari_shadowinv.fitting import Fit
 
     fit = Fit.from_dataset(dataset)
@@ -80,53 +80,57 @@ def _displacement(path: Path, array: AnyArray) -> FloatArray:
     raise _no_field(path, f"an array of shape {array.shape}")
 
 
-def _no_field(path: Path, found: str) -> FileFormatError:
+def _no_field(path: Path, kind: str) -> FileFormatError:
     return FileFormatError(
-        f"{path} is {found}: expected a .shadowinv result, or NPY with a displacement "
+        f"{path} is {kind}: expected a .shadowinv result, or NPY with a displacement "
         "(2, height, width) in px or a potential (height, width) in px²"
     )
 
 
-def experiments(
-    field: Field, seen: Setup | None, told: Setup | None, deflector: str | None, dispersion: float
+def choose_setups(
+    field: Field,
+    target: Setup | None,
+    made_with: Setup | None,
+    deflector: str | None,
+    dispersion: float,
 ) -> tuple[Setup | None, Setup | None]:
-    """Setups that a field was measured with, and that it is to be seen with."""
-    if told is not None and field.setup is not None and told != field.setup:
+    """Return the setup that a field was measured with, and the one to predict it for."""
+    if made_with is not None and field.setup is not None and made_with != field.setup:
         raise InputError(
             "received --made-with, but the field's file contains its own setup, "
             f"{setup_text(field.setup)}: leave it out"
         )
-    made_with = told or field.setup or seen
-    seen = seen or made_with
-    if (deflector is not None or dispersion != 1) and made_with == seen:
+    original = made_with or field.setup or target
+    target = target or original
+    if (deflector is not None or dispersion != 1) and original == target:
         raise InputError(
             "received --deflector or --dispersion, but only one setup: expected a different one "
             "with --setup, and for a field in px also --made-with"
         )
-    return made_with, seen
+    return original, target
 
 
-def predicted(
+def predict_image(
     displacement: FloatArray,
     source: FloatArray | None,
     made_with: Setup | None,
-    seen: Setup | None,
-    what: str | None,
+    target: Setup | None,
+    deflector: str | None,
     dispersion: float,
 ) -> tuple[FloatArray, str]:
-    """Return the image, and in words what was assumed."""
+    """Return the image, and a sentence with the assumptions."""
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.projection import default_deflector, project
 
-    if made_with is None or seen is None or made_with == seen:
+    if made_with is None or target is None or made_with == target:
         return synthetic_image(displacement, source), ""
     # Names of two words have a hyphen on the command line.
-    named = cast("Deflector | None", what and what.replace("-", " "))
-    deflector = named or default_deflector(made_with, seen)
+    name = cast("Deflector | None", deflector and deflector.replace("-", " "))
+    name = name or default_deflector(made_with, target)
     image = project(
-        displacement, made_with, seen, deflector=deflector, dispersion=dispersion, source=source
+        displacement, made_with, target, deflector=name, dispersion=dispersion, source=source
     )
     return image, (
-        f"From {setup_text(made_with)} to {setup_text(seen)}, assuming that only a {deflector} "
+        f"From {setup_text(made_with)} to {setup_text(target)}, assuming that only a {name} "
         "deflects the beam"
     )

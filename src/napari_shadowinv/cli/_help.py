@@ -21,7 +21,7 @@ _SHOW_HELP = "Show this page; --help-all shows all flags."
 
 
 class HelpfulCommand(TyperCommand):
-    """Command with a page of help that fits a screen, and a complete one."""
+    """Command with a short page of help, and a complete one."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         ctx.meta["help-all"] = "--help-all" in args
@@ -37,44 +37,43 @@ class HelpfulGroup(TyperGroup):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         width = _columns()
-        lines = [f"Usage: {ctx.command_path} COMMAND", "", *_wrapped(self.help, width)]
+        lines = [f"Usage: {ctx.command_path} COMMAND", "", *_wrap(self.help, width)]
         commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
-        rows = [(name, _first_sentence(one.help)) for name, one in commands.items() if one]
+        rows = [(name, _first_sentence(c.help)) for name, c in commands.items() if c]
         lines += ["", "Commands", *_table(rows, width)]
         lines += ["", "Options", *_table(_rows(self.get_params(ctx), ctx), width)]
-        lines += ["", *_wrapped(f"Help on a command: {ctx.command_path} COMMAND -h", width)]
+        lines += ["", *_wrap(f"Help on a command: {ctx.command_path} COMMAND -h", width)]
         formatter.write("\n".join(lines) + "\n")
 
 
 def _command_lines(command: Any, ctx: Any, is_complete: bool) -> Iterator[str]:
-    """Lines of the help of a command: the common flags, or all of it."""
+    """Yield the help of a command: the common flags, or all of it."""
     width = _columns()
     sections = _sections(command.epilog)
     arguments, panels = _by_panel(command.get_params(ctx))
-    names = " ".join(_argument_name(one) for one in arguments)
+    names = " ".join(map(_argument_name, arguments))
     yield f"Usage: {ctx.command_path} [OPTIONS] {names}".rstrip()
     yield ""
     summary, *details = (command.help or "").split("\n\n")
     for text in (summary, *(details if is_complete else ())):
-        yield from _wrapped(text, width)
+        yield from _wrap(text, width)
     examples = sections.pop("Examples", [])
-    described, common = _rows(arguments, ctx), _rows(panels.pop("", []), ctx)
+    positional, common = _rows(arguments, ctx), _rows(panels.pop("", []), ctx)
     if not is_complete:
-        fitting = [line for line in examples if len(line) <= width - 2]
-        examples = fitting[:_SHORT_EXAMPLES]
+        examples = [line for line in examples if len(line) <= width - 2][:_SHORT_EXAMPLES]
         text_width = width - _NAME_COLUMNS - 2
-        described = [(name, _shortened(text, 2 * text_width)) for name, text in described]
-        common = [(name, _shortened(text, text_width)) for name, text in common]
+        positional = [(name, _shorten(text, 2 * text_width)) for name, text in positional]
+        common = [(name, _shorten(text, text_width)) for name, text in common]
     if examples:
         yield from ("", "Examples", *(f"  {line}" for line in examples))
-    if described:
-        yield from ("", *_table(described, width))
+    if positional:
+        yield from ("", *_table(positional, width))
     yield from ("", "Options", *_table(common, width))
     if not is_complete:
-        hidden = [f"{_bare(title)} ({len(flags)} flags)" for title, flags in panels.items()]
-        hidden += [_bare(title) for title in sections]
+        hidden = [f"{_strip_remark(title)} ({len(flags)} flags)" for title, flags in panels.items()]
+        hidden += [_strip_remark(title) for title in sections]
         if hidden:
-            yield from ("", *_wrapped(f"--help-all also shows: {'; '.join(hidden)}", width))
+            yield from ("", *_wrap(f"--help-all also shows: {'; '.join(hidden)}", width))
         return
     for title, flags in panels.items():
         yield from ("", title, *_table(_rows(flags, ctx), width))
@@ -87,7 +86,7 @@ def _columns() -> int:
 
 
 def _sections(epilog: str | None) -> dict[str, list[str]]:
-    """Sections of an epilog by their titles; a title is in bold."""
+    """Split an epilog into its sections; a title is in bold."""
     sections: dict[str, list[str]] = {}
     lines: list[str] = []
     for line in (epilog or "").replace("\\[", "[").strip().splitlines():
@@ -103,7 +102,7 @@ def _sections(epilog: str | None) -> dict[str, list[str]]:
 
 
 def _by_panel(parameters: Iterable[Any]) -> tuple[list[Any], dict[str, list[Any]]]:
-    """Arguments, and the flags by the title of their panel; the common flags have none."""
+    """Return the arguments, and the flags by panel; the common flags have no panel."""
     arguments: list[Any] = []
     panels: dict[str, list[Any]] = {"": []}
     for parameter in parameters:
@@ -117,8 +116,8 @@ def _by_panel(parameters: Iterable[Any]) -> tuple[list[Any], dict[str, list[Any]
     return arguments, panels
 
 
-def _bare(title: str) -> str:
-    """A title without what stands in brackets."""
+def _strip_remark(title: str) -> str:
+    """Remove a remark in brackets from a title."""
     return re.sub(r" \(.*\)", "", title).strip()
 
 
@@ -144,7 +143,7 @@ def _argument_name(argument: Any) -> str:
 
 
 def _kind(option: Any, ctx: Any) -> str:
-    """Placeholder for the value of a flag; a switch has none."""
+    """Return the placeholder for the value of a flag; a switch has none."""
     if getattr(option, "is_flag", False) or getattr(option, "is_bool_flag", False):
         return ""
     if option.metavar:
@@ -160,7 +159,7 @@ def _annotation_name(option: Any) -> str:
 
 
 def _with_default(option: Any) -> str:
-    """Help of a flag, with its default where the text does not contain it."""
+    """Return the help of a flag, and its default if the text does not contain it."""
     text = option.help or ""
     default = option.default
     is_switch = isinstance(default, bool)
@@ -170,14 +169,14 @@ def _with_default(option: Any) -> str:
 
 
 def _first_sentence(text: str | None) -> str:
-    """First sentence of a text."""
+    """Return the first sentence of a text."""
     plain = " ".join((text or "").split())
     end = re.search(r"(?<=[a-z0-9)%'])[.](?= [A-Z])", plain)
     return plain if end is None else plain[: end.end()]
 
 
-def _shortened(text: str, length: int) -> str:
-    """The start of a text, up to the end of a clause if there is one."""
+def _shorten(text: str, length: int) -> str:
+    """Cut a text at the end of a clause, or else of a word."""
     sentence = _first_sentence(text)
     if len(sentence) <= length:
         return sentence
@@ -187,12 +186,12 @@ def _shortened(text: str, length: int) -> str:
     return textwrap.shorten(sentence, length, placeholder=" …")
 
 
-def _wrapped(text: str | None, width: int) -> list[str]:
+def _wrap(text: str | None, width: int) -> list[str]:
     return textwrap.wrap(" ".join((text or "").split()), width, break_long_words=False)
 
 
 def _table(rows: Iterable[tuple[str, str]], width: int) -> Iterator[str]:
-    """Names and texts side by side, the text below a name that is too long."""
+    """Lay out names and texts side by side, the text below a name that is too long."""
     for name, text in rows:
         indent = " " * (_NAME_COLUMNS + 2)
         lines = textwrap.wrap(

@@ -1,4 +1,4 @@
-"""What `shadowinv info` tells: of a file, `described`; for a bug report, `report_text`."""
+"""The output of `shadowinv info`: `file_table`, and `system_report` for a bug report."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ QT_BINDINGS = ("PyQt6", "PySide6", "PySide6_Essentials", "PyQt5", "PySide2")
 
 
 @refusing_damage
-def described(path: Path, variable: str | None = None) -> Table:
-    """Tell what a file is and what is in it."""
+def file_table(path: Path, variable: str | None = None) -> Table:
+    """Build a table of a file's kind and contents."""
     return _summary.two_columns(str(path), _rows(path, variable))
 
 
@@ -46,20 +46,20 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
 
     if is_stack(path):
         return store_rows(StackStore(path))
-    found = format_of(path)
-    if found.name == "mat":
+    form = format_of(path)
+    if form.name == "mat":
         return _matlab_rows(path, variable)
-    if found.name == "cpsa":
+    if form.name == "cpsa":
         return _radiograph_rows(read(path, variable=variable))
-    if variable is not None and found.named_reader:
+    if variable is not None and form.named_reader:
         array = read_hdf5(path, variable)
         return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
-    if found.name == "npy" and variable is None:
+    if form.name == "npy" and variable is None:
         return [("kind", "NPY array"), *_array_rows(read_npy(path))]
-    if found.name == "text" or variable is not None:
+    if form.name == "text" or variable is not None:
         return _radiograph_rows(read(path, variable=variable))
-    if "result" not in found.holds:
-        return _picture_rows(path, found)
+    if "result" not in form.holds:
+        return _picture_rows(path, form)
     content = read(path)
     if isinstance(content, Radiograph):
         return _radiograph_rows(content)
@@ -67,12 +67,12 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
 
 
 def _matlab_rows(path: Path, variable: str | None) -> _summary.Rows:
-    """The image of a MATLAB file, or a list to choose from."""
+    """Describe the image of a MATLAB file, or list the images to choose from."""
     from napari_shadowinv.io.matlab import mat_variables, read_mat
 
-    held = mat_variables(path)
-    rows = [("kind", "MATLAB file"), ("variables", ", ".join(map(str, held)) or "none")]
-    images = [item for item in held if item.is_image]
+    contents = mat_variables(path)
+    rows = [("kind", "MATLAB file"), ("variables", ", ".join(map(str, contents)) or "none")]
+    images = [array for array in contents if array.is_image]
     if variable is None and len(images) != 1:
         advice = "choose one with --variable" if images else "none that is an image"
         return [*rows, ("images", f"{len(images)}: {advice}")]
@@ -80,12 +80,12 @@ def _matlab_rows(path: Path, variable: str | None) -> _summary.Rows:
     return [*rows, ("image", metadata["variable"]), *_array_rows(array)]
 
 
-def _picture_rows(path: Path, found: Format) -> _summary.Rows:
+def _picture_rows(path: Path, form: Format) -> _summary.Rows:
     from napari_shadowinv.io.colours import film_warnings
 
-    array, metadata = found.read(path)
+    array, metadata = form.read(path)
     warnings = film_warnings(array, None) if array.ndim == 2 else ()
-    rows = [("kind", f"{found.name.upper()} picture, {metadata['bits']} bits per sample")]
+    rows = [("kind", f"{form.name.upper()} picture, {metadata['bits']} bits per sample")]
     if array.ndim == 3:
         advice = "convert a scan of film to dose, or choose with --channel"
         rows.append(("channels", f"{array.shape[-1]}: {advice}"))
@@ -113,8 +113,8 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _summary.Rows:
             rows.append((f"{name.replace('_', ' ')} ({unit})", f"{value:g}"))
     rows.append(("setup", _summary.setup_text(shot.setup, shot, shot.shape)))
     rows += [("note", text) for text in shot.notes]
-    doubts = () if shot.setup is None else setup_warnings(shot.setup, shot.shape)
-    return [*rows, *[("warning", caution.text) for caution in (*shot.warnings, *doubts)]]
+    warnings = () if shot.setup is None else setup_warnings(shot.setup, shot.shape)
+    return [*rows, *[("warning", caution.text) for caution in (*shot.warnings, *warnings)]]
 
 
 def _array_rows(array: AnyArray) -> _summary.Rows:
@@ -168,7 +168,7 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
 
 
 def _origin_rows(provenance: Provenance | None) -> _summary.Rows:
-    """Files that a result was made from, and what was done to them."""
+    """Return the files that a result was made from, and the steps before the inversion."""
     if provenance is None:
         return []
     origins = {"image": provenance.image, "source": provenance.source}
@@ -179,8 +179,8 @@ def _origin_rows(provenance: Provenance | None) -> _summary.Rows:
     return rows + _summary.provenance_rows(provenance)
 
 
-def report_text() -> str:
-    """Versions and the machine, one per line; neither napari nor Qt is loaded, which may fail."""
+def system_report() -> str:
+    """List versions and the machine; a broken napari or Qt cannot fail it, as neither is loaded."""
     memory = physical_memory()
     rows = [
         ("napari-shadowinv", __version__),
@@ -204,8 +204,8 @@ def _version(package: str) -> str | None:
 
 
 def _qt_bindings() -> list[str]:
-    found = ((name, _version(name)) for name in QT_BINDINGS)
-    return [f"{name} {number}" for name, number in found if number]
+    versions = ((name, _version(name)) for name in QT_BINDINGS)
+    return [f"{name} {number}" for name, number in versions if number]
 
 
 def _cores() -> str:
@@ -218,7 +218,7 @@ def _cores() -> str:
 
 
 def _compiled_code() -> str:
-    """The folder with the machine code; the home folder is written ~ to hide the user's name."""
+    """Return the folder of the machine code; ~ hides the name of the user."""
     try:
         from napari_shadowinv.inversion.machine_code import code_folder, is_compiled
 
@@ -226,8 +226,9 @@ def _compiled_code() -> str:
         if folder is None:
             return "not kept: compiled anew in each process"
         state = "compiled" if is_compiled() else "not compiled yet"
-    except Exception as error:  # a broken numba must not keep the rest from being reported
+    except Exception as error:  # a broken numba must not stop the report
         return f"not known: {type(error).__name__}: {' '.join(str(error).split())}"
     home = Path.home()
-    shown = Path("~") / folder.relative_to(home) if folder.is_relative_to(home) else folder
-    return f"{shown} ({state})"
+    if folder.is_relative_to(home):
+        folder = Path("~") / folder.relative_to(home)
+    return f"{folder} ({state})"

@@ -1,4 +1,4 @@
-"""What a command reads: a recipe, options, the setup and images."""
+"""Inputs of a command: a recipe, options, the setup and images."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def recipe_from(
     mask: Path | None = None,
     source_mask: Path | None = None,
 ) -> Recipe:
-    """Recipe from a file, with an options file and flags on top."""
+    """Read a recipe, and override it with an options file and flags."""
     from napari_shadowinv.cli._flags import recipe_of
     from napari_shadowinv.io import read_toml
     from napari_shadowinv.pipeline import read_recipe
@@ -54,7 +54,7 @@ def recipe_from(
 
 
 def options_from(flags: Mapping[str, Any], clip_negative: bool) -> InversionOptions:
-    """Options from flags alone."""
+    """Return the options that flags set."""
     return recipe_from(flags, None, None, clip_negative=clip_negative).options
 
 
@@ -67,7 +67,7 @@ def fit_recipe_from(
     gains: str | None,
     mask: Path | None,
 ) -> Recipe:
-    """Recipe of a fit from a file, with an options file and flags on top."""
+    """Read the recipe of a fit, and override it with an options file and flags."""
     from napari_shadowinv.cli._flags import fit_recipe_of
     from napari_shadowinv.io import read_toml
     from napari_shadowinv.pipeline import read_recipe
@@ -75,30 +75,30 @@ def fit_recipe_from(
 
     base = Recipe() if recipe is None else read_recipe(recipe)
     content = {} if options is None else read_toml(options)
-    own = {} if gains is None else {"gains": gains}
+    choices = {} if gains is None else {"gains": gains}
     changes: dict[str, Any] = {} if mask is None else {"mask": mask}
     if source is not None:
-        unknown = source == "unknown"
-        own["beam"] = "unknown" if unknown else "known"
-        changes["source"] = None if unknown else MeasuredSource(file=Path(source))
+        is_unknown = source == "unknown"
+        choices["beam"] = "unknown" if is_unknown else "known"
+        changes["source"] = None if is_unknown else MeasuredSource(file=Path(source))
     where = "options" if options is None else str(options)
-    return fit_recipe_of({**flags, **own}, base, content, where).model_copy(update=changes)
+    return fit_recipe_of({**flags, **choices}, base, content, where).model_copy(update=changes)
 
 
 def fit_recipe(
     recipe: Recipe, flags: Mapping[str, Any], options: Path | None, *, clip_negative: bool
 ) -> Recipe:
-    """Recipe for shots that are fitted; refuse flags of an inversion."""
+    """Return the recipe for shots to be fitted; refuse flags of an inversion."""
     from napari_shadowinv.options import FitChoices, InversionOptions
 
-    given = [
+    refused = [
         f"--{name.replace('_', '-')}" for name in InversionOptions.model_fields if name in flags
     ]
-    given += ["--options"] if options is not None else []
-    given += ["--clip-negative"] if clip_negative else []
-    if given:
+    refused += ["--options"] if options is not None else []
+    refused += ["--clip-negative"] if clip_negative else []
+    if refused:
         raise InputError(
-            f"received {given[0]}, which an inversion takes, and shots that are to be fitted: "
+            f"received {refused[0]}, which an inversion takes, and shots that are to be fitted: "
             "write the fit's options into the recipe's section [fit.options]"
         )
     return recipe.model_copy(update={"fit": recipe.fit or FitChoices()})
@@ -114,7 +114,7 @@ def recipe_for_shots(
     clip_negative: bool,
     **files: Path | None,
 ) -> Recipe:
-    """Recipe for many shots, which are fitted if it is asked for; `files` as for `recipe_from`."""
+    """Return the recipe for many shots, to invert or to fit; `files` as for `recipe_from`."""
     from napari_shadowinv.pipeline.files import setup_from
 
     chosen = recipe_from(flags, recipe, options, clip_negative=clip_negative, **files)  # type: ignore[arg-type]
@@ -126,7 +126,7 @@ def recipe_for_shots(
 
 
 def source_from(recipe: Recipe, image: Path, channel: str | None) -> Radiograph | None:
-    """Read the measured source that a recipe names; one without a file is in the image's."""
+    """Read the measured source that a recipe names, from its file or else the image's."""
     from napari_shadowinv.pipeline.files import read_part
     from napari_shadowinv.preprocessing import MeasuredSource
 
@@ -137,7 +137,7 @@ def source_from(recipe: Recipe, image: Path, channel: str | None) -> Radiograph 
 
 
 def setup_for(path: Path | None, shot: Radiograph, recipe: Recipe) -> Setup | None:
-    """Setup from a file, completed by the geometry that the image's file knows."""
+    """Read a setup, and complete it with the geometry in the image's file."""
     from napari_shadowinv.pipeline.files import setup_from
 
     if path is None:

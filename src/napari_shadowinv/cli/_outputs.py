@@ -1,4 +1,4 @@
-"""What a command writes: names chosen and checked before the work, files after it."""
+"""Outputs of a command: names chosen and checked before the work, files written after it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:
-    """Choose the names of result and figure; the figure never takes the image's name."""
+    """Choose the names of result and figure; the figure never replaces the image."""
     if not image.stem:
         raise InputError(f"{image} is a folder: expected an image; give the name of a file")
     result = Path(f"{image.stem}{RESULT.suffix}") if out is None else out
@@ -34,7 +34,7 @@ def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tup
 
 
 def check_outputs(outputs: Mapping[Path, tuple[str, ...]], overwrite: bool) -> None:
-    """Refuse, before any work, files whose ending, folder or existence forbids to write them."""
+    """Refuse, before any work, files with a wrong ending or folder, or that exist."""
     from napari_shadowinv.io import check_output
 
     for path, suffixes in outputs.items():
@@ -42,23 +42,23 @@ def check_outputs(outputs: Mapping[Path, tuple[str, ...]], overwrite: bool) -> N
 
 
 def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
-    """Refuse to overwrite what is read, whatever --overwrite says."""
-    read = {resolved_path(other) for other in inputs if other is not None}
+    """Refuse to overwrite an input, even with --overwrite."""
+    sources = {resolved_path(file) for file in inputs if file is not None}
     for path in outputs:
-        if resolved_path(path) in read:
+        if resolved_path(path) in sources:
             raise InputError(f"{path} is both read and written: choose another name for the output")
     if len({resolved_path(path) for path in outputs}) < len(outputs):
         raise InputError(f"{outputs[0]} would be written twice: choose two names")
 
 
 def protect_files_of(recipe: Recipe, outputs: list[Path]) -> None:
-    """Refuse to overwrite what a recipe reads."""
+    """Refuse to overwrite a file that a recipe names."""
     source = getattr(recipe.source, "file", None)
     protect(outputs, [recipe.mask, recipe.source_mask, source])
 
 
 def save_recipe(path: Path, recipe: Recipe, inputs: list[Path | None], overwrite: bool) -> None:
-    """Write a recipe, but over nothing that is read."""
+    """Write a recipe, but not over an input."""
     from napari_shadowinv.pipeline import write_recipe
 
     check_outputs({path: (".toml",)}, overwrite)
@@ -68,7 +68,7 @@ def save_recipe(path: Path, recipe: Recipe, inputs: list[Path | None], overwrite
 
 
 def protect_store(store: Path, output: Path) -> None:
-    """Refuse to write among the files of a store that is read."""
+    """Refuse to write into a store that is read."""
     if resolved_path(output).is_relative_to(resolved_path(store)):
         raise InputError(
             f"{output} is inside the store being read: choose another name for the output"
@@ -76,7 +76,7 @@ def protect_store(store: Path, output: Path) -> None:
 
 
 def check_setup(result: Path, setup: Setup | None, fields: Sequence[str] | None = None) -> None:
-    """Refuse a setup, or fields, that the result's format cannot keep."""
+    """Refuse a setup, or fields, that the result's format cannot store."""
     from napari_shadowinv.io.pradformat import check_pradformat_fields, check_pradformat_setup
 
     if result.suffix.lower() in PRADFORMAT.suffixes:
@@ -85,7 +85,7 @@ def check_setup(result: Path, setup: Setup | None, fields: Sequence[str] | None 
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, with those above it, unless it is there."""
+    """Make a folder and its parents, unless they exist."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -94,10 +94,10 @@ def make_folder(path: Path) -> None:
         ) from None
 
 
-def write_all(
+def write_inversion(
     inversion: Inversion, shot: Radiograph, out: Path, report: Path, overwrite: bool
 ) -> None:
-    """Write result and figure of an inversion, both or none of them."""
+    """Write the result and the figure of an inversion, both or neither."""
     from napari_shadowinv.io.files import text_of
     from napari_shadowinv.plotting import report_figure
 
@@ -109,12 +109,12 @@ def write_all(
 def write_with_figures(
     result: Inversion | xarray.Dataset, figures: Mapping[Path, Figure], out: Path, overwrite: bool
 ) -> None:
-    """Write a result and its figures, all or none of them."""
+    """Write a result and its figures, all or none."""
     from napari_shadowinv.io import replacing, write
     from napari_shadowinv.plotting._figures import DOTS_PER_INCH
 
-    with ExitStack() as drawn:
+    with ExitStack() as stack:
         for path, figure in figures.items():
-            temporary = drawn.enter_context(replacing(path, overwrite))
+            temporary = stack.enter_context(replacing(path, overwrite))
             figure.savefig(temporary, dpi=DOTS_PER_INCH)
         write(out, result, overwrite=overwrite)

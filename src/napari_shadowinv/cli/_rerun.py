@@ -1,4 +1,4 @@
-"""A result made again from its provenance, and what has changed since."""
+"""Rerun of an inversion from its provenance, and the changes since."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from napari_shadowinv import __version__
 from napari_shadowinv.cli._outputs import protect
-from napari_shadowinv.cli._terminal import inverted
+from napari_shadowinv.cli._terminal import invert_shot
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.pipeline.files import read_part
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from napari_shadowinv._typing import BoolArray
     from napari_shadowinv.preprocessing import Origin, Provenance, Radiograph, Recipe
 
-SAME = "none: the same result, bit for bit"
+UNCHANGED = "none: the same result, bit for bit"
 
 
 @dataclass(frozen=True)
-class Again:
-    """A result made again, and what has changed since the first time."""
+class InversionRerun:
+    """A repeated inversion, and the changes since the first one."""
 
     inversion: Inversion
     shot: Radiograph
@@ -39,8 +39,8 @@ class Again:
 
 
 @dataclass(frozen=True)
-class Places:
-    """Where the files of a result are looked for: as named now, beside it, and here.
+class FileLocator:
+    """Locator of the files of a result: in the arguments, its folder or the current folder.
 
     A result may come from anybody: files in other folders are read only if they are `trusted`.
     """
@@ -52,17 +52,17 @@ class Places:
 
     def check(self, file: Path, name: str) -> None:
         """Refuse a file outside of the result's folder and the current one, unless trusted."""
-        path = Path(os.path.abspath(file))  # a link beside the result is the user's
+        path = Path(os.path.abspath(file))  # a link in the result's folder belongs to the user
         folders = (self.result.parent, Path())
-        inside = (path.is_relative_to(os.path.abspath(folder)) for folder in folders)
-        if not self.trusted and not any(inside):
+        is_inside = any(path.is_relative_to(os.path.abspath(folder)) for folder in folders)
+        if not (self.trusted or is_inside):
             raise InputError(
                 f"{self.result} names {name} {file}, which is in another folder: name the file to "
                 "use, or read what the result names with --other-folders if you trust it"
             )
 
     def check_recipe(self, recipe: Recipe) -> None:
-        """Refuse files that a recipe names; that of a result names none."""
+        """Refuse files that a recipe names in other folders."""
         files = {
             "a mask": recipe.mask,
             "a source mask": recipe.source_mask,
@@ -73,47 +73,47 @@ class Places:
             if file is not None:
                 self.check(file, name)
 
-    def find(self, origin: Origin, name: str, given: Path | None = None) -> Path:
-        """Return the file of an image, source, mask or table."""
+    def find(self, origin: Origin, name: str, argument: Path | None = None) -> Path:
+        """Return the file of an image, source, mask or table; an argument has precedence."""
         folders = (self.result.parent, Path())
-        places = [folder / origin.file for folder in folders if origin.file]
-        if given is None and places:
-            self.check(places[0], name)
-        path = given or next((place for place in places if place.is_file()), None)
+        candidates = [folder / origin.file for folder in folders if origin.file]
+        if argument is None and candidates:
+            self.check(candidates[0], name)
+        path = argument or next((file for file in candidates if file.is_file()), None)
         if path is None:
-            found = f"{origin.file} is not there" if origin.file else "was not made from a file"
-            raise FileFormatError(f"{name} {found}: name the file to use")
+            reason = f"{origin.file} is not there" if origin.file else "was not made from a file"
+            raise FileFormatError(f"{name} {reason}: name the file to use")
         return path
 
-    def read(self, origin: Origin, name: str, given: Path | None = None) -> Radiograph:
-        """Return the part of a file that an image or source was."""
+    def read(self, origin: Origin, name: str, argument: Path | None = None) -> Radiograph:
+        """Read an image or source from its file."""
         channel = None if origin.channel is None else str(origin.channel)
-        return read_part(self.find(origin, name, given), channel, origin.variable)
+        return read_part(self.find(origin, name, argument), channel, origin.variable)
 
 
-def made_again(
-    dataset: xarray.Dataset, places: Places, outputs: list[Path], *, quiet: bool = False
-) -> Again:
-    """Make an inversion again. Nothing that is read may be among `outputs`."""
-    if len(places.images) > 1:
+def rerun_inversion(
+    dataset: xarray.Dataset, files: FileLocator, outputs: list[Path], *, quiet: bool = False
+) -> InversionRerun:
+    """Repeat an inversion; `outputs` must not contain an input."""
+    if len(files.images) > 1:
         raise InputError(
-            f"received {len(places.images)} images, and {places.result} was made from one: name "
+            f"received {len(files.images)} images, and {files.result} was made from one: name "
             "one, or none if it is beside the result"
         )
     before = Inversion.from_dataset(dataset)
-    made = before.provenance
-    if made is None:
-        check_readable(dataset, places.result)
+    provenance = before.provenance
+    if provenance is None:
+        check_readable(dataset, files.result)
         raise InputError(
-            f"{places.result} does not say how it was made, as results of scripts that call "
+            f"{files.result} does not say how it was made, as results of scripts that call "
             "invert() do not: make it again with a recipe (docs/recipes.md)"
         )
-    inversion, shot, changes = inversion_again(made, places, outputs, quiet=quiet)
-    return Again(inversion, shot, tuple(changes), _difference(before, inversion))
+    inversion, shot, changes = repeat_inversion(provenance, files, outputs, quiet=quiet)
+    return InversionRerun(inversion, shot, tuple(changes), _difference(before, inversion))
 
 
 def check_readable(dataset: xarray.Dataset, result: Path) -> None:
-    """Refuse a provenance that is there, but which this version does not understand."""
+    """Refuse a provenance that is damaged or of another version."""
     text = dataset.attrs.get("provenance", "")
     if not text:
         return
@@ -131,29 +131,30 @@ def check_readable(dataset: xarray.Dataset, result: Path) -> None:
     )
 
 
-def inversion_again(
-    made: Provenance, places: Places, outputs: list[Path], *, quiet: bool = False
+def repeat_inversion(
+    provenance: Provenance, files: FileLocator, outputs: list[Path], *, quiet: bool = False
 ) -> tuple[Inversion, Radiograph, list[str]]:
-    """Return the inversion that a provenance describes, its shot, and what has changed."""
-    places.check_recipe(made.recipe)
-    shot = places.read(made.image, "the image", next(iter(places.images), None))
-    beam, own = None, (made.image.file, made.image.variable)
-    if made.source is not None and (made.source.file, made.source.variable) != own:
-        beam = places.read(made.source, "the source", places.source)
-    protect(outputs, [places.result, shot.path, None if beam is None else beam.path])
-    masks = {"mask": made.mask, "source_mask": made.source_mask}
-    drawn = {name: _mask(origin, name.replace("_", " ")) for name, origin in masks.items()}
-    # What else its file holds was not used, unless the provenance says so.
-    image = shot.image if made.gain is None else shot.image / made.gain
-    alone = replace(shot, image=image, setup=None, mask=None, source_mask=None)
-    recipe = made.recipe
-    if made.dark is not None:
-        recipe = recipe.with_dark_file(places.find(made.dark, "the dark frame"))
-    inversion = inverted(recipe, alone, beam, quiet, **drawn)
+    """Return the inversion that a provenance describes, its shot, and the changes since."""
+    image, source = provenance.image, provenance.source
+    files.check_recipe(provenance.recipe)
+    shot = files.read(image, "the image", next(iter(files.images), None))
+    beam = None
+    if source is not None and (source.file, source.variable) != (image.file, image.variable):
+        beam = files.read(source, "the source", files.source)
+    protect(outputs, [files.result, shot.path, None if beam is None else beam.path])
+    origins = {"mask": provenance.mask, "source_mask": provenance.source_mask}
+    masks = {name: _mask(origin, name.replace("_", " ")) for name, origin in origins.items()}
+    # The provenance says which other contents of the file were used.
+    pixels = shot.image if provenance.gain is None else shot.image / provenance.gain
+    alone = replace(shot, image=pixels, setup=None, mask=None, source_mask=None)
+    recipe = provenance.recipe
+    if provenance.dark is not None:
+        recipe = recipe.with_dark_file(files.find(provenance.dark, "the dark frame"))
+    inversion = invert_shot(recipe, alone, beam, quiet, **masks)
     if inversion.provenance is not None:
-        told = inversion.provenance.model_copy(update={"gain": made.gain})
-        inversion = replace(inversion, provenance=told)
-    return inversion, shot, _changes(made, inversion)
+        completed = inversion.provenance.model_copy(update={"gain": provenance.gain})
+        inversion = replace(inversion, provenance=completed)
+    return inversion, shot, _changes(provenance, inversion)
 
 
 def _mask(origin: Origin | None, name: str) -> BoolArray | None:
@@ -169,29 +170,29 @@ def _mask(origin: Origin | None, name: str) -> BoolArray | None:
 
 
 def _changes(before: Provenance, again: Inversion) -> list[str]:
-    now = again.provenance
-    assert now is not None
+    after = again.provenance
+    assert after is not None
     return [
-        *changed_version(before.version),
-        *changed_file("image", before.image, now.image),
-        *changed_file("source", before.source, now.source),
-        *changed_file("dark frame", before.dark, now.dark),
+        *version_changes(before.version),
+        *file_changes("image", before.image, after.image),
+        *file_changes("source", before.source, after.source),
+        *file_changes("dark frame", before.dark, after.dark),
     ]
 
 
-def changed_version(before: str) -> list[str]:
-    """Tell that another version is at work now, if it is."""
+def version_changes(before: str) -> list[str]:
+    """Report a change of the program's version."""
     return [] if before == __version__ else [f"made by version {before}, now {__version__}"]
 
 
-def changed_file(name: str, before: Origin | None, now: Origin | None) -> list[str]:
-    """Tell that a file is not what it was, if so."""
-    if before is None or now is None:
+def file_changes(name: str, before: Origin | None, after: Origin | None) -> list[str]:
+    """Report a change of a file."""
+    if before is None or after is None:
         return []
     if not before.sha256:
-        return [f"the {name} was no file before: {now.file} may differ from it"]
-    if before.sha256 != now.sha256:
-        return [f"the {name} {now.file} differs from the {before.file} used before"]
+        return [f"the {name} was no file before: {after.file} may differ from it"]
+    if before.sha256 != after.sha256:
+        return [f"the {name} {after.file} differs from the {before.file} used before"]
     return []
 
 
@@ -199,7 +200,7 @@ def _difference(before: Inversion, again: Inversion) -> str:
     if before.displacement.shape != again.displacement.shape:
         return f"another size: {again.image.shape}, before {before.image.shape}"
     names = ("displacement", "potential", "weights", "source", "image", "reprojection")
-    if all(np.array_equal(getattr(before, one), getattr(again, one)) for one in names):
-        return SAME
+    if all(np.array_equal(getattr(before, name), getattr(again, name)) for name in names):
+        return UNCHANGED
     largest = np.abs(before.displacement - again.displacement).max()
     return f"displacement differs by up to {largest:.2g} px"

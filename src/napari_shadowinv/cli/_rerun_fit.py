@@ -1,4 +1,4 @@
-"""A fit made again from its provenance, and what has changed since."""
+"""Rerun of a fit from its provenance, and the changes since."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from napari_shadowinv._system.safety import refusing_damage
-from napari_shadowinv.cli._fit_result import fitted, refined
+from napari_shadowinv.cli._fit_result import fit_images, refine_inversion
 from napari_shadowinv.cli._outputs import protect
 from napari_shadowinv.cli._rerun import (
-    SAME,
-    Places,
-    changed_file,
-    changed_version,
+    UNCHANGED,
+    FileLocator,
     check_readable,
-    inversion_again,
+    file_changes,
+    repeat_inversion,
+    version_changes,
 )
 from napari_shadowinv.cli._summary import two_columns
 from napari_shadowinv.errors import InputError
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class FitAgain:
-    """A fit made again, and what has changed since the first time."""
+class FitRerun:
+    """A repeated fit, and the changes since the first one."""
 
     fit: Fit
     names: tuple[str, ...]
@@ -45,71 +45,75 @@ class FitAgain:
     difference: str
 
 
-def fit_made_again(
-    dataset: xarray.Dataset, places: Places, outputs: list[Path], *, quiet: bool = False
-) -> FitAgain:
-    """Make a fit again. Nothing that is read may be among `outputs`."""
-    before = _fit_in(places.result, dataset)
-    made = before.provenance
-    if made is None:
-        check_readable(dataset, places.result)
+def rerun_fit(
+    dataset: xarray.Dataset, files: FileLocator, outputs: list[Path], *, quiet: bool = False
+) -> FitRerun:
+    """Repeat a fit; `outputs` must not contain an input."""
+    before = _read_fit(files.result, dataset)
+    provenance = before.provenance
+    if provenance is None:
+        check_readable(dataset, files.result)
         raise InputError(
-            f"{places.result} does not say how it was made, as fits of scripts that call fit() do "
+            f"{files.result} does not say how it was made, as fits of scripts that call fit() do "
             "not: make it again with shadowinv fit (docs/fit.md)"
         )
-    count = len(made.images)
-    if len(places.images) not in (0, count):
+    count = len(provenance.images)
+    if len(files.images) not in (0, count):
         raise InputError(
-            f"received {len(places.images)} images, and {places.result} was made from {count}: "
+            f"received {len(files.images)} images, and {files.result} was made from {count}: "
             "name all of them in their order, or none if they are beside the result"
         )
-    if made.start is not None:
-        inversion, shot, changes = inversion_again(made.start, places, outputs, quiet=quiet)
-        again = refined(inversion, made, quiet)
-        return FitAgain(again, (str(shot.path),), tuple(changes), _difference(before, again))
-    places.check_recipe(made.recipe)
-    files = _Files(places, made)
-    shots = [files.shot(k) for k in range(count)]
-    fiducials = files.fiducials()
-    protect(outputs, [places.result, *files.read])
+    if provenance.start is not None:
+        inversion, shot, changes = repeat_inversion(provenance.start, files, outputs, quiet=quiet)
+        again = refine_inversion(inversion, provenance, quiet)
+        return FitRerun(again, (str(shot.path),), tuple(changes), _difference(before, again))
+    files.check_recipe(provenance.recipe)
+    inputs = _FitInputs(files, provenance)
+    shots = [inputs.shot(k) for k in range(count)]
+    fiducials = inputs.fiducials()
+    protect(outputs, [files.result, *inputs.paths])
     from napari_shadowinv.preprocessing import Origin
 
-    recipe, dark = made.recipe, made.recipe.dark_file
+    recipe, dark = provenance.recipe, provenance.recipe.dark_file
     if dark is not None:
-        recipe = recipe.with_dark_file(places.find(Origin(file=dark.name), "the dark frame"))
-    again = fitted(recipe, shots, fiducials, quiet)
-    names = [str(files.read[k]) for k in range(count)]
-    changes = [*changed_version(made.version), *_changes(made, again), *files.changes]
-    return FitAgain(again, tuple(names), tuple(changes), _difference(before, again))
+        recipe = recipe.with_dark_file(files.find(Origin(file=dark.name), "the dark frame"))
+    again = fit_images(recipe, shots, fiducials, quiet)
+    names = [str(path) for path in inputs.paths[:count]]
+    changes = [
+        *version_changes(provenance.version),
+        *_changes(provenance, again),
+        *inputs.changes,
+    ]
+    return FitRerun(again, tuple(names), tuple(changes), _difference(before, again))
 
 
 @refusing_damage
-def _fit_in(path: Path, dataset: xarray.Dataset) -> Fit:
+def _read_fit(path: Path, dataset: xarray.Dataset) -> Fit:
     return Fit.from_dataset(dataset)
 
 
-class _Files:
-    """The files of a fit, found again; what of their masks and tables differs from before."""
+class _FitInputs:
+    """Inputs of a fit, read again, and the changes of its masks and tables."""
 
-    def __init__(self, places: Places, made: FitProvenance) -> None:
-        self._places, self._made = places, made
-        self._images = [self._image(k) for k in range(len(made.images))]
-        self.read = [Path(str(image.path)) for image in self._images]
+    def __init__(self, files: FileLocator, provenance: FitProvenance) -> None:
+        self._files, self._provenance = files, provenance
+        self._images = [self._image(k) for k in range(len(provenance.images))]
+        self.paths = [Path(str(image.path)) for image in self._images]
         self.changes: list[str] = []
 
     def _image(self, k: int) -> Radiograph:
-        given = self._places.images[k] if self._places.images else None
-        return self._places.read(self._made.images[k].image, f"image {k + 1}", given)
+        argument = self._files.images[k] if self._files.images else None
+        return self._files.read(self._provenance.images[k].image, f"image {k + 1}", argument)
 
     def shot(self, k: int) -> FitShot:
-        """An image with all that was known about it."""
-        origin, image = self._made.images[k], self._images[k]
-        own, source = (origin.image.file, origin.image.variable), None
-        if origin.source is not None and (origin.source.file, origin.source.variable) != own:
+        """Return an image with its setup, source, masks and numbers."""
+        origin, image = self._provenance.images[k], self._images[k]
+        image_part, source = (origin.image.file, origin.image.variable), None
+        if origin.source is not None and (origin.source.file, origin.source.variable) != image_part:
             name = f"the source of image {k + 1}"
-            source = self._places.read(origin.source, name, self._places.source)
-            self.read.append(Path(str(source.path)))
-        # What else its file holds was not used, unless the provenance says so.
+            source = self._files.read(origin.source, name, self._files.source)
+            self.paths.append(Path(str(source.path)))
+        # The provenance says which other contents of the file were used.
         alone = replace(image, setup=None, mask=None, source_mask=None)
         return FitShot(
             image=alone,
@@ -123,49 +127,50 @@ class _Files:
             noise=origin.noise,
         )
 
-    def _mask(self, place: int | None, own: BoolArray | None) -> BoolArray | None:
-        if place is None:
+    def _mask(self, index: int | None, image_mask: BoolArray | None) -> BoolArray | None:
+        if index is None:
             return None
-        origin = self._made.masks[place]
-        kept = origin.mask()
-        if kept is not None:
-            return kept
-        if not origin.file and own is None:
+        origin = self._provenance.masks[index]
+        mask = origin.mask()
+        if mask is not None:
+            return mask
+        if not origin.file and image_mask is None:
             raise InputError(
                 "a mask was too complex to be kept with the result, and was no file: make the fit "
                 "again with shadowinv fit and the mask"
             )
         if not origin.file:
-            return own
-        path = self._places.find(origin, "the mask")
-        self._note("mask", origin, path)
+            return image_mask
+        path = self._files.find(origin, "the mask")
+        self._record_input("mask", origin, path)
         return picture_mask(path)
 
     def fiducials(self) -> FloatArray | Path | None:
-        """Known displacements, from the result or from their table."""
-        made = self._made
-        if made.fiducial_rows is not None:
-            return np.array(made.fiducial_rows)
-        if made.fiducials is None:
+        """Return the fiducial displacements, from the result or from their table."""
+        provenance = self._provenance
+        if provenance.fiducial_rows is not None:
+            return np.array(provenance.fiducial_rows)
+        if provenance.fiducials is None:
             return None
-        path = self._places.find(made.fiducials, "the table of fiducials")
-        self._note("table of fiducials", made.fiducials, path)
+        path = self._files.find(provenance.fiducials, "the table of fiducials")
+        self._record_input("table of fiducials", provenance.fiducials, path)
         return path
 
-    def _note(self, name: str, before: Origin, path: Path) -> None:
-        """Keep in mind what was read, and whether it is what it was."""
-        self.read.append(path)
-        now = before.model_copy(update={"file": path.name, "sha256": sha256(path)})
-        self.changes += [one for one in changed_file(name, before, now) if one not in self.changes]
+    def _record_input(self, name: str, before: Origin, path: Path) -> None:
+        """Record a file, and whether it has changed."""
+        self.paths.append(path)
+        after = before.model_copy(update={"file": path.name, "sha256": sha256(path)})
+        changes = file_changes(name, before, after)
+        self.changes += [change for change in changes if change not in self.changes]
 
 
 def _changes(before: FitProvenance, again: Fit) -> Sequence[str]:
     assert again.provenance is not None
-    found: list[str] = []
+    changes: list[str] = []
     for k, (old, new) in enumerate(zip(before.images, again.provenance.images, strict=True), 1):
-        found += changed_file(f"image {k}", old.image, new.image)
-        found += changed_file(f"source of image {k}", old.source, new.source)
-    return found
+        changes += file_changes(f"image {k}", old.image, new.image)
+        changes += file_changes(f"source of image {k}", old.source, new.source)
+    return changes
 
 
 def _difference(before: Fit, again: Fit) -> str:
@@ -173,23 +178,23 @@ def _difference(before: Fit, again: Fit) -> str:
         return f"another size: {again.images.shape[1:]}, before {before.images.shape[1:]}"
     pairs = list(zip(before.fields, again.fields, strict=True))
     names = ("images", "source", "gains", "frames", "reprojection", "chi2")
-    same = all(np.array_equal(getattr(before, one), getattr(again, one)) for one in names)
-    same = same and all(
-        np.array_equal(getattr(old, one), getattr(new, one))
+    is_equal = all(np.array_equal(getattr(before, name), getattr(again, name)) for name in names)
+    is_equal = is_equal and all(
+        np.array_equal(getattr(old, name), getattr(new, name))
         for old, new in pairs
-        for one in ("potential", "displacement")
+        for name in ("potential", "displacement")
     )
-    if same:
-        return SAME
+    if is_equal:
+        return UNCHANGED
     largest = max(np.abs(old.displacement - new.displacement).max() for old, new in pairs)
-    told = f"displacement differs by up to {largest:.2g} px"
+    text = f"displacement differs by up to {largest:.2g} px"
     if before.verdict != again.verdict:
-        told += f"; the verdict was '{before.verdict}'"
-    return told
+        text += f"; the verdict was '{before.verdict}'"
+    return text
 
 
-def refit_table(again: FitAgain, written: list[Path]) -> Table:
-    """Tell what has changed since a fit was made first."""
+def refit_table(again: FitRerun, written: list[Path]) -> Table:
+    """Build the table of a repeated fit: the changes since the first one."""
     rows = [
         *[(f"image {k}", name) for k, name in enumerate(again.names, 1)],
         *[("changed", text) for text in again.changes or ("nothing",)],

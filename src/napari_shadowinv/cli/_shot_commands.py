@@ -1,4 +1,4 @@
-"""What is done with one shot: `invert`, `forward`, `info` and `demo`."""
+"""Commands for one shot: `invert`, `rerun`, `forward`, `info` and `demo`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Annotated, Any
 import typer
 
 from napari_shadowinv.cli import _flags, _inputs, _outputs
-from napari_shadowinv.cli._terminal import alarm_unless_converged, inverted, notify_errors, say
+from napari_shadowinv.cli._terminal import exit_unless_converged, invert_shot, notify_errors, say
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 
-# Of arguments whose help is longer than a line.
+# Help of arguments, where it is longer than a line.
 HELP = {
     "image": "Its image, or another one; all images of a fit, in their order. Default: the files "
     "of that name beside the result or in the current folder.",
@@ -27,7 +27,7 @@ HELP = {
     "electric-field, plasma or refractive-index.",
     "dispersion": "For a refractive index: ratio of ln η at the new wavelength to ln η at the old "
     "one.",
-    "predicted": "Image file: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
+    "predicted_image": "Image file: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
     "Default: the field's name with _image.tif, in the current folder.",
 }
 INVERT_EPILOG = r"""
@@ -120,13 +120,13 @@ def invert(
     shot = read_part(image, channel, variable)
     chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
     _outputs.check_setup(result, chosen.setup)
-    inversion = inverted(chosen, shot, _inputs.source_from(chosen, image, channel), quiet)
-    _outputs.write_all(inversion, shot, result, figure, overwrite)
+    inversion = invert_shot(chosen, shot, _inputs.source_from(chosen, image, channel), quiet)
+    _outputs.write_inversion(inversion, shot, result, figure, overwrite)
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
     if not quiet:
         say(summary(inversion, shot, list(outputs)))
-    alarm_unless_converged(inversion.report, result)
+    exit_unless_converged(inversion.report, result)
 
 
 @notify_errors
@@ -159,9 +159,9 @@ def rerun(
     With the same files and version the result is the same, bit for bit.
     """
     from napari_shadowinv.cli import _fit_result
-    from napari_shadowinv.cli._film_command import pack_made_again, write_pack
-    from napari_shadowinv.cli._rerun import Places, made_again
-    from napari_shadowinv.cli._rerun_fit import fit_made_again, refit_table
+    from napari_shadowinv.cli._film_command import rerun_pack, write_pack
+    from napari_shadowinv.cli._rerun import FileLocator, rerun_inversion
+    from napari_shadowinv.cli._rerun_fit import refit_table, rerun_fit
     from napari_shadowinv.cli._summary import rerun_table, two_columns
     from napari_shadowinv.inversion.labels import is_fit, is_pack
     from napari_shadowinv.io import read_dataset
@@ -172,26 +172,26 @@ def rerun(
     written = [again_out, figure]
     _outputs.check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
     dataset = read_dataset(result)
-    places = Places(result, image or (), source, other_folders)
+    files = FileLocator(result, image or (), source, other_folders)
     if is_pack(dataset.attrs):
-        remade, changes = pack_made_again(dataset, places, written, quiet)
+        remade, changes = rerun_pack(dataset, files, written, quiet)
         write_pack(remade, result.name, again_out, figure, overwrite)
         if not quiet:
             say(two_columns("Film pack, made again", changes))
         return
     if is_fit(dataset.attrs):
         _outputs.check_outputs({again_out: tuple(FIT_WRITERS)}, overwrite)
-        refit = fit_made_again(dataset, places, written, quiet=quiet)
+        refit = rerun_fit(dataset, files, written, quiet=quiet)
         _fit_result.write_fit(refit.fit, refit.names, again_out, figure, overwrite)
         if not quiet:
             say(refit_table(refit, written))
-        _fit_result.alarm_unless_determined(refit.fit, again_out)
+        _fit_result.exit_unless_determined(refit.fit, again_out)
         return
-    again = made_again(dataset, places, written, quiet=quiet)
-    _outputs.write_all(again.inversion, again.shot, again_out, figure, overwrite)
+    again = rerun_inversion(dataset, files, written, quiet=quiet)
+    _outputs.write_inversion(again.inversion, again.shot, again_out, figure, overwrite)
     if not quiet:
         say(rerun_table(again, written))
-    alarm_unless_converged(again.inversion.report, again_out)
+    exit_unless_converged(again.inversion.report, again_out)
 
 
 FORWARD_EPILOG = """
@@ -224,7 +224,7 @@ def forward(
     source_variable: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the array in the source file.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help=HELP["predicted"])] = None,
+    out: Annotated[Path | None, typer.Option(help=HELP["predicted_image"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
@@ -233,7 +233,7 @@ def forward(
     Without --source, the result's own source is used if the setup is the same; otherwise
     the source is uniform.
     """
-    from napari_shadowinv.cli._forward import experiments, field_from, predicted
+    from napari_shadowinv.cli._forward import choose_setups, field_from, predict_image
     from napari_shadowinv.cli._summary import size_text
     from napari_shadowinv.io import read_radiograph, write
     from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
@@ -244,19 +244,19 @@ def forward(
     _outputs.protect([path], [field, source, setup, made_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")
-    seen = None if setup is None else setup_from(setup)
-    told = None if made_with is None else setup_from(made_with)
-    known = field_from(field, variable)
-    first, second = experiments(known, seen, told, deflector, dispersion)
-    # In another experiment the beam is another one, too.
-    beam = known.source if first == second else None
+    target = None if setup is None else setup_from(setup)
+    original = None if made_with is None else setup_from(made_with)
+    content = field_from(field, variable)
+    original, target = choose_setups(content, target, original, deflector, dispersion)
+    # The beam of another experiment is not known.
+    beam = content.source if original == target else None
     if source is not None:
         beam = read_radiograph(source, channel=channel, variable=source_variable).image
-    image, note = predicted(known.displacement, beam, first, second, deflector, dispersion)
-    write(path, image, setup=second, overwrite=overwrite)
+    image, note = predict_image(content.displacement, beam, original, target, deflector, dispersion)
+    write(path, image, setup=target, overwrite=overwrite)
     if not quiet:
-        kept = image.sum() / (image.size if beam is None else beam.sum())
-        say(f"Wrote {path}: {size_text(image)}, {kept:.2%} of the flux lands inside the image")
+        inside = image.sum() / (image.size if beam is None else beam.sum())
+        say(f"Wrote {path}: {size_text(image)}, {inside:.2%} of the flux lands inside the image")
         if note:
             say(note)
 
@@ -277,11 +277,11 @@ def info(
     if report:
         if file is not None or variable is not None:
             raise InputError("--report describes the installation: it takes no file or variable")
-        typer.echo(_info.report_text())
+        typer.echo(_info.system_report())
         return
     if file is None:
         raise InputError("no file given: name an image or a result, or use --report")
-    say(_info.described(file, variable))
+    say(_info.file_table(file, variable))
 
 
 @notify_errors
@@ -311,9 +311,9 @@ def demo(
     from napari_shadowinv.preprocessing import Radiograph, Recipe
 
     setup = paper_setup()
-    image, truth = _demo.simulated_shot(setup, dm, noise)
-    inversion = inverted(Recipe(setup=setup, options=chosen), Radiograph(image))
-    fields = _demo.compared_fields(image, truth, inversion)
+    image, truth = _demo.simulate_shot(setup, dm, noise)
+    inversion = invert_shot(Recipe(setup=setup, options=chosen), Radiograph(image))
+    fields = _demo.fields_to_compare(image, truth, inversion)
     written = _demo.write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
     say(_demo.demo_table(inversion, setup, fields, written))
-    alarm_unless_converged(inversion.report, written[0])
+    exit_unless_converged(inversion.report, written[0])

@@ -1,4 +1,4 @@
-"""What is done with many shots: `batch`, `status`, `export` and `movie`."""
+"""Commands for many shots: `batch`, `status`, `export` and `movie`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from napari_shadowinv.cli import _flags, _outputs
 from napari_shadowinv.cli._inputs import recipe_for_shots
 from napari_shadowinv.cli._terminal import notify_errors, say
 
-# Of options whose help is longer than a line.
+# Help of options, where it is longer than a line.
 HELP = {
     "source": "Undisturbed beam: one image, or a glob matching one image per shot. Default: "
     "uniform.",

@@ -1,4 +1,4 @@
-"""What `shadowinv fit` tells of images left out, and of windows of images."""
+"""Checks of `shadowinv fit`: images left out, and windows of images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import typer
 from napari_shadowinv.cli._summary import Rows
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
-    interrupted,
+    is_interrupted,
     plain,
     progress_bars,
     say_on_stderr,
@@ -32,82 +32,82 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Checked:
-    """Whether one static field explains the images, as far as it was asked for."""
+class StaticChecks:
+    """Checks that one static field explains the images, as far as requested."""
 
     left_out: LeaveOneOut | None = None
     windows: FitWindows | None = None
 
-    def added_to(self, dataset: xarray.Dataset) -> xarray.Dataset:
-        """Return the dataset of a fit with what was found."""
+    def add_to(self, dataset: xarray.Dataset) -> xarray.Dataset:
+        """Add the checks to the dataset of a fit."""
         if self.left_out is not None:
-            own = self.left_out.to_dataset()
-            dataset = dataset.assign(own.data_vars).assign_attrs(own.attrs)
+            addition = self.left_out.to_dataset()
+            dataset = dataset.assign(addition.data_vars).assign_attrs(addition.attrs)
         return dataset if self.windows is None else self.windows.added_to(dataset)
 
     def figures(self, fit: Fit, report: Path, title: str) -> dict[Path, Figure]:
-        """Return the figures of what was found, by the files beside that of the fit."""
+        """Return the figures of the checks by file."""
         from napari_shadowinv.plotting import left_out_figure, windows_figure
 
         left_out, windows = static_figures(report, left_out=True, window=1)
-        found = {}
+        figures = {}
         if self.left_out is not None:
-            found[left_out] = left_out_figure(self.left_out, fit.setups, title=title)
+            figures[left_out] = left_out_figure(self.left_out, fit.setups, title=title)
         if self.windows is not None:
-            found[windows] = windows_figure(self.windows, title=title)
-        return found
+            figures[windows] = windows_figure(self.windows, title=title)
+        return figures
 
     def tables(self, fit: Fit, names: Sequence[str]) -> list[Table]:
-        """Return a table for each part that was asked for."""
-        found = []
+        """Return a table for each check."""
+        tables = []
         if self.left_out is not None:
-            found.append(left_out_table(self.left_out, fit, names))
+            tables.append(left_out_table(self.left_out, fit, names))
         if self.windows is not None:
-            found.append(windows_table(self.windows))
-        return found
+            tables.append(windows_table(self.windows))
+        return tables
 
-    def alarm_unless_static(self, out: Path) -> None:
-        """End with the exit code of a doubtful result if an image is not explained."""
+    def exit_unless_static(self, out: Path) -> None:
+        """Exit with an error code if a static field does not explain an image."""
         if self.left_out is not None and not self.left_out.explained.all():
             say_on_stderr(f"NOT STATIC: {out} was written, but {self.left_out.explanation}")
             raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
-def check_asked(
+def check_requests(
     count: int, *, left_out: bool, window: int | None, fiducials: Path | None, result: Path
 ) -> None:
-    """Refuse, before any work, what cannot be left out or put into windows, or not be kept."""
+    """Refuse, before any work, checks that the images or the result file do not allow."""
     from napari_shadowinv.pipeline._static import check_count, check_window
 
     if left_out:
         check_count(count)
     if window is not None:
         check_window(window, count)
-    asked = "--leave-one-out" if left_out else "--window" if window is not None else None
-    if asked is None:
+    flag = "--leave-one-out" if left_out else "--window" if window is not None else None
+    if flag is None:
         return
     if fiducials is not None:
         raise InputError(
-            f"received {asked} and --fiducials, which hold for the first image alone: leave out "
+            f"received {flag} and --fiducials, which hold for the first image alone: leave out "
             "one of them"
         )
     if result.suffix.lower() not in RESULT.suffixes:
         raise InputError(
-            f"received {asked} and {result}, which has no room for it: write a {RESULT.suffix} file"
+            f"received {flag} and {result}, which has no room for it: write a {RESULT.suffix} file"
         )
 
 
 def static_figures(report: Path, *, left_out: bool, window: int | None) -> list[Path]:
-    """Return the names of further figures, beside that of the fit."""
-    asked = {"left_out": left_out, "windows": window is not None}
+    """Return the files of the checks' figures."""
+    requests = {"left_out": left_out, "windows": window is not None}
     return [
         report.with_name(f"{report.stem}_{name}{report.suffix}")
-        for name, wanted in asked.items()
-        if wanted
+        for name, is_requested in requests.items()
+        if is_requested
     ]
 
 
-def checked(
+def run_checks(
     recipe: Recipe,
     shots: Sequence[FitShot],
     fit: Fit,
@@ -115,7 +115,7 @@ def checked(
     *,
     left_out: bool,
     window: int | None,
-) -> Checked:
+) -> StaticChecks:
     """Leave out each image, and fit windows of them, with the fields of a fit."""
     from napari_shadowinv.options import FitChoices
     from napari_shadowinv.pipeline import run_leave_one_out, run_windows
@@ -125,27 +125,27 @@ def checked(
     )
     chosen = recipe.model_copy(update={"fit": choices})
     with nullcontext() if quiet else progress_bars() as show:
-        told: dict[str, Any] = {"on_progress": show, "should_stop": interrupted}
-        return Checked(
-            run_leave_one_out(chosen, shots, **told) if left_out else None,
-            None if window is None else run_windows(chosen, shots, window, **told),
+        callbacks: dict[str, Any] = {"on_progress": show, "should_stop": is_interrupted}
+        return StaticChecks(
+            run_leave_one_out(chosen, shots, **callbacks) if left_out else None,
+            None if window is None else run_windows(chosen, shots, window, **callbacks),
         )
 
 
-def left_out_table(found: LeaveOneOut, fit: Fit, names: Sequence[str]) -> Table:
-    """Tell how well the others predict each image."""
+def left_out_table(left_out: LeaveOneOut, fit: Fit, names: Sequence[str]) -> Table:
+    """Build a table of how well the other images predict each image."""
     headings = ["image", "energy", "χ² left out", "χ² alone", "up to", "r.m.s.", "verdict"]
-    table = _table("Left out", headings, found.explanation)
+    table = _table("Left out", headings, left_out.explanation)
     energies = [getattr(setup, "energy", None) for setup in fit.setups] or [None] * len(names)
     for k, (name, energy) in enumerate(zip(short_names(names), energies, strict=True)):
-        explained = bool(found.explained[k])
+        explained = bool(left_out.explained[k])
         table.add_row(
             plain(name),
             "" if energy is None else f"{energy:.4g} MeV",
-            f"{found.chi2[k]:.3g}",
-            f"{found.alone[k]:.3g}",
-            f"{found.limit[k]:.3g}",
-            f"{found.rms[k]:.2%}",
+            f"{left_out.chi2[k]:.3g}",
+            f"{left_out.alone[k]:.3g}",
+            f"{left_out.limit[k]:.3g}",
+            f"{left_out.rms[k]:.2%}",
             plain(_verdict(explained), "" if explained else "yellow"),
         )
     return table
@@ -161,12 +161,12 @@ def short_names(names: Sequence[str]) -> list[str]:
     return stems if len(set(stems)) == len(stems) else list(names)
 
 
-def windows_table(found: FitWindows) -> Table:
-    """Tell how well one field explains each group of images, and how strong it is."""
+def windows_table(windows: FitWindows) -> Table:
+    """Build a table of the fit of each window, and the peaks of its fields."""
     from napari_shadowinv.fitting import FIELDS
     from napari_shadowinv.physics.units import shown_fields
 
-    fields = found.fits[0].fields
+    fields = windows.fits[0].fields
     headings = [
         "images",
         "mean energy",
@@ -175,49 +175,49 @@ def windows_table(found: FitWindows) -> Table:
         *[f.name for f in fields],
         "verdict",
     ]
-    caption = "" if found.setup else "Fields at the strength of the image displaced most."
+    caption = "" if windows.setup else "Fields at the strength of the image displaced most."
     table = _table("Windows", headings, caption)
     peaks = [
-        shown_fields(list(found.displacement[:, m]), found.setup, FIELDS[field.name])
+        shown_fields(list(windows.displacement[:, m]), windows.setup, FIELDS[field.name])
         for m, field in enumerate(fields)
     ]
-    energies, times = found.energies, found.times_of_flight
-    for w, fit in enumerate(found.fits):
+    energies, times = windows.energies, windows.times_of_flight
+    for w, fit in enumerate(windows.fits):
         table.add_row(
-            ", ".join(str(k + 1) for k in found.numbers[w]),
+            ", ".join(str(k + 1) for k in windows.numbers[w]),
             "" if energies is None else f"{energies[w]:.4g} MeV",
             "" if times is None else f"{times[w] * 1e12:.4g} ps",
             ", ".join(f"{value:.3g}" for value in fit.chi2),
-            *[shown[w].peak_text() for shown in peaks],
+            *[values[w].peak_text() for values in peaks],
             str(fit.verdict),
         )
     return table
 
 
 def static_file_rows(dataset: xarray.Dataset) -> Rows:
-    """Tell what the file of a fit holds of images left out and of windows."""
+    """Describe the checks in the file of a fit."""
     from napari_shadowinv.fitting import LeaveOneOut
     from napari_shadowinv.fitting.windows import PREFIX
 
     rows: Rows = []
     if "left_out_chi2" in dataset:
-        found = LeaveOneOut.from_dataset(dataset)
-        static = bool(found.explained.all())
-        rows.append(("left out" if static else "warning", found.explanation))
+        left_out = LeaveOneOut.from_dataset(dataset)
+        is_static = bool(left_out.explained.all())
+        rows.append(("left out" if is_static else "warning", left_out.explanation))
         rows += [
             (
                 f"left out {k + 1}",
-                f"χ² {found.chi2[k]:.3g}, alone {found.alone[k]:.3g}, r.m.s. {found.rms[k]:.2%}: "
-                f"{_verdict(bool(found.explained[k]))}",
+                f"χ² {left_out.chi2[k]:.3g}, alone {left_out.alone[k]:.3g}, "
+                f"r.m.s. {left_out.rms[k]:.2%}: {_verdict(bool(left_out.explained[k]))}",
             )
-            for k in range(len(found.chi2))
+            for k in range(len(left_out.chi2))
         ]
     if f"{PREFIX}chi2" in dataset:
         numbers, chi2 = dataset[f"{PREFIX}image_number"].values, dataset[f"{PREFIX}chi2"].values
         for w, verdict in enumerate(dataset[f"{PREFIX}verdict"].values):
             images = ", ".join(str(k) for k in numbers[w])
-            told = ", ".join(f"{value:.3g}" for value in chi2[w])
-            rows.append((f"window {w + 1}", f"images {images}, χ² {told}: {verdict}"))
+            values = ", ".join(f"{value:.3g}" for value in chi2[w])
+            rows.append((f"window {w + 1}", f"images {images}, χ² {values}: {verdict}"))
     return rows
 
 

@@ -1,4 +1,4 @@
-"""What a command prints about an inversion, in two columns: `summary`, and rows of other tables."""
+"""Tables that the commands print: `summary` of an inversion, and rows of other tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-    from napari_shadowinv.cli._rerun import Again
+    from napari_shadowinv.cli._rerun import InversionRerun
     from napari_shadowinv.inversion import Inversion, Report
     from napari_shadowinv.inversion.budget import Errors
     from napari_shadowinv.physics.setup import Setup
@@ -40,7 +40,7 @@ def two_columns(title: str, rows: Rows) -> Table:
 
 
 def headline_row(inversion: Inversion, setup: Setup | None) -> tuple[str, str]:
-    """The result in one line; the name of the row is the level of trust."""
+    """Return the headline of a result; the name of the row is the level of trust."""
     headline = inversion.headline_in(setup)
     return (headline.level.value, headline.text)
 
@@ -58,7 +58,7 @@ def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Tabl
     return two_columns("Inversion", rows)
 
 
-def rerun_table(again: Again, written: list[Path]) -> Table:
+def rerun_table(again: InversionRerun, written: list[Path]) -> Table:
     """Build the table of a repeated inversion: its headline and the changes."""
     rows = [
         headline_row(again.inversion, again.inversion.setup),
@@ -71,15 +71,15 @@ def rerun_table(again: Again, written: list[Path]) -> Table:
 
 
 def provenance_rows(provenance: Provenance | None) -> Rows:
-    """What was done before the inversion, and where the source came from."""
+    """Return the steps before the inversion, and the origin of the source."""
     if provenance is None:
         return []
     source, estimate = provenance.source, provenance.recipe.estimate
     if source is not None:
-        told = source.file or "an array"
+        origin = source.file or "an array"
     else:
-        told = "uniform" if estimate is None else estimate.described
-    rows = [*[("prepared", note) for note in provenance.notes], ("source", told)]
+        origin = "uniform" if estimate is None else estimate.described
+    rows = [*[("prepared", note) for note in provenance.notes], ("source", origin)]
     for name, mask in (("mask", provenance.mask), ("source mask", provenance.source_mask)):
         if mask is not None:
             rows.append((name, mask.file or "drawn"))
@@ -89,7 +89,7 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
 
 
 def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
-    """How well an inversion went, and the strongest point of its field."""
+    """Return the quality of an inversion, and the strongest point of its field."""
     report = inversion.report
     verdict = "converged" if report.converged else "NOT converged"
     free = {"flux left": report.flux_left, "flux entered": report.flux_entered}
@@ -124,7 +124,7 @@ def peak_rows(
     mask: BoolArray | None = None,
     errors: Errors | None = None,
 ) -> Rows:
-    """The strongest point inside the mask, in pixels and where there is a setup in SI units."""
+    """Return the strongest point inside the mask, in px and with a setup in SI units."""
     from napari_shadowinv.physics.units import shown_fields
 
     error = None if errors is None else errors.of_peak
@@ -138,7 +138,7 @@ def peak_rows(
 
 
 def closing_rows(report: Report, written: Iterable[Path] = ()) -> Rows:
-    """The time that it took, warnings, and the files that were written."""
+    """Return the time, the warnings, and the files."""
     stages = ", ".join(f"{stage} {value:.2f}" for stage, value in report.seconds.items())
     return [
         ("time", f"{sum(report.seconds.values()):.2f} s ({stages})"),
@@ -152,7 +152,7 @@ def setup_text(
     shot: Radiograph | None = None,
     shape: tuple[int, ...] | None = None,
 ) -> str:
-    """Describe the experiment in a line, or say what is missing for SI units."""
+    """Describe the setup in a line, or name the values that are missing for SI units."""
     if setup is not None:
         from napari_shadowinv.physics.setup import field_of_view_text
 
@@ -181,10 +181,10 @@ def setup_text(
 
 
 def options_text(options: Mapping[str, Any]) -> str:
-    """Options in a line that wraps between words."""
+    """Format options as a line that wraps between words."""
     return ", ".join(f"{name} = {value}" for name, value in options.items())
 
 
 def size_text(array: AnyArray) -> str:
-    """Height and width are given as people do, width first."""
+    """Format the size of an image, width first."""
     return f"{array.shape[1]} × {array.shape[0]} px (width × height)"

@@ -1,6 +1,6 @@
-"""A command on the terminal: what it prints, its progress, Ctrl-C, and how it ends.
+"""Terminal of a command: messages, progress bars, Ctrl-C and exit codes.
 
-Names and messages may come from files of others; a bracket in them is no markup, and an escape
+Names and messages may come from untrusted files: a bracket in them is not markup, and an escape
 sequence must not reach the terminal.
 """
 
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 EXIT_MISTAKE = 2
 EXIT_NOT_CONVERGED = 3
 
-# Controls, invisible marks of direction, halves of characters, and ends of lines.
-_UNSEEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-_ONE_WISH = 2.0  # seconds in which impatient fingers mean one and the same Ctrl-C
+# Control characters, marks of direction, lone surrogates, and ends of lines.
+_INVISIBLE_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+_REPEAT_S = 2.0  # repeated presses of Ctrl-C within this time count once
 
 P = ParamSpec("P")
 
@@ -46,17 +46,17 @@ _ending_signal: int = signal.SIGINT
 
 
 def plain(text: object, style: str = "") -> Text:
-    """Text to print as it is, without markup; what cannot be seen becomes a visible escape."""
+    """Return text to print without markup, with invisible characters escaped."""
     from rich.text import Text
 
-    return Text(visible(text), style=style)
+    return Text(escape_invisible(text), style=style)
 
 
-def visible(text: object) -> str:
-    """Text in which characters that cannot be seen are escapes."""
+def escape_invisible(text: object) -> str:
+    """Replace invisible characters by escape sequences."""
     return "".join(
         character.encode("unicode_escape").decode()
-        if unicodedata.category(character) in _UNSEEN
+        if unicodedata.category(character) in _INVISIBLE_CATEGORIES
         else character
         for character in str(text)
     )
@@ -73,27 +73,27 @@ def say(content: str | Table) -> None:
 
 
 def say_on_stderr(text: str) -> None:
-    """Print what went wrong, in one line."""
+    """Print an error in one line."""
     from rich.console import Console
 
     line = plain(" ".join(text.split()), "bold red")
     Console(stderr=True).print(line, soft_wrap=True, highlight=False)
 
 
-def inverted(
+def invert_shot(
     recipe: Recipe,
     shot: Radiograph,
     source: Radiograph | None = None,
     quiet: bool = False,
     **masks: Any,
 ) -> Inversion:
-    """Apply a recipe to a shot; a mistake is told with the file's name."""
+    """Apply a recipe to a shot; errors name the file."""
     from napari_shadowinv.pipeline import run
 
     with nullcontext() if quiet else progress_bars() as show:
         try:
             return run(
-                recipe, shot, source=source, **masks, on_progress=show, should_stop=interrupted
+                recipe, shot, source=source, **masks, on_progress=show, should_stop=is_interrupted
             )
         except InputError as error:
             raise InputError(f"{shot.path}: {error}" if shot.path else str(error)) from error
@@ -101,7 +101,7 @@ def inverted(
 
 @contextmanager
 def progress_bars() -> Iterator[OnProgress | None]:
-    """One bar for each stage, on a terminal only."""
+    """Show a bar for each stage, on a terminal only."""
     from rich import progress as bar
     from rich.console import Console
     from rich.table import Column
@@ -110,12 +110,12 @@ def progress_bars() -> Iterator[OnProgress | None]:
     if not console.is_terminal:
         yield None
         return
-    cut = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # so that a line stays one line
+    flexible = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # keeps each bar on one line
     columns = (
         bar.TextColumn("{task.description:<10}", markup=False),
         bar.BarColumn(bar_width=30),
         bar.TimeElapsedColumn(),
-        bar.TextColumn("{task.fields[message]}", style="dim", markup=False, table_column=cut),
+        bar.TextColumn("{task.fields[message]}", style="dim", markup=False, table_column=flexible),
     )
     with bar.Progress(*columns, console=console, expand=True) as bars:
         tasks: dict[str, TaskID] = {}
@@ -125,46 +125,46 @@ def progress_bars() -> Iterator[OnProgress | None]:
                 bars.update(task, total=1, completed=1)
                 bars.stop_task(task)
 
-        def show(news: Progress) -> None:
-            if news.stage not in tasks:
+        def show(progress: Progress) -> None:
+            if progress.stage not in tasks:
                 finish_all()
-                tasks[news.stage] = bars.add_task(news.stage, total=None, message="")
-            task = tasks[news.stage]
-            bars.update(task, total=news.total, completed=news.step, message=news.text)
+                tasks[progress.stage] = bars.add_task(progress.stage, total=None, message="")
+            task = tasks[progress.stage]
+            bars.update(task, total=progress.total, completed=progress.step, message=progress.text)
 
         yield show
         finish_all()
 
 
 def notify_errors(command: Callable[P, None]) -> Callable[P, None]:
-    """Turn a user's mistake into one sentence, and Ctrl-C into a word."""
+    """Print bad input as one sentence and Ctrl-C as one word, with an exit code."""
 
     @functools.wraps(command)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
-            with _noting_interrupts():
+            with _handle_interrupts():
                 command(*args, **kwargs)
         except typer.Exit:
             raise
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt | InversionCancelled) or (
-                # Some libraries make another error of Ctrl-C.
-                isinstance(error, Exception) and interrupted()
+                # Some libraries convert Ctrl-C to another error.
+                isinstance(error, Exception) and is_interrupted()
             ):
-                code, text = cancelled_code(), "Cancelled"
+                code, text = cancel_exit_code(), "Cancelled"
             elif isinstance(error, OSError | MemoryError | InputError | ValidationError):
                 code, text = EXIT_MISTAKE, str(error) or "There is not enough memory for this"
             else:
-                raise  # a mistake of ours deserves its traceback
-            with suppress(OSError):  # a terminal that was closed
+                raise  # a bug deserves its traceback
+            with suppress(OSError):  # the terminal was closed
                 say_on_stderr(text)
             raise typer.Exit(code) from None
 
     return run
 
 
-def alarm_unless_converged(report: Report, out: Path) -> None:
-    """End with an exit code of its own if what was written is not to be trusted."""
+def exit_unless_converged(report: Report, out: Path) -> None:
+    """Exit with an error code if an inversion has not converged."""
     if not report.converged:
         say_on_stderr(
             f"NOT CONVERGED: {out} was written, but its flux residual is {report.residual:.2g} "
@@ -173,21 +173,21 @@ def alarm_unless_converged(report: Report, out: Path) -> None:
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
-def interrupted() -> bool:
-    """Whether Ctrl-C was pressed since the command began; for `should_stop`."""
+def is_interrupted() -> bool:
+    """Whether Ctrl-C was pressed since the command began, as `should_stop`."""
     return _ctrl_c.is_set()
 
 
-def cancelled_code() -> int:
-    """Return the exit code of a command that a signal has ended, as shells count."""
+def cancel_exit_code() -> int:
+    """Return the exit code of a command that a signal has ended: 128 and its number."""
     return 128 + _ending_signal
 
 
 @contextmanager
-def _noting_interrupts() -> Iterator[None]:
-    """Note Ctrl-C for `interrupted`, should compiled code swallow it, and raise it as usual.
+def _handle_interrupts() -> Iterator[None]:
+    """Record Ctrl-C for `is_interrupted`, as compiled code may swallow it, and raise it.
 
-    SIGTERM and SIGHUP count as Ctrl-C, so that nothing half written is left behind.
+    SIGTERM and SIGHUP count as Ctrl-C, so that no half-written file remains.
     """
     _ctrl_c.clear()
     pressed = float("-inf")
@@ -199,10 +199,10 @@ def _noting_interrupts() -> Iterator[None]:
         nonlocal pressed
         _ctrl_c.set()
         _ending_signal = number
-        if time.monotonic() < pressed + _ONE_WISH:
-            return  # it would interrupt the clearing up after the first
+        if time.monotonic() < pressed + _REPEAT_S:
+            return  # it would interrupt the clean-up after the first
         pressed = time.monotonic()
-        # What is half made now complains when Python clears up.
+        # Half-made objects would print errors when Python exits.
         sys.unraisablehook = lambda _: None
         raise KeyboardInterrupt
 

@@ -1,4 +1,4 @@
-"""`shadowinv watch`: a line for each shot, and how it ended."""
+"""Output of `shadowinv watch`: a line for each shot, and a summary."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_good, names_of
+from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_reliable, split_names
 from napari_shadowinv.cli._terminal import (
-    cancelled_code,
-    interrupted,
+    cancel_exit_code,
+    is_interrupted,
     plain,
     say,
     say_on_stderr,
@@ -28,55 +28,56 @@ if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.stack import WatchProgress
 
-_WIDTH = 100  # columns of a line
-_SHORTEST_NAME = 12
+_LINE_COLUMNS = 100
+_MIN_NAME_COLUMNS = 12
 
 
 @dataclass
-class _Lines:
-    """Prints what happens, and remembers how things stand."""
+class _WatchPrinter:
+    """Printer of the shots, with the latest progress of the run."""
 
     folder: Path
     pattern: str
     quiet: bool
     out: Console
     err: Console
-    now: WatchProgress | None = None
+    progress: WatchProgress | None = None
     warned: set[str] = field(default_factory=set)
     is_watching: bool = False
 
-    def show(self, news: WatchProgress) -> None:
-        self.now = news
+    def update(self, progress: WatchProgress) -> None:
+        self.progress = progress
         if self.quiet:
             return
-        if news.note or news.preparing:
-            text = news.note or f"{news.preparing[:1].upper()}{news.preparing[1:]}"
+        if progress.note or progress.preparing:
+            text = progress.note or f"{progress.preparing[:1].upper()}{progress.preparing[1:]}"
             self._print(self.err, text, "dim")
-        elif news.outcome is not None:
-            self._show_shot(news)
+        elif progress.outcome is not None:
+            self._print_shot(progress)
         elif not self.is_watching:
             self.is_watching = True
-            there = f"{news.done} done, {news.failed} failed; " if news.total else ""
+            counts = f"{progress.done} done, {progress.failed} failed; " if progress.total else ""
             self._print(
-                self.out, f"Watching {self.folder} for {self.pattern}; {there}Ctrl-C ends it."
+                self.out, f"Watching {self.folder} for {self.pattern}; {counts}Ctrl-C ends it."
             )
 
-    def _show_shot(self, news: WatchProgress) -> None:
-        outcome = news.outcome
+    def _print_shot(self, progress: WatchProgress) -> None:
+        outcome = progress.outcome
         assert outcome is not None
-        name = f"{news.name} (again, as it has changed)" if news.again else news.name
-        waiting = f"  {news.waiting} waiting" if news.waiting else ""
+        name = f"{progress.name} (again, as it has changed)" if progress.again else progress.name
+        waiting = f"  {progress.waiting} waiting" if progress.waiting else ""
         if outcome.reason:
             self._print(self.err, f"failed: {name}: {outcome.reason}", "red")
             return
-        assert news.result is not None
-        told, doubts = _told(news.result)
-        told = f"  {told}  {outcome.seconds:.2f} s{waiting}{doubts}"
-        self._print(self.out, f"{_shortened(name, _WIDTH - len(told))}{told}", _style(doubts))
-        for warning in _warnings_of(news.result):
+        assert progress.result is not None
+        summary, doubts = _shot_summary(progress.result)
+        summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}{doubts}"
+        name = _shorten_name(name, _LINE_COLUMNS - len(summary))
+        self._print(self.out, f"{name}{summary}", _style(doubts))
+        for warning in _warnings_of(progress.result):
             if warning.code not in self.warned:
                 self.warned.add(warning.code)
-                self._print(self.err, f"warning: {news.name}: {warning.text}", "yellow")
+                self._print(self.err, f"warning: {progress.name}: {warning.text}", "yellow")
 
     def _print(self, console: Console, text: str, style: str = "") -> None:
         console.print(plain(text, style), soft_wrap=True, highlight=False)
@@ -86,10 +87,10 @@ def _style(doubts: str) -> str:
     return "yellow" if doubts else ""
 
 
-def _shortened(name: str, room: int) -> str:
-    """Name of a file in so many columns; its end tells it apart."""
-    room = max(room, _SHORTEST_NAME)
-    return name if len(name) <= room else f"…{name[1 - room :]}"
+def _shorten_name(name: str, columns: int) -> str:
+    """Cut the start of a long name; its end identifies the file."""
+    columns = max(columns, _MIN_NAME_COLUMNS)
+    return name if len(name) <= columns else f"…{name[1 - columns :]}"
 
 
 def _warnings_of(result: Inversion | Fit) -> tuple[Caution, ...]:
@@ -100,8 +101,8 @@ def _warnings_of(result: Inversion | Fit) -> tuple[Caution, ...]:
     return () if result.verdict_caution is None else (result.verdict_caution,)
 
 
-def _told(result: Inversion | Fit) -> tuple[str, str]:
-    """Return the numbers of a shot, and what casts doubt on them."""
+def _shot_summary(result: Inversion | Fit) -> tuple[str, str]:
+    """Return the numbers of a shot, and the doubts about them."""
     from napari_shadowinv.facts import Level
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.units import shown_fields, with_error
@@ -133,46 +134,48 @@ def run_watch(
     quiet: bool,
     **choices: Any,
 ) -> None:
-    """Watch a folder with `choices` of `watch_stack`, print a line for each shot, and sum up."""
+    """Watch a folder with `choices` of `watch_stack`; print a line for each shot and a summary."""
     from rich.console import Console
 
     from napari_shadowinv.stack import read_shot, watch_stack
 
-    part: dict[str, Any] = {"channel": channel}
+    selection: dict[str, Any] = {"channel": channel}
     if variable is not None:
-        part["variable"] = variable
-    lines = _Lines(folder, pattern, quiet, Console(), Console(stderr=True))
+        selection["variable"] = variable
+    printer = _WatchPrinter(folder, pattern, quiet, Console(), Console(stderr=True))
     with suppress(KeyboardInterrupt, InversionCancelled):
         watch_stack(
             folder,
             out,
             pattern=pattern,
-            variables=None if variables is None else names_of(variables),
-            reader=functools.partial(read_shot, **part),
-            on_progress=lines.show,
-            should_stop=interrupted,
+            variables=None if variables is None else split_names(variables),
+            reader=functools.partial(read_shot, **selection),
+            on_progress=printer.update,
+            should_stop=is_interrupted,
             **choices,
         )
-    _sum_up(lines.now, out, quiet)
+    _print_summary(printer.progress, out, quiet)
 
 
-def _sum_up(now: WatchProgress | None, out: Path, quiet: bool) -> None:
+def _print_summary(progress: WatchProgress | None, out: Path, quiet: bool) -> None:
     from napari_shadowinv.io.store import StackStore
 
-    done, failed, waiting = (0, 0, 0) if now is None else (now.done, now.failed, now.waiting)
-    stopped = interrupted() and waiting
-    left = f", {waiting} not yet inverted" if waiting else ""
+    done, failed, waiting = 0, 0, 0
+    if progress is not None:
+        done, failed, waiting = progress.done, progress.failed, progress.waiting
+    remaining = f", {waiting} not yet inverted" if waiting else ""
     if not done:
         text = f"Ended: {failed} failed, nothing was written" if failed else "Ended: no shot"
-        text = f"{text}{left}; repeat the command to watch again."
+        text = f"{text}{remaining}; repeat the command to watch again."
     else:
-        text = f"Ended: {done} done, {failed} failed{left}; repeat the command to go on with {out}."
-    if stopped:
+        text = f"Ended: {done} done, {failed} failed{remaining}"
+        text = f"{text}; repeat the command to go on with {out}."
+    if is_interrupted() and waiting:
         say_on_stderr(text)
-        raise typer.Exit(cancelled_code())
+        raise typer.Exit(cancel_exit_code())
     if not quiet:
         say(text)
     if done:
-        exit_unless_good(StackStore(out))
+        exit_unless_reliable(StackStore(out))
     elif failed:
         raise typer.Exit(EXIT_FAILED_SHOTS)

@@ -1,4 +1,4 @@
-"""The command `watch`: shots inverted as they arrive."""
+"""The command `watch`: inversion of shots as they arrive."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from napari_shadowinv.cli._stack_commands import HELP
 from napari_shadowinv.cli._terminal import notify_errors
 from napari_shadowinv.io.formats import NEW_SHOTS
 
-_SETTLE = (
+_SETTLE_HELP = (
     "Seconds without a change after which a file is complete where the system does not tell "
     "that it was closed (network file systems, macOS, Windows)."
 )
-_FIT = (
+_FIT_HELP = (
     "Fit the forward model to each shot in place of inverting it, as the recipe's section fit says."
 )
 EPILOG = """
@@ -52,7 +52,7 @@ def watch(
     save_recipe: _flags.SaveRecipe = None,
     setup: _flags.SetupFile = None,
     options: _flags.OptionsFile = None,
-    fit: Annotated[bool, typer.Option("--fit", help=_FIT)] = False,
+    fit: Annotated[bool, typer.Option("--fit", help=_FIT_HELP)] = False,
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
     clip_negative: _flags.ClipNegative = False,
@@ -63,7 +63,7 @@ def watch(
             "--warm-start/--no-warm-start", help="Initialise each shot from the previous one."
         ),
     ] = True,
-    settle: Annotated[float, typer.Option(metavar="S", help=_SETTLE)] = 1.0,
+    settle: Annotated[float, typer.Option(metavar="S", help=_SETTLE_HELP)] = 1.0,
     polling: Annotated[
         bool,
         typer.Option("--polling", help="Look at the folder every second, whatever it lies on."),
