@@ -1,4 +1,4 @@
-"""The command as tests run it, in this process."""
+"""Helpers to run the command in tests."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from napari_shadowinv.cli import app
 
 
 def shadowinv(*arguments: object) -> Result:
-    """What the command makes of some arguments."""
+    """Run the command in this process."""
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def flat(text: str) -> str:
-    """Text without its line breaks, which depend on the terminal."""
+    """Replace line breaks, which depend on the terminal, by spaces."""
     return " ".join(text.split())
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """All files of a folder."""
+    """Read all files of a folder."""
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 

@@ -97,15 +97,15 @@ def refused(folder: Path) -> Callable[..., None]:
 def prepared(
     image: str, source: str | None = None, mask: str | None = None, **flags: Any
 ) -> Radiograph:
-    """A shot and its source after the steps that flags ask for."""
+    """Return a shot and its source after the steps that flags ask for."""
     recipe = recipe_of(flags, Recipe(mask=None if mask is None else Path(mask)), {})
     return gathered(recipe, image, source=source).prepared()
 
 
 def dataset(path: str | Path) -> xr.Dataset:
-    found = read(path)
-    assert isinstance(found, xr.Dataset)
-    return found
+    content = read(path)
+    assert isinstance(content, xr.Dataset)
+    return content
 
 
 def test_version_and_help() -> None:
@@ -138,7 +138,7 @@ def test_complete_help_of_a_command_shows_all_its_flags(command: str) -> None:
     text = shadowinv(command, "--help-all").output
     words = set(re.findall(r"--[\w-]+", text))
     parameters = get_command(app).commands[command].params  # type: ignore[attr-defined]
-    flags = {flag for one in parameters for flag in one.opts if flag.startswith("--")}
+    flags = {flag for option in parameters for flag in option.opts if flag.startswith("--")}
     assert flags <= words
     for kind in ("<bool>", "BOOLEAN", "<path>", "<str>"):
         assert kind not in text
@@ -176,10 +176,10 @@ def test_invert_writes_what_the_core_returns(folder: Path, shot: Path) -> None:
     expected = invert(np.load(shot), options=options)
     np.testing.assert_array_equal(saved["displacement"], expected.displacement)
     assert Inversion.from_dataset(saved).options == options
-    kept = Provenance.of(saved.attrs)
-    assert kept is not None
-    assert kept.image == Origin(file="shot.npy", sha256=sha256(shot), shape=(24, 32))
-    assert kept.recipe == Recipe(source=UniformEstimate(), options=options)
+    provenance = Provenance.of(saved.attrs)
+    assert provenance is not None
+    assert provenance.image == Origin(file="shot.npy", sha256=sha256(shot), shape=(24, 32))
+    assert provenance.recipe == Recipe(source=UniformEstimate(), options=options)
     assert iio.imread("shot.png").ndim == 3
     for word in ("300", "converged", "peak |d|", "shot.shadowinv", "shot.png"):
         assert word in result.stdout
@@ -200,10 +200,10 @@ def test_source_setup_and_options_are_used(folder: Path, shot: Path) -> None:
     assert result.exit_code == 0, result.output
     saved = dataset("result.shadowinv")
     np.testing.assert_array_equal(saved["source"], source.astype(np.float32))
-    kept = Provenance.of(saved.attrs)
-    assert kept is not None
-    assert kept.source is not None
-    assert kept.source.file == "beam.tif"
+    provenance = Provenance.of(saved.attrs)
+    assert provenance is not None
+    assert provenance.source is not None
+    assert provenance.source.file == "beam.tif"
     # A flag wins over the file.
     assert Inversion.from_dataset(saved).options == InversionOptions(n_sites=200, tolerance=0.01)
     assert setup_from_dataset(saved) == ProtonSetup(
@@ -320,14 +320,14 @@ def test_names_reach_the_terminal_as_they_are(folder: Path, name: str) -> None:
     path = Path(name)
     path.parent.mkdir(exist_ok=True)
     tifffile.imwrite(path, np.rint(100 * synthetic_image(BLOB.displacement)).astype(np.uint16))
-    shown = name.replace("\x1b", r"\x1b").replace("\u202e", r"\u202e").replace("\n", r"\n")
+    visible = name.replace("\x1b", r"\x1b").replace("\u202e", r"\u202e").replace("\n", r"\n")
     for arguments in (("info", name), ("invert", name, "--n-sites", 100, "--out", "a.shadowinv")):
         result = shadowinv(*arguments)
         assert result.exit_code == 0, result.output
-        assert shown in result.stdout.replace("\n", "")
+        assert visible in result.stdout.replace("\n", "")
         assert not set("\x1b\u202e") & set(result.stdout)
     line = shadowinv("info", f"{name}.gone").stderr
-    assert shown.replace(r"\n", " ") in line
+    assert visible.replace(r"\n", " ") in line
     assert not set("\x1b\u202e") & set(line)
 
 
@@ -466,8 +466,8 @@ def test_mistakes_in_a_setup_are_named(
     names: tuple[str, ...],
 ) -> None:
     key = line.split()[0].replace("enerky", "energy")
-    kept = [old for old in PROTON_TOML.splitlines() if not old.startswith(key)]
-    (folder / "setup.toml").write_text("\n".join([*kept, line]))
+    lines = [entry for entry in PROTON_TOML.splitlines() if not entry.startswith(key)]
+    (folder / "setup.toml").write_text("\n".join([*lines, line]))
     refused("invert", shot, "--setup", "setup.toml", names=("setup.toml", *names))
 
 
@@ -632,9 +632,9 @@ def test_geometry_in_a_text_image_is_used_and_shown(folder: Path) -> None:
         assert setup.object_pixel_size == pytest.approx(1e-5)
     light = "wavelength = 5e-7\nsource_object_distance = inf\n"
     (folder / "light.toml").write_text(light)
-    seen = setup_for(Path("light.toml"), read_part(Path("all.txt"), None, None), Recipe())
-    assert isinstance(seen, OpticalSetup)
-    assert (seen.object_image_distance, seen.magnification) == (0.3, 1)
+    setup = setup_for(Path("light.toml"), read_part(Path("all.txt"), None, None), Recipe())
+    assert isinstance(setup, OpticalSetup)
+    assert (setup.object_image_distance, setup.magnification) == (0.3, 1)
 
 
 def test_reference_in_a_text_image_is_the_source(folder: Path) -> None:
@@ -689,12 +689,12 @@ def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
         used = mask if "usable.png" in flags else True
         saved = dataset("shot.shadowinv")
         np.testing.assert_array_equal(saved["source"], np.where(used, expected, 0))
-        kept = Inversion.from_dataset(saved).provenance
-        assert kept is not None
-        assert kept.recipe.estimate is not None
-        assert kept.recipe.estimate.name() == name
+        provenance = Inversion.from_dataset(saved).provenance
+        assert provenance is not None
+        assert provenance.recipe.estimate is not None
+        assert provenance.recipe.estimate.name() == name
         text = " ".join(result.stdout.split())
-        assert f"source {kept.recipe.estimate.described}" in text
+        assert f"source {provenance.recipe.estimate.described}" in text
 
 
 def test_filters_are_those_of_the_library(folder: Path) -> None:
@@ -780,8 +780,8 @@ def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
         np.save("beam.npy", beam)
         result = shadowinv("invert", shot, "--source", "beam.npy", *flags, "--out", name)
         assert result.exit_code == 0, result.output
-    one, two = dataset("one.shadowinv"), dataset("two.shadowinv")
-    np.testing.assert_array_equal(one["displacement"], two["displacement"])
+    first, second = dataset("one.shadowinv"), dataset("two.shadowinv")
+    np.testing.assert_array_equal(first["displacement"], second["displacement"])
 
 
 @pytest.mark.parametrize(
@@ -873,19 +873,19 @@ def test_a_recipe_that_was_saved_does_the_same(folder: Path, shot: Path) -> None
     usable[3, 4:6] = 0
     iio.imwrite("usable.png", usable)
     (folder / "setup.toml").write_text(PROTON_TOML)
-    (folder / "kept").mkdir()
+    (folder / "recipes").mkdir()
     flags = [
         "--mask", "usable.png", "--setup", "setup.toml", "--bin", 2, "--crop-x", "2:",
         "--source-from", "polynomial", "--source-degree", 1, "--n-sites", 150, "--seed", 3,
     ]  # fmt: skip
-    kept = ["--save-recipe", "kept/recipe.toml", "--out", "first.shadowinv"]
-    result = shadowinv("invert", shot, *flags, *kept)
+    files = ["--save-recipe", "recipes/recipe.toml", "--out", "first.shadowinv"]
+    result = shadowinv("invert", shot, *flags, *files)
     assert result.exit_code == 0, result.output
-    recipe = read_recipe(folder / "kept" / "recipe.toml")
+    recipe = read_recipe(folder / "recipes" / "recipe.toml")
     assert recipe.steps == (Crop(x=(2, None)), Bin(factor=2))
     assert recipe.mask is not None
     assert recipe.mask.resolve() == folder / "usable.png"
-    again = ["--recipe", "kept/recipe.toml", "--out", "second.shadowinv"]
+    again = ["--recipe", "recipes/recipe.toml", "--out", "second.shadowinv"]
     assert shadowinv("invert", shot, *again).exit_code == 0
     first, second = dataset("first.shadowinv"), dataset("second.shadowinv")
     for name in first.data_vars:
@@ -893,11 +893,11 @@ def test_a_recipe_that_was_saved_does_the_same(folder: Path, shot: Path) -> None
     assert first.attrs["provenance"] == second.attrs["provenance"]
     # A flag wins over the recipe, where it stands.
     assert shadowinv("invert", shot, *again, "--bin", 3, "--overwrite").exit_code == 0
-    made = Provenance.of(dataset("second.shadowinv").attrs)
-    assert made is not None
-    assert made.recipe.steps == (Crop(x=(2, None)), Bin(factor=3))
-    assert made.setup is not None
-    assert made.setup.object_pixel_size == pytest.approx(3e-5)
+    provenance = Provenance.of(dataset("second.shadowinv").attrs)
+    assert provenance is not None
+    assert provenance.recipe.steps == (Crop(x=(2, None)), Bin(factor=3))
+    assert provenance.setup is not None
+    assert provenance.setup.object_pixel_size == pytest.approx(3e-5)
 
 
 def test_what_a_recipe_names_is_never_overwritten(
@@ -927,12 +927,12 @@ def test_a_damaged_mask_in_a_result_is_told(
     iio.imwrite("usable.png", usable)
     assert shadowinv("invert", shot, "--mask", "usable.png").exit_code == 0
     saved = dataset("shot.shadowinv")
-    made = Provenance.of(saved.attrs)
-    assert made is not None
-    assert made.mask is not None
+    provenance = Provenance.of(saved.attrs)
+    assert provenance is not None
+    assert provenance.mask is not None
     for change in ({"pixels": "nonsense"}, {"pixels": "\N{BULLET}"}, {"shape": (10**9, 10**9)}):
-        mask = made.mask.model_copy(update=change)
-        text = made.model_copy(update={"mask": mask}).model_dump_json()
+        mask = provenance.mask.model_copy(update=change)
+        text = provenance.model_copy(update={"mask": mask}).model_dump_json()
         write("bad.shadowinv", saved.assign_attrs(provenance=text), overwrite=True)
         refused("rerun", "bad.shadowinv", names="the mask kept with the result is damaged")
 
@@ -992,11 +992,11 @@ def test_rerun_reads_no_foreign_file(
     shadowinv("invert", "private/shot.npy", "--out", "first.shadowinv")
     first = dataset("first.shadowinv")
     provenance = json.loads(first.attrs["provenance"])
-    provenance["image"]["file"] = named = place.format(folder=folder)
+    provenance["image"]["file"] = file = place.format(folder=folder)
     write("mine/bad.shadowinv", first.assign_attrs(provenance=json.dumps(provenance)))
     os.chdir(folder / "mine")
 
-    refused("rerun", "bad.shadowinv", names=(named, "in another folder", "--other-folders"))
+    refused("rerun", "bad.shadowinv", names=(file, "in another folder", "--other-folders"))
     assert shadowinv("rerun", "bad.shadowinv", "--other-folders").exit_code == 0
     assert shadowinv("rerun", "bad.shadowinv", "../private/shot.npy", "--overwrite").exit_code == 0
 
@@ -1038,8 +1038,8 @@ def test_the_result_of_a_film_pack_is_known_but_no_field(
 ) -> None:
     names = ("dose", "fluence", "usable")
     planes = {name: (("layer", "y", "x"), np.ones((2, 5, 7), np.float32)) for name in names}
-    told = {"format": PACK_FORMAT, "package_version": "1.2", "warnings": '["film 2 is dark"]'}
-    pack = xr.Dataset(planes, {"energy": ("layer", [3.0, 5.5])}, told)
+    attributes = {"format": PACK_FORMAT, "package_version": "1.2", "warnings": '["film 2 is dark"]'}
+    pack = xr.Dataset(planes, {"energy": ("layer", [3.0, 5.5])}, attributes)
     write("pack.shadowinv", pack)
     xr.testing.assert_identical(read("pack.shadowinv"), pack)
     text = flat(shadowinv("info", "pack.shadowinv").stdout)
@@ -1051,18 +1051,18 @@ def test_the_result_of_a_film_pack_is_known_but_no_field(
 
 def test_info_reports_the_installation() -> None:
     text = shadowinv("info", "--report").stdout
-    told = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in text.splitlines())
-    assert told["napari-shadowinv"] == __version__
-    assert told["python"].startswith(platform.python_version())
+    entries = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in text.splitlines())
+    assert entries["napari-shadowinv"] == __version__
+    assert entries["python"].startswith(platform.python_version())
     for package in ("numpy", "scipy", "numba", "dask", "xarray", "zarr", "h5py"):
-        assert told[package] == metadata.version(package)
-    assert platform.machine() in told["platform"]
-    assert told["cores"].startswith(f"{os.cpu_count()}, ")
+        assert entries[package] == metadata.version(package)
+    assert platform.machine() in entries["platform"]
+    assert entries["cores"].startswith(f"{os.cpu_count()}, ")
     size = physical_memory()
-    assert told["memory"] == ("not known" if size is None else f"{size / 2**30:.1f} GiB")
+    assert entries["memory"] == ("not known" if size is None else f"{size / 2**30:.1f} GiB")
     folder = code_folder()
     assert folder is not None
-    assert Path(told["compiled code"].rpartition(" (")[0]).expanduser() == folder
+    assert Path(entries["compiled code"].rpartition(" (")[0]).expanduser() == folder
 
 
 def test_the_report_tells_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1072,9 +1072,9 @@ def test_the_report_tells_what_is_not_installed(monkeypatch: pytest.MonkeyPatch)
         return metadata.version(name)
 
     monkeypatch.setattr(_info, "version", without_windows)
-    told = [line.split(maxsplit=1) for line in shadowinv("info", "--report").stdout.splitlines()]
+    entries = [line.split(maxsplit=1) for line in shadowinv("info", "--report").stdout.splitlines()]
     for name in ("napari", "npe2", "qtpy", "Qt"):
-        assert [name, "not installed"] in told
+        assert [name, "not installed"] in entries
     only = {"PySide6_Essentials": "6.11.0"}
     monkeypatch.setattr(_info, "_version", only.get)
     assert _info._qt_bindings() == ["PySide6_Essentials 6.11.0"]
@@ -1123,9 +1123,9 @@ def test_info_of_a_result_tells_options_and_peak(folder: Path, shot: Path) -> No
     peak = np.hypot(*dataset("shot.shadowinv")["displacement"].values).max()
     for words in ("32 × 24 px", "seed = 12", "14.7 MeV proton", "shot.npy", "converged"):
         assert words in text
-    found = re.search(r"peak \|d\| ([\d.]+) ± [\d.]+ px \([^)]+\), at", text)
-    assert found
-    assert float(found[1]) == pytest.approx(peak, rel=0.02)
+    match = re.search(r"peak \|d\| ([\d.]+) ± [\d.]+ px \([^)]+\), at", text)
+    assert match
+    assert float(match[1]) == pytest.approx(peak, rel=0.02)
 
 
 def test_info_tells_a_field_of_another_program(folder: Path, inversion: Inversion) -> None:
@@ -1168,9 +1168,9 @@ def test_a_name_that_is_no_text_is_kept_as_its_bytes(folder: Path, shot: Path) -
     os.rename(shot, b"sh\xf6t.npy")
     result = shadowinv("invert", os.fsdecode(b"sh\xf6t.npy"), "--out", "a.shadowinv")
     assert result.exit_code == 0, result.output
-    kept = Provenance.of(dataset("a.shadowinv").attrs)
-    assert kept is not None
-    assert kept.image.file == r"sh\xf6t.npy"
+    provenance = Provenance.of(dataset("a.shadowinv").attrs)
+    assert provenance is not None
+    assert provenance.image.file == r"sh\xf6t.npy"
 
 
 def test_our_own_bug_is_not_blamed_on_the_user(shot: Path, monkeypatch: pytest.MonkeyPatch) -> None:

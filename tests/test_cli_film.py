@@ -58,9 +58,9 @@ def test_a_pack_from_scans_to_files_for_a_fit(truth: Truth, here: Path) -> None:
 
 def test_it_is_made_again_and_described(truth: Truth, here: Path) -> None:
     assert shadowinv("film", truth.pack, "-q").output == ""
-    told = flat(shadowinv("info", "pack.shadowinv").output)
-    assert "film pack of shadowinv" in told
-    assert "3 of 90 × 120 px" in told
+    output = flat(shadowinv("info", "pack.shadowinv").output)
+    assert "film pack of shadowinv" in output
+    assert "3 of 90 × 120 px" in output
     # A result may come from anybody: scans that lie elsewhere are asked for.
     refused = shadowinv("rerun", "pack.shadowinv")
     assert refused.exit_code == 2
@@ -68,8 +68,8 @@ def test_it_is_made_again_and_described(truth: Truth, here: Path) -> None:
     again = shadowinv("rerun", "pack.shadowinv", "--other-folders")
     assert again.exit_code == 0, again.output
     assert "the same result, bit for bit" in flat(again.output)
-    one, other = read("pack.shadowinv"), read("pack_again.shadowinv")
-    np.testing.assert_array_equal(one["fluence"], other["fluence"])
+    first, second = read("pack.shadowinv"), read("pack_again.shadowinv")
+    np.testing.assert_array_equal(first["fluence"], second["fluence"])
     for command, out in (("invert", "x.shadowinv"), ("fit", "x.shadowinv"), ("forward", "x.tif")):
         refused = shadowinv(command, "pack.shadowinv", "--out", out)
         assert refused.exit_code == 2
@@ -116,7 +116,7 @@ def test_what_is_wrong_is_told_and_nothing_is_left(
 
 
 def test_a_cancelled_run_leaves_nothing(truth: Truth, here: Path, monkeypatch) -> None:
-    monkeypatch.setattr(_film_command, "interrupted", lambda: True)
+    monkeypatch.setattr(_film_command, "is_interrupted", lambda: True)
     ended = shadowinv("film", truth.pack)
     assert ended.exit_code == 130
     assert content(here) == {}

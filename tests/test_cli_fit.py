@@ -57,19 +57,19 @@ def empty_figure(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def given(
+def fit_arguments(
     monkeypatch: pytest.MonkeyPatch, make_fit: Callable[..., Fit], empty_figure: None
 ) -> dict[str, Any]:
-    """What the command gives to `fit`, which then does no work."""
-    seen: dict[str, Any] = {}
+    """Record the arguments that the command passes to `fit`, which then does no work."""
+    recorded: dict[str, Any] = {}
 
     def fit(**arguments: Any) -> Fit:
-        seen.update(arguments)
+        recorded.update(arguments)
         strengths = (1.0, 1.7, 2.0, 3.0)[: len(arguments["images"])]
         return make_fit(strengths=strengths)
 
     monkeypatch.setattr("napari_shadowinv.pipeline._fit.fit", fit)
-    return seen
+    return recorded
 
 
 @pytest.fixture
@@ -95,12 +95,12 @@ def fit_in(path: str) -> tuple[Fit, xr.Dataset]:
 
 
 def provenance_in(path: str) -> FitProvenance:
-    made = fit_in(path)[0].provenance
-    assert made is not None
-    return made
+    provenance = fit_in(path)[0].provenance
+    assert provenance is not None
+    return provenance
 
 
-# What it finds and writes
+# Results
 
 
 def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
@@ -114,19 +114,19 @@ def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
     assert fit.setups == (FIRST, SECOND)
     assert fit.options == FitOptions(samples=2, beam_variation=0)
     assert setup_from_dataset(dataset) == FIRST
-    told = flat(result.stdout)
-    assert "verdict determined" in told
-    assert fit.explanation in told
-    assert "image 2 b.tif, 5 MeV proton, χ²" in told
-    assert "MG·µm)" in told
-    assert "; peak |d|" in told
-    assert "a beam that differs by 1 %" in told
+    output = flat(result.stdout)
+    assert "verdict determined" in output
+    assert fit.explanation in output
+    assert "image 2 b.tif, 5 MeV proton, χ²" in output
+    assert "MG·µm)" in output
+    assert "; peak |d|" in output
+    assert "a beam that differs by 1 %" in output
 
-    described = flat(shadowinv("info", "a_fit.shadowinv").stdout)
+    description = flat(shadowinv("info", "a_fit.shadowinv").stdout)
     for words in ("kind fit of shadowinv", "verdict determined", "image 1 a.tif, 14.7 MeV proton"):
-        assert words in described
-    assert sha256("b.tif")[:40] in described
-    assert "peak |∫B×dz|" in described
+        assert words in description
+    assert sha256("b.tif")[:40] in description
+    assert "peak |∫B×dz|" in description
 
 
 def test_a_field_that_one_image_cannot_tell_is_written_with_an_exit_code_of_its_own() -> None:
@@ -168,22 +168,26 @@ def test_ctrl_c_leaves_nothing(folder: Path) -> None:
 # What it gives to the fit
 
 
-def test_images_setups_and_choices_reach_the_fit(given: dict[str, Any]) -> None:
+def test_images_setups_and_choices_reach_the_fit(fit_arguments: dict[str, Any]) -> None:
     result = shadowinv(
         *PAIR, "--fields", "B, E", "--noise", "poisson", "--psf", 1.5, "--gains", "free",
         "--align", "shift", "--seed", 3,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    np.testing.assert_array_equal(given["images"][1], tifffile.imread("b.tif"))
-    assert given["setups"] == (FIRST, SECOND)
-    assert "strengths" not in given
-    assert given["fields"] == ("B", "E")
-    assert (given["noise"], given["psf"], given["gains"]) == ("poisson", [1.5, 1.5], "free")
-    assert given["options"] == FitOptions(align="shift", seed=3)
-    assert not {"source", "mask", "fiducials"} & given.keys()
+    np.testing.assert_array_equal(fit_arguments["images"][1], tifffile.imread("b.tif"))
+    assert fit_arguments["setups"] == (FIRST, SECOND)
+    assert "strengths" not in fit_arguments
+    assert fit_arguments["fields"] == ("B", "E")
+    assert (fit_arguments["noise"], fit_arguments["psf"], fit_arguments["gains"]) == (
+        "poisson",
+        [1.5, 1.5],
+        "free",
+    )
+    assert fit_arguments["options"] == FitOptions(align="shift", seed=3)
+    assert not {"source", "mask", "fiducials"} & fit_arguments.keys()
 
 
-def test_a_table_describes_each_image(folder: Path, given: dict[str, Any]) -> None:
+def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any]) -> None:
     night = folder / "night"
     night.mkdir()
     for name in ("a.tif", "b.tif", "setup.toml"):
@@ -201,78 +205,84 @@ def test_a_table_describes_each_image(folder: Path, given: dict[str, Any]) -> No
     )
     result = shadowinv("fit", "night/shots.csv", "--psf", 2, "--noise", 30)
     assert result.exit_code == 0, result.output
-    assert given["setups"] == (FIRST, SECOND)
+    assert fit_arguments["setups"] == (FIRST, SECOND)
     # Flags hold where a cell is empty.
-    assert given["psf"] == [2.0, 0.5]
-    assert given["noise"] == (20.0, 30.0)
-    assert given["gains"] == (1.0, 1.2)
-    np.testing.assert_array_equal(given["source"], np.full((2, *SHAPE), 900))
-    np.testing.assert_array_equal(given["mask"], [mask > 0, np.ones(SHAPE, bool)])
-    made = provenance_in("a_fit.shadowinv")
-    assert [one.image.file for one in made.images] == ["a.tif", "b.tif"]
-    assert made.images[1].image.sha256 == sha256(night / "b.tif")
-    assert [one.mask for one in made.images] == [0, None]
-    (kept,) = made.masks
-    assert (kept.file, kept.sha256) == ("mask.tif", sha256(night / "mask.tif"))
-    np.testing.assert_array_equal(kept.mask(), mask > 0)
-    assert [one.psf for one in made.images] == [None, 0.5]
-    assert [one.gain for one in made.images] == [1.0, 1.2]
-    assert [one.setup for one in made.images] == [FIRST, SECOND]
+    assert fit_arguments["psf"] == [2.0, 0.5]
+    assert fit_arguments["noise"] == (20.0, 30.0)
+    assert fit_arguments["gains"] == (1.0, 1.2)
+    np.testing.assert_array_equal(fit_arguments["source"], np.full((2, *SHAPE), 900))
+    np.testing.assert_array_equal(fit_arguments["mask"], [mask > 0, np.ones(SHAPE, bool)])
+    provenance = provenance_in("a_fit.shadowinv")
+    assert [image.image.file for image in provenance.images] == ["a.tif", "b.tif"]
+    assert provenance.images[1].image.sha256 == sha256(night / "b.tif")
+    assert [image.mask for image in provenance.images] == [0, None]
+    (origin,) = provenance.masks
+    assert (origin.file, origin.sha256) == ("mask.tif", sha256(night / "mask.tif"))
+    np.testing.assert_array_equal(origin.mask(), mask > 0)
+    assert [image.psf for image in provenance.images] == [None, 0.5]
+    assert [image.gain for image in provenance.images] == [1.0, 1.2]
+    assert [image.setup for image in provenance.images] == [FIRST, SECOND]
 
 
-def test_a_table_of_numbers_is_an_image(given: dict[str, Any]) -> None:
+def test_a_table_of_numbers_is_an_image(fit_arguments: dict[str, Any]) -> None:
     image = np.random.default_rng(1).uniform(1, 2, SHAPE)
     np.savetxt("numbers.csv", image, delimiter=",", fmt="%.17g")
     assert shadowinv("fit", "numbers.csv").exit_code == 0
-    np.testing.assert_array_equal(given["images"], image[None])
+    np.testing.assert_array_equal(fit_arguments["images"], image[None])
 
 
-def test_binning_sums_pixels_and_makes_those_of_the_setup_larger(given: dict[str, Any]) -> None:
+def test_binning_sums_pixels_and_makes_those_of_the_setup_larger(
+    fit_arguments: dict[str, Any],
+) -> None:
     tifffile.imwrite("beam.tif", np.full(SHAPE, 10, np.float32))
     sizes = "--source-size", 1e-5, "--resolution", 4e-4
     result = shadowinv(*PAIR, "--bin", 2, "--source", "beam.tif", *sizes)
     assert result.exit_code == 0, result.output
     blocks = tifffile.imread("a.tif").astype(float).reshape(24, 2, 28, 2).sum(axis=(1, 3))
-    np.testing.assert_allclose(given["images"][0], blocks)
-    np.testing.assert_array_equal(given["source"], np.full((2, 24, 28), 40))
+    np.testing.assert_allclose(fit_arguments["images"][0], blocks)
+    np.testing.assert_array_equal(fit_arguments["source"], np.full((2, 24, 28), 40))
     first = FIRST.model_copy(update={"pixel_size": 2e-5})
-    assert given["setups"][0] == first
-    assert given["psf"][0] == pytest.approx(point_spread(first, 1e-5, 4e-4))
+    assert fit_arguments["setups"][0] == first
+    assert fit_arguments["psf"][0] == pytest.approx(point_spread(first, 1e-5, 4e-4))
 
 
-def test_strengths_take_the_place_of_energies_and_units_are_kept(given: dict[str, Any]) -> None:
+def test_strengths_take_the_place_of_energies_and_units_are_kept(
+    fit_arguments: dict[str, Any],
+) -> None:
     assert shadowinv(*PAIR, "--strengths", "1 1,1.7 2.9", "--fields", "B,E").exit_code == 0
-    assert given["strengths"] == ((1.0, 1.0), (1.7, 2.9))
-    assert "setups" not in given
+    assert fit_arguments["strengths"] == ((1.0, 1.0), (1.7, 2.9))
+    assert "setups" not in fit_arguments
     assert fit_in("a_fit.shadowinv")[0].setups == (FIRST, SECOND)
 
 
-def test_known_displacements_come_from_a_table(given: dict[str, Any]) -> None:
+def test_known_displacements_come_from_a_table(fit_arguments: dict[str, Any]) -> None:
     Path("mesh.csv").write_text("x;y;dx;dy;sigma\n20;10;0.5;-0.25;0.1\n30;12;0.4;0;0.2\n")
     assert shadowinv("fit", "a.tif", "--fiducials", "mesh.csv").exit_code == 0
     rows = ((10, 20, -0.25, 0.5, 0.1), (12, 30, 0, 0.4, 0.2))
-    np.testing.assert_array_equal(given["fiducials"], rows)
-    made = provenance_in("a_fit.shadowinv")
-    assert made.fiducials == Origin(file="mesh.csv", sha256=sha256("mesh.csv"))
-    assert made.fiducial_rows == rows
+    np.testing.assert_array_equal(fit_arguments["fiducials"], rows)
+    provenance = provenance_in("a_fit.shadowinv")
+    assert provenance.fiducials == Origin(file="mesh.csv", sha256=sha256("mesh.csv"))
+    assert provenance.fiducial_rows == rows
 
 
-def test_light_is_bent_by_a_refractive_index_unless_said_otherwise(given: dict[str, Any]) -> None:
+def test_light_is_bent_by_a_refractive_index_unless_said_otherwise(
+    fit_arguments: dict[str, Any],
+) -> None:
     light = 'kind = "optical"\nobject_image_distance = 0.1\npixel_size = 1e-5\nwavelength = '
     for name, wavelength in (("one", "532e-9"), ("two", "1064e-9")):
         Path(f"{name}.toml").write_text(light + wavelength)
     assert shadowinv("fit", "a.tif", "--setup", "one.toml").exit_code == 0
-    assert given["fields"] == ("phase",)
+    assert fit_arguments["fields"] == ("phase",)
     Path("shots.csv").write_text("file,setup\na.tif,one.toml\nb.tif,two.toml\n")
     result = shadowinv("fit", "shots.csv", "--overwrite")
     assert result.exit_code == 2
     assert "wavelengths differ" in result.stderr
 
 
-def test_options_come_from_a_file_and_flags_override_it(given: dict[str, Any]) -> None:
+def test_options_come_from_a_file_and_flags_override_it(fit_arguments: dict[str, Any]) -> None:
     Path("options.toml").write_text('edge = "free"\nsamples = 4\n')
     assert shadowinv("fit", "a.tif", "--options", "options.toml", "--samples", 0).exit_code == 0
-    assert given["options"] == FitOptions(edge="free", samples=0)
+    assert fit_arguments["options"] == FitOptions(edge="free", samples=0)
 
 
 def test_every_option_of_a_fit_has_a_flag() -> None:
@@ -354,11 +364,11 @@ def test_an_input_is_never_overwritten(refused: Callable[..., None]) -> None:
 
 
 def test_a_result_is_replaced_only_if_asked(
-    refused: Callable[..., None], given: dict[str, Any]
+    refused: Callable[..., None], fit_arguments: dict[str, Any]
 ) -> None:
     Path("a_fit.png").write_text("mine")
     refused("fit", "a.tif", names=("a_fit.png exists", "--overwrite"))
-    assert not given
+    assert not fit_arguments
     assert shadowinv("fit", "a.tif", "--overwrite").exit_code == 0
 
 
@@ -395,11 +405,11 @@ def test_info_tells_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
         make_fit(), verdict=Verdict.SEVERAL, explanation="2 different fields explain the data"
     )
     write("fit.shadowinv", doubtful)
-    told = flat(shadowinv("info", "fit.shadowinv").stdout)
-    assert "verdict one of several" in told
-    assert "warning 2 different fields explain the data" in told
-    assert "other start from near: objective +20.00%, displacement 30.00% away" in told
-    assert "gain 1.1, shifted by y" in told
+    output = flat(shadowinv("info", "fit.shadowinv").stdout)
+    assert "verdict one of several" in output
+    assert "warning 2 different fields explain the data" in output
+    assert "other start from near: objective +20.00%, displacement 30.00% away" in output
+    assert "gain 1.1, shifted by y" in output
 
 
 # Making it again
@@ -413,24 +423,24 @@ def test_a_fit_is_made_again_bit_for_bit(
     tifffile.imwrite("mask.tif", mask)
     tifffile.imwrite("beam.tif", np.full(SHAPE, 1000, np.float32))
     steps = ("--crop-y", "2:46", "--crop-x", "0:54", "--hot-pixels", 8)
-    known = ("--mask", "mask.tif", "--source", "beam.tif", "--psf", 0.3, "--noise", 20)
+    inputs = ("--mask", "mask.tif", "--source", "beam.tif", "--psf", 0.3, "--noise", 20)
     quick = ("--samples", 2, "--steps", 5, "--spacing", 0.25)
-    result = shadowinv(*PAIR, *steps, *known, *quick, "--gains", "1,1.01")
+    result = shadowinv(*PAIR, *steps, *inputs, *quick, "--gains", "1,1.01")
     assert result.exit_code in (0, 3), result.output
     # A mask whose pixels are kept need not be there any more.
     Path("mask.tif").unlink()
     Path("setup.toml").unlink()
     again = shadowinv("rerun", "a_fit.shadowinv")
-    told = flat(again.stdout)
-    assert "changed nothing difference none: the same result, bit for bit" in told
+    output = flat(again.stdout)
+    assert "changed nothing difference none: the same result, bit for bit" in output
     first, second = fit_in("a_fit.shadowinv")[0], fit_in("a_fit_again.shadowinv")[0]
     assert first.provenance is not None
     assert second.provenance is not None
     assert first.provenance.recipe == second.provenance.recipe
     assert first.provenance.images == second.provenance.images
     assert first.options == second.options
-    for one, other in zip(first.fields, second.fields, strict=True):
-        np.testing.assert_array_equal(one.uncertainty, other.uncertainty)
+    for before, after in zip(first.fields, second.fields, strict=True):
+        np.testing.assert_array_equal(before.uncertainty, after.uncertainty)
 
     # Elsewhere, with an image that is not the same.
     elsewhere = folder / "elsewhere"
@@ -443,10 +453,10 @@ def test_a_fit_is_made_again_bit_for_bit(
     alone = ("rerun", "a_fit.shadowinv", "b.tif", "--overwrite")
     refused(*alone, names=("received 1 images", "made from 2"))
     moved = shadowinv("rerun", "a_fit.shadowinv", "elsewhere/a.tif", "elsewhere/c.tif", *where)
-    told = flat(moved.stdout)
-    assert "changed the image 2 c.tif differs from the b.tif used before" in told
-    assert "displacement differs by up to" in told
-    assert "nothing" not in told
+    output = flat(moved.stdout)
+    assert "changed the image 2 c.tif differs from the b.tif used before" in output
+    assert "displacement differs by up to" in output
+    assert "nothing" not in output
 
 
 def test_a_fit_of_an_older_version_is_told(empty_figure: None) -> None:
@@ -456,9 +466,9 @@ def test_a_fit_of_an_older_version_is_told(empty_figure: None) -> None:
     assert fit.provenance is not None
     older = fit.provenance.model_copy(update={"version": "0.0.1"})
     write(Path("old.shadowinv"), dataclasses.replace(fit, provenance=older))
-    told = flat(shadowinv("rerun", "old.shadowinv").stdout)
-    assert "changed made by version 0.0.1, now" in told
-    assert "the same result, bit for bit" in told
+    output = flat(shadowinv("rerun", "old.shadowinv").stdout)
+    assert "changed made by version 0.0.1, now" in output
+    assert "the same result, bit for bit" in output
 
 
 def test_known_displacements_and_own_masks_are_taken_again(empty_figure: None) -> None:
@@ -474,13 +484,13 @@ def test_known_displacements_and_own_masks_are_taken_again(empty_figure: None) -
     part = ("--crop-y", "9:49", "--crop-x", "8:56")
     result = shadowinv("fit", "shots.csv", "--fiducials", "mesh.csv", *part, *quick)
     assert result.exit_code in (0, 3), result.output
-    made = provenance_in("image_one_fit.shadowinv")
-    assert made.fiducial_rows is None
-    assert made.masks[1].pixels is None
+    provenance = provenance_in("image_one_fit.shadowinv")
+    assert provenance.fiducial_rows is None
+    assert provenance.masks[1].pixels is None
     assert "bit for bit" in shadowinv("rerun", "image_one_fit.shadowinv").stdout
     Path("mesh.csv").write_text("\n".join(rows[:-1]))
-    told = flat(shadowinv("rerun", "image_one_fit.shadowinv", "--overwrite").stdout)
-    assert "changed the table of fiducials mesh.csv differs from the mesh.csv used before" in told
+    output = flat(shadowinv("rerun", "image_one_fit.shadowinv", "--overwrite").stdout)
+    assert "changed the table of fiducials mesh.csv differs from the mesh.csv used before" in output
     Path("two.tif").unlink()
     missing = shadowinv("rerun", "image_one_fit.shadowinv", "--overwrite")
     assert missing.exit_code == 2
@@ -497,13 +507,13 @@ def test_a_fit_of_arrays_does_not_say_how_it_was_made(
 # A recipe
 
 
-def test_a_recipe_that_was_saved_makes_the_same_fit(given: dict[str, Any]) -> None:
+def test_a_recipe_that_was_saved_makes_the_same_fit(fit_arguments: dict[str, Any]) -> None:
     tifffile.imwrite("mask.tif", np.eye(*SHAPE, dtype=np.uint8) == 0)
     chosen = ("--bin", 2, "--mask", "mask.tif", "--noise", "poisson", "--source", "unknown")
     lengths = ("--source-size", 1e-5, "--samples", 0)
     first = shadowinv(*PAIR, *chosen, *lengths, "--fields", "B,E", "--save-recipe", "r.toml")
     assert first.exit_code == 0, first.output
-    before = dict(given)
+    before = dict(fit_arguments)
     recipe = read_recipe(Path("r.toml"))
     assert recipe.fit == FitChoices(
         fields=("B", "E"),
@@ -513,35 +523,35 @@ def test_a_recipe_that_was_saved_makes_the_same_fit(given: dict[str, Any]) -> No
         options=FitOptions(samples=0),
     )
     assert shadowinv(*PAIR, "--recipe", "r.toml", "--overwrite").exit_code == 0
-    assert before.keys() == given.keys()
+    assert before.keys() == fit_arguments.keys()
     for name in before.keys() - {"on_progress", "should_stop"}:
-        np.testing.assert_equal(given[name], before[name], err_msg=name)
+        np.testing.assert_equal(fit_arguments[name], before[name], err_msg=name)
 
     # Flags override what it says.
-    own = ("--psf", 0.5, "--samples", 3, "--source", "a.tif", "--gains", "free", "--bin", 4)
-    changed = shadowinv(*PAIR, "--recipe", "r.toml", *own, "--overwrite")
+    overrides = ("--psf", 0.5, "--samples", 3, "--source", "a.tif", "--gains", "free", "--bin", 4)
+    changed = shadowinv(*PAIR, "--recipe", "r.toml", *overrides, "--overwrite")
     assert changed.exit_code == 0, changed.output
-    assert given["psf"] == [0.5, 0.5]
-    assert given["options"] == FitOptions(samples=3)
-    assert given["source"].shape == (2, SHAPE[0] // 4, SHAPE[1] // 4)
-    assert (given["gains"], given["fields"]) == ("free", ("B", "E"))
+    assert fit_arguments["psf"] == [0.5, 0.5]
+    assert fit_arguments["options"] == FitOptions(samples=3)
+    assert fit_arguments["source"].shape == (2, SHAPE[0] // 4, SHAPE[1] // 4)
+    assert (fit_arguments["gains"], fit_arguments["fields"]) == ("free", ("B", "E"))
 
 
-def test_the_setup_of_one_image_is_in_its_recipe(given: dict[str, Any]) -> None:
+def test_the_setup_of_one_image_is_in_its_recipe(fit_arguments: dict[str, Any]) -> None:
     alone = ("fit", "a.tif", "--energies", 14.7, "--setup", "setup.toml")
     assert shadowinv(*alone, "--save-recipe", "r.toml").exit_code == 0
     assert read_recipe(Path("r.toml")).setup == FIRST
     assert shadowinv("fit", "b.tif", "--recipe", "r.toml", "--energies", 5).exit_code == 0
-    assert given["setups"] == (SECOND,)
+    assert fit_arguments["setups"] == (SECOND,)
     assert shadowinv(*PAIR, "--save-recipe", "both.toml", "--overwrite").exit_code == 0
     assert read_recipe(Path("both.toml")).setup is None
 
 
-def test_the_source_can_be_estimated_by_the_recipe(given: dict[str, Any]) -> None:
+def test_the_source_can_be_estimated_by_the_recipe(fit_arguments: dict[str, Any]) -> None:
     Path("r.toml").write_text('[source]\nmethod = "polynomial"\ndegree = 1\n')
     assert shadowinv("fit", "a.tif", "--recipe", "r.toml").exit_code == 0
     expected = polynomial_source(tifffile.imread("a.tif").astype(float), degree=1)
-    np.testing.assert_array_equal(given["source"], expected[None])
+    np.testing.assert_array_equal(fit_arguments["source"], expected[None])
 
 
 RECIPES = {
@@ -561,18 +571,18 @@ def test_a_recipe_that_cannot_be_is_refused(
     refused("fit", "a.tif", "--recipe", "r.toml", names=names)
 
 
-def test_the_recipe_on_the_page_works(given: dict[str, Any]) -> None:
+def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
     page = (Path(__file__).parents[1] / "docs" / "fit.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     Path("page.toml").write_text(text, encoding="utf-8")
     result = shadowinv(*PAIR, "--recipe", "page.toml")
     assert result.exit_code == 0, result.output
-    assert (given["noise"], given["gains"]) == ("poisson", "free")
-    assert given["options"] == FitOptions(samples=10)
-    assert given["images"].shape == (2, 24, 28)
-    assert given["psf"][0] > 0
-    shown = tomllib.loads(text)["fit"].keys()
-    assert set(FitChoices.model_fields) - shown == {"psf"}
+    assert (fit_arguments["noise"], fit_arguments["gains"]) == ("poisson", "free")
+    assert fit_arguments["options"] == FitOptions(samples=10)
+    assert fit_arguments["images"].shape == (2, 24, 28)
+    assert fit_arguments["psf"][0] > 0
+    keys = tomllib.loads(text)["fit"].keys()
+    assert set(FitChoices.model_fields) - keys == {"psf"}
 
 
 # Choices of fields compared
@@ -582,19 +592,19 @@ def test_fields_are_compared_and_the_likeliest_is_written(empty_figure: None) ->
     quick = ("--noise", 20, "--samples", 0, "--steps", 5, "--spacing", 0.25, "--smoothness", 10)
     result = shadowinv(*PAIR, "--compare", *quick)
     assert result.exit_code in (0, 3), result.output
-    told = flat(result.stdout)
+    output = flat(result.stdout)
     # The displacements grow like those of a magnetic field: 1.72 times for momenta, 2.9 for E.
-    assert re.search(r"Comparison .* likeliest .* E [\d.]+, [\d.]+ -\d+\.\d does not fit", told)
+    assert re.search(r"Comparison .* likeliest .* E [\d.]+, [\d.]+ -\d+\.\d does not fit", output)
     fit, _ = fit_in("a_fit.shadowinv")
     names = tuple(field.name for field in fit.fields)
     assert "B" in names
-    assert re.search(f"verdict ─* *{', '.join(names)} [^a-z]* likeliest", told)
-    made = provenance_in("a_fit.shadowinv")
-    assert made.recipe.fit is not None
-    assert made.recipe.fit.fields == names
+    assert re.search(f"verdict ─* *{', '.join(names)} [^a-z]* likeliest", output)
+    provenance = provenance_in("a_fit.shadowinv")
+    assert provenance.recipe.fit is not None
+    assert provenance.recipe.fit.fields == names
     assert fit.options.evidence
-    own = shadowinv(*PAIR, "--compare", "--fields", "E", *quick, "--overwrite")
-    assert own.exit_code in (0, 3), own.output
+    chosen = shadowinv(*PAIR, "--compare", "--fields", "E", *quick, "--overwrite")
+    assert chosen.exit_code in (0, 3), chosen.output
     assert [field.name for field in fit_in("a_fit.shadowinv")[0].fields] == ["E"]
 
 
@@ -607,7 +617,7 @@ def test_what_cannot_be_compared_is_refused(refused: Callable[..., None]) -> Non
 
 
 def films() -> None:
-    """Four images, the last two of a stronger object, and a table that tells their energies."""
+    """Write four images, one of them of a stronger object, and a table of their energies."""
     noise = np.random.default_rng(1)
     energies = (5.0, 7.0, 14.7, 10.0)
     for name, energy, factor in zip("abcd", energies, (1, 1, 1.4, 1), strict=True):
@@ -627,9 +637,9 @@ def test_images_left_out_and_windows_are_told_drawn_and_written(folder: Path) ->
     before = set(content(folder))
     result = shadowinv(*FILMS, "--spacing", 0.2, "--leave-one-out", "--window", 3)
     assert result.exit_code == 3, result.output
-    told = flat(result.stdout)
+    output = flat(result.stdout)
     for words in ("Left out", "c 14.7", "not explained", "Windows", "1, 2, 4", "2, 4, 3"):
-        assert words in told
+        assert words in output
     sentence = "the image at 14.7 MeV is not explained by one static field with the others"
     assert f"NOT STATIC: a_fit.shadowinv was written, but {sentence}" in flat(result.stderr)
     written = {f"a_fit{ending}.png" for ending in ("", "_left_out", "_windows")}
@@ -640,9 +650,9 @@ def test_images_left_out_and_windows_are_told_drawn_and_written(folder: Path) ->
     np.testing.assert_array_equal(left_out.images, fit.images)
     assert dataset["window_displacement"].shape == (2, 2, *SHAPE)
     np.testing.assert_allclose(dataset["window_energy"], [22 / 3, 31.7 / 3])
-    described = flat(shadowinv("info", "a_fit.shadowinv").stdout)
-    assert sentence in described
-    assert "window 2 images 2, 4, 3, χ²" in described
+    description = flat(shadowinv("info", "a_fit.shadowinv").stdout)
+    assert sentence in description
+    assert "window 2 images 2, 4, 3, χ²" in description
 
 
 STATIC_MISTAKES = {
