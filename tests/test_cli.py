@@ -977,9 +977,9 @@ def test_a_result_is_made_again_bit_for_bit(
     )
     for path in (shot, folder / "old_again.shadowinv", folder / "old_again.png"):
         path.unlink()
-    refused("rerun", "first.shadowinv", "--overwrite", names=("shot.npy", "not there"))
+    refused("rerun", "first.shadowinv", "--overwrite", names=("shot.npy", "does not exist"))
     write("bare.shadowinv", invert(np.ones((8, 8))))
-    refused("rerun", "bare.shadowinv", names=("bare.shadowinv", "does not say how it was made"))
+    refused("rerun", "bare.shadowinv", names=("bare.shadowinv", "has no provenance"))
 
 
 @pytest.mark.parametrize("place", ["{folder}/private/shot.npy", "../private/shot.npy"])
@@ -1059,7 +1059,7 @@ def test_info_reports_the_installation() -> None:
     assert platform.machine() in entries["platform"]
     assert entries["cores"].startswith(f"{os.cpu_count()}, ")
     size = physical_memory()
-    assert entries["memory"] == ("not known" if size is None else f"{size / 2**30:.1f} GiB")
+    assert entries["memory"] == ("unknown" if size is None else f"{size / 2**30:.1f} GiB")
     folder = code_folder()
     assert folder is not None
     assert Path(entries["compiled code"].rpartition(" (")[0]).expanduser() == folder
@@ -1094,7 +1094,7 @@ def test_the_report_survives_a_compiler_that_fails(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(machine_code, "code_folder", broken)
     last = shadowinv("info", "--report").stdout.splitlines()[-1]
-    assert last.endswith("not known: ImportError: llvmlite does not load")
+    assert last.endswith("unknown: ImportError: llvmlite does not load")
 
 
 def test_the_report_loads_neither_napari_nor_qt() -> None:

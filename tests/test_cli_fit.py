@@ -408,7 +408,7 @@ def test_info_tells_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
     output = flat(shadowinv("info", "fit.shadowinv").stdout)
     assert "verdict one of several" in output
     assert "warning 2 different fields explain the data" in output
-    assert "other start from near: objective +20.00%, displacement 30.00% away" in output
+    assert "alternative from near: objective +20.00%, displacement 30.00% away" in output
     assert "gain 1.1, shifted by y" in output
 
 
@@ -449,7 +449,7 @@ def test_a_fit_is_made_again_bit_for_bit(
         Path(name).rename(elsewhere / name)
     tifffile.imwrite(elsewhere / "c.tif", tifffile.imread("b.tif") + np.float32(5))
     where = ("--source", "elsewhere/beam.tif", "--overwrite")
-    refused("rerun", "a_fit.shadowinv", "--overwrite", names=("image 1 a.tif is not there",))
+    refused("rerun", "a_fit.shadowinv", "--overwrite", names=("image 1 a.tif does not exist",))
     alone = ("rerun", "a_fit.shadowinv", "b.tif", "--overwrite")
     refused(*alone, names=("received 1 images", "made from 2"))
     moved = shadowinv("rerun", "a_fit.shadowinv", "elsewhere/a.tif", "elsewhere/c.tif", *where)
@@ -494,14 +494,14 @@ def test_known_displacements_and_own_masks_are_taken_again(empty_figure: None) -
     Path("two.tif").unlink()
     missing = shadowinv("rerun", "image_one_fit.shadowinv", "--overwrite")
     assert missing.exit_code == 2
-    assert "the mask two.tif is not there: name the file" in missing.stderr
+    assert "the mask two.tif does not exist: name the file" in missing.stderr
 
 
 def test_a_fit_of_arrays_does_not_say_how_it_was_made(
     refused: Callable[..., None], make_fit: Callable[..., Fit]
 ) -> None:
     write(Path("fit.shadowinv"), make_fit())
-    refused("rerun", "fit.shadowinv", names=("fit.shadowinv does not say how it was made",))
+    refused("rerun", "fit.shadowinv", names=("fit.shadowinv has no provenance",))
 
 
 # A recipe
@@ -659,7 +659,7 @@ STATIC_MISTAKES = {
     "fit a.tif b.tif --strengths 1,2 --leave-one-out": ("received 2 images", "needs 3 or more"),
     "fit a.tif b.tif --strengths 1,2 --window 3": ("received 2 images and windows of 3",),
     "fit a.tif b.tif --window 2": ("neither strengths nor setups",),
-    "fit a.tif b.tif --strengths 1,2 --window 2 --out fit.h5": ("fit.h5", "no room"),
+    "fit a.tif b.tif --strengths 1,2 --window 2 --out fit.h5": ("fit.h5", "a format without it"),
     "fit a.tif b.tif --strengths 1,2 --window 2 --fiducials mesh.csv": ("--fiducials", "first"),
 }
 

@@ -40,7 +40,7 @@ from napari_shadowinv import (
     write,
 )
 from napari_shadowinv._system.safety import LIMIT_VARIABLE, check_regular, resolved_path
-from napari_shadowinv.cli._export import _cell
+from napari_shadowinv.cli._export import _escape_cell
 from napari_shadowinv.film import Calibration, Pack, usable_pixels
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.labels import setup_from_dataset
@@ -336,7 +336,7 @@ def test_result_of_a_later_version_is_not_taken_for_a_script() -> None:
     ],
 )
 def test_exported_cell_is_no_command(name: str, cell: str) -> None:
-    assert _cell(name) == cell
+    assert _escape_cell(name) == cell
 
 
 def test_environment_that_numba_refuses_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -253,7 +253,7 @@ def test_the_command_inverts_a_scan_and_makes_it_again(
     again = shadowinv("rerun", "a.shadowinv")
     assert again.exit_code == 0, again.output
     told = flat(shadowinv("info", scan, "--variable", chosen).output)
-    assert "tracks in CR-39" in told
+    assert "CR-39 tracks" in told
     assert "288 of 432 tracks counted in bins of 100 µm" in told
     assert "detector pixel size (m)" in told
     assert "all 432 tracks are counted" in flat(shadowinv("info", scan).output)

@@ -71,4 +71,4 @@ def test_film_command_writes_a_new_pack(scans: Path) -> None:
     assert "exists" in flat(again.output)
     nothing = shadowinv("film")
     assert nothing.exit_code == 2
-    assert "no pack is given" in flat(nothing.output)
+    assert "received no pack file" in flat(nothing.output)

@@ -68,7 +68,7 @@ def test_the_commands_work_as_shown(folder, night):
     (watching,) = [command for command in COMMANDS if command.startswith("shadowinv watch")]
     result = runner.invoke(app, [*watching.split()[1:], "--idle", "0.2", "--n-sites", "100"])
     assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines()[0] == "Watching shots for *.tif; Ctrl-C ends it."
+    assert result.stdout.splitlines()[0] == "Watching shots for *.tif; press Ctrl-C to stop."
     others = [command for command in COMMANDS if not re.search("batch|watch", command)]
     assert len(others) == 7
     for command in others:

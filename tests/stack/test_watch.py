@@ -477,7 +477,7 @@ def test_the_command_tells_a_line_for_each_shot(folder, out, tmp_path, monkeypat
     assert warning.startswith("warning: shot_0.npy: the field reaches the image's edge")
     assert all(line.endswith("doubtful, 1 warning") for line in told)
     assert failure.startswith("failed: shot_2.npy: ")
-    assert lines[-1].startswith("Ended: 2 done, 1 failed; repeat the command to go on with")
+    assert lines[-1].startswith("Stopped: 2 done, 1 failed; repeat the command to continue")
     assert shadowinv(*command, "--quiet").stdout == ""
 
 
@@ -510,8 +510,8 @@ def test_ctrl_c_is_the_normal_end_unless_files_wait(
     )  # fmt: skip
     assert result.exit_code == code
     left = ", 2 not yet inverted" if files > 1 else ""
-    (end,) = [line for line in result.output.splitlines() if line.startswith("Ended")]
-    assert end == (f"Ended: 1 done, 0 failed{left}; repeat the command to go on with {out}.")
+    (end,) = [line for line in result.output.splitlines() if line.startswith("Stopped")]
+    assert end == f"Stopped: 1 done, 0 failed{left}; repeat the command to continue {out}."
     assert list(read(out).status.values) == [DONE]
     assert not list(tmp_path.glob(".*.lock"))
 

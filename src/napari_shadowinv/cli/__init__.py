@@ -29,7 +29,7 @@ __all__ = ["app"]
 
 app = typer.Typer(
     name="shadowinv",
-    help="Shadowgrams and proton radiographs to deflection potentials and fields.",
+    help="Retrieve deflection potentials and fields from shadowgrams and proton radiographs.",
     invoke_without_command=True,
     context_settings={"help_option_names": list(HELP_NAMES)},
     cls=HelpfulGroup,
@@ -67,7 +67,7 @@ def main(
         ),
     ] = False,
 ) -> None:
-    """Shadowgrams and proton radiographs to deflection potentials and fields."""
+    """Retrieve deflection potentials and fields from shadowgrams and proton radiographs."""
     _check_environment()
     if ctx.invoked_subcommand is None:
         typer.echo(ctx.get_help())

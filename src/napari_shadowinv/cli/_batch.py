@@ -68,7 +68,7 @@ class _RunStatus:
     def rate_text(self) -> str:
         seconds = time.monotonic() - self.start
         if not self.ended:
-            return "no shot ended"
+            return "no shot finished"
         rate = self.ended / seconds
         return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
 
@@ -78,7 +78,7 @@ class _RunStatus:
             return ""
         pending = self.progress.total - self.progress.done - self.progress.failed
         seconds = round(pending * (time.monotonic() - self.start) / self.ended)
-        return f"{timedelta(seconds=seconds)} left" if pending else "closing"
+        return f"{timedelta(seconds=seconds)} left" if pending else "finishing"
 
 
 def run_batch(
@@ -259,7 +259,7 @@ def _site_rows(store: StackStore) -> Rows:
     counts = sorted({report["n_sites"] for report in reports})
     least, most = f"{counts[0]:,}", f"{counts[-1]:,}"
     reasons = dict.fromkeys(report.get("sites_reason") or "as given" for report in reports)
-    reason = next(iter(reasons)) if len(reasons) == 1 else "each for its own reason"
+    reason = next(iter(reasons)) if len(reasons) == 1 else "for different reasons"
     rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
     errors = [report["errors"] for report in reports if report.get("errors")]
     medians = [
@@ -288,7 +288,7 @@ def _trouble_rows(store: StackStore) -> Rows:
             rows.append((label, f"and {hidden} more: shadowinv status {store.path} --all"))
     rows += [(STATUS_NAMES[DAMAGED], problem) for problem in store.damage.files[:_MAX_LISTED]]
     if store.damage.shots or store.damage.files:
-        rows.append(("warning", "repeat the run with --resume to repair what is damaged"))
+        rows.append(("warning", "repeat the run with --resume to repair the damage"))
     unconverged = [
         store.names[index]
         for index, report in enumerate(store.reports())
@@ -402,7 +402,7 @@ def _notes(store: StackStore) -> Iterator[tuple[int, str]]:
 
 def _checksums_text(store: StackStore) -> str:
     if not store.has_checksums:
-        return "none: the store was written by an earlier version, and damage cannot be noticed"
+        return "none: the store was written by an earlier version, so damage cannot be detected"
     count = len(store.damage.shots) + len(store.damage.files)
     return f"{count} do not match" if count else "all files match"
 

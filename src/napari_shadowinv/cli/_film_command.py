@@ -25,11 +25,12 @@ if TYPE_CHECKING:
 LayersFormat = Literal["tiff", "pradformat"]
 # Help of options, where it is longer than a line.
 HELP = {
-    "pack": "TOML file: what the pack is made of, which scan shows which film.",
-    "layers": "Folder for the fluence of each layer as an image, with a table of them for fit and "
+    "pack": "TOML file with the layers of the pack and their scans.",
+    "layers": "Folder for the fluence images of the layers, with a table of them for fit and "
     "batch.",
-    "corners": "Table (.csv) for the corners that were found, to correct and give to the pack.",
-    "new": "Folder of scans for which to write a pack.toml to complete, instead of a run.",
+    "corners": "Table (.csv) for the detected corners of the films, to correct and name in the "
+    "pack file.",
+    "new": "Folder of scans: only write a pack.toml for them, to be completed.",
     "out": "Result file. Default: the pack's name with .shadowinv, in the current folder.",
 }
 EPILOG = r"""
@@ -38,10 +39,10 @@ shadowinv film --new scans
 shadowinv film scans/pack.toml --layers layers
 shadowinv fit layers/layers.csv --gains free --source unknown
 
-[bold]pack.toml[/bold] (files are looked for beside it)
-seen_from = "source"                          # or detector: decides the sign of B
+[bold]pack.toml[/bold] (paths are relative to this file)
+seen_from = "source"                          # or detector: sets the sign of B
 scan = "scan.tif"                             # all films on one scan; or a file for each layer
-\[setup]                                       # distances, if they are known
+\[setup]                                       # distances, if known
 source_object_distance = 0.01
 object_image_distance = 0.1
 \[films.HDV2]
@@ -63,7 +64,8 @@ def film(
     pack: Annotated[Path | None, typer.Argument(help=HELP["pack"], show_default=False)] = None,
     layers: Annotated[Path | None, typer.Option(help=HELP["layers"])] = None,
     layers_format: Annotated[
-        LayersFormat, typer.Option(help="Format of the layers' images.")
+        LayersFormat,
+        typer.Option(metavar="tiff|pradformat", help="Format of the layers' images."),
     ] = "tiff",
     corners: Annotated[Path | None, typer.Option("--save-corners", help=HELP["corners"])] = None,
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
@@ -72,10 +74,10 @@ def film(
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
-    """Turn the scans of a film pack into doses and fluences, layer by layer.
+    """Convert the scans of a film pack to doses and fluences, layer by layer.
 
-    Finds and straightens the films, leaves out writing and damage, lays the layers on each
-    other, and unfolds the spectrum of protons in every pixel.
+    Finds and straightens the films, masks handwriting and damage, aligns the layers, and
+    unfolds the proton spectrum in every pixel.
     """
     from napari_shadowinv.film import write_corners
     from napari_shadowinv.io import replacing
@@ -88,8 +90,7 @@ def film(
         return
     if pack is None:
         raise InputError(
-            "no pack is given: name the TOML file that describes it, or a folder of scans with "
-            "--new to write one"
+            "received no pack file: name one, or write one for a folder of scans with --new"
         )
     result, figure = _outputs.result_and_figure(pack, out, report)
     outputs: dict[Path, tuple[str, ...]] = {
@@ -125,7 +126,9 @@ def _write_new(folder: Path, pack: Path | None, overwrite: bool) -> None:
     from napari_shadowinv.pipeline.new_pack import draft_pack, missing_entries, write_new_pack
 
     if pack is not None:
-        raise InputError(f"--new writes a pack file and {pack} is one: give only one of them")
+        raise InputError(
+            f"received --new, which writes a pack file, and the pack file {pack}: use one of them"
+        )
     entries = draft_pack(folder)
     rows = [("layers", str(len(entries["layers"])))]
     rows += [("to complete", text) for text in missing_entries(entries)]

@@ -14,22 +14,22 @@ from napari_shadowinv.io.formats import IMAGE_TITLES
 # Help of arguments, where it is longer than a line.
 HELP = {
     "images": f"Images of one object ({IMAGE_TITLES}), or one table (.csv) with a row for each.",
-    "energies": "Energy of each image in MeV, separated by commas, with --setup for the rest.",
-    "strengths": "Displacement of each image relative to the first, separated by commas, where "
+    "energies": "Energy of each image in MeV, separated by commas; --setup gives the geometry.",
+    "strengths": "Displacement of each image relative to the first, separated by commas, if "
     "there are no setups; for two fields '1 1,0.7 0.5'.",
     "setup": "TOML file with the experimental geometry of all images.",
-    "source": "Image of the undisturbed beam, or unknown to fit a smooth one. Default: uniform.",
-    "compare": "Fit B alone, E alone and both, and tell which explains the images; needs setups. "
-    "Writes the likeliest, or what --fields names.",
-    "leave_one_out": "Also predict each image from a fit of the others, and name those that one "
-    "static field does not explain.",
-    "window": "Also fit so many neighbouring images at a time, in order of energy: a film of the "
-    "field.",
-    "gains": "known: images are as bright as the source; free: by unknown factors brighter; or "
-    "the factors, separated by commas.",
-    "mask": "Image of the same size, 0 at pixels that no image can use.",
-    "fiducials": "Table (.csv) of known displacements in the first image: columns y, x, dy, dx "
-    "and sigma, in px after --bin.",
+    "source": "Image of the undisturbed beam, or unknown to fit a smooth beam. Default: uniform.",
+    "compare": "Fit B alone, E alone and both, and report which explains the images best; needs "
+    "setups. Writes the likeliest fit, or the one that --fields names.",
+    "leave_one_out": "Also predict each image from a fit of the others, and list the images that "
+    "one static field does not explain.",
+    "window": "Also fit each group of N neighbouring images, in order of energy, for a movie of "
+    "the field.",
+    "gains": "known: images are as bright as the source; free: fit the brightness of each image; "
+    "or the brightness of each relative to the source, separated by commas.",
+    "mask": "Image of the same size, 0 at pixels to ignore in all images.",
+    "fiducials": "Table (.csv) of known displacements in the first image, with columns y, x, dy, "
+    "dx and sigma, in px after --bin.",
     "out": "Result file: .shadowinv, or .h5 for one field alone (pradformat). Default: the first "
     "image's name with _fit.shadowinv, in the current folder.",
 }
@@ -43,20 +43,20 @@ shadowinv fit shots.csv --setup setup.toml --compare
 shadowinv fit shots.csv --setup setup.toml --leave-one-out --window 3
 shadowinv fit next.csv --recipe recipe.toml
 
-[bold]shots.csv[/bold] (files are looked for beside it; flags hold where a cell is empty)
+[bold]shots.csv[/bold] (paths are relative to this file; flags apply where a cell is empty)
 file, energy, setup, source, gain
 a.tif, 14.7, setup.toml, beam.tif, 1
 b.tif, 30, setup.toml, beam.tif, 1.2
-Columns: file, setup, energy, strength, gain, psf, mask, source, noise; exclude (yes leaves the
-image out); shot for many shots.
+Columns: file, setup, energy, strength, gain, psf, mask, source, noise; exclude (yes to skip the
+image); shot, for shadowinv batch.
 
 [bold]Verdict[/bold]
-Whether the field may be believed is told with each result: "determined", "one of several",
+Each result states whether its field can be trusted: "determined", "one of several",
 "one image cannot tell", "too uncertain", "reaches the edge" or "does not fit".
 
 [bold]Exit codes[/bold]
 0 the field is determined; 2 invalid input, nothing written;
-3 result written, but its verdict is another, or images left out are not explained;
+3 result written, but with another verdict, or an image left out is not explained;
 130 cancelled.
 """
 
@@ -99,9 +99,9 @@ def fit(
     *,
     flags: dict[str, Any],
 ) -> None:
-    """Find the fields and the beam that explain one or several images of an object.
+    """Fit the fields, and the beam, to one or several images of an object.
 
-    Rays may cross, images may be blurred, the beam may be unknown. Writes fields with error
+    Rays may cross, images may be blurred, and the beam may be unknown. Writes fields with error
     bars, re-projections, residuals and a verdict to one file, and a figure next to it.
     """
     from napari_shadowinv.cli import _fit_result, _static_result

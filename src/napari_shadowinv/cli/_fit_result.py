@@ -95,7 +95,7 @@ def comparison_table(fits: Sequence[Fit]) -> Table:
 
     headings = "fields", "χ²", "log evidence", "verdict"
     table = Table(*headings, title="Comparison", title_justify="left", box=box.SIMPLE)
-    table.caption = "A difference of 10 decides."
+    table.caption = "A difference of 10 is decisive."
     best = fits[0].report.log_evidence
     for fit in fits:
         names = ", ".join(field.name for field in fit.fields)
@@ -198,7 +198,7 @@ def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
     best, *alternatives = fit.basins
     rows += [
         (
-            "other start",
+            "alternative",
             f"{solution.start}: objective {solution.objective / best.objective - 1:+.2%}, "
             f"displacement {solution.distance:.2%} away",
         )

@@ -28,7 +28,7 @@ _STEPS = "Steps before the inversion, in this order"
 _ESTIMATES = "Source estimated from the image (docs/sources.md)"
 _OPTIONS = "Options of the inversion"
 _FIT_STEPS = "Steps before the fit, in this order"
-_FIT_CHOICES = "What the fit finds and what is known"
+_FIT_CHOICES = "Unknowns and data of the fit"
 _FIT_OPTIONS = "Options of the fit"
 
 ImageFile = Annotated[
@@ -47,12 +47,12 @@ RecipeFile = Annotated[
     Path | None,
     Option(
         "--recipe",
-        help="TOML file with everything that is done to a shot; flags override what it says.",
+        help="TOML file with all steps, files and options; flags override it.",
     ),
 ]
 SaveRecipe = Annotated[
     Path | None,
-    Option("--save-recipe", help="Write what was done as a TOML file for --recipe, or napari."),
+    Option("--save-recipe", help="Write all steps, files and options to a TOML file for --recipe."),
 ]
 SetupFile = Annotated[
     Path | None,
@@ -67,16 +67,16 @@ Variable = Annotated[
     Option(
         "--variable",
         metavar="NAME",
-        help="Name of the array in an HDF5 file, or in a MATLAB file with several images; of a "
-        "CR-39 scan the tracks to count, such as 'diameter=4:12 contrast=:40 bin=300'.",
+        help="Name of the array in an HDF5 file, or in a MATLAB file with several images; for a "
+        "CR-39 scan, the tracks to count, such as 'diameter=4:12 contrast=:40 bin=300'.",
     ),
 ]
 SourceVariable = Annotated[
     str | None,
     Option(
         metavar="NAME",
-        help="Name of the array with the undisturbed beam, in the --source file or else in the "
-        "image file.",
+        help="Name of the array with the undisturbed beam, in the --source file or otherwise in "
+        "the image file.",
     ),
 ]
 ChosenShots = Annotated[

@@ -74,7 +74,7 @@ def _matlab_rows(path: Path, variable: str | None) -> _summary.Rows:
     rows = [("kind", "MATLAB file"), ("variables", ", ".join(map(str, contents)) or "none")]
     images = [array for array in contents if array.is_image]
     if variable is None and len(images) != 1:
-        advice = "choose one with --variable" if images else "none that is an image"
+        advice = "choose one with --variable" if images else "no variable is an image"
         return [*rows, ("images", f"{len(images)}: {advice}")]
     array, metadata = read_mat(path, variable)
     return [*rows, ("image", metadata["variable"]), *_array_rows(array)]
@@ -87,7 +87,7 @@ def _picture_rows(path: Path, form: Format) -> _summary.Rows:
     warnings = film_warnings(array, None) if array.ndim == 2 else ()
     rows = [("kind", f"{form.name.upper()} picture, {metadata['bits']} bits per sample")]
     if array.ndim == 3:
-        advice = "convert a scan of film to dose, or choose with --channel"
+        advice = "convert a film scan to dose, or choose one with --channel"
         rows.append(("channels", f"{array.shape[-1]}: {advice}"))
     return [*rows, *_array_rows(array), *[("warning", caution.text) for caution in warnings]]
 
@@ -99,7 +99,7 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _summary.Rows:
     names = {
         "text": "numbers as text",
         "pradformat": "pradformat radiograph",
-        "cpsa": "tracks in CR-39",
+        "cpsa": "CR-39 tracks",
     }
     kind = str(shot.metadata["kind"])
     rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image)]
@@ -180,7 +180,7 @@ def _origin_rows(provenance: Provenance | None) -> _summary.Rows:
 
 
 def system_report() -> str:
-    """List versions and the machine; a broken napari or Qt cannot fail it, as neither is loaded."""
+    """List versions and the system, without loading napari or Qt, which may be broken."""
     memory = physical_memory()
     rows = [
         ("napari-shadowinv", __version__),
@@ -189,7 +189,7 @@ def system_report() -> str:
         ("Qt", ", ".join(_qt_bindings()) or "not installed"),
         ("platform", f"{platform.platform()}, {platform.machine()}"),
         ("cores", _cores()),
-        ("memory", "not known" if memory is None else f"{memory / 2**30:.1f} GiB"),
+        ("memory", "unknown" if memory is None else f"{memory / 2**30:.1f} GiB"),
         ("compiled code", _compiled_code()),
     ]
     width = max(len(name) for name, _ in rows)
@@ -214,7 +214,7 @@ def _cores() -> str:
         usable = len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS or Windows
         usable = count or 1
-    return f"{count or 'not known'}, {usable} usable"
+    return f"{count or 'unknown'}, {usable} usable"
 
 
 def _compiled_code() -> str:
@@ -224,10 +224,10 @@ def _compiled_code() -> str:
 
         folder = code_folder()
         if folder is None:
-            return "not kept: compiled anew in each process"
+            return "not cached: compiled again in each process"
         state = "compiled" if is_compiled() else "not compiled yet"
     except Exception as error:  # a broken numba must not stop the report
-        return f"not known: {type(error).__name__}: {' '.join(str(error).split())}"
+        return f"unknown: {type(error).__name__}: {' '.join(str(error).split())}"
     home = Path.home()
     if folder.is_relative_to(home):
         folder = Path("~") / folder.relative_to(home)

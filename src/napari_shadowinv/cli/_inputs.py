@@ -98,8 +98,8 @@ def fit_recipe(
     refused += ["--clip-negative"] if clip_negative else []
     if refused:
         raise InputError(
-            f"received {refused[0]}, which an inversion takes, and shots that are to be fitted: "
-            "write the fit's options into the recipe's section [fit.options]"
+            f"received {refused[0]}, an option of inversions, for a fit: set the options of the "
+            "fit in the recipe's section [fit.options]"
         )
     return recipe.model_copy(update={"fit": recipe.fit or FitChoices()})
 

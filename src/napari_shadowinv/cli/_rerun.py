@@ -58,7 +58,7 @@ class FileLocator:
         if not (self.trusted or is_inside):
             raise InputError(
                 f"{self.result} names {name} {file}, which is in another folder: name the file to "
-                "use, or read what the result names with --other-folders if you trust it"
+                "use, or add --other-folders if you trust the result"
             )
 
     def check_recipe(self, recipe: Recipe) -> None:
@@ -81,7 +81,7 @@ class FileLocator:
             self.check(candidates[0], name)
         path = argument or next((file for file in candidates if file.is_file()), None)
         if path is None:
-            reason = f"{origin.file} is not there" if origin.file else "was not made from a file"
+            reason = f"{origin.file} does not exist" if origin.file else "was not made from a file"
             raise FileFormatError(f"{name} {reason}: name the file to use")
         return path
 
@@ -98,15 +98,15 @@ def rerun_inversion(
     if len(files.images) > 1:
         raise InputError(
             f"received {len(files.images)} images, and {files.result} was made from one: name "
-            "one, or none if it is beside the result"
+            "one, or none if it is in the result's folder"
         )
     before = Inversion.from_dataset(dataset)
     provenance = before.provenance
     if provenance is None:
         check_readable(dataset, files.result)
         raise InputError(
-            f"{files.result} does not say how it was made, as results of scripts that call "
-            "invert() do not: make it again with a recipe (docs/recipes.md)"
+            f"{files.result} has no provenance, like all results of invert() in scripts: "
+            "repeat the inversion with a recipe (docs/recipes.md)"
         )
     inversion, shot, changes = repeat_inversion(provenance, files, outputs, quiet=quiet)
     return InversionRerun(inversion, shot, tuple(changes), _difference(before, inversion))
@@ -123,11 +123,11 @@ def check_readable(dataset: xarray.Dataset, result: Path) -> None:
         version = __version__
     if version == __version__:
         raise InputError(
-            f"{result} has a damaged provenance: make it again with a recipe (docs/recipes.md)"
+            f"{result} has a damaged provenance: repeat it with a recipe (docs/recipes.md)"
         ) from None
     raise InputError(
-        f"{result} was made by version {str(version)[:20]}, and version {__version__} does not "
-        "understand how: use that version, or make it again with a recipe (docs/recipes.md)"
+        f"{result} was made by version {str(version)[:20]}, and version {__version__} cannot read "
+        "its provenance: use that version, or repeat it with a recipe (docs/recipes.md)"
     )
 
 
@@ -163,7 +163,7 @@ def _mask(origin: Origin | None, name: str) -> BoolArray | None:
     mask = origin.mask()
     if mask is None:
         raise InputError(
-            f"the {name} {origin.file} was too complex to be kept with the result: repeat the "
+            f"the {name} {origin.file} is too complex to be stored in the result: repeat the "
             "inversion with --recipe and the mask"
         )
     return mask
@@ -190,7 +190,7 @@ def file_changes(name: str, before: Origin | None, after: Origin | None) -> list
     if before is None or after is None:
         return []
     if not before.sha256:
-        return [f"the {name} was no file before: {after.file} may differ from it"]
+        return [f"the {name} was not a file before: {after.file} may differ from it"]
     if before.sha256 != after.sha256:
         return [f"the {name} {after.file} differs from the {before.file} used before"]
     return []
@@ -198,7 +198,7 @@ def file_changes(name: str, before: Origin | None, after: Origin | None) -> list
 
 def _difference(before: Inversion, again: Inversion) -> str:
     if before.displacement.shape != again.displacement.shape:
-        return f"another size: {again.image.shape}, before {before.image.shape}"
+        return f"different size: {again.image.shape}, before {before.image.shape}"
     names = ("displacement", "potential", "weights", "source", "image", "reprojection")
     if all(np.array_equal(getattr(before, name), getattr(again, name)) for name in names):
         return UNCHANGED

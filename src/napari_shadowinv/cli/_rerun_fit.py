@@ -54,14 +54,14 @@ def rerun_fit(
     if provenance is None:
         check_readable(dataset, files.result)
         raise InputError(
-            f"{files.result} does not say how it was made, as fits of scripts that call fit() do "
-            "not: make it again with shadowinv fit (docs/fit.md)"
+            f"{files.result} has no provenance, like all results of fit() in scripts: repeat the "
+            "fit with shadowinv fit (docs/fit.md)"
         )
     count = len(provenance.images)
     if len(files.images) not in (0, count):
         raise InputError(
             f"received {len(files.images)} images, and {files.result} was made from {count}: "
-            "name all of them in their order, or none if they are beside the result"
+            "name all of them in their order, or none if they are in the result's folder"
         )
     if provenance.start is not None:
         inversion, shot, changes = repeat_inversion(provenance.start, files, outputs, quiet=quiet)
@@ -136,8 +136,8 @@ class _FitInputs:
             return mask
         if not origin.file and image_mask is None:
             raise InputError(
-                "a mask was too complex to be kept with the result, and was no file: make the fit "
-                "again with shadowinv fit and the mask"
+                "a mask is too complex to be stored in the result, and was not a file: repeat the "
+                "fit with shadowinv fit and the mask"
             )
         if not origin.file:
             return image_mask
@@ -175,7 +175,7 @@ def _changes(before: FitProvenance, again: Fit) -> Sequence[str]:
 
 def _difference(before: Fit, again: Fit) -> str:
     if before.images.shape != again.images.shape:
-        return f"another size: {again.images.shape[1:]}, before {before.images.shape[1:]}"
+        return f"different size: {again.images.shape[1:]}, before {before.images.shape[1:]}"
     pairs = list(zip(before.fields, again.fields, strict=True))
     names = ("images", "source", "gains", "frames", "reprojection", "chi2")
     is_equal = all(np.array_equal(getattr(before, name), getattr(again, name)) for name in names)

@@ -15,16 +15,16 @@ from napari_shadowinv.options import InversionOptions
 
 # Help of arguments, where it is longer than a line.
 HELP = {
-    "image": "Its image, or another one; all images of a fit, in their order. Default: the files "
-    "of that name beside the result or in the current folder.",
+    "image": "The image, if it has moved or changed; for a fit, all images in their order. "
+    "Default: the files named in the result, in its folder or the current one.",
     "field": ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) "
     "containing a displacement (2, H, W) in px or a potential (H, W) in px².",
-    "setup": "TOML file with the setup to predict the image for, for example another energy. "
+    "setup": "TOML file with the setup of the prediction, for example with another energy. "
     "Default: the field's own setup.",
-    "made_with": "TOML file with the setup the field was measured with, if its file does not "
+    "made_with": "TOML file with the setup of the measurement, if the field's file does not "
     "contain it.",
-    "deflector": "What deflects the beam, if --setup differs from the field's: magnetic-field, "
-    "electric-field, plasma or refractive-index.",
+    "deflector": "Cause of the deflection, if --setup differs from the field's setup: "
+    "magnetic-field, electric-field, plasma or refractive-index.",
     "dispersion": "For a refractive index: ratio of ln η at the new wavelength to ln η at the old "
     "one.",
     "predicted_image": "Image file: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
@@ -39,7 +39,7 @@ shadowinv invert shots.mat --variable shot3 --source-variable beam
 shadowinv invert shot.tif --hot-pixels 6 --source-from polynomial --source-degree 2
 
 [bold]setup.toml[/bold]
-kind = "proton"                  # any charged particles; or "optical"
+kind = "proton"                  # any charged particle; or "optical"
 species = "proton"               # or "electron", "deuteron", "alpha", …
 energy = 14.7                    # MeV; or with a unit: "700 keV"; for light: wavelength
 source_object_distance = 0.01    # m; inf for a collimated beam
@@ -51,7 +51,7 @@ n_sites = 100000
 tolerance = 1e-4
 floor = 1e-3
 
-[bold]recipe.toml[/bold] (all of it in one file: try --save-recipe)
+[bold]recipe.toml[/bold] (all settings in one file; --save-recipe writes one)
 \[\[steps]]                        # in this order
 step = "hot-pixels"
 threshold = 6                    # standard deviations
@@ -138,25 +138,28 @@ def rerun(
         list[Path] | None, typer.Argument(help=HELP["image"], show_default=False)
     ] = None,
     source: Annotated[
-        Path | None, typer.Option("--source", help="Its measured source, if it has moved.")
+        Path | None, typer.Option("--source", help="The measured source, if it has moved.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Result file. Default: the result's name with _again.")
+        Path | None,
+        typer.Option(
+            help="Result file. Default: the result's name with _again, in the current folder."
+        ),
     ] = None,
     report: _flags.Figure = None,
     other_folders: Annotated[
         bool,
         typer.Option(
             "--other-folders",
-            help="Also read files that the result names in other folders than its own.",
+            help="Also read the files in other folders that the result names.",
         ),
     ] = False,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,
 ) -> None:
-    """Make a result again from the recipe it contains, and say what has changed.
+    """Repeat a result from the recipe it contains, and report the changes.
 
-    With the same files and version the result is the same, bit for bit.
+    With the same files and version, the result is identical bit for bit.
     """
     from napari_shadowinv.cli import _fit_result
     from napari_shadowinv.cli._film_command import rerun_pack, write_pack
@@ -177,7 +180,7 @@ def rerun(
         remade, changes = rerun_pack(dataset, files, written, quiet)
         write_pack(remade, result.name, again_out, figure, overwrite)
         if not quiet:
-            say(two_columns("Film pack, made again", changes))
+            say(two_columns("Rerun", changes))
         return
     if is_fit(dataset.attrs):
         _outputs.check_outputs({again_out: tuple(FIT_WRITERS)}, overwrite)
@@ -203,7 +206,7 @@ shadowinv forward d.npy --made-with first.toml --setup second.toml
 
 [bold]Another experiment[/bold]
 A deflection depends on the beam; the object's line integral does not. To convert between
-experiments, choose what deflects the beam: a magnetic field (∫B dl, angles scale as charge /
+experiments, choose the cause of the deflection: a magnetic field (∫B dl, angles scale as charge /
 momentum; the default for particles), an electric field (∫E dl, charge / (momentum velocity)),
 a plasma (∫n dz, wavelength squared) or a refractive index (∫ln η dz, unchanged apart from
 dispersion). Both images have the same centre; the predicted one has the pixel size of --setup
@@ -228,7 +231,7 @@ def forward(
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
-    """Predict the image of a displacement field, with the same setup or another.
+    """Predict the image of a displacement field, for the same setup or another.
 
     Without --source, the result's own source is used if the setup is the same; otherwise
     the source is uniform.
@@ -268,7 +271,10 @@ def info(
     ] = None,
     variable: _flags.Variable = None,
     report: Annotated[
-        bool, typer.Option("--report", help="Print versions and machine instead, for a bug report.")
+        bool,
+        typer.Option(
+            "--report", help="Print the versions and the system instead, for a bug report."
+        ),
     ] = False,
 ) -> None:
     """Describe a file and its contents."""
@@ -288,14 +294,16 @@ def info(
 def demo(
     out: Annotated[Path, typer.Option(help="Output folder.")] = Path("demo"),
     dm: Annotated[float, typer.Option(help="Peak path-integrated field in MG·µm.")] = 97.0,
-    noise: Annotated[float, typer.Option(help="Noise, as a fraction of the mean.")] = 0.1,
+    noise: Annotated[
+        float, typer.Option(help="Standard deviation of the noise, as a fraction of the mean.")
+    ] = 0.1,
     n_sites: Annotated[
         int | None, typer.Option(help=InversionOptions.model_fields["n_sites"].description)
     ] = None,
 ) -> None:
     """Simulate a proton radiograph of a toroidal field, invert it and compare with the truth.
 
-    The setup is that of Kasim et al., arXiv:1607.04179, Section IV. Caustics form from
+    The setup follows Kasim et al., arXiv:1607.04179, section IV. Caustics form from
     about 185 MG·µm.
     """
     if not 0 <= noise < float("inf"):

@@ -21,10 +21,10 @@ HELP = {
     "workers": "Number of shots processed at once on this machine. Default: one per core.",
     "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
     "csv (a table with one row per shot).",
-    "shots": "A quoted glob, a list of files, one multi-page TIFF with one shot per page, or one "
-    "table (.csv) with a row for each shot.",
-    "fit": "Fit the forward model to each shot in place of inverting it, as the recipe's section "
-    "fit says; rows of a table with the same shot are images of one object.",
+    "shots": "A quoted glob, a list of files, a multi-page TIFF with one shot per page, or a table "
+    "(.csv) with one row per shot.",
+    "fit": "Fit the forward model to each shot instead of inverting it, with the recipe's section "
+    "[fit]; table rows with the same shot are images of one object.",
     "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
 }
 BATCH_EPILOG = """
@@ -36,14 +36,14 @@ shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
 shadowinv batch pack.csv --setup setup.toml --out pack.shadowinv.zarr
 shadowinv batch shots.csv --fit --recipe recipe.toml --out fits.shadowinv.zarr
 
-[bold]pack.csv[/bold] (one inversion for each row; flags hold where a cell is empty)
+[bold]pack.csv[/bold] (one inversion per row; flags apply where a cell is empty)
 file, energy, gain, mask, exclude
 film1.tif, 4.3, 1, mask1.png,
 film2.tif, 6.1, 1.2, mask2.png,
 film3.tif, 7.6, 0.8, , yes
 Columns: file, setup, energy, gain, mask, source, exclude.
 
-[bold]shots.csv[/bold] (one fit for each shot; other columns as for shadowinv fit)
+[bold]shots.csv[/bold] (one fit per shot; other columns as for shadowinv fit)
 shot, file, energy, setup
 7, shot7_low.tif, 14.7, setup.toml
 7, shot7_high.tif, 30, setup.toml
@@ -90,7 +90,7 @@ def batch(
     *,
     flags: dict[str, Any],
 ) -> None:
-    """Invert, or fit, many shots into one store, which can be resumed after a crash."""
+    """Invert or fit many shots into one store; an interrupted run can be resumed."""
     from napari_shadowinv.cli._batch import run_batch
 
     chosen = recipe_for_shots(
@@ -148,7 +148,9 @@ def status(
 @notify_errors
 def export(
     store: _flags.StoreFolder,
-    form: Annotated[str, typer.Option("--format", help=HELP["format"])],
+    form: Annotated[
+        str, typer.Option("--format", metavar="tiff|pradformat|csv", help=HELP["format"])
+    ],
     shots: _flags.ChosenShots = None,
     variables: Annotated[
         str, typer.Option(help="For tiff: variables to export, separated by commas.")
@@ -181,7 +183,10 @@ def movie(
     rate: Annotated[float, typer.Option(help="Shots per second.")] = 10.0,
     limits: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Limits of the colour scale. Default: the range over all shots."),
+        typer.Option(
+            metavar="MIN MAX",
+            help="Limits of the colour scale. Default: the range over all shots.",
+        ),
     ] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,

@@ -88,12 +88,11 @@ def check_requests(
         return
     if fiducials is not None:
         raise InputError(
-            f"received {flag} and --fiducials, which hold for the first image alone: leave out "
-            "one of them"
+            f"received {flag} and --fiducials, which apply to the first image only: use one of them"
         )
     if result.suffix.lower() not in RESULT.suffixes:
         raise InputError(
-            f"received {flag} and {result}, which has no room for it: write a {RESULT.suffix} file"
+            f"received {flag} and {result}, a format without it: write a {RESULT.suffix} file"
         )
 
 

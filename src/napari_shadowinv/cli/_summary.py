@@ -84,7 +84,7 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
         if mask is not None:
             rows.append((name, mask.file or "drawn"))
     if provenance.gain is not None:
-        rows.append(("gain", f"{provenance.gain:g}, by which the image was divided"))
+        rows.append(("gain", f"{provenance.gain:g} (the image was divided by it)"))
     return rows
 
 

@@ -58,13 +58,16 @@ class _WatchPrinter:
             self.is_watching = True
             counts = f"{progress.done} done, {progress.failed} failed; " if progress.total else ""
             self._print(
-                self.out, f"Watching {self.folder} for {self.pattern}; {counts}Ctrl-C ends it."
+                self.out,
+                f"Watching {self.folder} for {self.pattern}; {counts}press Ctrl-C to stop.",
             )
 
     def _print_shot(self, progress: WatchProgress) -> None:
         outcome = progress.outcome
         assert outcome is not None
-        name = f"{progress.name} (again, as it has changed)" if progress.again else progress.name
+        name = (
+            f"{progress.name} (again, as the file has changed)" if progress.again else progress.name
+        )
         waiting = f"  {progress.waiting} waiting" if progress.waiting else ""
         if outcome.reason:
             self._print(self.err, f"failed: {name}: {outcome.reason}", "red")
@@ -165,11 +168,11 @@ def _print_summary(progress: WatchProgress | None, out: Path, quiet: bool) -> No
         done, failed, waiting = progress.done, progress.failed, progress.waiting
     remaining = f", {waiting} not yet inverted" if waiting else ""
     if not done:
-        text = f"Ended: {failed} failed, nothing was written" if failed else "Ended: no shot"
+        text = f"Stopped: {failed} failed, nothing written" if failed else "Stopped: no shots"
         text = f"{text}{remaining}; repeat the command to watch again."
     else:
-        text = f"Ended: {done} done, {failed} failed{remaining}"
-        text = f"{text}; repeat the command to go on with {out}."
+        text = f"Stopped: {done} done, {failed} failed{remaining}"
+        text = f"{text}; repeat the command to continue {out}."
     if is_interrupted() and waiting:
         say_on_stderr(text)
         raise typer.Exit(cancel_exit_code())

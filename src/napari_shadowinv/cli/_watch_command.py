@@ -14,11 +14,11 @@ from napari_shadowinv.cli._terminal import notify_errors
 from napari_shadowinv.io.formats import NEW_SHOTS
 
 _SETTLE_HELP = (
-    "Seconds without a change after which a file is complete where the system does not tell "
+    "Seconds without a change after which a file is complete, where the system does not report "
     "that it was closed (network file systems, macOS, Windows)."
 )
 _FIT_HELP = (
-    "Fit the forward model to each shot in place of inverting it, as the recipe's section fit says."
+    "Fit the forward model to each shot instead of inverting it, with the recipe's section [fit]."
 )
 EPILOG = """
 [bold]Examples[/bold]
@@ -26,12 +26,12 @@ shadowinv watch shots --source reference.tif --out night.shadowinv.zarr
 shadowinv watch shots --pattern '*.bmp' --channel mean --bin 2 --out night.shadowinv.zarr
 shadowinv watch shots --source reference.tif --out night.shadowinv.zarr --idle 600
 
-Ctrl-C ends it. The same command again goes on with the same store.
+Press Ctrl-C to stop. The same command continues with the same store.
 
 [bold]Exit codes[/bold]
 0 all shots that arrived are done; 1 some failed, the others are written; 2 invalid input, or the
-folder disappeared; 3 all done, but some did not converge or are not determined; 130 ended by
-Ctrl-C while files were waiting.
+folder disappeared; 3 all done, but some did not converge or are not determined; 130 stopped
+by Ctrl-C while files were waiting.
 """
 
 
@@ -43,7 +43,7 @@ def watch(
     ],
     out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
     pattern: Annotated[
-        str, typer.Option(help="What names of shots look like, in quotes.")
+        str, typer.Option(help="File name pattern of the shots, in quotes.")
     ] = NEW_SHOTS,
     source: _flags.SourceFile = None,
     mask: _flags.MaskFile = None,
@@ -66,27 +66,31 @@ def watch(
     settle: Annotated[float, typer.Option(metavar="S", help=_SETTLE_HELP)] = 1.0,
     polling: Annotated[
         bool,
-        typer.Option("--polling", help="Look at the folder every second, whatever it lies on."),
+        typer.Option(
+            "--polling",
+            help="Poll the folder once a second instead of relying on file-system events.",
+        ),
     ] = False,
     idle: Annotated[
         float | None,
-        typer.Option(metavar="S", help="End when nothing has arrived for so many seconds."),
+        typer.Option(metavar="S", help="Stop after this many seconds without a new file."),
     ] = None,
     most: Annotated[
-        int | None, typer.Option("--shots", metavar="N", help="End when N shots have ended.")
+        int | None, typer.Option("--shots", metavar="N", help="Stop after N shots, done or failed.")
     ] = None,
     skip_existing: Annotated[
-        bool, typer.Option("--skip-existing", help="Leave out files that are there already.")
+        bool,
+        typer.Option("--skip-existing", help="Skip files that are in the folder at the start."),
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Discard an earlier run.")] = False,
     redo_failed: Annotated[
-        bool, typer.Option("--redo-failed", help="Retry shots of the store that failed.")
+        bool, typer.Option("--redo-failed", help="Retry the failed shots of the store.")
     ] = False,
     quiet: _flags.Quiet = False,
     *,
     flags: dict[str, Any],
 ) -> None:
-    """Invert each shot as soon as it appears in a folder, into a store that grows."""
+    """Invert or fit each new shot in a folder, and append it to a store."""
     from napari_shadowinv.cli._watch import run_watch
 
     chosen = recipe_for_shots(

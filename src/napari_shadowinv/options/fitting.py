@@ -59,67 +59,67 @@ class FitOptions(CheckedModel):
         title="Smoothness",
         description=(
             "Weight of the squared fourth derivatives of each field's potential (px). Default: "
-            "those of fourth and sixth derivatives are found from the data, for each field."
+            "weights of fourth and sixth derivatives estimated from the data, for each field."
         ),
     )
     edge: Literal["fading", "free"] = Field(
         default="fading",
-        title="Field at the edge",
+        title="Boundary",
         description=(
-            "'fading': the object lies within the image, its field fades towards the edge. "
-            "'free': it goes on beyond the edge, where its potential decays."
+            "'fading': the object lies within the image and its field fades towards the edge. "
+            "'free': the object extends beyond the edge, where its potential decays."
         ),
     )
     strip: int | None = Field(
         default=None,
         ge=16,
         multiple_of=8,
-        title="Strip around the image (px)",
+        title="Margin (px)",
         description=(
-            "Width of the strip beyond the edge from which rays may enter. Default: 16, or with a "
-            "free edge a tenth of the shorter side."
+            "Width of the strip beyond each edge from which rays may enter. Default: 16, or with a "
+            "free boundary a tenth of the image's shorter side."
         ),
     )
     fade_length: float | None = Field(
         default=None,
         ge=0.1,
         le=1e6,
-        title="Decay length of the field (px)",
+        title="Decay length (px)",
         description=(
-            "Free edge only: length over which the potential decays beyond the edge. Default: "
-            "the width of the strip."
+            "Free boundary only: distance over which the potential decays beyond the edge. "
+            "Default: the margin."
         ),
     )
     align: Literal["none", "shift", "affine"] = Field(
         default="none",
-        title="Align",
+        title="Alignment",
         description=(
-            "What is not known of how later images lie on the first: 'none', their 'shift', or "
-            "also rotation, magnification and shear ('affine')."
+            "Misalignment to fit for all images after the first: 'none', 'shift', or 'affine' "
+            "(also rotation, magnification and shear)."
         ),
     )
     align_spread: float = Field(
         default=5.0,
         gt=0,
-        title="Shift (px)",
+        title="Expected shift (px)",
         description=(
-            "How far later images are shifted, about: standard deviation in px after all steps. "
-            "Fields displace what images show, too; a small one leaves that to the fields."
+            "Expected misalignment of later images (standard deviation in px after all steps). A "
+            "small value attributes more of the displacement to the fields."
         ),
     )
     beam_modes: int = Field(
         default=8,
         ge=2,
         le=32,
-        title="Cosines of the beam",
-        description="With an unknown source: how many cosines its logarithm has along each axis.",
+        title="Beam modes",
+        description="Number of cosine modes per axis for the logarithm of an unknown beam.",
     )
     samples: int = Field(
         default=6,
         ge=0,
         le=1000,
         title="Samples",
-        description="Random fields from which the error bars are made; 0 for none.",
+        description="Number of random fields for the error bars; 0 for no error bars.",
     )
     beam_variation: float | None = Field(
         default=None,
@@ -142,32 +142,32 @@ class FitOptions(CheckedModel):
         default=False,
         title="Evidence",
         description=(
-            "Work out how likely the choice of fields makes the data, to compare choices; takes "
-            "as long as some samples."
+            "Compute the log evidence, to compare choices of fields; takes as long as a few "
+            "samples."
         ),
     )
     spacing: float | None = Field(
         default=None,
         ge=0.05,
         le=0.5,
-        title="Spacing of rays (px)",
+        title="Ray spacing (px)",
         description=(
-            "Largest distance between the landing points of neighbouring rays. Default: 0.2, and "
+            "Largest distance between the landing points of neighbouring rays. Default: 0.2, or "
             "0.14 if bright lines need it."
         ),
     )
     steps: int = Field(
         default=120,
         ge=1,
-        title="Steps at full size",
-        description="Maximum number of steps with the pixels as recorded.",
+        title="Iterations",
+        description="Maximum solver iterations at full resolution.",
     )
     ambiguous: bool = Field(
         default=False,
-        title="Fit what one image cannot tell",
+        title="Allow an ambiguous fit",
         description=(
-            "Fit a single image with an unknown source, too, though many beams and fields explain "
-            "it equally well."
+            "Fit a single image even if its source is unknown, although many beams and fields "
+            "explain it equally well."
         ),
     )
     seed: int = Field(
@@ -192,7 +192,7 @@ def _parse_noise(value: Any) -> Any:
     except (TypeError, ValueError):
         deviation = 0.0
     if not 0 < deviation < float("inf"):
-        raise ValueError("expected 'poisson', 'proportional' or the standard deviation in a pixel")
+        raise ValueError("expected 'poisson', 'proportional' or the standard deviation of a pixel")
     return deviation
 
 
@@ -223,30 +223,34 @@ class FitChoices(CheckedModel):
         default=None,
         title="Fields",
         description=(
-            "What deflects: B, E, plasma or phase; two of them separated by a comma need images "
-            "of two energies. Default: B, and for light phase."
+            "Cause of the deflection: B, E, plasma or phase. Two of them, separated by a comma, "
+            "need images at two energies. Default: B, or phase for light."
         ),
         json_schema_extra={"metavar": "NAMES"},
     )
     beam: Literal["known", "unknown"] = Field(
         default="known",
         title="Beam",
-        description="'unknown': a smooth beam is fitted, the same for all images but for gains.",
+        description=(
+            "'known': the source is the beam. 'unknown': fit a smooth beam, the same for all "
+            "images apart from their gains."
+        ),
     )
     gains: Literal["known", "free"] = Field(
         default="known",
         title="Gains",
         description=(
-            "'known': images are as bright as the source; 'free': by unknown factors brighter."
+            "'known': images are as bright as the source. 'free': fit the brightness of each image "
+            "relative to the source."
         ),
     )
     noise: Noise | None = Field(
         default=None,
         title="Noise",
         description=(
-            "'poisson' if images are counts; 'proportional' if noise is a share of each pixel, as "
-            "that of film; or the standard deviation in a pixel after all steps. Default: "
-            "estimated from the images, the same in all pixels."
+            "'poisson' for images in counts; 'proportional' if the noise is a fraction of each "
+            "pixel, as on film; or the standard deviation of a pixel after all steps. Default: "
+            "estimated from the images, the same for all pixels."
         ),
         json_schema_extra={"metavar": "poisson|proportional|NUMBER"},
     )
@@ -254,15 +258,15 @@ class FitChoices(CheckedModel):
         default=None,
         ge=0,
         title="Point spread (px)",
-        description="Point spread: standard deviation in px after all steps. Default: none.",
+        description="Standard deviation of the point spread in px after all steps. Default: none.",
     )
     source_size: float | None = Field(
         default=None,
         ge=0,
         title="Source size (m)",
         description=(
-            "Standard deviation of the beam's source in m (FWHM / 2.355); with the resolution in "
-            "place of the point spread in px."
+            "Standard deviation of the beam's source in m (FWHM / 2.355). Use it with the "
+            "resolution, instead of the point spread in px."
         ),
     )
     resolution: float | None = Field(
@@ -292,7 +296,7 @@ class FitChoices(CheckedModel):
     def _check_point_spread(self) -> Self:
         if self.psf is not None and (self.source_size, self.resolution) != (None, None):
             raise ValueError(
-                f"received a point spread of {self.psf:g} px, and a source size or resolution in "
-                "m, which ask for another: expected one of them"
+                f"received a point spread of {self.psf:g} px and a source size or resolution in m: "
+                "expected one or the other"
             )
         return self

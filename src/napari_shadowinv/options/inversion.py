@@ -38,8 +38,8 @@ class InversionOptions(CheckedModel):
         ge=4,
         title="Sites",
         description=(
-            "Number of sites placed over the source. Default: as many as the accuracy needs, at "
-            f"most one per pixel and {MAX_DEFAULT_SITES:,}."
+            "Number of sites over the source. Default: as many as the accuracy needs, at most one "
+            f"per pixel and {MAX_DEFAULT_SITES:,}."
         ),
         json_schema_extra=_MOVES_SITES,
     )
@@ -49,10 +49,10 @@ class InversionOptions(CheckedModel):
         lt=1,
         title="Accuracy",
         description=(
-            "Where no number of sites is given, and the stages are 'multi' and the solver "
-            "'newton': sites are added until their discretisation error of the displacement "
-            "(r.m.s., relative) is below this, or below a fifth of what the image's noise does. "
-            "In a stack the first shots decide for all."
+            "Target discretisation error of the displacement (relative r.m.s.). Sites are added "
+            "until it is reached or falls below a fifth of the noise error; in a stack, the first "
+            "shots decide for all. Ignored with a number of sites, 'single' stages or a solver "
+            "other than 'newton'."
         ),
     )
     floor: float = Field(
@@ -144,7 +144,7 @@ class InversionOptions(CheckedModel):
         title="Boundary",
         description=(
             "'closed': no flux crosses the image edge, as in the paper. 'free': flux may leave "
-            "and enter, and the object's potential decays beyond the edge."
+            "and enter, and the potential of the object decays beyond the edge."
         ),
         json_schema_extra={**_MOVES_SITES, **_BOUNDARY},
     )
@@ -187,7 +187,7 @@ class InversionOptions(CheckedModel):
         description=(
             "Regions where the Jacobian determinant of the map is below this are marked as "
             "caustics: rays cross or nearly cross there, and the field is less certain. Specks "
-            "that vanish in the average over the spacing of the sites are noise."
+            "that vanish when averaged over the site spacing count as noise."
         ),
     )
     noise_level: float | None = Field(
@@ -205,8 +205,8 @@ class InversionOptions(CheckedModel):
         gt=0,
         title="Quantum",
         description=(
-            "Image units per detected quantum, for the error budget: the noise is then that of "
-            "counting (Poisson)."
+            "Image units per detected quantum, for the error budget: the noise is then Poisson "
+            "noise."
         ),
         json_schema_extra=_BUDGET,
     )
@@ -262,7 +262,7 @@ class InversionOptions(CheckedModel):
         if self.noise_level is not None and self.quantum is not None:
             raise ValueError(
                 f"noise_level is {self.noise_level:g} and quantum {self.quantum:g}, expected one "
-                "of them: a quantum means the noise of counting"
+                "of them: a quantum implies Poisson noise"
             )
         return self
 

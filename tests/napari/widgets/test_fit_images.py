@@ -857,7 +857,7 @@ def test_what_was_no_file_is_asked_for(
     for number, layer in enumerate(list(window.layers)[:2]):
         np.save(tmp_path / f"{number}.npy", layer.data)
     output = command("rerun", "window.shadowinv", "0.npy", "1.npy", "--out", "again.shadowinv")
-    assert "image 2 was no file before" in output
+    assert "image 2 was not a file before" in output
     assert_same(Fit.from_dataset(read(tmp_path / "again.shadowinv")), result)
 
 
