@@ -167,7 +167,7 @@ def test_help_needs_no_heavy_import() -> None:
     assert result.stdout.strip() == "[]", result.stderr
 
 
-def test_invert_writes_what_the_core_returns(folder: Path, shot: Path) -> None:
+def test_invert_writes_the_result_of_the_library(folder: Path, shot: Path) -> None:
     result = shadowinv("invert", shot, "--n-sites", 300, "--seed", 4)
     assert result.exit_code == 0, result.output
     assert sorted(content(folder)) == ["shot.npy", "shot.png", "shot.shadowinv"]
@@ -185,7 +185,7 @@ def test_invert_writes_what_the_core_returns(folder: Path, shot: Path) -> None:
         assert word in result.stdout
 
 
-def test_quiet_says_nothing(shot: Path) -> None:
+def test_quiet_prints_nothing(shot: Path) -> None:
     result = shadowinv("invert", shot, "--quiet")
     assert (result.exit_code, result.output) == (0, "")
 
@@ -268,7 +268,7 @@ def test_pradformat_in_and_out(folder: Path) -> None:
             source_object_dist=0.01,
             object_image_dist=0.3,
         )
-    # The file knows the geometry, the setup only what it leaves out.
+    # The file contains the geometry, the setup only the missing values.
     (folder / "energy.toml").write_text("energy = 14.7\n")
     result = shadowinv("invert", "shot.h5", "--setup", "energy.toml", "--out", "field.h5")
     assert result.exit_code == 0, result.output
@@ -301,7 +301,7 @@ def test_colour_film_by_channel(folder: Path) -> None:
     )
 
 
-def test_grey_film_is_told_but_a_linear_image_is_not(folder: Path) -> None:
+def test_grey_film_warns_but_a_linear_image_does_not(folder: Path) -> None:
     counts = 1000 * synthetic_image(BLOB.displacement)
     film = np.full(counts.shape, 60_000.0)
     film[3:-3, 3:-3] *= 10 ** (-counts[3:-3, 3:-3] / 3000)
@@ -316,7 +316,7 @@ def test_grey_film_is_told_but_a_linear_image_is_not(folder: Path) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="such names are not allowed there")
 @pytest.mark.parametrize("name", ["a[/b].tif", "a[red]b.tif", "a\x1b[31mb\u202e.tif", "a\nb.tif"])
-def test_names_reach_the_terminal_as_they_are(folder: Path, name: str) -> None:
+def test_file_names_are_printed_without_control_characters(folder: Path, name: str) -> None:
     path = Path(name)
     path.parent.mkdir(exist_ok=True)
     tifffile.imwrite(path, np.rint(100 * synthetic_image(BLOB.displacement)).astype(np.uint16))
@@ -359,7 +359,7 @@ def test_free_boundary_is_chosen_reported_and_kept(folder: Path) -> None:
     assert "flux is 'known' and boundary 'closed'" in " ".join(refused.stderr.split())
 
 
-def test_unconverged_result_is_written_with_an_alarm(folder: Path) -> None:
+def test_unconverged_result_is_written_with_exit_code_3(folder: Path) -> None:
     np.save("shot.npy", synthetic_image(gaussian_blob((32, 32), 60.0, 4.0).displacement))
     (folder / "few.toml").write_text("max_iterations = 1\ntolerance = 1e-9\n")
     result = shadowinv("invert", "shot.npy", "--options", "few.toml")
@@ -376,7 +376,7 @@ def test_figure_of_a_png_gets_another_name(folder: Path) -> None:
     assert content(folder)["shot.png"] == before
 
 
-def test_existing_files_are_replaced_only_if_asked(
+def test_existing_files_need_overwrite(
     folder: Path, shot: Path, refused: Callable[..., None]
 ) -> None:
     (folder / "shot.shadowinv").write_text("old")
@@ -387,7 +387,7 @@ def test_existing_files_are_replaced_only_if_asked(
     refused("invert", shot, names="shot.png exists")
 
 
-def test_outputs_without_a_place_are_refused(
+def test_outputs_without_a_folder_are_refused(
     folder: Path, shot: Path, refused: Callable[..., None]
 ) -> None:
     refused("invert", shot, "--out", "nowhere/a.shadowinv", names="folder nowhere does not exist")
@@ -502,7 +502,7 @@ def test_forward_predicts_the_image(folder: Path, shot: Path) -> None:
     np.testing.assert_allclose(np.load("again.npy"), saved["reprojection"], rtol=1e-12)
 
 
-def test_forward_refuses_what_is_no_field(folder: Path, refused: Callable[..., None]) -> None:
+def test_forward_refuses_files_without_a_field(folder: Path, refused: Callable[..., None]) -> None:
     np.save("three.npy", np.zeros((3, 24, 32)))
     refused("forward", "three.npy", names=("three.npy", "(3, 24, 32)"))
     iio.imwrite("shot.png", np.zeros((24, 32), np.uint8))
@@ -533,7 +533,7 @@ def test_forward_to_another_energy(folder: Path, shot: Path) -> None:
     np.testing.assert_allclose(np.load("e.npy"), synthetic_image(ratio * displacement), 1e-6)
 
 
-def test_forward_to_other_pixels_keeps_what_is_seen(folder: Path) -> None:
+def test_forward_to_other_pixels_keeps_the_picture(folder: Path) -> None:
     (folder / "first.toml").write_text(PROTON_TOML)
     (folder / "second.toml").write_text(PROTON_TOML.replace("1e-5", "5e-6"))
     np.save("d.npy", BLOB.displacement)
@@ -551,9 +551,7 @@ def test_forward_to_other_pixels_keeps_what_is_seen(folder: Path) -> None:
         assert pixels / units == pytest.approx(1e-2 / 5e-6, rel=1e-6)
 
 
-def test_forward_says_which_experiments_do_not_fit(
-    folder: Path, refused: Callable[..., None]
-) -> None:
+def test_forward_refuses_mismatched_setups(folder: Path, refused: Callable[..., None]) -> None:
     np.save("d.npy", BLOB.displacement)
     (folder / "high.toml").write_text(PROTON_TOML)
     (folder / "low.toml").write_text(LOW_ENERGY_TOML)
@@ -697,7 +695,7 @@ def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
         assert f"source {provenance.recipe.estimate.described}" in text
 
 
-def test_filters_are_those_of_the_library(folder: Path) -> None:
+def test_filters_match_the_library(folder: Path) -> None:
     ramp = np.tile(np.linspace(80, 120, 64), (48, 1))
     image = synthetic_image(gaussian_blob((48, 64), 12.0, 8.0).displacement, ramp)
     image += np.random.default_rng(0).normal(size=image.shape)
@@ -740,7 +738,7 @@ def test_filters_are_those_of_the_library(folder: Path) -> None:
     np.testing.assert_array_equal(beam, filters.low_pass(ramp, 2.0))
 
 
-def test_the_butterworth_filter_is_that_of_the_library(folder: Path, shot: Path) -> None:
+def test_butterworth_filter_matches_the_library(folder: Path, shot: Path) -> None:
     image = np.load(shot)
     flags = ["--butterworth", 12, "--butterworth-order", 3]
     result = shadowinv("invert", shot, "--n-sites", 300, *flags)
@@ -810,7 +808,7 @@ def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
         (["--variable", "shot"], ("shot.npy", "neither a MATLAB nor an HDF5 file")),
     ],
 )
-def test_choices_that_make_no_sense_are_refused(
+def test_contradictory_flags_are_refused(
     shot: Path, refused: Callable[..., None], flags: list[object], names: str | tuple[str, ...]
 ) -> None:
     refused("invert", shot, *flags, names=names)
@@ -826,7 +824,7 @@ def test_one_mask_for_bad_pixels_and_for_the_object_is_refused(
         refused("invert", shot, *flags, names=("shot.npy", "excluded from the inversion"))
 
 
-def test_a_point_source_is_taken_for_one_or_told_of(folder: Path, shot: Path) -> None:
+def test_a_point_source_is_used_or_suggested(folder: Path, shot: Path) -> None:
     near = ProtonSetup(
         energy=14.7, source_object_distance=1e-3, object_image_distance=0.28, pixel_size=1e-5
     )
@@ -868,7 +866,7 @@ def test_mistakes_in_a_recipe_are_named(
     refused("invert", shot, "--options", "options.toml", names=("[prepare]", "--recipe"))
 
 
-def test_a_recipe_that_was_saved_does_the_same(folder: Path, shot: Path) -> None:
+def test_a_saved_recipe_gives_the_same_result(folder: Path, shot: Path) -> None:
     usable = np.ones((24, 32), np.uint8)
     usable[3, 4:6] = 0
     iio.imwrite("usable.png", usable)
@@ -900,7 +898,7 @@ def test_a_recipe_that_was_saved_does_the_same(folder: Path, shot: Path) -> None
     assert provenance.setup.object_pixel_size == pytest.approx(3e-5)
 
 
-def test_what_a_recipe_names_is_never_overwritten(
+def test_files_of_a_recipe_are_never_overwritten(
     folder: Path, shot: Path, refused: Callable[..., None]
 ) -> None:
     iio.imwrite("shot.png", np.ones((24, 32), np.uint8))  # a mask with the figure's usual name
@@ -919,7 +917,7 @@ def test_what_a_recipe_names_is_never_overwritten(
     refused("rerun", "c.shadowinv", *again, names=("b.png", "both read and written"))
 
 
-def test_a_damaged_mask_in_a_result_is_told(
+def test_a_damaged_mask_in_a_result_is_reported(
     folder: Path, shot: Path, refused: Callable[..., None]
 ) -> None:
     usable = np.ones((24, 32), np.uint8)
@@ -937,7 +935,7 @@ def test_a_damaged_mask_in_a_result_is_told(
         refused("rerun", "bad.shadowinv", names="the mask kept with the result is damaged")
 
 
-def test_a_result_is_made_again_bit_for_bit(
+def test_rerun_is_identical_bit_for_bit(
     folder: Path, shot: Path, refused: Callable[..., None]
 ) -> None:
     np.save("beam.npy", 100 * np.tile(np.linspace(0.9, 1.1, 32), (24, 1)))
@@ -964,7 +962,7 @@ def test_a_result_is_made_again_bit_for_bit(
     first, second = dataset("first.shadowinv"), dataset("first_again.shadowinv")
     for name in first.data_vars:
         np.testing.assert_array_equal(first[name], second[name])
-    # Another file of the same name is told of.
+    # Another file of the same name is reported.
     np.save(shot, 1.5 * np.load(shot) + 3)
     text = flat(shadowinv("rerun", "first.shadowinv", "--overwrite").stdout)
     assert "changed the image shot.npy differs" in text
@@ -1018,7 +1016,7 @@ def test_rerun_reads_no_file_of_a_recipe(
     refused("rerun", "bad.shadowinv", names=("/etc/hostname", "in another folder"))
 
 
-def test_info_tells_what_is_inside(folder: Path) -> None:
+def test_info_describes_the_contents(folder: Path) -> None:
     values = np.array([[1.0, 2.0, np.nan], [-3.0, 4.0, 5.0]])
     np.save("a.npy", values)
     text = " ".join(shadowinv("info", "a.npy").stdout.split())
@@ -1033,7 +1031,7 @@ def test_info_tells_what_is_inside(folder: Path) -> None:
     assert "channels 3" in text
 
 
-def test_the_result_of_a_film_pack_is_known_but_no_field(
+def test_a_film_pack_is_described_but_has_no_field(
     folder: Path, refused: Callable[..., None]
 ) -> None:
     names = ("dose", "fluence", "usable")
@@ -1065,7 +1063,7 @@ def test_info_reports_the_installation() -> None:
     assert Path(entries["compiled code"].rpartition(" (")[0]).expanduser() == folder
 
 
-def test_the_report_tells_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_report_lists_missing_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     def without_windows(name: str) -> str:
         if name in ("napari", "npe2", "qtpy", *_info.QT_BINDINGS):
             raise metadata.PackageNotFoundError(name)
@@ -1110,13 +1108,13 @@ print(sorted({"napari", "qtpy", "PyQt6", "PySide6"} & set(sys.modules)))
     assert done.stdout.strip() == "[]", done.stderr
 
 
-def test_info_wants_a_file_or_a_report(refused: Callable[..., None]) -> None:
+def test_info_needs_a_file_or_report(refused: Callable[..., None]) -> None:
     refused("info", names="--report")
     refused("info", "shot.npy", "--report", names="no file")
     refused("info", "--variable", "beam", "--report", names="no file")
 
 
-def test_info_of_a_result_tells_options_and_peak(folder: Path, shot: Path) -> None:
+def test_info_of_a_result_shows_options_and_peak(folder: Path, shot: Path) -> None:
     (folder / "setup.toml").write_text(PROTON_TOML)
     shadowinv("invert", shot, "--setup", "setup.toml", "--seed", 12)
     text = " ".join(shadowinv("info", "shot.shadowinv").stdout.split())
@@ -1128,7 +1126,7 @@ def test_info_of_a_result_tells_options_and_peak(folder: Path, shot: Path) -> No
     assert float(match[1]) == pytest.approx(peak, rel=0.02)
 
 
-def test_info_tells_a_field_of_another_program(folder: Path, inversion: Inversion) -> None:
+def test_info_describes_a_foreign_field(folder: Path, inversion: Inversion) -> None:
     setup = ProtonSetup(
         energy=14.7, source_object_distance=0.01, object_image_distance=0.3, pixel_size=1e-5
     )
@@ -1140,7 +1138,7 @@ def test_info_tells_a_field_of_another_program(folder: Path, inversion: Inversio
         assert "14.7 MeV proton" in text
 
 
-def test_demo_finds_the_field_that_it_made(folder: Path) -> None:
+def test_demo_recovers_its_field(folder: Path) -> None:
     result = shadowinv("demo", "--n-sites", 6000, "--noise", 0, "--out", "tour")
     assert result.exit_code == 0, result.output
     written = ["toroid_97.png", "toroid_97.shadowinv", "toroid_97_comparison.png"]
@@ -1154,7 +1152,7 @@ def test_demo_finds_the_field_that_it_made(folder: Path) -> None:
     assert again.exit_code == 0, again.output
 
 
-def test_demo_refuses_nonsense(folder: Path, refused: Callable[..., None]) -> None:
+def test_demo_refuses_invalid_numbers(folder: Path, refused: Callable[..., None]) -> None:
     refused("demo", "--noise", -1, names="noise is -1")
     refused("demo", "--dm", "nan", names=("dm is nan", "MG·µm"))
     assert not (folder / "demo").exists()
@@ -1164,7 +1162,7 @@ def test_demo_refuses_nonsense(folder: Path, refused: Callable[..., None]) -> No
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names there are text")
-def test_a_name_that_is_no_text_is_kept_as_its_bytes(folder: Path, shot: Path) -> None:
+def test_a_name_that_is_not_text_is_stored_as_bytes(folder: Path, shot: Path) -> None:
     os.rename(shot, b"sh\xf6t.npy")
     result = shadowinv("invert", os.fsdecode(b"sh\xf6t.npy"), "--out", "a.shadowinv")
     assert result.exit_code == 0, result.output
@@ -1173,7 +1171,7 @@ def test_a_name_that_is_no_text_is_kept_as_its_bytes(folder: Path, shot: Path) -
     assert provenance.image.file == r"sh\xf6t.npy"
 
 
-def test_our_own_bug_is_not_blamed_on_the_user(shot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_keeps_its_traceback(shot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*arguments: object, **options: object) -> None:
         raise ValueError("shapes do not broadcast")
 
@@ -1202,7 +1200,7 @@ def test_ctrl_c_while_computing_leaves_nothing(folder: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
-def test_ctrl_c_that_a_library_makes_another_error_of(folder: Path, shot: Path) -> None:
+def test_ctrl_c_converted_by_a_library_still_cancels(folder: Path, shot: Path) -> None:
     half_imported = """
         import time
         from napari_shadowinv import io
@@ -1264,7 +1262,7 @@ def test_neither_result_nor_figure_is_left_on_a_full_disk(
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
-def test_a_second_ctrl_c_does_not_interrupt_the_clearing_up(folder: Path, shot: Path) -> None:
+def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Path) -> None:
     impatient = """
         import signal, time
         from napari_shadowinv.io import dataset, files

@@ -1,4 +1,4 @@
-"""Facts about `shadowinv film`: what it writes, and how it refuses."""
+"""The command `shadowinv film`: its files, and its errors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_pack_from_scans_to_files_for_a_fit(truth: Truth, here: Path) -> None:
     assert content(here) == before
 
 
-def test_it_is_made_again_and_described(truth: Truth, here: Path) -> None:
+def test_a_pack_is_described_and_repeated(truth: Truth, here: Path) -> None:
     assert shadowinv("film", truth.pack, "-q").output == ""
     output = flat(shadowinv("info", "pack.shadowinv").output)
     assert "film pack of shadowinv" in output
@@ -76,7 +76,7 @@ def test_it_is_made_again_and_described(truth: Truth, here: Path) -> None:
         assert "film pack" in flat(refused.output), refused.output
 
 
-def test_without_distances_the_table_tells_strengths(truth: Truth, here: Path) -> None:
+def test_without_distances_the_table_lists_strengths(truth: Truth, here: Path) -> None:
     text = truth.pack.read_text()
     text = re.sub(r"\[setup\].*?(?=\[films)", "", text, flags=re.DOTALL)
     pack = truth.folder / "no_setup.toml"
@@ -102,7 +102,7 @@ def test_without_distances_the_table_tells_strengths(truth: Truth, here: Path) -
         ("bad.toml", '[[layers]]\nfilm = "EBT3"\n', "layer 1 has no file"),
     ],
 )
-def test_what_is_wrong_is_told_and_nothing_is_left(
+def test_mistakes_in_a_pack_leave_nothing(
     here: Path, name: str, written: str | None, message: str
 ) -> None:
     if written is not None:

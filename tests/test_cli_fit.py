@@ -1,4 +1,4 @@
-"""The command `shadowinv fit`: what it reads, what it gives to `fit`, what it writes and tells."""
+"""The command `shadowinv fit`: its inputs, the arguments of `fit`, its files and messages."""
 
 import dataclasses
 import os
@@ -129,7 +129,7 @@ def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
     assert "peak |∫B×dz|" in description
 
 
-def test_a_field_that_one_image_cannot_tell_is_written_with_an_exit_code_of_its_own() -> None:
+def test_an_ambiguous_field_is_written_with_exit_code_3() -> None:
     arguments = ("fit", "a.tif", "--source", "unknown", "--samples", 0, "--steps", 2)
     result = shadowinv(*arguments, "--ambiguous", "--beam-modes", 3, "--quiet")
     assert result.exit_code == 3
@@ -143,7 +143,7 @@ def test_a_field_that_one_image_cannot_tell_is_written_with_an_exit_code_of_its_
     assert fit.provenance.recipe.fit.beam == "unknown"
 
 
-def test_one_image_and_an_unknown_beam_need_to_be_asked_for(refused: Callable[..., None]) -> None:
+def test_one_image_with_unknown_beam_needs_ambiguous(refused: Callable[..., None]) -> None:
     refused("fit", "a.tif", "--source", "unknown", names=("one image", "--ambiguous"))
 
 
@@ -231,7 +231,7 @@ def test_a_table_of_numbers_is_an_image(fit_arguments: dict[str, Any]) -> None:
     np.testing.assert_array_equal(fit_arguments["images"], image[None])
 
 
-def test_binning_sums_pixels_and_makes_those_of_the_setup_larger(
+def test_binning_sums_pixels_and_enlarges_the_pixel_size(
     fit_arguments: dict[str, Any],
 ) -> None:
     tifffile.imwrite("beam.tif", np.full(SHAPE, 10, np.float32))
@@ -246,7 +246,7 @@ def test_binning_sums_pixels_and_makes_those_of_the_setup_larger(
     assert fit_arguments["psf"][0] == pytest.approx(point_spread(first, 1e-5, 4e-4))
 
 
-def test_strengths_take_the_place_of_energies_and_units_are_kept(
+def test_strengths_replace_energies_and_keep_units(
     fit_arguments: dict[str, Any],
 ) -> None:
     assert shadowinv(*PAIR, "--strengths", "1 1,1.7 2.9", "--fields", "B,E").exit_code == 0
@@ -265,7 +265,7 @@ def test_known_displacements_come_from_a_table(fit_arguments: dict[str, Any]) ->
     assert provenance.fiducial_rows == rows
 
 
-def test_light_is_bent_by_a_refractive_index_unless_said_otherwise(
+def test_light_is_deflected_by_a_refractive_index_by_default(
     fit_arguments: dict[str, Any],
 ) -> None:
     light = 'kind = "optical"\nobject_image_distance = 0.1\npixel_size = 1e-5\nwavelength = '
@@ -315,7 +315,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize(("table", "names"), TABLES.items(), ids=[n[0] for n in TABLES.values()])
-def test_a_table_that_is_wrong_is_refused(
+def test_wrong_tables_are_refused(
     refused: Callable[..., None], table: str, names: tuple[str, ...]
 ) -> None:
     Path("shots.csv").write_text(table)
@@ -347,7 +347,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize(("command", "names"), MISTAKES.items(), ids=list(MISTAKES))
-def test_a_mistake_is_told_in_a_sentence(
+def test_mistakes_give_one_sentence(
     refused: Callable[..., None], command: str, names: tuple[str, ...]
 ) -> None:
     tifffile.imwrite("small.tif", np.ones((40, 40), np.float32))
@@ -363,7 +363,7 @@ def test_an_input_is_never_overwritten(refused: Callable[..., None]) -> None:
         refused("fit", "a.tif", *arguments, names=("beam.png is both read and written",))
 
 
-def test_a_result_is_replaced_only_if_asked(
+def test_replacing_a_result_needs_overwrite(
     refused: Callable[..., None], fit_arguments: dict[str, Any]
 ) -> None:
     Path("a_fit.png").write_text("mine")
@@ -383,7 +383,7 @@ def test_forward_takes_the_field_of_a_fit(make_fit: Callable[..., Fit]) -> None:
     np.testing.assert_array_equal(np.load("seen.npy"), expected)
 
 
-def test_a_damaged_fit_is_told_in_a_sentence(
+def test_a_damaged_fit_gives_one_sentence(
     refused: Callable[..., None], make_fit: Callable[..., Fit]
 ) -> None:
     write("fit.shadowinv", make_fit().to_dataset().assign_attrs(verdict="perhaps"))
@@ -400,7 +400,7 @@ def test_forward_asks_which_of_two_fields(
     assert result.exit_code == 0, result.output
 
 
-def test_info_tells_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
+def test_info_shows_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
     doubtful = dataclasses.replace(
         make_fit(), verdict=Verdict.SEVERAL, explanation="2 different fields explain the data"
     )
@@ -415,7 +415,7 @@ def test_info_tells_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
 # Making it again
 
 
-def test_a_fit_is_made_again_bit_for_bit(
+def test_rerun_of_a_fit_is_identical_bit_for_bit(
     folder: Path, refused: Callable[..., None], empty_figure: None
 ) -> None:
     mask = np.full(SHAPE, 255, np.uint8)
@@ -459,7 +459,7 @@ def test_a_fit_is_made_again_bit_for_bit(
     assert "nothing" not in output
 
 
-def test_a_fit_of_an_older_version_is_told(empty_figure: None) -> None:
+def test_rerun_reports_an_older_version(empty_figure: None) -> None:
     quick = ("--samples", 0, "--steps", 1, "--spacing", 0.5, "--smoothness", 10)
     assert shadowinv("fit", "a.tif", "--bin", 1, *quick).exit_code in (0, 3)
     fit, _ = fit_in("a_fit.shadowinv")
@@ -471,7 +471,7 @@ def test_a_fit_of_an_older_version_is_told(empty_figure: None) -> None:
     assert "the same result, bit for bit" in output
 
 
-def test_known_displacements_and_own_masks_are_taken_again(empty_figure: None) -> None:
+def test_rerun_uses_the_fiducials_and_masks(empty_figure: None) -> None:
     rng = np.random.default_rng(3)
     for name in ("one", "two"):  # too complex to be kept with the result
         tifffile.imwrite(f"{name}.tif", (rng.random((400, 600)) > 0.15).astype(np.uint8))
@@ -497,7 +497,7 @@ def test_known_displacements_and_own_masks_are_taken_again(empty_figure: None) -
     assert "the mask two.tif does not exist: name the file" in missing.stderr
 
 
-def test_a_fit_of_arrays_does_not_say_how_it_was_made(
+def test_rerun_refuses_a_fit_without_provenance(
     refused: Callable[..., None], make_fit: Callable[..., Fit]
 ) -> None:
     write(Path("fit.shadowinv"), make_fit())
@@ -507,7 +507,7 @@ def test_a_fit_of_arrays_does_not_say_how_it_was_made(
 # A recipe
 
 
-def test_a_recipe_that_was_saved_makes_the_same_fit(fit_arguments: dict[str, Any]) -> None:
+def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> None:
     tifffile.imwrite("mask.tif", np.eye(*SHAPE, dtype=np.uint8) == 0)
     chosen = ("--bin", 2, "--mask", "mask.tif", "--noise", "poisson", "--source", "unknown")
     lengths = ("--source-size", 1e-5, "--samples", 0)
@@ -527,7 +527,7 @@ def test_a_recipe_that_was_saved_makes_the_same_fit(fit_arguments: dict[str, Any
     for name in before.keys() - {"on_progress", "should_stop"}:
         np.testing.assert_equal(fit_arguments[name], before[name], err_msg=name)
 
-    # Flags override what it says.
+    # Flags override the recipe.
     overrides = ("--psf", 0.5, "--samples", 3, "--source", "a.tif", "--gains", "free", "--bin", 4)
     changed = shadowinv(*PAIR, "--recipe", "r.toml", *overrides, "--overwrite")
     assert changed.exit_code == 0, changed.output
@@ -564,7 +564,7 @@ RECIPES = {
 
 
 @pytest.mark.parametrize(("text", "names"), RECIPES.items(), ids=[n[0] for n in RECIPES.values()])
-def test_a_recipe_that_cannot_be_is_refused(
+def test_invalid_recipes_are_refused(
     refused: Callable[..., None], text: str, names: tuple[str, ...]
 ) -> None:
     Path("r.toml").write_text(text)
@@ -608,7 +608,7 @@ def test_fields_are_compared_and_the_likeliest_is_written(empty_figure: None) ->
     assert [field.name for field in fit_in("a_fit.shadowinv")[0].fields] == ["E"]
 
 
-def test_what_cannot_be_compared_is_refused(refused: Callable[..., None]) -> None:
+def test_incomparable_fields_are_refused(refused: Callable[..., None]) -> None:
     refused(*PAIR, "--compare", "--fields", "plasma", names=("plasma", "B; E; B,E"))
     refused("fit", "a.tif", "b.tif", "--compare", "--strengths", "1,2", names=("needs the setup",))
 
@@ -632,7 +632,7 @@ def films() -> None:
 FILMS = ("fit", "films.csv", "--setup", "setup.toml", "--noise", 20, "--samples", 2)
 
 
-def test_images_left_out_and_windows_are_told_drawn_and_written(folder: Path) -> None:
+def test_left_out_images_and_windows_are_written(folder: Path) -> None:
     films()
     before = set(content(folder))
     result = shadowinv(*FILMS, "--spacing", 0.2, "--leave-one-out", "--window", 3)
@@ -665,7 +665,7 @@ STATIC_MISTAKES = {
 
 
 @pytest.mark.parametrize(("command", "names"), STATIC_MISTAKES.items(), ids=list(STATIC_MISTAKES))
-def test_what_cannot_be_left_out_or_put_into_windows_is_refused(
+def test_impossible_static_checks_are_refused(
     refused: Callable[..., None], command: str, names: tuple[str, ...]
 ) -> None:
     Path("mesh.csv").write_text("x,y,dx,dy,sigma\n20,10,0.5,-0.25,0.1\n")
