@@ -165,7 +165,7 @@ def test_ctrl_c_leaves_nothing(folder: Path) -> None:
     assert content(folder) == before
 
 
-# What it gives to the fit
+# Arguments of the fit
 
 
 def test_images_setups_and_choices_reach_the_fit(fit_arguments: dict[str, Any]) -> None:
@@ -295,7 +295,7 @@ def test_every_option_of_a_fit_has_a_flag() -> None:
     assert recipe == Recipe(steps=(Bin(factor=2),), fit=FitChoices(options=options))
 
 
-# What it refuses
+# Errors
 
 TABLES = {
     "file,enrgy\na.tif,3\n": ("column 'enrgy'", "did you mean 'energy'?"),
@@ -372,7 +372,7 @@ def test_replacing_a_result_needs_overwrite(
     assert shadowinv("fit", "a.tif", "--overwrite").exit_code == 0
 
 
-# What else takes a fit
+# Fits in other commands
 
 
 def test_forward_takes_the_field_of_a_fit(make_fit: Callable[..., Fit]) -> None:
@@ -412,7 +412,7 @@ def test_info_shows_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
     assert "gain 1.1, shifted by y" in output
 
 
-# Making it again
+# Rerun
 
 
 def test_rerun_of_a_fit_is_identical_bit_for_bit(
@@ -504,7 +504,7 @@ def test_rerun_refuses_a_fit_without_provenance(
     refused("rerun", "fit.shadowinv", names=("fit.shadowinv has no provenance",))
 
 
-# A recipe
+# Recipes
 
 
 def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> None:
@@ -585,7 +585,7 @@ def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
     assert set(FitChoices.model_fields) - keys == {"psf"}
 
 
-# Choices of fields compared
+# Comparison of fields
 
 
 def test_fields_are_compared_and_the_likeliest_is_written(empty_figure: None) -> None:
@@ -613,7 +613,7 @@ def test_incomparable_fields_are_refused(refused: Callable[..., None]) -> None:
     refused("fit", "a.tif", "b.tif", "--compare", "--strengths", "1,2", names=("needs the setup",))
 
 
-# Whether one static field explains the images
+# Static field
 
 
 def films() -> None:
