@@ -26,7 +26,7 @@ from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import read_shot
-from napari_shadowinv.stack._references import described_reader
+from napari_shadowinv.stack._sources import described_reader
 
 OPTIONS = InversionOptions(n_sites=100)
 

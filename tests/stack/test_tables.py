@@ -33,7 +33,7 @@ from napari_shadowinv.physics.setup import BeamSetup, OpticalSetup, ProtonSetup
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, shot_rows
 from napari_shadowinv.preprocessing import Bin, PolynomialEstimate, Provenance
 from napari_shadowinv.stack import read_shot
-from napari_shadowinv.stack._spec import describe_stack
+from napari_shadowinv.stack._plan import describe_stack
 
 SHAPE = (64, 64)
 SETUP = ProtonSetup(

@@ -30,7 +30,7 @@ from napari_shadowinv import (
 from napari_shadowinv._system.locking import locked
 from napari_shadowinv.cli import _watch
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
-from napari_shadowinv.stack import WatchProgress, _arrivals, _watching
+from napari_shadowinv.stack import WatchProgress, _folder_events, _watch_loop
 
 IMAGES, SOURCE = make_shots(6)
 SETTLE = 0.1
@@ -97,8 +97,8 @@ def folder(tmp_path: Path, compiled: None) -> Path:
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """End at once when asked to."""
-    monkeypatch.setattr(_watching, "_POLL", 0.02)
-    monkeypatch.setattr(_arrivals, "_CHECK_EVERY", 0.1)
+    monkeypatch.setattr(_watch_loop, "_POLL", 0.02)
+    monkeypatch.setattr(_folder_events, "_CHECK_EVERY", 0.1)
 
 
 def put(folder: Path, *indices: int) -> None:
@@ -382,7 +382,7 @@ def test_it_ends_after_so_many_shots_or_when_nothing_arrives(folder, out):
 
 
 def test_by_looking_itself_it_waits_until_a_file_has_settled(folder, out, monkeypatch):
-    monkeypatch.setattr(_arrivals, "_LOOK_EVERY", 0.05)
+    monkeypatch.setattr(_folder_events, "_LOOK_EVERY", 0.05)
     put(folder, 0)
     data = whole(1)
     with Watched(folder, out, polling=True, settle=0.4) as watch:
@@ -400,7 +400,7 @@ def test_without_room_for_another_watch_it_looks_itself(folder, out, monkeypatch
     def full(_arrivals: Any) -> Any:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(_arrivals, "_started", full)
+    monkeypatch.setattr(_folder_events, "_started", full)
     put(folder, 0)
     with Watched(folder, out) as watch:
         watch.ended(1)
@@ -410,15 +410,15 @@ def test_without_room_for_another_watch_it_looks_itself(folder, out, monkeypatch
 
 def test_a_folder_that_is_gone_before_it_is_observed_leaves_no_thread(folder):
     before = set(threading.enumerate())
-    arrivals = _arrivals.Arrivals(folder.resolve(), "*")
+    arrivals = _folder_events.Arrivals(folder.resolve(), "*")
     shutil.rmtree(folder)
     with (
         pytest.raises(FileFormatError, match="can no longer be read"),
-        _arrivals.observing(arrivals, polling=False, on_note=print),
+        _folder_events.observing(arrivals, polling=False, on_note=print),
     ):
         pass
     with pytest.raises(OSError, match="No such file"):
-        _arrivals._started(arrivals)
+        _folder_events._started(arrivals)
     assert set(threading.enumerate()) == before
 
 
@@ -560,7 +560,7 @@ def test_shot_not_converged_ends_with_exit_code_3(folder, out, tmp_path, command
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only there the system reports a closed file")
 def test_file_opened_again_is_not_taken_until_closed(folder):
-    arrivals = _arrivals.Arrivals(folder.resolve(), "*.npy", settle=SETTLE)
+    arrivals = _folder_events.Arrivals(folder.resolve(), "*.npy", settle=SETTLE)
 
     def until(condition: Callable[[], bool]) -> None:
         end = time.monotonic() + 30
@@ -568,7 +568,7 @@ def test_file_opened_again_is_not_taken_until_closed(folder):
             assert time.monotonic() < end
             time.sleep(0.005)
 
-    with _arrivals.observing(arrivals, polling=False, on_note=print):
+    with _folder_events.observing(arrivals, polling=False, on_note=print):
         put(folder, 0)
         until(lambda: arrivals.waiting == 1)
         with (folder / "shot_0.npy").open("r+b") as file:

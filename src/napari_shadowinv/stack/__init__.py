@@ -9,13 +9,13 @@
 """
 
 from napari_shadowinv.stack._lazy import invert_stack
-from napari_shadowinv.stack._references import read_shot
+from napari_shadowinv.stack._plan import STORED
 from napari_shadowinv.stack._run import RunProgress, run_stack
-from napari_shadowinv.stack._spec import STORED
+from napari_shadowinv.stack._sources import read_shot
 from napari_shadowinv.stack._statistics import stack_statistics
-from napari_shadowinv.stack._watch import watch_stack
-from napari_shadowinv.stack._watching import WatchProgress
+from napari_shadowinv.stack._watch_loop import WatchProgress
 from napari_shadowinv.stack._worker import ShotOutcome
+from napari_shadowinv.stack.watch import watch_stack
 
 __all__ = [
     "STORED",

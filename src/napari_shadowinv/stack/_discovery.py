@@ -21,8 +21,8 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, text_of
 from napari_shadowinv.io.formats import kind_of
 from napari_shadowinv.io.images import tiff_pages
-from napari_shadowinv.stack import _references
-from napari_shadowinv.stack._references import Reader, Shot, read_shot
+from napari_shadowinv.stack import _sources
+from napari_shadowinv.stack._sources import Reader, Shot, read_shot
 
 if TYPE_CHECKING:
     import xarray
@@ -112,7 +112,7 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
     pages = _page_count(path, reader)
     if pages == 1:
         return _from_files([path], reader, shape)
-    items = [_references.PageShot(path.absolute(), page, reader) for page in range(pages)]
+    items = [_sources.PageShot(path.absolute(), page, reader) for page in range(pages)]
     names = tuple(f"{text_of(path.name)}[{page}]" for page in range(pages))
     return Shots(items, names, shape or usual_shape(items))
 
@@ -126,7 +126,7 @@ def _page_count(path: Path, reader: Reader) -> int:
 def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | None) -> Shots:
     if not paths:
         raise InputError("shots are an empty list: expected at least one path")
-    items = [_references.FileShot(path.absolute(), reader) for path in paths]
+    items = [_sources.FileShot(path.absolute(), reader) for path in paths]
     return Shots(items, names_of(paths), shape or usual_shape(items))
 
 
@@ -194,7 +194,7 @@ def _from_array(shots: Any, coordinate: Any = None) -> Shots:
         items = _Blocks(array)
     else:
         array = da.from_array(np.asarray(shots), chunks=(1, -1, -1))
-        items = [_references.ArrayShot(plane) for plane in np.asarray(shots)]
+        items = [_sources.ArrayShot(plane) for plane in np.asarray(shots)]
     names = tuple(str(value) for value in (range(count) if coordinate is None else coordinate))
     return Shots(items, names, (shots.shape[1], shots.shape[2]), coordinate, array, mask)
 
@@ -238,7 +238,7 @@ class _Blocks(Sequence[Shot]):
             return _Blocks(self._array[index])
         dask: Any = import_module("dask")
         # Without the tasks of other shots, which would travel with it.
-        return _references.BlockShot(dask.optimize(self._array.blocks[index])[0])
+        return _sources.BlockShot(dask.optimize(self._array.blocks[index])[0])
 
 
 def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots | None:
@@ -247,7 +247,7 @@ def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots 
         return None
     single = isinstance(source, (str, Path)) and not _MAGIC.search(str(source))
     if single and _page_count(Path(source), reader) == 1:
-        return _references.FileShot(Path(source).absolute(), reader).load()[0]
+        return _sources.FileShot(Path(source).absolute(), reader).load()[0]
     if getattr(source, "ndim", None) == 2:
         return np.asarray(source)
     sources = find_shots(source, reader=reader)

@@ -16,7 +16,7 @@ from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.stack._local import local_client
-from napari_shadowinv.stack._references import BlockShot, Shot
+from napari_shadowinv.stack._sources import BlockShot, Shot
 
 _CONNECT_SECONDS = 10.0
 _POLL = 0.1  # seconds between two looks at `should_stop` while connecting

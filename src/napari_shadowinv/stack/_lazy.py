@@ -17,10 +17,10 @@ from napari_shadowinv.io.store import SUMMARY
 from napari_shadowinv.io.store_setups import with_places
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.stack import _spec
-from napari_shadowinv.stack._choosing import choose_sites
-from napari_shadowinv.stack._references import Reader, Shot, read_shot
-from napari_shadowinv.stack._stacks import Stack
+from napari_shadowinv.stack import _plan
+from napari_shadowinv.stack._shots import Stack
+from napari_shadowinv.stack._site_count import choose_sites
+from napari_shadowinv.stack._sources import Reader, Shot, read_shot
 from napari_shadowinv.stack._worker import Beam, Work, numbers_of
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def invert_stack(
             "the recipe has a section fit, and invert_stack inverts: use run_stack to fit, or "
             "leave the section out"
         )
-    stack = _spec.describe_stack(
+    stack = _plan.describe_stack(
         shots,
         variables=variables,
         source=source,
@@ -231,7 +231,7 @@ class _Graph:
             dtype, labels = SUMMARY[name]
             variables[name] = (("shot",), self._of_each(name, (), dtype), labels)
         dataset = xr.Dataset(
-            variables, coords=_spec.coordinates_of(stack), attrs=_spec.attributes_of(stack)
+            variables, coords=_plan.coordinates_of(stack), attrs=_plan.attributes_of(stack)
         )
         return dataset if setups is None else with_places(dataset)
 
@@ -251,13 +251,13 @@ class _Graph:
         )
         da: Any = import_module("dask.array")
         chunks = ((1,) * sizes["shot"], *((sizes[dim],) for dim in dims))
-        return da.Array(graph, layer, chunks, dtype=dtype or _spec.dtype_of(name))
+        return da.Array(graph, layer, chunks, dtype=dtype or _plan.dtype_of(name))
 
     def _shared(self, name: str, dims: tuple[str, ...]) -> Any:
         from dask.delayed import delayed
 
-        beam = delayed(_spec.values_of_beam, pure=True)(self._beam, self._stack.recipe.options)
+        beam = delayed(_plan.values_of_beam, pure=True)(self._beam, self._stack.recipe.options)
         value = delayed(_pick, pure=True)(beam, name, False)
         da: Any = import_module("dask.array")
         shape = tuple(self._stack.sizes[dim] for dim in dims)
-        return da.from_delayed(value, shape, dtype=_spec.dtype_of(name))
+        return da.from_delayed(value, shape, dtype=_plan.dtype_of(name))

@@ -24,12 +24,12 @@ from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_s
 from napari_shadowinv.io.store_layout import create_store, remove_unfinished
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.stack._choosing import choose_sites
 from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
-from napari_shadowinv.stack._references import Reader, read_shot
-from napari_shadowinv.stack._resuming import append_shots, contents_of, reopen_damaged, resume
-from napari_shadowinv.stack._spec import STORED, describe_stack
-from napari_shadowinv.stack._stacks import Stack
+from napari_shadowinv.stack._plan import STORED, describe_stack
+from napari_shadowinv.stack._resume import append_shots, contents_of, reopen_damaged, resume
+from napari_shadowinv.stack._shots import Stack
+from napari_shadowinv.stack._site_count import choose_sites
+from napari_shadowinv.stack._sources import Reader, read_shot
 from napari_shadowinv.stack._worker import Settings, ShotOutcome, run_shots
 
 if TYPE_CHECKING:

@@ -34,7 +34,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.pipeline import Cache, Inputs, run_prepared
 from napari_shadowinv.preprocessing import UniformEstimate
 from napari_shadowinv.stack._fit_work import FitWork
-from napari_shadowinv.stack._references import Shot, checksum
+from napari_shadowinv.stack._sources import Shot, checksum
 from napari_shadowinv.transport.sites import SitePlan
 
 _ASKED_AGAIN_AFTER = 10.0  # seconds: workers come and go, but asking takes milliseconds

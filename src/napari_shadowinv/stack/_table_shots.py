@@ -28,7 +28,7 @@ from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, rows_to_invert
 from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe
 from napari_shadowinv.stack._discovery import names_of
-from napari_shadowinv.stack._references import Shot, doubts_of_file, stamp
+from napari_shadowinv.stack._sources import Shot, doubts_of_file, stamp
 from napari_shadowinv.stack._worker import Beam, Work
 
 

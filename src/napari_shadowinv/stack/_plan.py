@@ -39,13 +39,13 @@ from napari_shadowinv.preprocessing import (
     UniformEstimate,
 )
 from napari_shadowinv.stack._discovery import Shots, find_shots, find_source, usual_shape
-from napari_shadowinv.stack._references import (
+from napari_shadowinv.stack._shots import FitStack, Stack, TableStack
+from napari_shadowinv.stack._sources import (
     Reader,
     described_reader,
     read_shot,
 )
-from napari_shadowinv.stack._stacks import FitStack, Stack, TableStack
-from napari_shadowinv.stack._tables import (
+from napari_shadowinv.stack._table_shots import (
     RowShot,
     first_image,
     row_shots,

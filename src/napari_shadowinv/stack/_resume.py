@@ -14,10 +14,10 @@ from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.store import DONE, StackStore, check_files
 from napari_shadowinv.io.store_layout import Contents, Variable, grow_store
-from napari_shadowinv.stack import _spec
-from napari_shadowinv.stack._references import checksum
-from napari_shadowinv.stack._spec import dtype_of
-from napari_shadowinv.stack._stacks import CHAINED, Stack
+from napari_shadowinv.stack import _plan
+from napari_shadowinv.stack._plan import dtype_of
+from napari_shadowinv.stack._shots import CHAINED, Stack
+from napari_shadowinv.stack._sources import checksum
 
 _CHOSEN = "chosen_sites"  # attribute: how many sites the first shots needed for the accuracy
 _APPENDED = "appended_at"  # attribute: where later runs began to append shots
@@ -27,7 +27,7 @@ _INSTEAD = "use the same, overwrite the store, or choose another name"
 
 def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
     identity = {name: value for name, value in _identity(stack, dtype).items() if value}
-    attributes: dict[str, Any] = {**_spec.attributes_of(stack), **identity}
+    attributes: dict[str, Any] = {**_plan.attributes_of(stack), **identity}
     if stack.as_arrived:
         attributes |= NUMBERED_AS_ARRIVED
     if stack.sites_chosen:
@@ -37,7 +37,7 @@ def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
 
 def _coordinates(stack: Stack) -> dict[str, Variable]:
     return {
-        name: _stored_coordinate(values) for name, values in _spec.coordinates_of(stack).items()
+        name: _stored_coordinate(values) for name, values in _plan.coordinates_of(stack).items()
     }
 
 
@@ -66,7 +66,7 @@ def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
         exact = dtype_of(name).kind != "f" or "site" in dims
         kept = dtype_of(name) if exact else dtype
         if stack.beam is not None and stack.is_shared(name):
-            values = np.asarray(_spec.values_of_beam(stack.beam, stack.recipe.options)[name])
+            values = np.asarray(_plan.values_of_beam(stack.beam, stack.recipe.options)[name])
             found[name] = Variable(dims, kept, labels, values)
         else:
             found[name] = Variable(("shot", *dims), kept, labels, None)

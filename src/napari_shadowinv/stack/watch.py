@@ -19,11 +19,11 @@ from napari_shadowinv.io.formats import NEW_SHOTS
 from napari_shadowinv.io.store import check_store_path
 from napari_shadowinv.io.store_layout import remove_unfinished
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.stack._arrivals import Arrivals, checked_folder, observing
-from napari_shadowinv.stack._references import Reader, read_shot
+from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, observing
+from napari_shadowinv.stack._plan import describe_stack
 from napari_shadowinv.stack._run import stored_type, stored_variables
-from napari_shadowinv.stack._spec import describe_stack
-from napari_shadowinv.stack._watching import Books, OnWatchProgress, StackMaker, Watch
+from napari_shadowinv.stack._sources import Reader, read_shot
+from napari_shadowinv.stack._watch_loop import Books, OnWatchProgress, StackMaker, Watch
 
 if TYPE_CHECKING:
     import xarray

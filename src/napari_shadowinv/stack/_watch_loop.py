@@ -26,13 +26,13 @@ from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.io.store_growing import GrowingStore
 from napari_shadowinv.io.store_layout import create_store
-from napari_shadowinv.stack._arrivals import Arrivals
-from napari_shadowinv.stack._choosing import TRIED, shares_needed, with_chosen
 from napari_shadowinv.stack._discovery import Shots
-from napari_shadowinv.stack._references import FileShot, Reader, Shot, stamp
-from napari_shadowinv.stack._resuming import NUMBERED_AS_ARRIVED, contents_of, made_alike
+from napari_shadowinv.stack._folder_events import Arrivals
+from napari_shadowinv.stack._resume import NUMBERED_AS_ARRIVED, contents_of, made_alike
 from napari_shadowinv.stack._run import RunProgress
-from napari_shadowinv.stack._stacks import FitStack, Stack
+from napari_shadowinv.stack._shots import FitStack, Stack
+from napari_shadowinv.stack._site_count import TRIED, shares_needed, with_chosen
+from napari_shadowinv.stack._sources import FileShot, Reader, Shot, stamp
 from napari_shadowinv.stack._worker import ShotOutcome, Tried, reason_of, try_shot, write_shot
 
 if TYPE_CHECKING:

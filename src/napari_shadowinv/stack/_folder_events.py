@@ -18,7 +18,7 @@ from typing import Any
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
-from napari_shadowinv.stack._references import stamp
+from napari_shadowinv.stack._sources import stamp
 
 _LOOK_EVERY = 1.0  # seconds between two looks at a folder of which the system tells nothing
 _CHECK_EVERY = 1.0  # seconds between two looks whether the folder is still there

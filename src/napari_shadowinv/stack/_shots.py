@@ -17,8 +17,8 @@ from napari_shadowinv.pipeline._fit import usual_fields
 from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe
 from napari_shadowinv.stack._discovery import Shots
 from napari_shadowinv.stack._fit_work import FitWork
-from napari_shadowinv.stack._references import ArrayShot, Shot, checksum
-from napari_shadowinv.stack._tables import RowShot, RowWork
+from napari_shadowinv.stack._sources import ArrayShot, Shot, checksum
+from napari_shadowinv.stack._table_shots import RowShot, RowWork
 from napari_shadowinv.stack._worker import Beam, Work
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion import Inversion, count_sites
 from napari_shadowinv.inversion.normalise import number_of_sites
-from napari_shadowinv.stack._stacks import Stack
+from napari_shadowinv.stack._shots import Stack
 
 TRIED, _INVERTED = 10, 3  # shots at the beginning of a stack
 
