@@ -15,16 +15,16 @@ def power_diagram(sites, density, weights=None) -> PowerDiagram:
 
 def clipped(polygon: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
     """Sutherland and Hodgman: the part of a convex polygon where normal · r ≤ offset."""
-    kept = []
+    part = []
     distances = polygon @ normal - offset
     for k in range(len(polygon)):
-        here, there = polygon[k], polygon[(k + 1) % len(polygon)]
-        d_here, d_there = distances[k], distances[(k + 1) % len(polygon)]
-        if d_here <= 0:
-            kept.append(here)
-        if d_here * d_there < 0:
-            kept.append(here + (there - here) * d_here / (d_here - d_there))
-    return np.array(kept).reshape(-1, 2)
+        start, end = polygon[k], polygon[(k + 1) % len(polygon)]
+        d_start, d_end = distances[k], distances[(k + 1) % len(polygon)]
+        if d_start <= 0:
+            part.append(start)
+        if d_start * d_end < 0:
+            part.append(start + (end - start) * d_start / (d_start - d_end))
+    return np.array(part).reshape(-1, 2)
 
 
 def rectangle(low: tuple[float, float], high: tuple[float, float]) -> np.ndarray:
@@ -48,11 +48,11 @@ def shoelace(polygon: np.ndarray) -> tuple[float, np.ndarray, float]:
     """Area, first moments and moment of inertia about the origin (paper, Eqs. 7)."""
     if len(polygon) < 3:
         return 0.0, np.zeros(2), 0.0
-    here, there = polygon, np.roll(polygon, -1, axis=0)
-    cross = here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]
+    starts, ends = polygon, np.roll(polygon, -1, axis=0)
+    cross = starts[:, 0] * ends[:, 1] - starts[:, 1] * ends[:, 0]
     area = cross.sum() / 2
-    moments = ((here + there) * cross[:, None]).sum(axis=0) / 6
-    squares = (here**2 + here * there + there**2).sum(axis=1)
+    moments = ((starts + ends) * cross[:, None]).sum(axis=0) / 6
+    squares = (starts**2 + starts * ends + ends**2).sum(axis=1)
     return area, moments, float((squares * cross).sum() / 12)
 
 

@@ -14,8 +14,8 @@ def integrate(polygon, density):
     """Sum the walks along all edges of a polygon given in the image's coordinates."""
     corners = polygon + 0.5
     total = np.zeros(5)
-    for here, there in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        total += walk_edge(density.image, density.sums, *here, *there, True)
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        total += walk_edge(density.image, density.sums, *start, *end, True)
     # the walk goes counter-clockwise in (y, x), for which ∮ F dy is minus the mass
     return -total[1:]
 
@@ -67,9 +67,9 @@ def test_edges_through_pixel_corners_and_along_borders_cancel_in_return(ends):
     """Walking there and back is nothing, and the ways round a pixel grid close."""
     ya, xa, yb, xb = (end / 2 - 1 for end in ends)
     density = Density.from_image(np.arange(1.0, 17.0).reshape(4, 4))
-    there = np.array(walk_edge(density.image, density.sums, ya, xa, yb, xb, True))
+    forward = np.array(walk_edge(density.image, density.sums, ya, xa, yb, xb, True))
     back = np.array(walk_edge(density.image, density.sums, yb, xb, ya, xa, True))
-    np.testing.assert_allclose(there[1:], -back[1:], atol=1e-12)
+    np.testing.assert_allclose(forward[1:], -back[1:], atol=1e-12)
     detour = np.array([ya, xb])
     triangle = np.array([[ya, xa], detour, [yb, xb]]) - 0.5
     mass, moments, _ = over_pixels(triangle, np.arange(1.0, 17.0).reshape(4, 4))

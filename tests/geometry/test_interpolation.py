@@ -117,8 +117,8 @@ def test_mirror_images_lie_beyond_the_border_at_the_same_distance():
         (9.2, 10.0, 2, 1, -1),
         (9.8, 10.0, 2, -1, -1),
     }
-    found = np.column_stack([points, origin, sense])[3:].round(9)
-    assert set(map(tuple, found.tolist())) == expected
+    images = np.column_stack([points, origin, sense])[3:].round(9)
+    assert set(map(tuple, images.tolist())) == expected
 
 
 def test_one_and_many_threads_agree_bit_for_bit():
@@ -127,8 +127,8 @@ def test_one_and_many_threads_agree_bit_for_bit():
     triangulation = RegularTriangulation(sites)
     values, gradients = rng.random(5000), rng.random((5000, 2))
     queries = np.indices((100, 100)).reshape(2, -1).T.astype(float)
-    one, many = (
+    single, parallel = (
         CloughTocher(triangulation, values, gradients, threads=threads)(queries)
         for threads in (1, 3)
     )
-    np.testing.assert_array_equal(one, many)
+    np.testing.assert_array_equal(single, parallel)

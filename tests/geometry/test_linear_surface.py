@@ -35,10 +35,10 @@ def mean_of_triangles(triangulation, values):
 def test_gradients_are_those_of_one_set_of_values_at_a_time(triangulation, values):
     surface = with_gradients(triangulation, values)
     np.testing.assert_array_equal(surface[:, 0], values)
-    for one in range(WIDTH):
-        begun = mean_of_triangles(triangulation, values[:, one])
-        fitted = fit_gradients(triangulation, values[:, one], begun)
-        np.testing.assert_allclose(surface[:, 1:, one], fitted, rtol=1e-9, atol=1e-9)
+    for column in range(WIDTH):
+        begun = mean_of_triangles(triangulation, values[:, column])
+        fitted = fit_gradients(triangulation, values[:, column], begun)
+        np.testing.assert_allclose(surface[:, 1:, column], fitted, rtol=1e-9, atol=1e-9)
 
 
 def test_weights_of_corners_make_the_surface_also_beyond_the_sites(triangulation, values):
@@ -47,9 +47,9 @@ def test_weights_of_corners_make_the_surface_also_beyond_the_sites(triangulation
     queries = np.sort(rng.random((5000, 2)) * 24 - 2, axis=0)
     corners, weights = corner_weights(triangulation, queries)
     at_sites = np.column_stack([values[:, 0], gradients])
-    found = (weights * at_sites[corners]).sum(axis=(1, 2))
+    interpolated = (weights * at_sites[corners]).sum(axis=(1, 2))
     surface = CloughTocher(triangulation, values[:, 0], gradients)
-    np.testing.assert_allclose(found, surface(queries), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(interpolated, surface(queries), rtol=1e-9, atol=1e-9)
     again = corner_weights(triangulation, queries, threads=3)
     np.testing.assert_array_equal(corners, again[0])
     np.testing.assert_array_equal(weights, again[1])

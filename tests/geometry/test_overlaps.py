@@ -33,14 +33,14 @@ def test_each_pixel_is_shared_out_among_the_cells(diagram):
 def test_they_make_the_masses_of_any_image(diagram):
     image = np.random.default_rng(1).normal(size=SHAPE)
     exact = PowerDiagram(diagram._triangulation, Density.from_image(image)).masses
-    found = pixel_shares(diagram, SHAPE) @ image.ravel()
-    np.testing.assert_allclose(found, exact, atol=1e-11)
+    masses = pixel_shares(diagram, SHAPE) @ image.ravel()
+    np.testing.assert_allclose(masses, exact, atol=1e-11)
 
 
 def test_threads_change_no_bit():
     rng = np.random.default_rng(2)
     triangulation = RegularTriangulation(rng.random((9000, 2)) * SHAPE - 0.5)
     diagram = PowerDiagram(triangulation, Density.from_image(np.ones(SHAPE)))
-    one, two = (pixel_shares(diagram, SHAPE, threads=threads) for threads in (1, 2))
+    single, parallel = (pixel_shares(diagram, SHAPE, threads=threads) for threads in (1, 2))
     for name in ("indptr", "indices", "data"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+        np.testing.assert_array_equal(getattr(single, name), getattr(parallel, name))

@@ -62,8 +62,8 @@ def test_masses_equal_half_plane_clipping_whatever_sites_and_weights(kind, seed)
             power_cell(sites, weights, i, *low_and_high(image.shape)) for i in range(len(sites))
         ]
         expected = [over_pixels(cell, image)[0] for cell in cells]
-        found = power_diagram(sites, Density.from_image(image), weights).masses
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * image.sum() / len(sites))
+        masses = power_diagram(sites, Density.from_image(image), weights).masses
+        np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-10 * image.sum() / len(sites))
 
 
 def test_a_border_that_ends_far_away_is_as_exact_as_any():
@@ -106,18 +106,20 @@ def test_flux_through_each_border_is_that_of_the_polygons():
     for i in range(30):
         cell = power_cell(sites, weights, i, *low_and_high(shape))
         lift = (sites**2).sum(axis=1) - weights
-        for here, there in zip(cell, np.roll(cell, -1, axis=0), strict=True):
-            middle = (here + there) / 2
+        for start, end in zip(cell, np.roll(cell, -1, axis=0), strict=True):
+            middle = (start + end) / 2
             powers = lift - 2 * sites @ middle
             nearest = np.argsort(powers)[:2]
             if powers[nearest[1]] - powers[nearest[0]] < 1e-9:
-                lengths[tuple(sorted(nearest))] = np.linalg.norm(here - there)
+                lengths[tuple(sorted(nearest))] = np.linalg.norm(start - end)
     laplacian = diagram.laplacian().toarray()
     fluxes = -2 * laplacian * np.linalg.norm(sites[:, None] - sites, axis=-1)
-    found = {(i, j): fluxes[i, j] for i, j in np.argwhere(np.triu(fluxes, 1) > 1e-9).tolist()}
-    assert found.keys() == lengths.keys()
+    border_lengths = {
+        (i, j): fluxes[i, j] for i, j in np.argwhere(np.triu(fluxes, 1) > 1e-9).tolist()
+    }
+    assert border_lengths.keys() == lengths.keys()
     for pair, length in lengths.items():
-        assert found[pair] == pytest.approx(length, abs=1e-9)
+        assert border_lengths[pair] == pytest.approx(length, abs=1e-9)
 
 
 def test_regular_grid_of_sites_gives_equal_square_cells():
@@ -147,14 +149,14 @@ def test_one_and_many_threads_agree_bit_for_bit():
     rng = np.random.default_rng(6)
     density = Density.from_image(rng.random((60, 60)))
     triangulation = RegularTriangulation(rng.random((20000, 2)) * 60 - 0.5)
-    one, many = (
+    single, parallel = (
         PowerDiagram(triangulation, density, with_moments=True, threads=threads)
         for threads in (1, 5)
     )
-    np.testing.assert_array_equal(one.masses, many.masses)
-    np.testing.assert_array_equal(one.centroids, many.centroids)
-    np.testing.assert_array_equal(one.inertia, many.inertia)
-    np.testing.assert_array_equal(one.laplacian().data, many.laplacian().data)
+    np.testing.assert_array_equal(single.masses, parallel.masses)
+    np.testing.assert_array_equal(single.centroids, parallel.centroids)
+    np.testing.assert_array_equal(single.inertia, parallel.inertia)
+    np.testing.assert_array_equal(single.laplacian().data, parallel.laplacian().data)
 
 
 def test_hidden_site_has_an_empty_cell():

@@ -433,9 +433,9 @@ def test_copy_is_independent() -> None:
     rng = np.random.default_rng(3)
     triangulation = RegularTriangulation(rng.random((100, 2)))
     before = triangles(triangulation)
-    other = triangulation.copy()
-    assert triangles(other) == before
-    other.update(rng.random(100))
+    duplicate = triangulation.copy()
+    assert triangles(duplicate) == before
+    duplicate.update(rng.random(100))
     assert triangles(triangulation) == before
     assert not triangulation.hidden.any()
 
@@ -483,17 +483,17 @@ def test_hilbert_order_is_a_permutation_with_short_steps() -> None:
 def test_building_in_parts_gives_the_same_triangles(monkeypatch: pytest.MonkeyPatch) -> None:
     sites = np.random.default_rng(0).random((1000, 2))
     weights = np.random.default_rng(1).random(1000) / 500
-    whole = RegularTriangulation(sites, weights)
-    monkeypatch.setattr(module, "_PART", 150)
+    at_once = RegularTriangulation(sites, weights)
+    monkeypatch.setattr(module, "_SITES_PER_PART", 150)
     signs: list[int] = []
-    parts = RegularTriangulation(sites, weights, alive=lambda: signs.append(1))
+    in_parts = RegularTriangulation(sites, weights, alive=lambda: signs.append(1))
     assert len(signs) == 7
-    np.testing.assert_array_equal(parts.vertices, whole.vertices)
-    np.testing.assert_array_equal(parts.hidden, whole.hidden)
+    np.testing.assert_array_equal(in_parts.vertices, at_once.vertices)
+    np.testing.assert_array_equal(in_parts.hidden, at_once.hidden)
 
 
 def test_building_ends_when_a_sign_of_life_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_PART", 150)
+    monkeypatch.setattr(module, "_SITES_PER_PART", 150)
     signs: list[int] = []
 
     def stopped() -> None:
@@ -535,11 +535,11 @@ def test_more_sites_are_put_in_as_if_they_had_been_there(sorted_first):
         first = first[hilbert_order(first)]
     more = np.concatenate([rng.uniform(-2, 12, (80, 2)), first[:3]])
     before = RegularTriangulation(first)
-    known = before.vertices.copy()
+    vertices = before.vertices.copy()
     grown = before.with_more(more)
     everything = np.concatenate([first, more])
     np.testing.assert_array_equal(grown.sites, everything)
-    np.testing.assert_array_equal(before.vertices, known)
+    np.testing.assert_array_equal(before.vertices, vertices)
     assert grown.hidden.sum() == 3
 
     def triangles(triangulation):

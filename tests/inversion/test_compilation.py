@@ -123,13 +123,13 @@ print([name for name, _ in signatures() - compiled])
 ONE_KERNEL = """
 import numpy as np
 from napari_shadowinv.preprocessing._total_variation import _smooth_row as kernel
-from napari_shadowinv.geometry._kernel import is_kept
+from napari_shadowinv.geometry._kernel import is_code_cached
 
 image = np.ones((3, 4))
 smooth = np.empty(4)
 kernel(image, 0 * image, 0 * image, 1, smooth)
 assert (smooth == 1).all()
-print(is_kept(), sum(kernel.stats.cache_hits.values()), kernel.stats.cache_path)
+print(is_code_cached(), sum(kernel.stats.cache_hits.values()), kernel.stats.cache_path)
 """
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.fitting import _ray_kernels
 from napari_shadowinv.fitting.rays import RayModel
-from napari_shadowinv.geometry._kernel import is_kept
+from napari_shadowinv.geometry._kernel import is_code_cached
 from napari_shadowinv.inversion import compilation as of_transport
 from napari_shadowinv.inversion.machine_code import how_often
 
@@ -47,7 +47,7 @@ def is_compiled() -> bool:
 
 def _is_kept(kernel: Any) -> bool:
     """Whether there is machine code that was made of the kernel as it is now."""
-    if not is_kept():
+    if not is_code_cached():
         return False
     source = Path(kernel.py_func.__code__.co_filename)
     version = f"py{sys.version_info.major}{sys.version_info.minor}"

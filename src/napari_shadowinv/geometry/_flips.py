@@ -37,8 +37,8 @@ MOST_STRAYS = 0.1
 
 
 @kernel
-def _state(mesh: Mesh, h: int, g: int) -> int:
-    """Tell the state of the edge h with twin g; its corners are a = after(h), b = before(h)."""
+def _symmetric_edge_state(mesh: Mesh, h: int, g: int) -> int:
+    """Return the state of the edge h with twin g, whose corners are a = after(h), b = before(h)."""
     # Seen from a distant corner the small differences between the others would be lost, so the
     # nearer one looks. The answer must not depend on the side that the edge was reached from.
     points = mesh.points
@@ -73,17 +73,17 @@ def _raise_vertex(mesh: Mesh, h: int, a: int, b: int, c: int) -> None:
 
 
 @kernel
-def _give_way(mesh: Mesh, h: int, g: int, reflex_a: bool) -> None:
+def _remove_or_raise(mesh: Mesh, h: int, g: int, reflex_a: bool) -> None:
     """Remove or raise the hidden end of the edge h, whose twin is g."""
     v = after(h) if reflex_a else before(h)
     if mesh.counters[_mesh.POLICY] == REMOVE:
         _mesh.remove(mesh, v)
         return
     p, q = mesh.corners[h], mesh.corners[g]
-    other = mesh.corners[before(h) if reflex_a else after(h)]
+    corner = mesh.corners[before(h) if reflex_a else after(h)]
     if not reflex_a:
         p, q = q, p
-    _raise_vertex(mesh, v, p, q, other)
+    _raise_vertex(mesh, v, p, q, corner)
 
 
 @kernel
@@ -100,7 +100,7 @@ def restore(mesh: Mesh) -> int:
         g = twins[h]
         if g < 0:
             continue
-        state = _state(mesh, h, g)
+        state = _symmetric_edge_state(mesh, h, g)
         if state == LEGAL:
             continue
         if counters[_mesh.FLIPS] + counters[_mesh.RAISES] >= counters[_mesh.LIMIT]:
@@ -120,7 +120,7 @@ def restore(mesh: Mesh) -> int:
             counters[_mesh.TOP] = 0
             return HIDDEN
         counters[_mesh.EVERYWHERE] = 1
-        _give_way(mesh, h, g, state == REFLEX_A)
+        _remove_or_raise(mesh, h, g, state == REFLEX_A)
     return DONE
 
 
@@ -132,7 +132,7 @@ def _irregular_edges(mesh: Mesh, t: int) -> int:
     corners, twins, points, weights = mesh.corners, mesh.twins, mesh.points, mesh.weights
     e = 3 * t
     i, j, k = corners[e], corners[e + 1], corners[e + 2]
-    found = 0
+    irregular = 0
     x0, y0, w0 = points[i, 0], points[i, 1], weights[i]
     ax, ay, a_gain = points[j, 0] - x0, points[j, 1] - y0, weights[j] - w0
     bx, by, b_gain = points[k, 0] - x0, points[k, 1] - y0, weights[k] - w0
@@ -157,8 +157,8 @@ def _irregular_edges(mesh: Mesh, t: int) -> int:
                 + b_size * (abs(ax * qy) + abs(ay * qx))
             )
             if height < LIFT_BOUND * size:
-                found |= 1 << (h - e)
-    return found
+                irregular |= 1 << (h - e)
+    return irregular
 
 
 @kernel
@@ -176,7 +176,7 @@ def _mark_irregular(mesh: Mesh, t: int) -> bool:
     for h in range(3 * t, 3 * t + 3):
         if edges >> (h - 3 * t) & 1:
             g = mesh.twins[h]
-            if g > h and (_is_inner(mesh, t) or _state(mesh, h, g) != LEGAL):
+            if g > h and (_is_inner(mesh, t) or _symmetric_edge_state(mesh, h, g) != LEGAL):
                 push(mesh, h)
                 marked = True
     return marked
@@ -195,13 +195,13 @@ def _sweep(mesh: Mesh, suspects: BoolArray) -> int:
     # Triangles known to be no suspects are passed over at first; those that a flip makes have
     # their edges looked at anyway.
     counters = mesh.counters
-    known = suspects.size
+    n_screened = suspects.size
     counters[_mesh.OVERFLOW] = 1
     while counters[_mesh.OVERFLOW] == 1:
         counters[_mesh.OVERFLOW] = 0
         t = 0
         while t < counters[_mesh.SIZE]:
-            if mesh.corners[3 * t] < 0 or (t < known and not suspects[t]):
+            if mesh.corners[3 * t] < 0 or (t < n_screened and not suspects[t]):
                 marked = False
             elif counters[_mesh.POLICY] == RAISE:
                 _mesh.push_triangle(mesh, t)
@@ -214,7 +214,7 @@ def _sweep(mesh: Mesh, suspects: BoolArray) -> int:
                 if status != DONE:
                     return status
             t += 1
-        known = 0
+        n_screened = 0
     return DONE
 
 
@@ -298,7 +298,7 @@ def _return_hidden(mesh: Mesh) -> int:
 
 
 @kernel
-def _begin(mesh: Mesh, policy: int) -> None:
+def _reset_counters(mesh: Mesh, policy: int) -> None:
     for counter in (_mesh.TOP, _mesh.FLIPS, _mesh.RAISES):
         mesh.counters[counter] = 0
     mesh.counters[_mesh.POLICY] = policy
@@ -307,7 +307,7 @@ def _begin(mesh: Mesh, policy: int) -> None:
 @kernel_that_allocates
 def repair(mesh: Mesh, policy: int, suspects: BoolArray) -> int:
     """Make any valid triangulation regular; `suspects` are `look_for_irregular`'s, or empty."""
-    _begin(mesh, policy)
+    _reset_counters(mesh, policy)
     status = _sweep(mesh, suspects)
     if status == DONE:
         status = _return_hidden(mesh)
@@ -339,7 +339,7 @@ def raise_hidden(mesh: Mesh) -> int:
     # Rounding leaves some of them a trace above the hull; these are raised a trace more, until
     # none is hidden. Where the weights' own rounding exceeds the squared distance of sites times
     # the relative rounding (tight clusters), that may not end; then the trace is left.
-    _begin(mesh, KEEP)
+    _reset_counters(mesh, KEEP)
     for v in insertion_order(mesh.hidden.size):
         if mesh.hidden[v] and _insert_on_hull(mesh, v) == EXHAUSTED:
             return EXHAUSTED
@@ -353,7 +353,7 @@ def raise_hidden(mesh: Mesh) -> int:
 
 
 @kernel
-def _start(mesh: Mesh) -> None:
+def _start_with_ghosts(mesh: Mesh) -> None:
     """Make two triangles of ghosts, with no site."""
     n = mesh.hidden.size
     mesh.counters[:] = 0
@@ -397,7 +397,7 @@ def _sort_triangles(mesh: Mesh) -> None:
 def build(mesh: Mesh, order: IntArray, first: int, last: int) -> int:
     """Put the sites `order[first:last]` in: the first part begins anew, the last one finishes."""
     if first == 0:
-        _start(mesh)
+        _start_with_ghosts(mesh)
     status = DONE
     for v in order[first:last]:
         status = insert(mesh, v, 1.0)
@@ -415,7 +415,7 @@ def build(mesh: Mesh, order: IntArray, first: int, last: int) -> int:
 @kernel_that_allocates
 def add(mesh: Mesh, order: IntArray) -> int:
     """Insert sites that are in the arrays of the mesh, but not yet in its triangles."""
-    _begin(mesh, REMOVE)
+    _reset_counters(mesh, REMOVE)
     status = DONE
     for v in order:
         status = insert(mesh, v, 1.0)
@@ -428,30 +428,30 @@ def add(mesh: Mesh, order: IntArray) -> int:
 
 
 @kernel
-def _stay_behind(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
-    """Return the corners of overturned triangles to their origins; tell if there were any."""
-    found = False
+def _return_overturned(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
+    """Return corners of overturned triangles to their origins, and whether there were any."""
+    overturned = False
     for t in range(mesh.counters[_mesh.SIZE]):
         i, j, k = mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2]
         if turn(mesh.points, mesh.scratch, i, j, k) <= 0:
-            found = True
+            overturned = True
             for v in (i, j, k):
                 if v < strays.size:
                     mesh.points[v, 0], mesh.points[v, 1] = origins[v, 0], origins[v, 1]
                     strays[v] = True
-    return found
+    return overturned
 
 
 @kernel
-def _take_out(mesh: Mesh, strays: BoolArray) -> int:
+def _remove_strays(mesh: Mesh, strays: BoolArray) -> int:
     """Remove the strays that are in the triangulation."""
-    found = True
-    while found:  # flips may move a stray to a triangle that the pass has left behind
-        found = False
+    removed = True
+    while removed:  # flips may move a stray to a triangle that the pass has left behind
+        removed = False
         for h in range(3 * mesh.counters[_mesh.SIZE]):
             v = mesh.corners[h]
             if mesh.corners[h - h % 3] >= 0 and v < strays.size and strays[v]:
-                found = True
+                removed = True
                 _mesh.remove(mesh, h)
                 mesh.counters[_mesh.EVERYWHERE] = 1
                 if restore(mesh) != DONE:
@@ -470,11 +470,11 @@ def relocate(mesh: Mesh, targets: FloatArray) -> int:
     # By single numbers: numba takes two seconds to compile assignments of arrays.
     for v in range(n):
         mesh.points[v, 0], mesh.points[v, 1] = targets[v, 0], targets[v, 1]
-    while _stay_behind(mesh, origins, strays):
+    while _return_overturned(mesh, origins, strays):
         pass
     if strays.sum() > MOST_STRAYS * n or repair(mesh, REMOVE, strays[:0]) != DONE:
         return EXHAUSTED
-    status = _take_out(mesh, strays)
+    status = _remove_strays(mesh, strays)
     for v in range(n):
         if strays[v]:
             mesh.points[v, 0], mesh.points[v, 1] = targets[v, 0], targets[v, 1]

@@ -30,7 +30,7 @@ def _distance_along(x: int, y: int) -> int:
 
 
 @kernel_that_allocates
-def _keys(points: FloatArray) -> NDArray[np.uint64]:
+def _curve_keys(points: FloatArray) -> NDArray[np.uint64]:
     """Return numbers to sort by: a point's distance along the curve, then its row."""
     n = points.shape[0]
     keys = np.arange(n).astype(np.uint64)
@@ -50,11 +50,11 @@ def _keys(points: FloatArray) -> NDArray[np.uint64]:
 
 def hilbert_permutation(points: FloatArray) -> Indices:
     """Sort points along a Hilbert curve through 2¹⁶ × 2¹⁶ cells; those in one keep their order."""
-    return (np.sort(_keys(points)) & 0xFFFFFFFF).astype(np.int32)
+    return (np.sort(_curve_keys(points)) & 0xFFFFFFFF).astype(np.int32)
 
 
 @kernel
-def _round_of(k: int) -> int:
+def _insertion_round(k: int) -> int:
     """Return how many rounds before the last point k is inserted, by a hash of k."""
     z = (np.uint64(k) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -74,13 +74,13 @@ def insertion_order(n: int) -> IntArray:
     # Choi and Rote 2003, Proc. 19th Symp. Computational Geometry, 211.
     starts = np.zeros(33, dtype=np.int64)
     for k in range(n):
-        starts[32 - _round_of(k)] += 1
+        starts[32 - _insertion_round(k)] += 1
     total = 0
     for r in range(33):
         total, starts[r] = total + starts[r], total
     order = np.empty(n, dtype=np.int64)
     for k in range(n):
-        r = 32 - _round_of(k)
+        r = 32 - _insertion_round(k)
         order[starts[r]] = k
         starts[r] += 1
     return order

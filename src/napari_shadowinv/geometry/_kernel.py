@@ -1,10 +1,9 @@
-"""How kernels are compiled, and where their machine code is kept.
+"""Compilation of kernels, and the folder that caches their machine code.
 
-Numba keeps machine code in the folder ``NUMBA_CACHE_DIR``, beside the package, or else in the
-home, and fails where none of these can be written, as for an account without a home that runs
-an installation shared by many users. There it is kept in a private folder in the temporary
-directory, which starts with what lies beside the package; failing that, each process compiles
-anew.
+Numba caches machine code in the folder ``NUMBA_CACHE_DIR``, next to the package, or in the home
+directory. It fails if it can write to none of these, for example under an account without a home
+that runs a shared installation. Then a private folder in the temporary directory is used, which
+starts as a copy of the code next to the package. Failing that, each process compiles anew.
 """
 
 from __future__ import annotations
@@ -25,56 +24,56 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def njit(**options: Any) -> Callable[[Function], Function]:
-    """Return numba's decorator; `cache` is true wherever machine code can be kept."""
+    """Return numba's decorator; `cache` is true wherever machine code can be cached."""
 
     def compiled(function: Function) -> Function:
-        made: Any = numba.njit(**{**options, "cache": is_kept()})(function)
-        if _own_folder_is_used():
-            beside_package = Path(made.py_func.__code__.co_filename).parent / "__pycache__"
-            _copy_code(beside_package, Path(made.stats.cache_path))
-        return cast(Function, made)
+        dispatcher: Any = numba.njit(**{**options, "cache": is_code_cached()})(function)
+        if _uses_private_folder():
+            beside_package = Path(dispatcher.py_func.__code__.co_filename).parent / "__pycache__"
+            _copy_code(beside_package, Path(dispatcher.stats.cache_path))
+        return cast(Function, dispatcher)
 
     return compiled
 
 
 @cache
-def is_kept() -> bool:
-    """Return whether machine code is kept for later processes."""
-    return _numba_finds_a_folder() or _own_folder_is_used()
+def is_code_cached() -> bool:
+    """Return whether machine code is cached for later processes."""
+    return _numba_can_cache() or _uses_private_folder()
 
 
 @cache
-def _numba_finds_a_folder() -> bool:
+def _numba_can_cache() -> bool:
     try:
-        numba.njit(cache=True)(_kernel_of_nothing)
+        numba.njit(cache=True)(_empty_kernel)
     except RuntimeError:
         return False
     return True
 
 
-def _kernel_of_nothing() -> None:
-    """For numba to look where it would keep its machine code."""
+def _empty_kernel() -> None:
+    """Do nothing: numba looks for its cache folder when it compiles this."""
 
 
 @cache
-def _own_folder_is_used() -> bool:
-    """Have numba use a folder in the temporary directory, if it finds none itself."""
-    if _numba_finds_a_folder():
+def _uses_private_folder() -> bool:
+    """Make numba use a folder in the temporary directory if it has none of its own."""
+    if _numba_can_cache():
         return False
-    folder = _own_folder()
+    folder = _private_folder()
     if folder is None:
         return False
     settings: Any = numba.config
     settings.CACHE_DIR = str(folder)
     try:
-        numba.njit(cache=True)(_kernel_of_nothing)
+        numba.njit(cache=True)(_empty_kernel)
     except RuntimeError:
         settings.CACHE_DIR = ""
         return False
     return True
 
 
-def _own_folder() -> Path | None:
+def _private_folder() -> Path | None:
     """Return a folder that nobody else can have put code into."""
     if not hasattr(os, "getuid"):
         return None
@@ -82,23 +81,23 @@ def _own_folder() -> Path | None:
         folder = Path(tempfile.gettempdir()) / f"napari-shadowinv-{os.getuid()}"
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        found = folder.lstat()
-        is_private = not stat.S_IMODE(found.st_mode) & 0o077
-        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and is_private:
+        status = folder.lstat()
+        is_private = not stat.S_IMODE(status.st_mode) & 0o077
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and is_private:
             return folder
     return None
 
 
 @cache
-def _copy_code(made: Path, kept: Path) -> None:
-    """Start with what was compiled when the package was installed."""
-    if any(kept.glob("*.nbi")):
+def _copy_code(installed: Path, cache_folder: Path) -> None:
+    """Copy the code that was compiled when the package was installed."""
+    if any(cache_folder.glob("*.nbi")):
         return
     # Numba does without what is missing.
     with suppress(OSError, shutil.Error):
         # The index of a kernel after its code, to which it refers.
-        for path in sorted(made.glob("*.nb[ci]")):
-            shutil.copy(path, kept)
+        for path in sorted(installed.glob("*.nb[ci]")):
+            shutil.copy(path, cache_folder)
 
 
 def kernel_that_allocates(function: Function) -> Function:

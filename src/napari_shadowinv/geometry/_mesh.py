@@ -140,8 +140,8 @@ def split_triangle(mesh: Mesh, t: int, v: int) -> None:
     _join(mesh, 3 * t + 1, 3 * u + 2)
     _join(mesh, 3 * u + 1, 3 * s + 2)
     _join(mesh, 3 * s + 1, 3 * t + 2)
-    for one in (u, s, t):
-        push(mesh, 3 * one)
+    for triangle in (u, s, t):
+        push(mesh, 3 * triangle)
 
 
 @kernel
@@ -165,8 +165,8 @@ def split_edge(mesh: Mesh, h: int, v: int) -> None:
     _join(mesh, 3 * s + 1, 3 * u + 2)
     _join(mesh, 3 * u + 1, 3 * r + 2)
     _join(mesh, 3 * r + 1, 3 * t + 2)
-    for one in (t, s, u, r):
-        push(mesh, 3 * one)
+    for triangle in (t, s, u, r):
+        push(mesh, 3 * triangle)
 
 
 @kernel
@@ -238,9 +238,9 @@ def _merge_three(mesh: Mesh, h: int) -> int:
 @kernel
 def _merge_four(mesh: Mesh, h: int) -> int:
     """Remove a vertex of degree four that lies on a diagonal of its neighbours."""
-    v, here = mesh.corners[h], mesh.corners[after(h)]
+    v, neighbour = mesh.corners[h], mesh.corners[after(h)]
     opposite = mesh.corners[before(around(mesh, h))]
-    if turn(mesh.points, mesh.scratch, here, v, opposite) != 0:
+    if turn(mesh.points, mesh.scratch, neighbour, v, opposite) != 0:
         h = around(mesh, h)
     g = around(mesh, h)
     f = around(mesh, g)

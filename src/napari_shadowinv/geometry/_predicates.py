@@ -36,7 +36,7 @@ SPLITTER = 2.0**27 + 1.0
 
 @kernel
 def _two_difference(a: float, b: float) -> tuple[float, float]:
-    """Return a - b rounded, and what rounding took away."""
+    """Return a - b rounded, and the rounding error."""
     difference = a - b
     b_virtual = a - difference
     a_virtual = difference + b_virtual
@@ -45,7 +45,7 @@ def _two_difference(a: float, b: float) -> tuple[float, float]:
 
 @kernel
 def _two_sum(a: float, b: float) -> tuple[float, float]:
-    """Return a + b rounded, and what rounding took away."""
+    """Return a + b rounded, and the rounding error."""
     total = a + b
     b_virtual = total - a
     a_virtual = total - b_virtual
@@ -54,7 +54,7 @@ def _two_sum(a: float, b: float) -> tuple[float, float]:
 
 @kernel
 def _two_product(a: float, b: float) -> tuple[float, float]:
-    """Return a·b rounded, and what rounding took away."""
+    """Return a·b rounded, and the rounding error."""
     product = a * b
     scaled = SPLITTER * a
     a_high = scaled - (scaled - a)
@@ -95,9 +95,9 @@ def _exact_turn(points: FloatArray, terms: FloatArray, a: int, b: int, c: int) -
     vx, vx_tail = _two_difference(points[c, 0], points[a, 0])
     vy, vy_tail = _two_difference(points[c, 1], points[a, 1])
     if ux_tail == 0.0 and uy_tail == 0.0 and vx_tail == 0.0 and vy_tail == 0.0:
-        left, left_tail = _two_product(ux, vy)
-        right, right_tail = _two_product(uy, vx)
-        return _sign(left - right) if left != right else _sign(left_tail - right_tail)
+        x_term, x_tail = _two_product(ux, vy)
+        y_term, y_tail = _two_product(uy, vx)
+        return _sign(x_term - y_term) if x_term != y_term else _sign(x_tail - y_tail)
     count = _grow_product(terms, 0, ux_tail, vy_tail)
     count = _grow_product(terms, count, -uy_tail, vx_tail)
     count = _grow_product(terms, count, ux_tail, vy)
@@ -115,10 +115,10 @@ def _exact_turn(points: FloatArray, terms: FloatArray, a: int, b: int, c: int) -
 @kernel
 def turn(points: FloatArray, scratch: FloatArray, a: int, b: int, c: int) -> int:
     """Return the exact sign of cross(b - a, c - a): 1 where a, b, c turn counter-clockwise."""
-    left = (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1])
-    right = (points[b, 1] - points[a, 1]) * (points[c, 0] - points[a, 0])
-    cross = left - right
-    bound = CROSS_BOUND * (abs(left) + abs(right))
+    x_term = (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1])
+    y_term = (points[b, 1] - points[a, 1]) * (points[c, 0] - points[a, 0])
+    cross = x_term - y_term
+    bound = CROSS_BOUND * (abs(x_term) + abs(y_term))
     if cross > bound:
         return 1
     if cross < -bound:
@@ -150,7 +150,7 @@ def _lifted(
 def edge_state(
     points: FloatArray, weights: FloatArray, scratch: FloatArray, p: int, a: int, b: int, q: int
 ) -> int:
-    """Tell what to do with the edge a-b; p, a, q, b go around it counter-clockwise."""
+    """Classify the edge a-b; p, a, q, b go around it counter-clockwise."""
     height, size, _ = _lifted(points, weights, q, a, b, p)
     if height >= -LIFT_BOUND * size:
         return LEGAL

@@ -31,7 +31,7 @@ __all__ = ["Density", "split_pixels", "walk_edge"]
 
 Triple = tuple[float, float, float]
 
-_WORTH_A_THREAD = 100_000  # pixels
+_MIN_PIXELS_PER_THREAD = 100_000  # pixels
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Density:
             values = values.copy()
         height, width = values.shape
         sums = np.zeros((3, height, width + 1))
-        rows = max(1, _WORTH_A_THREAD // max(1, width))
+        rows = max(1, _MIN_PIXELS_PER_THREAD // max(1, width))
         in_ranges(_sum_rows, height, available_threads(threads), values, sums, smallest=rows)
         return cls(values, sums)
 
@@ -77,13 +77,13 @@ class Density:
 @njit(nogil=True, cache=True)
 def _sum_rows(start: int, stop: int, image: FloatArray, sums: FloatArray) -> None:
     for row in range(start, stop):
-        for left in range(image.shape[1]):
-            value = image[row, left]
-            right = left + 1
+        for column in range(image.shape[1]):
+            value = image[row, column]
+            right = column + 1
             # ∫ s ds and ∫ s² ds over the pixel
-            sums[0, row, right] = sums[0, row, left] + value
-            sums[1, row, right] = sums[1, row, left] + value * (left + 0.5)
-            sums[2, row, right] = sums[2, row, left] + value * (left * right + 1 / 3)
+            sums[0, row, right] = sums[0, row, column] + value
+            sums[1, row, right] = sums[1, row, column] + value * (column + 0.5)
+            sums[2, row, right] = sums[2, row, column] + value * (column * right + 1 / 3)
 
 
 def split_pixels(image: FloatArray, factor: int) -> FloatArray:
@@ -115,13 +115,13 @@ def _moments_in_pixel(
     x1: float,
 ) -> Triple:
     """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
-    left = float(column)
-    left2 = left * left
-    left3 = left2 * left
+    x_left = float(column)
+    x_left2 = x_left * x_left
+    x_left3 = x_left2 * x_left
     x_mid = 0.5 * (x0 + x1)
-    f_base = sums[0, row, column] - value * left
-    g_base = sums[1, row, column] - value * left2 / 2
-    k_base = sums[2, row, column] - value * left3 / 3
+    f_base = sums[0, row, column] - value * x_left
+    g_base = sums[1, row, column] - value * x_left2 / 2
+    k_base = sums[2, row, column] - value * x_left3 / 3
     g = 6 * g_base + value * (x0 * x0 + 4 * x_mid * x_mid + x1 * x1) / 2
     third = value / 3
     f = f_base + value * x0, f_base + value * x_mid, f_base + value * x1
@@ -220,18 +220,18 @@ def walk_edge(
     start, end = _inside_share(ya, yb - ya, height)
     if start >= end:
         return 0.0, 0.0, 0.0, 0.0, 0.0
-    left, right = _inside_share(xa, xb - xa, width)
-    left = min(max(left, start), end)
-    right = max(min(right, end), left)
+    t_enter, t_leave = _inside_share(xa, xb - xa, width)
+    t_enter = min(max(t_enter, start), end)
+    t_leave = max(min(t_leave, end), t_enter)
     flux = mass = moment_y = moment_x = inertia = 0.0
-    if right > left:
-        y0, x0 = _point(ya, xa, yb, xb, left, height, width)
-        y1, x1 = _point(ya, xa, yb, xb, right, height, width)
+    if t_leave > t_enter:
+        y0, x0 = _point(ya, xa, yb, xb, t_enter, height, width)
+        y1, x1 = _point(ya, xa, yb, xb, t_leave, height, width)
         flux, mass, moment_y, moment_x, inertia = _walk_inside(
             image, sums, y0, x0, y1, x1, with_moments
         )
     # the parts before and after the image count where they are to its right
-    for t0, t1 in ((start, left), (right, end)):
+    for t0, t1 in ((start, t_enter), (t_leave, end)):
         if t1 > t0 and xa + 0.5 * (t0 + t1) * (xb - xa) > 0.5 * width:
             y0, _ = _point(ya, xa, yb, xb, t0, height, width)
             y1, _ = _point(ya, xa, yb, xb, t1, height, width)

@@ -30,10 +30,10 @@ __all__ = [
     "BLOCK",
     "PATCH",
     "CloughTocher",
-    "arrays_of",
     "fill_patch",
     "fit_gradients",
     "locate",
+    "mesh_arrays",
     "nearest_corner",
     "value_on_patch",
     "with_mirror_images",
@@ -41,17 +41,17 @@ __all__ = [
 
 BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
 PATCH = 31  # numbers that describe the surface over a triangle
-_KEPT = 512  # triangles whose patches are remembered
+_CACHED_PATCHES = 512  # triangles whose patches are remembered
 
 
 def with_mirror_images(
     sites: FloatArray, shape: tuple[int, int], band: float
 ) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
-    """Append to the sites the images of those closer than `band` px to the border, across it.
+    """Append to the sites the mirror images of those closer than `band` px to the border.
 
     A site near a corner has three. Returns the k points, the site that each comes from, and the
-    sense, shape (k, 2): -1 for the axes along which a point was mirrored, else 1, which is what a
-    mirrored gradient is multiplied by.
+    sense, shape (k, 2): -1 for the axes along which a point was mirrored, else 1. A mirrored
+    gradient is multiplied by it.
     """
     points, origin, sense = sites, np.arange(len(sites)), np.ones_like(sites)
     for axis in (0, 1):
@@ -111,12 +111,12 @@ def fit_gradients(
 ) -> FloatArray:
     """Improve gradients at the sites so that the surface bends least along the edges."""
     for _ in range(sweeps):
-        gradients = _sweep(*arrays_of(triangulation), values, gradients, len(values))
+        gradients = _sweep(*mesh_arrays(triangulation), values, gradients, len(values))
     return gradients
 
 
-def arrays_of(triangulation: RegularTriangulation) -> tuple[Indices, Indices, FloatArray]:
-    """Return what kernels want to know of a triangulation."""
+def mesh_arrays(triangulation: RegularTriangulation) -> tuple[Indices, Indices, FloatArray]:
+    """Return vertices, neighbours and points of a triangulation, as kernels take them."""
     return triangulation.vertices, triangulation.neighbors, triangulation.points
 
 
@@ -129,13 +129,13 @@ def locate(
     for _ in range(2 * vertices.shape[0] + 10):
         moved = False
         for k in range(3):
-            other = neighbors[t, k]
-            if other < 0 or other == came_from:
+            neighbour = neighbors[t, k]
+            if neighbour < 0 or neighbour == came_from:
                 continue
             a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
             ey, ex = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
             if ey * (x - points[a, 1]) - ex * (y - points[a, 0]) < 0:
-                came_from, t = t, other
+                came_from, t = t, neighbour
                 moved = True
                 break
         if not moved:
@@ -159,11 +159,11 @@ def _edge_ordinates(
 
 @njit(nogil=True, cache=True)
 def fill_patch(p: FloatArray, f: FloatArray, g: FloatArray, patch: FloatArray) -> None:
-    """Work out what `value_on_patch` needs of the surface over the triangle p.
+    """Compute the coefficients for `value_on_patch` of the surface over the triangle p.
 
     Three barycentric coordinates as a y + b x + c; then ordinates: at each vertex, along the edge
     opposite to it near its two ends, inside that edge's patch, on the way from the vertex to
-    the centre, beside the centre; and at the centre.
+    the centre, next to the centre; and at the centre.
     """
     cy = (p[0, 0] + p[1, 0] + p[2, 0]) / 3
     cx = (p[0, 1] + p[1, 1] + p[2, 1]) / 3
@@ -231,22 +231,22 @@ def _evaluate_blocks(
     """Evaluate blocks `start` to `stop` of the queries."""
     n = values.shape[0]
     p, f, g = np.empty((3, 2)), np.empty(3), np.empty((3, 2))
-    patches = np.empty((_KEPT, PATCH))
-    kept = np.empty(_KEPT, np.int64)
+    patches = np.empty((_CACHED_PATCHES, PATCH))
+    triangle_of_slot = np.empty(_CACHED_PATCHES, np.int64)
     for block in range(start, stop):
         # Nothing is left from the block before, so that it does not matter who has worked on it.
         t, patch = 0, patches[0]
-        kept[:] = -1
+        triangle_of_slot[:] = -1
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
             y, x = queries[q]
-            if kept[t % _KEPT] == t:
+            if triangle_of_slot[t % _CACHED_PATCHES] == t:
                 out[q], least = value_on_patch(patch, y, x)
                 if least >= 0:
                     continue
             t = locate(vertices, neighbors, points, t, y, x)
-            slot = t % _KEPT
+            slot = t % _CACHED_PATCHES
             patch = patches[slot]
-            if kept[slot] == t:
+            if triangle_of_slot[slot] == t:
                 out[q], _ = value_on_patch(patch, y, x)
                 continue
             outside = False
@@ -260,7 +260,7 @@ def _evaluate_blocks(
                     p[k, axis], g[k, axis] = points[a, axis], gradients[a, axis]
             if not outside:
                 fill_patch(p, f, g, patch)
-                kept[slot] = t
+                triangle_of_slot[slot] = t
                 out[q], _ = value_on_patch(patch, y, x)
                 continue
             nearest = nearest_corner(vertices[t], points, n, y, x)
@@ -319,7 +319,7 @@ class CloughTocher:
         if not queries.flags.writeable:  # the kernel is compiled for one type
             queries = queries.copy()
         out = np.zeros(len(queries))
-        surface = (*arrays_of(self._triangulation), self._values, self._gradients)
+        surface = (*mesh_arrays(self._triangulation), self._values, self._gradients)
         blocks = -(-len(queries) // BLOCK)
         in_ranges(_evaluate_blocks, blocks, self._threads, queries, *surface, out, smallest=2)
         return out

@@ -1,7 +1,7 @@
 """A C¹ surface for many sets of values at the same sites, `WIDTH` at a time.
 
-The same surface as `napari_shadowinv.geometry.interpolation` makes. It is linear in the values:
-what a triangle or an edge is like is found once for all sets, which lie side by side.
+The surface is the same as in `napari_shadowinv.geometry.interpolation`. It is linear in the
+values, so the geometry of each triangle and edge is computed once for all sets.
 
 - gradients at the sites, by values there: `with_gradients`
 - the surface anywhere, by values and gradients at the corners of triangles: `corner_weights`
@@ -18,9 +18,9 @@ from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.interpolation import (
     BLOCK,
     PATCH,
-    arrays_of,
     fill_patch,
     locate,
+    mesh_arrays,
     nearest_corner,
     value_on_patch,
 )
@@ -28,7 +28,7 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 __all__ = ["WIDTH", "corner_weights", "with_gradients"]
 
-WIDTH = 8  # so many numbers fill a line of the cache; a constant, so that loops are unrolled
+WIDTH = 8  # numbers in a cache line; a constant, so that loops are unrolled
 
 
 @njit(nogil=True, cache=True)
@@ -63,7 +63,7 @@ def _mean_slopes(
 
 
 @njit(nogil=True, cache=True)
-def _bend_least(
+def _minimise_bending(
     vertices: Indices,
     neighbors: Indices,
     points: FloatArray,
@@ -71,7 +71,7 @@ def _bend_least(
     gradients: FloatArray,
     surface: FloatArray,
 ) -> None:
-    """Make the sweep of `fit_gradients` from gradients, which end as those of the surface."""
+    """Do the sweep of `fit_gradients`, starting from `gradients`; write values and gradients."""
     n = values.shape[0]
     system = np.zeros((n, 3))
     for t in range(vertices.shape[0]):
@@ -109,13 +109,13 @@ def _bend_least(
 def with_gradients(triangulation: RegularTriangulation, values: FloatArray) -> FloatArray:
     """Return `WIDTH` sets of values at n sites, (n, WIDTH), and their gradients: (n, 3, WIDTH).
 
-    They are those of `fit_gradients`, begun with the mean of the triangles around each site.
+    The gradients equal `fit_gradients`, started from the mean of the triangles around each site.
     """
-    vertices, neighbors, points = arrays_of(triangulation)
+    vertices, neighbors, points = mesh_arrays(triangulation)
     gradients = np.zeros((len(values), 2, WIDTH))
     _mean_slopes(vertices, points, values, gradients)
     surface = np.zeros((len(values), 3, WIDTH))
-    _bend_least(vertices, neighbors, points, values, gradients, surface)
+    _minimise_bending(vertices, neighbors, points, values, gradients, surface)
     return surface
 
 
@@ -164,13 +164,13 @@ def _weigh_corners(
 def corner_weights(
     triangulation: RegularTriangulation, queries: FloatArray, threads: int | None = None
 ) -> tuple[Indices, FloatArray]:
-    """Return which three sites make the surface at each of m points, (m, 3), and how.
+    """Return the three sites that determine the surface at each of m points, and their weights.
 
-    The weights, (m, 3, 3), are for each site those of its value and its gradient along y and x.
-    Neighbours in the list should be neighbours in the plane.
+    The sites have shape (m, 3). The weights, (m, 3, 3), multiply each site's value and its
+    gradient along y and x. Neighbours in the list should be neighbours in the plane.
     """
     corners, weights = np.zeros((len(queries), 3), np.int32), np.zeros((len(queries), 3, 3))
-    mesh = *arrays_of(triangulation), len(triangulation.sites)
+    mesh = *mesh_arrays(triangulation), len(triangulation.sites)
     blocks = -(-len(queries) // BLOCK)
     operands = queries, *mesh, corners, weights
     in_ranges(_weigh_corners, blocks, available_threads(threads), *operands, smallest=2)

@@ -19,7 +19,7 @@ from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
-from napari_shadowinv.geometry.interpolation import BLOCK, arrays_of, locate
+from napari_shadowinv.geometry.interpolation import BLOCK, locate, mesh_arrays
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 __all__ = ["natural_neighbor"]
@@ -43,7 +43,7 @@ def _circumcentre(
 
 @njit(nogil=True, cache=True)
 def _circle_holds(points: FloatArray, corners: Indices, y: float, x: float) -> bool:
-    """Tell whether (y, x) lies inside the circumcircle of a counter-clockwise triangle."""
+    """Return whether (y, x) lies inside the circumcircle of a counter-clockwise triangle."""
     a, b, c = corners[0], corners[1], corners[2]
     ay, ax = points[a, 0] - y, points[a, 1] - x
     by, bx = points[b, 0] - y, points[b, 1] - x
@@ -70,17 +70,17 @@ def _cavity(
         t = cavity[done]
         done += 1
         for k in range(3):
-            other = neighbors[t, k]
-            if other < 0 or _position(cavity, count, other) >= 0:
+            neighbour = neighbors[t, k]
+            if neighbour < 0 or _index_of(cavity, count, neighbour) >= 0:
                 continue
-            if count < cavity.shape[0] and _circle_holds(points, vertices[other], y, x):
-                cavity[count] = other
+            if count < cavity.shape[0] and _circle_holds(points, vertices[neighbour], y, x):
+                cavity[count] = neighbour
                 count += 1
     return count
 
 
 @njit(nogil=True, cache=True)
-def _position(items: Indices, count: int, item: int) -> int:
+def _index_of(items: Indices, count: int, item: int) -> int:
     for i in range(count):
         if items[i] == item:
             return i
@@ -118,10 +118,10 @@ def _stolen_area(
         double_area += last_y * centre_x - last_x * centre_y
         last_y, last_x = centre_y, centre_x
         # cross the edge from b to corner i, towards the rest of b's cavity triangles
-        other = neighbors[t, j]
-        if other < 0 or _position(cavity, count, other) < 0:
+        neighbour = neighbors[t, j]
+        if neighbour < 0 or _index_of(cavity, count, neighbour) < 0:
             break
-        t = other
+        t = neighbour
         pivot = 0
         while vertices[t, pivot] != b:
             pivot += 1
@@ -163,8 +163,8 @@ def _interpolate_blocks(
             out[q] = 0.0
             for c in range(count):
                 for k in range(3):
-                    other = neighbors[cavity[c], k]
-                    if other >= 0 and _position(cavity, count, other) >= 0:
+                    neighbour = neighbors[cavity[c], k]
+                    if neighbour >= 0 and _index_of(cavity, count, neighbour) >= 0:
                         continue
                     site, area = _stolen_area(
                         vertices, neighbors, points, cavity, count, cavity[c], k, y, x
@@ -197,8 +197,8 @@ def natural_neighbor(
     out = np.empty((len(points), columns.shape[1]))
     for column in range(columns.shape[1]):
         result = np.empty(len(points))
-        known = (*arrays_of(triangulation), np.ascontiguousarray(columns[:, column]))
+        surface = (*mesh_arrays(triangulation), np.ascontiguousarray(columns[:, column]))
         work = -(-len(points) // BLOCK), available_threads(threads), points
-        in_ranges(_interpolate_blocks, *work, *known, result, smallest=2)
+        in_ranges(_interpolate_blocks, *work, *surface, result, smallest=2)
         out[:, column] = result
     return out.reshape(len(points), *at_sites.shape[1:])

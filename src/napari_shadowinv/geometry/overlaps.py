@@ -20,10 +20,10 @@ __all__ = ["pixel_shares"]
 
 
 @njit(nogil=True, cache=True)
-def _reach(
+def _extent_between(
     low: float, high: float, a: float, b: float, of_a: float, of_b: float
 ) -> tuple[float, float]:
-    """Where a segment lies along one axis while it is between low and high along the other."""
+    """Return the extent of a segment along one axis between low and high along the other."""
     if not (min(a, b) <= high and max(a, b) >= low):
         return np.inf, -np.inf
     if a != b:
@@ -34,7 +34,7 @@ def _reach(
 
 
 @njit(nogil=True, cache=True)
-def _within(low: float, high: float, size: int) -> tuple[int, int]:
+def _pixel_range(low: float, high: float, size: int) -> tuple[int, int]:
     """Return the pixels, first and one beyond the last, that a range of positions touches."""
     if not low <= high:
         return 0, 0
@@ -53,9 +53,9 @@ def _list_shares(
     pixels: Indices,
     shares: FloatArray,
 ) -> None:
-    """List what cells hold; while there is no room for that, only count it in `starts`."""
+    """List the pixels of each cell; without room for them, only count them in `starts`."""
     height, width = shape
-    one, sums = np.ones((1, 1)), np.zeros((3, 1, 2))
+    unit_image, sums = np.ones((1, 1)), np.zeros((3, 1, 2))
     sums[0, 0, 1] = 1.0
     for i in range(start, stop):
         count = 0
@@ -63,14 +63,14 @@ def _list_shares(
         for k in range(around[i], around[i + 1]):
             low = min(low, borders[k, 0], borders[k, 2])
             high = max(high, borders[k, 0], borders[k, 2])
-        top, bottom = _within(low, high, height)
+        top, bottom = _pixel_range(low, high, height)
         for row in range(top, bottom):
             low, high = np.inf, -np.inf
             for k in range(around[i], around[i + 1]):
                 ya, xa, yb, xb, _ = borders[k]
-                left, right = _reach(row, row + 1.0, ya, yb, xa, xb)
-                low, high = min(low, left), max(high, right)
-            first, beyond = _within(low, high, width)
+                x_min, x_max = _extent_between(row, row + 1.0, ya, yb, xa, xb)
+                low, high = min(low, x_min), max(high, x_max)
+            first, beyond = _pixel_range(low, high, width)
             if len(pixels) == 0:
                 count += beyond - first
                 continue
@@ -78,10 +78,10 @@ def _list_shares(
                 share = 0.0
                 for k in range(around[i], around[i + 1]):
                     ya, xa, yb, xb, sense = borders[k]
-                    found = walk_edge(
-                        one, sums, ya - row, xa - column, yb - row, xb - column, False
+                    integrals = walk_edge(
+                        unit_image, sums, ya - row, xa - column, yb - row, xb - column, False
                     )
-                    share += sense * found[1]
+                    share += sense * integrals[1]
                 pixels[starts[i] + count] = row * width + column
                 shares[starts[i] + count] = share
                 count += 1
@@ -94,8 +94,8 @@ def pixel_shares(
 ) -> csr_array:
     """Return the area of each pixel in each of the n cells, (n, H W), over images of a shape.
 
-    The columns are the pixels row by row. To be asked before the triangulation is updated, as
-    `PowerDiagram.cell`. Results do not depend on the number of threads.
+    The columns are the pixels row by row. Like `PowerDiagram.cell`, it reads the
+    triangulation: call it before the next update. Results do not depend on the number of threads.
     """
     n = diagram.n_sites
     cells, senses = diagram.edges.T.ravel(), np.repeat([1.0, -1.0], len(diagram.edges))

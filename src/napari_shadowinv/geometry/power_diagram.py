@@ -1,4 +1,4 @@
-"""Power diagrams over an image: what each cell holds and what flows between cells.
+"""Power diagrams over an image: the contents of each cell and the flux between cells.
 
 The power diagram of sites r_i with weights w_i gives site i the cell
 
@@ -66,11 +66,11 @@ def _list_edges(vertices: Indices, neighbors: Indices, pairs: Indices, sides: In
     count = 0
     for t in range(vertices.shape[0]):
         for k in range(3):
-            other = neighbors[t, k]
-            if other > t:
+            neighbour = neighbors[t, k]
+            if neighbour > t:
                 pairs[count, 0] = vertices[t, (k + 1) % 3]
                 pairs[count, 1] = vertices[t, (k + 2) % 3]
-                sides[count, 0], sides[count, 1] = t, other
+                sides[count, 0], sides[count, 1] = t, neighbour
                 count += 1
     return count
 
@@ -88,13 +88,17 @@ def _integrate_edges(
 ) -> None:
     """Walk each border; columns of `integrals`: flux, mass, moments y and x, inertia."""
     for e in range(start, stop):
-        left, right = sides[e, 0], sides[e, 1]
-        ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
-        yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
-        found = walk_edge(image, sums, ya, xa, yb, xb, with_moments)
-        integrals[e, 0], integrals[e, 1] = found[0], found[1]
+        t_left, t_right = sides[e, 0], sides[e, 1]
+        ya, xa = centres[t_left, 0] + 0.5, centres[t_left, 1] + 0.5
+        yb, xb = centres[t_right, 0] + 0.5, centres[t_right, 1] + 0.5
+        walk = walk_edge(image, sums, ya, xa, yb, xb, with_moments)
+        integrals[e, 0], integrals[e, 1] = walk[0], walk[1]
         if with_moments:
-            integrals[e, 2], integrals[e, 3], integrals[e, 4] = found[2], found[3], found[4]
+            integrals[e, 2], integrals[e, 3], integrals[e, 4] = (
+                walk[2],
+                walk[3],
+                walk[4],
+            )
 
 
 @njit(nogil=True, cache=True)
@@ -228,7 +232,7 @@ class PowerDiagram:
     def borders(self) -> FloatArray:
         """Ends (y, x) of the border between each pair of `edges`, shape (e, 2, 2).
 
-        The first of the pair lies to its left. To be asked before the triangulation is updated.
+        The first of the pair lies to its left. Read it before the triangulation is updated.
         """
         _, sides = _edges_of(self._triangulation)
         return np.asarray(self.vertices[sides])
@@ -236,14 +240,14 @@ class PowerDiagram:
     def cell(self, site: int) -> FloatArray:
         """Return the corners of a site's cell, counter-clockwise in (y, x), shape (k, 2).
 
-        Cells at the rim reach far beyond the image. An empty cell has no corners. To be asked
-        before the triangulation is updated.
+        Cells at the rim reach far beyond the image. An empty cell has no corners. Call it before
+        the triangulation is updated.
         """
         pairs, sides = _edges_of(self._triangulation)
         around = {}
         for k in np.flatnonzero((pairs == site).any(axis=1)):
-            left, right = sides[k]
-            around.update({right: left} if pairs[k, 0] == site else {left: right})
+            t_left, t_right = sides[k]
+            around.update({t_right: t_left} if pairs[k, 0] == site else {t_left: t_right})
         if not around:
             return np.empty((0, 2))
         first = triangle = next(iter(around))

@@ -46,7 +46,7 @@ GHOST_STEP = 1024.0
 
 STACK_SIZE = 1 << 14
 
-_PART = 1 << 17  # sites between two signs of life
+_SITES_PER_PART = 1 << 17  # sites inserted between two calls of `alive`
 
 T = TypeVar("T", bound=np.generic)
 
@@ -131,12 +131,12 @@ class RegularTriangulation:
         region: ArrayLike | None = None,
         alive: Callable[[], None] | None = None,
     ) -> None:
-        given = _checked_points(sites)
-        n = given.shape[0]
-        order = hilbert_permutation(given)
+        positions = _checked_points(sites)
+        n = positions.shape[0]
+        order = hilbert_permutation(positions)
         self._order = None if np.array_equal(order, np.arange(n)) else order
         points, self._ghost_distance = _with_ghosts(
-            given if self._order is None else given[order], region
+            positions if self._order is None else positions[order], region
         )
         self._region = region
         self._mesh = Mesh(
@@ -195,9 +195,9 @@ class RegularTriangulation:
     ) -> bool:
         """Repair the triangulation for new weights; return False if it was stopped.
 
-        That is, on demand, as soon as a site that is in the triangulation is proven hidden: what
-        is left is valid and has all those sites, but is irregular until the next update. The
-        threads look for irregular edges; the flips themselves take one.
+        With `stop_when_hidden` it stops as soon as a site of the triangulation is proven hidden.
+        The triangulation is then valid and contains the same sites, but is irregular until the
+        next update. Irregular edges are searched for in parallel; flips run in one thread.
         """
         self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
         self.forget()
@@ -221,11 +221,11 @@ class RegularTriangulation:
         as a new triangulation. Copies made before keep the old places. Of sites that come to the
         same place with the same weight any one may become the vertex.
         """
-        given = _checked_points(sites)
+        positions = _checked_points(sites)
         n = self._mesh.hidden.size
-        if len(given) != n:
-            raise InputError(f"got {len(given)} sites to move {n} sites to: expected as many")
-        targets = given if self._order is None else given[self._order]
+        if len(positions) != n:
+            raise InputError(f"got {len(positions)} sites to move {n} sites to: expected as many")
+        targets = positions if self._order is None else positions[self._order]
         points, self._ghost_distance = _with_ghosts(targets, self._region)
         same_ghosts = np.array_equal(points[n:], self._mesh.points[n:])
         self.forget()
@@ -241,9 +241,9 @@ class RegularTriangulation:
         """Raise the weights of hidden sites by the least that makes their cells count.
 
         The lifted heights (|r|² - w) / 2 of hidden sites are lowered to the convex hull of the
-        others. The triangulation is then that of the new weights, with every site in it; the
+        others. The triangulation then belongs to the new weights and contains every site; the
         cells of the raised sites have no area within rounding. In clusters so tight that the
-        weights' rounding exceeds what separates the cells, such sites may hide again in the next
+        weights' rounding exceeds the distance of the cells, such sites may hide again in the next
         `update`. Sites at the same place get the weight of the heaviest; only one of them can be
         in the triangulation. Returns the new weights.
         """
@@ -276,9 +276,9 @@ class RegularTriangulation:
         """
         if not np.size(sites):
             return self.copy()
-        given = _checked_points(sites)
-        count, n = len(given), self._mesh.hidden.size
-        order = hilbert_permutation(given)
+        positions = _checked_points(sites)
+        count, n = len(positions), self._mesh.hidden.size
+        order = hilbert_permutation(positions)
         old = self._mesh
         size = 6 * (n + count) + 6
         used = 3 * old.counters[SIZE]
@@ -290,12 +290,12 @@ class RegularTriangulation:
 
         twin = object.__new__(RegularTriangulation)
         twin._region, twin._ghost_distance = self._region, self._ghost_distance
-        own = np.arange(n, dtype=np.int32) if self._order is None else self._order
-        twin._order = np.append(own, n + order).astype(np.int32)
+        old_order = np.arange(n, dtype=np.int32) if self._order is None else self._order
+        twin._order = np.append(old_order, n + order).astype(np.int32)
         counters = old.counters.copy()
         counters[LIMIT] += 100 * count
         twin._mesh = Mesh(
-            points=np.concatenate([old.points[:n], given[order], old.points[n:]]),
+            points=np.concatenate([old.points[:n], positions[order], old.points[n:]]),
             weights=np.concatenate([old.weights[:n], np.zeros(count), old.weights[n:]]),
             corners=grown(old.corners, n),
             twins=grown(old.twins, size),
@@ -310,10 +310,10 @@ class RegularTriangulation:
 
     def _build(self, alive: Callable[[], None] | None = None) -> None:
         order = insertion_order(self._mesh.hidden.size)
-        for first in range(0, order.size, _PART):
+        for first in range(0, order.size, _SITES_PER_PART):
             if alive is not None:
                 alive()
-            last = min(first + _PART, order.size)
+            last = min(first + _SITES_PER_PART, order.size)
             if _flips.build(self._mesh, order, first, last) == _flips.EXHAUSTED:
                 raise RuntimeError(self._exhausted())
 
@@ -337,11 +337,11 @@ class RegularTriangulation:
     def _in_given_order(self, values: NDArray[T]) -> NDArray[T]:
         if self._order is None:
             return values
-        given = values.copy()
-        given[self._order] = values[: self._order.size]
-        return given
+        reordered = values.copy()
+        reordered[self._order] = values[: self._order.size]
+        return reordered
 
     def forget(self) -> None:
-        """Let go of arrays that are made when they are asked for."""
+        """Drop the cached arrays, which are computed on demand."""
         for name in ("points", "weights", "hidden", "vertices", "neighbors"):
             self.__dict__.pop(name, None)

@@ -53,9 +53,9 @@ def compiling_together() -> Iterator[None]:
 
 def how_often() -> str:
     """Return how often the compiler is waited for, in words."""
-    from napari_shadowinv.geometry._kernel import is_kept
+    from napari_shadowinv.geometry._kernel import is_code_cached
 
-    if is_kept():
+    if is_code_cached():
         return "once, for a minute or so"
     return "every time: set NUMBA_CACHE_DIR to a writable folder"
 
@@ -73,8 +73,8 @@ def is_compiled() -> bool:
 def code_folder() -> Path | None:
     """Return the folder of the triangulation's machine code; None where none can be kept."""
     from napari_shadowinv.geometry._flips import build
-    from napari_shadowinv.geometry._kernel import is_kept
+    from napari_shadowinv.geometry._kernel import is_code_cached
 
-    if not is_kept():
+    if not is_code_cached():
         return None
     return Path(build.stats.cache_path)  # type: ignore[attr-defined]
