@@ -134,14 +134,14 @@ def test_cells_hold_the_same_of_split_pixels(parts):
     level = planned(UNIFORM).levels[0]
     weights = np.random.default_rng(3).normal(0, 2, len(level.sites))
     smaller = level.split(parts)
-    whole = PowerDiagram(
+    unsplit = PowerDiagram(
         RegularTriangulation(level.sites, weights), Density.from_image(smooth_image())
     )
     split = PowerDiagram(
         RegularTriangulation(smaller.sites, parts**2 * weights),
         Density.from_image(split_pixels(smooth_image(), parts)),
     )
-    np.testing.assert_allclose(split.masses, whole.masses, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(split.masses, unsplit.masses, rtol=1e-9, atol=1e-12)
     assert smaller.spacing == pytest.approx(parts * level.spacing)
 
 
@@ -173,9 +173,9 @@ def test_an_unsolved_image_leaves_the_solution_of_a_blurred_one(stages):
     answer = solve(plan.levels, image, options)[-1]
     assert not answer.converged
     assert "all 27 iterations" in answer.reason
-    told = re.search(r"blurred by (\S+) px", answer.reason)
+    blur = re.search(r"blurred by (\S+) px", answer.reason)
     level = plan.levels[-1]
-    widths = np.linspace(0.9, 1.1, 21) * float(told[1])
+    widths = np.linspace(0.9, 1.1, 21) * float(blur[1])
     assert min(residual_when_blurred(level, answer.weights, image, w) for w in widths) < 0.3
     assert residual(level, answer.weights, image) == pytest.approx(answer.residual, rel=1e-6)
 
@@ -228,8 +228,8 @@ def test_a_square_on_a_disc_keeps_its_symmetry_and_shrinks_evenly():
     inner = slice(2, -2)  # at the edge the potential is extrapolated
     potential = inversion.potential[inner, inner]
     assert inversion.report.converged
-    for other in (np.rot90(potential), potential[::-1], potential.T):
-        np.testing.assert_allclose(other, potential, rtol=0, atol=2e-3 * np.ptp(potential))
+    for symmetric in (np.rot90(potential), potential[::-1], potential.T):
+        np.testing.assert_allclose(symmetric, potential, rtol=0, atol=2e-3 * np.ptp(potential))
     shrinkage = jacobian_determinant(inversion.displacement)[8:-8, 8:-8]
     expected = 1 / raised(DISC).max()
     assert shrinkage.mean() == pytest.approx(expected, rel=0.02)
@@ -238,7 +238,7 @@ def test_a_square_on_a_disc_keeps_its_symmetry_and_shrinks_evenly():
 
 def test_threads_do_not_change_the_way_to_a_sharp_image():
     plan = planned(UNIFORM, 12_000)
-    one, two = (
+    single, parallel = (
         solve(
             plan.levels[-1:],
             raised(np.maximum(DISC, 0.1)),
@@ -246,6 +246,6 @@ def test_threads_do_not_change_the_way_to_a_sharp_image():
         )[-1]
         for threads in (1, 2)
     )
-    assert one.converged
-    assert one.iterations == two.iterations
-    np.testing.assert_array_equal(one.weights, two.weights)
+    assert single.converged
+    assert single.iterations == parallel.iterations
+    np.testing.assert_array_equal(single.weights, parallel.weights)

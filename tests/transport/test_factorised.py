@@ -28,13 +28,15 @@ def test_every_system_is_solved(laplacian, grounded):
     ground = np.where(rng.random(n) < 0.1, 2.0, 0.0) if grounded else None
     right = rng.normal(size=(n, WIDTH))
     right[:, -1] = 0
-    found = FactorisedLaplacian(laplacian, ground).solve(right)
+    solution = FactorisedLaplacian(laplacian, ground).solve(right)
     if ground is None:
-        np.testing.assert_array_equal(found[0], 0)
-        np.testing.assert_allclose(laplacian @ found, right - right.mean(axis=0), atol=1e-7)
+        np.testing.assert_array_equal(solution[0], 0)
+        np.testing.assert_allclose(laplacian @ solution, right - right.mean(axis=0), atol=1e-7)
     else:
-        np.testing.assert_allclose(laplacian @ found + ground[:, None] * found, right, atol=1e-7)
-    np.testing.assert_array_equal(found[:, -1], 0)
+        np.testing.assert_allclose(
+            laplacian @ solution + ground[:, None] * solution, right, atol=1e-7
+        )
+    np.testing.assert_array_equal(solution[:, -1], 0)
 
 
 def test_groups_without_conductors_between_them_are_refused(laplacian):

@@ -226,11 +226,11 @@ def test_a_zero_right_side_gives_zeros() -> None:
 def test_a_graph_in_two_pieces_is_refused(sizes: tuple[int, int]) -> None:
     pieces = [path(size) for size in sizes]
     n = sum(sizes)
-    whole = coo_array((n, n)).tolil()
-    whole[: sizes[0], : sizes[0]] = pieces[0]
-    whole[sizes[0] :, sizes[0] :] = pieces[1]
+    matrix = coo_array((n, n)).tolil()
+    matrix[: sizes[0], : sizes[0]] = pieces[0]
+    matrix[sizes[0] :, sizes[0] :] = pieces[1]
     with pytest.raises(RuntimeError, match="several groups with no flux between them"):
-        SimilarSystems().solve(csr_array(whole), noise(n), 1e-2)
+        SimilarSystems().solve(csr_array(matrix), noise(n), 1e-2)
 
 
 def test_many_pieces_are_refused() -> None:
@@ -284,15 +284,15 @@ def test_one_setup_solves_similar_systems(grounded: bool, monkeypatch: pytest.Mo
         varied = scale @ laplacian @ scale
         varied = csr_array(varied - diags_array(varied.sum(axis=1)))
         ground = 0.1 * rng.random(3000) if grounded else None
-        whole = varied if ground is None else varied + diags_array(ground)
+        matrix = varied if ground is None else varied + diags_array(ground)
         right = length * noise(3000)
-        assert residual(whole, systems.solve(varied, right, 1e-9, ground=ground), right) <= 1e-9
+        assert residual(matrix, systems.solve(varied, right, 1e-9, ground=ground), right) <= 1e-9
     assert len(setups) == 1
-    other = smooth_contrast(3000)
-    assert residual(other, systems.solve(other, right, 1e-9), right) <= 1e-9
+    changed = smooth_contrast(3000)
+    assert residual(changed, systems.solve(changed, right, 1e-9), right) <= 1e-9
     assert len(setups) == 2
     for _ in range(2):  # a step that was kept short changes the matrix too much
-        systems.solve(other, right, 1e-9)
+        systems.solve(changed, right, 1e-9)
     assert len(setups) == 4
 
 
@@ -303,9 +303,9 @@ def test_a_ground_makes_the_system_regular(n: int, strength: float) -> None:
     ground = np.where(np.arange(n) % 7 == 0, strength, 0.0)
     right = np.random.default_rng(2).random(n)  # its sum flows off through the ground
     exact = splu((laplacian + diags_array(ground)).tocsc()).solve(right)
-    found = SimilarSystems().solve(laplacian, right, 1e-10, ground=ground)
-    np.testing.assert_allclose(found, exact, rtol=1e-5, atol=1e-7 * np.abs(exact).max())
-    assert ground @ found == pytest.approx(right.sum(), rel=1e-6)
+    solution = SimilarSystems().solve(laplacian, right, 1e-10, ground=ground)
+    np.testing.assert_allclose(solution, exact, rtol=1e-5, atol=1e-7 * np.abs(exact).max())
+    assert ground @ solution == pytest.approx(right.sum(), rel=1e-6)
 
 
 def test_grounded_multigrid_needs_few_iterations() -> None:

@@ -44,9 +44,9 @@ def test_hessian_is_the_slope_of_the_gradient(problem):
 
 def test_value_is_convex_and_ignores_a_common_weight(problem):
     objective, weights, rng = problem
-    other = weights + rng.normal(size=50)
-    ends = [objective.value_and_gradient(w)[0] for w in (weights, other)]
-    middle = objective.value_and_gradient((weights + other) / 2)[0]
+    second_weights = weights + rng.normal(size=50)
+    ends = [objective.value_and_gradient(w)[0] for w in (weights, second_weights)]
+    middle = objective.value_and_gradient((weights + second_weights) / 2)[0]
     assert middle < np.mean(ends)
     shifted = objective.value_and_gradient(weights + 3.0)[0]
     assert shifted == pytest.approx(ends[0], rel=1e-12)

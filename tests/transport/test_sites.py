@@ -85,11 +85,11 @@ def test_few_sites_on_a_small_bright_spot_still_hold_the_whole_image():
 @pytest.mark.parametrize("threads", [1, 3])
 def test_all_levels_stop_when_asked_to(threads):
     """The coarse levels, which are made in another thread, must not be waited for."""
-    asked = []
+    calls = []
 
     def soon():
-        asked.append(True)
-        return len(asked) > 3
+        calls.append(True)
+        return len(calls) > 3
 
     plan = plan_levels(gaussian_beam(), 4000, lloyd_iterations=1_000_000, threads=threads)
     with pytest.raises(InversionCancelled):
@@ -97,10 +97,10 @@ def test_all_levels_stop_when_asked_to(threads):
 
 
 def test_levels_do_not_depend_on_threads():
-    one, three = (
+    single, parallel = (
         plan_levels(gaussian_beam(), 5000, lloyd_iterations=3, threads=threads)
         for threads in (1, 3)
     )
-    for a, b in zip(one.levels, three.levels, strict=True):
+    for a, b in zip(single.levels, parallel.levels, strict=True):
         np.testing.assert_array_equal(a.sites, b.sites)
         np.testing.assert_array_equal(a.mass, b.mass)

@@ -156,11 +156,11 @@ def test_threads_do_not_change_the_weights():
     y, x = np.indices((60, 60))
     image = 0.3 + np.exp(-(((y - 25) / 9) ** 2) - ((x - 33) / 8) ** 2)
     image /= image.mean()
-    one, three = (
+    single, parallel = (
         solve(plan.levels, image, InversionOptions(threads=threads))[-1].weights
         for threads in (1, 3)
     )
-    np.testing.assert_array_equal(one, three)
+    np.testing.assert_array_equal(single, parallel)
 
 
 def test_blurring_keeps_the_flux_and_adds_variances():

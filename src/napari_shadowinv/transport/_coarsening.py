@@ -26,9 +26,9 @@ from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry._kernel import njit
 from napari_shadowinv.geometry._mesh import Indices
 
-_COARSEST = 60
-_WEAKEST_TIE = 0.2
-_FEW_PAIRS = 0.75
+_MAX_COARSEST_NODES = 60
+_MIN_TIE = 0.2
+_MAX_PAIRED_SHARE = 0.75
 _NOT_CONNECTED = (
     "the cells form several groups with no flux between them, so the relative weights of the "
     "groups are undetermined"
@@ -47,7 +47,7 @@ class Network(NamedTuple):
 
 
 class Hierarchy(NamedTuple):
-    """All that one cycle needs: the nodes of level k are `bounds[k]` to `bounds[k + 1]`."""
+    """Data of one cycle: the nodes of level k are `bounds[k]` to `bounds[k + 1]`."""
 
     bounds: IntArray
     twice: BoolArray
@@ -133,23 +133,25 @@ def _pair(
         free = taken = -1
         free_tie = taken_tie = weakest
         for k in range(starts[i], starts[i + 1]):
-            other = neighbors[k]
-            group = groups[other]
+            neighbour = neighbors[k]
+            group = groups[neighbour]
             if group < 0:
-                tie = conductances[k] * (inverses[i] + inverses[other])
+                tie = conductances[k] * (inverses[i] + inverses[neighbour])
                 if tie > free_tie:
-                    free, free_tie = other, tie
+                    free, free_tie = neighbour, tie
             else:
                 tie = conductances[k] * (inverses[i] + group_inverses[group - first])
                 if tie > taken_tie:
                     taken, taken_tie = group, tie
         if free >= 0:
             groups[i] = groups[free] = count
-            group_inverses[count - first] = _of_sum(inverses[i], inverses[free])
+            group_inverses[count - first] = _join_inverses(inverses[i], inverses[free])
             count += 1
         elif taken >= 0:
             groups[i] = taken
-            group_inverses[taken - first] = _of_sum(inverses[i], group_inverses[taken - first])
+            group_inverses[taken - first] = _join_inverses(
+                inverses[i], group_inverses[taken - first]
+            )
         else:
             groups[i] = count
             group_inverses[count - first] = inverses[i]
@@ -158,8 +160,8 @@ def _pair(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _of_sum(a: float, b: float) -> float:
-    """Return the inverse of the sum of two numbers, all given by their inverses."""
+def _join_inverses(a: float, b: float) -> float:
+    """Return the inverse of the sum of two numbers from their inverses."""
     return a * b / (a + b)
 
 
@@ -197,13 +199,13 @@ def _contract(
         for m in range(begins[g - first], begins[g - first + 1]):
             node = members[m]
             for k in range(starts[node], starts[node + 1]):
-                other = groups[neighbors[k]]
-                if other == g:
+                adjacent = groups[neighbors[k]]
+                if adjacent == g:
                     continue
-                at = place[other - first]
+                at = place[adjacent - first]
                 if at < begin:
-                    place[other - first] = end
-                    coarse_neighbors[end], coarse_conductances[end] = other, conductances[k]
+                    place[adjacent - first] = end
+                    coarse_neighbors[end], coarse_conductances[end] = adjacent, conductances[k]
                     end += 1
                 else:
                     coarse_conductances[at] += conductances[k]
@@ -219,8 +221,8 @@ def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> H
     n = int(laplacian.shape[0])
     # every level has at most three quarters of the nodes of the last, so 4 n are enough;
     # pages that are never touched take no memory
-    network = _empty_network(4 * n + _COARSEST, 2 * int(laplacian.nnz))
-    parents: Indices = np.empty(4 * n + _COARSEST, np.int32)
+    network = _empty_network(4 * n + _MAX_COARSEST_NODES, 2 * int(laplacian.nnz))
+    parents: Indices = np.empty(4 * n + _MAX_COARSEST_NODES, np.int32)
     _read_laplacian(
         laplacian.indptr.astype(np.int32, copy=False),
         laplacian.indices.astype(np.int32, copy=False),
@@ -229,7 +231,7 @@ def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> H
     )
     _tie_to_ground(network, 0, ground)
     bounds = [0, n]
-    while bounds[-1] - bounds[-2] > _COARSEST:
+    while bounds[-1] - bounds[-2] > _MAX_COARSEST_NODES:
         network, last = _add_level(network, parents, bounds[-2], bounds[-1])
         if ground is not None:
             groups = parents[bounds[-2] : bounds[-1]] - bounds[-1]
@@ -258,24 +260,24 @@ def _add_level(network: Network, parents: Indices, start: int, stop: int) -> tup
     if stop - start > 1 and not network.degrees[start:stop].min() > 0.0:
         raise RuntimeError(_NOT_CONNECTED)
     inverses = np.empty(stop - start)
-    for weakest in (_WEAKEST_TIE, 0.0):
+    for weakest in (_MIN_TIE, 0.0):
         count = _pair(network, start, stop, weakest, network.inverse_degrees, parents, 0, inverses)
-        if count <= _FEW_PAIRS * (stop - start):
+        if count <= _MAX_PAIRED_SHARE * (stop - start):
             break
     else:
         raise RuntimeError("the fluxes between cells are not finite, or underflow")
     pairs = _empty_network(count, network.starts[stop] - network.starts[start])
     _contract(network, start, stop, parents, pairs, 0, count)
     groups = np.empty(count, np.int32)
-    last = _pair(pairs, 0, count, _WEAKEST_TIE, inverses, groups, stop, np.empty(count))
-    network = _with_room(network, network.starts[stop] + pairs.starts[count])
+    last = _pair(pairs, 0, count, _MIN_TIE, inverses, groups, stop, np.empty(count))
+    network = _grow_network(network, network.starts[stop] + pairs.starts[count])
     _contract(pairs, 0, count, groups, network, stop, last)
     parents[start:stop] = groups[parents[start:stop]]
     return network, last
 
 
-def _with_room(network: Network, entries: int) -> Network:
-    """Make room for that many entries; a planar network comes with enough."""
+def _grow_network(network: Network, entries: int) -> Network:
+    """Make room for a number of entries; a planar network comes with enough."""
     missing = entries - len(network.neighbors)
     if missing <= 0:
         return network
@@ -286,7 +288,7 @@ def _with_room(network: Network, entries: int) -> Network:
 
 
 def _choose_second_steps(network: Network, bounds: list[int]) -> BoolArray:
-    """Tell at which levels a cycle does two steps: where all visits cost less than level 0."""
+    """Choose the levels with two steps a cycle: those whose visits cost less than level 0."""
     entries = np.diff(network.starts[bounds])
     twice = np.zeros(len(entries), np.bool_)
     visits = 2

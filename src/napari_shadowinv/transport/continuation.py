@@ -32,30 +32,30 @@ __all__ = ["blurred", "sharpen"]
 
 Soften = Callable[[Level, float, int], TransportObjective]
 
-_WIDEST = 1 / 6  # of the image's longer side
-_SHARP_ENOUGH = 0.5  # in site spacings: from there the sharp image is tried
-_SHARPER = 4.0  # times less blur before the sharp image is tried again
-_NARROWEST = 1e-3  # px
-_CLOSEST = 1.02  # ratio of two widths
+_MAX_BLUR_SHARE = 1 / 6  # of the image's longer side
+_SHARP_BLUR_SPACINGS = 0.5  # in site spacings: from there the sharp image is tried
+_RETRY_RATIO = 4.0  # times less blur before the sharp image is tried again
+_MIN_BLUR_PX = 1e-3
+_MIN_BLUR_RATIO = 1.02
 _PATH_TOLERANCE = 0.3  # a blurred image's solution only has to start the next
 _SHORTEST_STEP = 1e-2
-_FINE = 16.0  # pixels to a blur that are as good as more
-_SMOOTH = 1.5  # smallest blur, in pixels, that hides them
-_MOST_PARTS = 8  # of a pixel's side
-_MOST_PIXELS = 2**22  # after splitting
+_MAX_BLUR_IN_PIXELS = 16.0  # wider blurs are computed on means of pixels
+_MIN_BLUR_IN_PIXELS = 1.5  # smallest blur, in pixels, that hides them
+_MAX_PARTS = 8  # of a pixel's side
+_MAX_PIXELS = 2**22  # after splitting
 _SHARES_OF_PREDICTION = (1.0, 0.5, 0.25)
-_LEAST_OF_PREDICTION = 1e-2  # of the smallest flux to reach
+_MIN_PREDICTED_SHARE = 1e-2  # of the smallest flux to reach
 
 
 def blurred(image: FloatArray, width: float, threads: int | None = 1) -> FloatArray:
-    """Let a positive image's flux diffuse to a standard deviation in px, mirrored at the border.
+    """Blur a positive image by a standard deviation in px, mirrored at the border.
 
     The kernel is the discrete Gaussian (T. Lindeberg, IEEE Trans. Pattern Anal. Mach. Intell. 12,
-    234, 1990), which has no negative lobes at any width; the sum stays. A wide blur is that of the
-    means of squares that are small beside it.
+    234, 1990), which has no negative lobes at any width; the sum stays. For a wide blur, the means
+    of squares much smaller than its width are blurred instead of pixels.
     """
     height, breadth = image.shape
-    parts = max(1, int(width / _FINE))
+    parts = max(1, int(width / _MAX_BLUR_IN_PIXELS))
     means = _means(image, parts)
     workers = available_threads(threads)
     spectrum = dctn(means, workers=workers)
@@ -70,10 +70,10 @@ def blurred(image: FloatArray, width: float, threads: int | None = 1) -> FloatAr
 
 
 def _means(image: FloatArray, parts: int) -> FloatArray:
-    """Means of squares of pixels; at the end those at the border count for what is beyond it."""
+    """Return the means of squares of pixels; the last pixels are repeated beyond the border."""
     height, width = image.shape
-    whole = np.pad(image, ((0, -height % parts), (0, -width % parts)), mode="edge")
-    rows = sum((whole[k::parts] for k in range(parts)), start=np.zeros(()))
+    padded = np.pad(image, ((0, -height % parts), (0, -width % parts)), mode="edge")
+    rows = sum((padded[k::parts] for k in range(parts)), start=np.zeros(()))
     return sum((rows[:, k::parts] for k in range(parts)), start=np.zeros(())) / parts**2
 
 
@@ -89,21 +89,21 @@ def sharpen(
     """Solve one level from zero weights by following the solution from a blurred image.
 
     `soften` makes the objective for the level of split pixels, the blur in those pixels, and the
-    parts of a pixel's side (see `Level.split`). The iterations count on all images together.
-    Where the sharp image could not be reached, the solution is that of the sharpest one that was,
-    and the reason tells its blur; where the sharp image was nearly solved, that solution.
+    parts of a pixel's side (see `Level.split`). The limit of iterations covers all images together.
+    If the sharp image cannot be solved, the solution of the sharpest solved image is returned and
+    the reason names its blur; if the sharp image was nearly solved, that solution is returned.
     """
     solved: list[_Solved] = []
     nearest: Solution | None = None
-    width: float | None = _WIDEST * max(level.shape)
-    sharp_below = _SHARP_ENOUGH * level.spacing
+    width: float | None = _MAX_BLUR_SHARE * max(level.shape)
+    sharp_below = _SHARP_BLUR_SPACINGS * level.spacing
     split = cache(level.split)
     steps = 0
     while width is not None and steps < max_iterations:
         parts = _parts(width, level.shape)
         objective = soften(split(parts), parts * width, parts) if width else sharp
         # weights are squares of lengths
-        before = [_Solved(one.width, parts**2 * one.weights) for one in solved[-2:]]
+        before = [_Solved(earlier.width, parts**2 * earlier.weights) for earlier in solved[-2:]]
         for start in _starts(objective, split(parts), width, before):
             solution = newton(
                 objective,
@@ -123,9 +123,9 @@ def sharpen(
         if solution.converged:
             solved.append(_Solved(width, solution.weights / parts**2))
         if solved and not width:
-            sharp_below = solved[-1].width / _SHARPER
+            sharp_below = solved[-1].width / _RETRY_RATIO
         width = _next_width(width, solved, level, sharp_below, converged=solution.converged)
-    answer = _blurred_answer(sharp, solved, level, tolerance)
+    answer = _blurred_solution(sharp, solved, level, tolerance)
     used_up = f"the solver used all {max_iterations} iterations allowed"
     if nearest is not None and nearest.residual < min(answer.residual, _PATH_TOLERANCE):
         reason = used_up if steps >= max_iterations else nearest.reason
@@ -135,12 +135,12 @@ def sharpen(
 
 
 def _parts(width: float, shape: tuple[int, int]) -> int:
-    """Return into how many parts a pixel's side is split for a blur of so many px."""
+    """Return the number of parts into which a pixel's side is split for a blur in px."""
     parts = 1
     while (
-        0 < width * parts < _SMOOTH
-        and parts < _MOST_PARTS
-        and 4 * parts**2 * shape[0] * shape[1] <= _MOST_PIXELS
+        0 < width * parts < _MIN_BLUR_IN_PIXELS
+        and parts < _MAX_PARTS
+        and 4 * parts**2 * shape[0] * shape[1] <= _MAX_PIXELS
     ):
         parts *= 2
     return parts
@@ -156,14 +156,14 @@ class _Solved(NamedTuple):
 def _next_width(
     width: float, solved: list[_Solved], level: Level, sharp_below: float, *, converged: bool
 ) -> float | None:
-    """Return the blur to try after this one, None where there is no more to try."""
+    """Return the next blur to try, or None if there is none."""
     if converged:
         return width / 2 if width >= 2 * sharp_below else 0.0
     if not solved:
         return 2 * width if width < max(level.shape) else None
     before = solved[-1].width
     width = np.sqrt(width * before) if width else before / 2
-    return float(width) if _NARROWEST < width < before / _CLOSEST else None
+    return float(width) if _MIN_BLUR_PX < width < before / _MIN_BLUR_RATIO else None
 
 
 def _starts(
@@ -176,7 +176,7 @@ def _starts(
         return
     last = solved[-1]
     if len(solved) > 1:
-        least = _LEAST_OF_PREDICTION * float(objective.mass.min())
+        least = _MIN_PREDICTED_SHARE * float(objective.mass.min())
         slope = (last.weights - solved[-2].weights) / (last.width - solved[-2].width)
         for share in _SHARES_OF_PREDICTION:
             predicted = last.weights + share * (width - last.width) * slope
@@ -204,7 +204,7 @@ def _same_moments(level: Level, image: FloatArray) -> FloatArray:
 
 
 def _moments(points: FloatArray, flux: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the centre of flux and the covariance, that of a pixel included."""
+    """Return the centre of flux and the covariance, which includes the extent of a pixel."""
     share = (flux / flux.sum())[:, None]
     centre = (share * points).sum(axis=0)
     away = points - centre
@@ -217,10 +217,10 @@ def _square_root(matrix: FloatArray) -> FloatArray:
     return root
 
 
-def _blurred_answer(
+def _blurred_solution(
     sharp: TransportObjective, solved: list[_Solved], level: Level, tolerance: float
 ) -> Solution:
-    """Return the sharpest solution that was found, and how far it is from the sharp image's."""
+    """Return the sharpest solution, with its residual for the sharp image."""
     width, weights = solved[-1] if solved else _Solved(np.inf, np.zeros(len(level.sites)))
     residual = sharp.residual(sharp.diagram(weights))
     rounded = float(f"{width:.2g}")

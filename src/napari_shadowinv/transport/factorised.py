@@ -24,23 +24,23 @@ def _substitute(
 ) -> None:
     """Solve L D Lᵀ x = b in place; each column of L begins with its diagonal, which is 1."""
     n = len(pivots)
-    here = np.empty(WIDTH)
+    unknown = np.empty(WIDTH)
     for j in range(n):
         for s in range(WIDTH):
-            here[s] = x[j, s]
+            unknown[s] = x[j, s]
         for k in range(starts[j] + 1, starts[j + 1]):
             i, value = rows[k], factor[k]
             for s in range(WIDTH):
-                x[i, s] -= value * here[s]
+                x[i, s] -= value * unknown[s]
     for j in range(n - 1, -1, -1):
         for s in range(WIDTH):
-            here[s] = x[j, s] / pivots[j]
+            unknown[s] = x[j, s] / pivots[j]
         for k in range(starts[j] + 1, starts[j + 1]):
             i, value = rows[k], factor[k]
             for s in range(WIDTH):
-                here[s] -= value * x[i, s]
+                unknown[s] -= value * x[i, s]
         for s in range(WIDTH):
-            x[j, s] = here[s]
+            x[j, s] = unknown[s]
 
 
 class FactorisedLaplacian:

@@ -35,10 +35,10 @@ from napari_shadowinv.transport._coarsening import (
 
 __all__ = ["LaplacianSolver", "SimilarSystems", "factorise"]
 
-_DIRECT_BELOW = 200
-_MORE_ITERATIONS = 3  # that cost less than a new setup
-_SHORTER = 0.4  # right-hand side relative to that of the setup, from where it serves
-_KEPT_BELOW = 500_000  # nodes; a larger setup takes the memory that trial steps need
+_MAX_DIRECT_NODES = 200
+_EXTRA_ITERATIONS = 3  # that cost less than a new setup
+_REUSE_LENGTH = 0.4  # right-hand sides below this length, relative to the setup's, reuse it
+_MAX_KEPT_NODES = 500_000  # nodes; a larger setup takes the memory that trial steps need
 
 
 class _Vectors(NamedTuple):
@@ -64,7 +64,7 @@ def _multiply(start: int, stop: int, network: Network, x: FloatArray, product: F
 def _descend(
     start: int, stop: int, end: int, network: Network, parents: Indices, vectors: _Vectors
 ) -> None:
-    """Sweep forward from zero and hand what is left to the next level, up to `end`."""
+    """Sweep forward from zero and pass the residual to the next level, up to `end`."""
     # After such a sweep only the conductors to higher nodes leave a residual, and each is
     # also an entry of the higher node's row: both are done in one walk over half the entries.
     residual, x = vectors.residual, vectors.correction
@@ -222,11 +222,11 @@ class LaplacianSolver:
         laplacian: csr_array | None = None,
         ground: FloatArray | None = None,
     ) -> tuple[FloatArray, int, float]:
-        """Solve L x = b; return x, the iterations done, and the residual that was reached.
+        """Solve L x = b; return x, the number of iterations, and the residual.
 
-        Tolerance and residual are norms relative to that of b. Without a ground the mean of b
-        is ignored, and that of x is zero. A `laplacian` with its ground, if given, takes the place
-        of the one that was set up for, and should be near to it.
+        Tolerance and residual are relative to the norm of b. Without a ground the mean of b is
+        ignored, and x has zero mean. A `laplacian` with its ground, if passed, replaces the matrix
+        of the setup, and should be similar to it.
         """
         if laplacian is not None:
             self._matrix = _with_ground(laplacian, ground)
@@ -255,7 +255,7 @@ class LaplacianSolver:
         return self._centred(solution), iterations, relative
 
     def _centred(self, values: FloatArray) -> FloatArray:
-        """Take off the constant that a network without a ground does not feel."""
+        """Subtract the mean, to which a network without a ground is insensitive."""
         return values if self._grounded else values - values.mean()
 
     def _iterate(self, solution: FloatArray, energy: float) -> float:
@@ -284,10 +284,10 @@ def _with_ground(laplacian: csr_array, ground: FloatArray | None) -> csr_array:
 
 
 class SimilarSystems:
-    """Solves systems one after the other; what was set up for one serves the next ones, too.
+    """Solver of consecutive systems that reuses its setup.
 
-    That is as good as a setup for each where their matrices change little, as Newton's do once
-    their right-hand sides have become short.
+    Reuse costs nothing if the matrices change little, as Newton's do once their right-hand sides
+    have become short.
     """
 
     def __init__(self) -> None:
@@ -303,9 +303,9 @@ class SimilarSystems:
         ground: FloatArray | None = None,
     ) -> FloatArray:
         """Solve L x = b as `LaplacianSolver` does, or by factors if small or too hard for it."""
-        if len(right) < _DIRECT_BELOW:
+        if len(right) < _MAX_DIRECT_NODES:
             require_connected(laplacian)
-            return _solved_by_factors(laplacian, right, ground)
+            return _solve_by_factors(laplacian, right, ground)
         length = float(np.sqrt(np.sum(right * right)))
         if self._solver is not None and length < self._longest:
             solution, _, residual = self._solver.solve(
@@ -317,14 +317,14 @@ class SimilarSystems:
         solver = LaplacianSolver(laplacian, ground)
         solution, iterations, residual = solver.solve(right, tolerance)
         if residual > tolerance:
-            return _solved_by_factors(laplacian, right, ground)
-        if len(right) < _KEPT_BELOW:
-            self._solver, self._most = solver, iterations + _MORE_ITERATIONS
-            self._longest = _SHORTER * length
+            return _solve_by_factors(laplacian, right, ground)
+        if len(right) < _MAX_KEPT_NODES:
+            self._solver, self._most = solver, iterations + _EXTRA_ITERATIONS
+            self._longest = _REUSE_LENGTH * length
         return solution
 
 
-def _solved_by_factors(
+def _solve_by_factors(
     laplacian: csr_array, right: FloatArray, ground: FloatArray | None
 ) -> FloatArray:
     if ground is not None:

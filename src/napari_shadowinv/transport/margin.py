@@ -1,12 +1,12 @@
 """A free boundary: flux may cross the image's edge.
 
-The sites cover a margin around the image too, where the beam goes on undisturbed as far as is
-known. What arrives in the margin is not seen, so it is not prescribed: where the potential φ of
-the deflection does not vanish, the flux S (1 + φ / ℓ²) is taken to arrive instead of S. In the
-linear limit, Δφ = φ / ℓ²: beyond the edge the potential fades over the decay length ℓ. Each end
-of the scale is well known: ℓ → 0 is φ = 0 at the edge, where flux leaves and enters at no more
-than the cost of its transport; ℓ → ∞ is a margin filled with the source. In between, the
-potential runs on smoothly across the edge.
+The sites also cover a margin around the image, in which the beam is assumed to continue
+undisturbed. The flux that arrives in the margin is not measured, so it is not prescribed: where
+the potential φ of the deflection does not vanish, the flux S (1 + φ / ℓ²) arrives instead of S. In
+the linear limit, Δφ = φ / ℓ²: beyond the edge the potential decays over the decay length ℓ. Both
+limits are simple: ℓ → 0 means φ = 0 at the edge, where flux leaves and enters at no more than the
+cost of its transport; ℓ → ∞ is a margin filled with the source. In between, the potential
+continues smoothly across the edge.
 
 - the beam in the margin: `Margin`
 - flux that crosses each side of the image: `edge_flux`
@@ -44,9 +44,9 @@ class Margin:
             return_indices=True,
         )
         beam = np.pad(source, width)[rows, columns]
-        made = cls(beam, width)
-        made.within(beam)[:] = source
-        return made
+        margin = cls(beam, width)
+        margin.within(beam)[:] = source
+        return margin
 
     def split(self, factor: int) -> Margin:
         """Return the same beam for pixels that are split into factor × factor."""
@@ -81,7 +81,7 @@ class Margin:
 def edge_flux(
     left_behind: FloatArray, arrived: FloatArray, margin: Margin
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return what left and what entered the image at each side, as shares of its source's flux.
+    """Return the flux that left and entered the image at each side, relative to its source's flux.
 
     The image's part of the source has landed as `left_behind`, the margin's as `arrived`.
     """

@@ -34,12 +34,13 @@ __all__ = ["SHORTEST_STEP", "descend", "newton", "with_full_cells"]
 
 SHORTEST_STEP = 1e-7
 
-_EVENINGS, _EVENING_SHARE = 3, 0.6
-_UNEVEN = 1.0  # largest relative flux error of a cell
-_PATIENCE = 15  # steps within which the error must halve, or the start was a bad one
+_EVENING_STEPS = 3
+_EVENING_SHARE = 0.6
+_EVEN_RESIDUAL = 1.0  # largest relative flux error of a cell
+_HALVING_STEPS = 15  # steps within which the error must halve, or the start was a bad one
 _LINEAR_TOLERANCE = 1e-2
 _SHARES_OF_START = (0.999, 0.99, 0.9, 0.5)
-_LEAST_START = 1e-12  # of a mean cell's flux
+_MIN_START_FLUX = 1e-12  # of a mean cell's flux
 
 _MATRICES = 4  # n × n matrices that scipy's BFGS holds at once
 _METHODS: dict[str, tuple[str, dict[str, float]]] = {
@@ -61,16 +62,16 @@ def newton(
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
 
-    Where cells may be empty at the start, they are to be filled first (`with_full_cells`). It
-    gives up where the error has not halved in many steps (the start was a bad one), and where less
-    than `shortest_step` of Newton's step would be possible.
+    With `fill`, empty cells are filled first (`with_full_cells`). The solver stops without
+    convergence if the error has not halved in many steps (a bad start), or if less than
+    `shortest_step` of Newton's step is possible.
     """
     mass = objective.mass
     if fill:
         weights, diagram = with_full_cells(objective, weights)
     else:
         diagram = objective.diagram(weights)
-    weights, diagram = _evened_out(objective, weights, diagram)
+    weights, diagram = _even_out(objective, weights, diagram)
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     errors = [_length(mass - diagram.masses)]
@@ -99,15 +100,15 @@ def newton(
         first = min(1.0, (8 if share == first else 2) * share)
         residual = objective.residual(diagram)
         errors.append(_length(mass - diagram.masses))
-        if len(errors) > _PATIENCE and errors[-1] > 0.5 * errors[-1 - _PATIENCE]:
-            reason = f"the error has not halved in {_PATIENCE} steps"
+        if len(errors) > _HALVING_STEPS and errors[-1] > 0.5 * errors[-1 - _HALVING_STEPS]:
+            reason = f"the error has not halved in {_HALVING_STEPS} steps"
             break
     converged = residual <= tolerance
     reason = "" if converged else reason
     return Solution(objective.in_gauge(weights), residual, len(errors) - 1, converged, reason)
 
 
-def _evened_out(
+def _even_out(
     objective: TransportObjective, weights: FloatArray, diagram: PowerDiagram
 ) -> tuple[FloatArray, PowerDiagram]:
     """Let cells that are almost empty or far too full settle with their neighbours.
@@ -115,8 +116,8 @@ def _evened_out(
     A start from coarser sites has a few such cells near caustics, and they alone would keep
     Newton's steps short for the whole image.
     """
-    for _ in range(_EVENINGS):
-        if objective.residual(diagram) <= _UNEVEN:
+    for _ in range(_EVENING_STEPS):
+        if objective.residual(diagram) <= _EVEN_RESIDUAL:
             break
         gap = np.clip(objective.mass - diagram.masses, -objective.mass, objective.mass)
         stiffness = _stiffness(diagram.laplacian())
@@ -173,16 +174,16 @@ def _length(vector: FloatArray) -> float:
 def with_full_cells(
     objective: TransportObjective, weights: FloatArray
 ) -> tuple[FloatArray, PowerDiagram]:
-    """Find weights near the given ones for which every cell holds some flux, and their diagram.
+    """Find nearby weights for which every cell holds some flux, and their diagram.
 
     Hidden sites are lowered to where they just show; then a little of the zero weights,
     for which every cell is round and full, is mixed in.
     """
-    shown = objective.triangulation.lower_hidden(weights)
+    visible = objective.triangulation.lower_hidden(weights)
     for share in _SHARES_OF_START:
-        diagram = objective.diagram_if_full(share * shown)
-        if diagram is not None and diagram.masses.min() > _LEAST_START * objective.mass.mean():
-            return share * shown, diagram
+        diagram = objective.diagram_if_full(share * visible)
+        if diagram is not None and diagram.masses.min() > _MIN_START_FLUX * objective.mass.mean():
+            return share * visible, diagram
     weights = np.zeros(len(weights))
     return weights, objective.diagram(weights)
 

@@ -5,7 +5,7 @@
 
 - f, its gradient and its Hessian at given weights: `TransportObjective`; where flux may cross
   the image's edge: `OpenObjective`
-- what a solver returns: `Solution`
+- the result of a solver: `Solution`
 
 References
 ----------
@@ -89,19 +89,19 @@ class TransportObjective:
         gap: FloatArray,
         tolerance: float,
     ) -> FloatArray:
-        """Return the change of the weights that fills what each cell lacks to first order.
+        """Return the change of the weights that fills each cell's gap to first order.
 
-        The Laplacian is that of the diagram for these weights. Raises a RuntimeError where the
+        The Laplacian belongs to the diagram of these weights. A RuntimeError is raised if the
         cells fall into groups with no flux between them.
         """
         return systems.solve(laplacian, gap, tolerance, ground=self.ground(weights))
 
     def ground(self, weights: FloatArray) -> FloatArray | None:
-        """Return what a change of each weight adds to the image there, if anything."""
+        """Return the derivative of each site's image flux by its weight, if it is not zero."""
         return None
 
     def in_gauge(self, weights: FloatArray) -> FloatArray:
-        """Fix the constant that the weights are known up to: their mean is zero."""
+        """Fix the undetermined constant of the weights: their mean becomes zero."""
         centred: FloatArray = weights - weights.mean()
         return centred
 
@@ -117,7 +117,7 @@ class TransportObjective:
 
 
 class OpenObjective(TransportObjective):
-    """The function for a level over image and margin, which receives what the potential asks for.
+    """The function for a level over image and margin; the potential sets the margin's flux.
 
     The decay length ℓ is in px; see `napari_shadowinv.transport.margin`.
     """
@@ -143,7 +143,7 @@ class OpenObjective(TransportObjective):
         self._gain = 0.5 / decay_length**2  # the potential is half the weight
 
     def image_for(self, weights: FloatArray) -> Density:
-        """Return the image with what arrives around it."""
+        """Return the image with the flux that arrives around it."""
         excess = self._gain * weights[self._site]
         # 1 + x where that is more than 1, else eˣ, which is never negative
         share = np.where(excess > 0, 1 + excess, np.exp(np.minimum(excess, 0)))
@@ -151,7 +151,7 @@ class OpenObjective(TransportObjective):
         return Density.from_image(self._pixels)
 
     def ground(self, weights: FloatArray) -> FloatArray:
-        """More weight in the margin brings more flux."""
+        """Return the derivative: more weight in the margin attracts more flux."""
         excess = self._gain * weights[self._site]
         slope = self._gain * self._beam * np.exp(np.minimum(excess, 0))
         return np.bincount(self._site, slope, len(weights)).astype(np.float64)

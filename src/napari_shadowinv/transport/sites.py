@@ -41,7 +41,7 @@ __all__ = ["Level", "Levels", "SitePlan", "lloyd", "plan_levels", "sample_sites"
 COARSEST = 600  # sites with which the solver can start from zero weights
 RATIO = 4  # sites of a level per site of the next coarser one
 
-_POLL = 0.05  # seconds between two looks at work in another thread
+_POLL_S = 0.05  # between two looks at work in another thread
 _MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between sites
 
 
@@ -98,7 +98,7 @@ class Level:
 
 
 class Levels(Sequence[Level]):
-    """Levels, coarse to fine, each made when it is first asked for; a slice shares them.
+    """Levels, coarse to fine, each computed on first use; a slice shares them.
 
     >>> levels = plan_levels(np.ones((60, 60)), 3600, lloyd_iterations=2).levels
     >>> levels.counts, len(levels[1].sites), [len(level.sites) for level in levels[:2]]
@@ -119,8 +119,8 @@ class Levels(Sequence[Level]):
 
     @property
     def is_complete(self) -> bool:
-        """Whether there are no others than those that `counts` names."""
-        return self._make is _no_other
+        """Whether only the levels of `counts` are available."""
+        return self._make is _refuse_level
 
     def __len__(self) -> int:
         return len(self.counts)
@@ -137,34 +137,34 @@ class Levels(Sequence[Level]):
         return self.at(self.counts[number])
 
     def at(self, count: int) -> Level:
-        """Return the level with so many sites."""
+        """Return the level with `count` sites."""
         return self._level(count, self._report)
 
     def up_to(self, count: int) -> Levels:
-        """Return the levels with fewer sites than so many, and one with just so many."""
-        counts = (*(one for one in self.counts if one < count), count)
+        """Return the levels with fewer than `count` sites, and the level with `count`."""
+        counts = (*(level_count for level_count in self.counts if level_count < count), count)
         return Levels(counts, self._make, self._made, self._report)
 
     def heard_by(self, report: Reporter | None) -> Levels:
-        """Return the same levels; those still to be made will be reported."""
+        """Return the same levels with another report for those still to be computed."""
         return Levels(self.counts, self._make, self._made, report)
 
     def made(self, threads: int | None = None) -> Levels:
-        """Make all levels; what is returned has no others, and needs no source any more."""
+        """Compute all levels; the result offers no others and no longer refers to the source."""
         with self.in_background(threads) as begin:
-            # Beside the finest level, which takes three times as long as all others.
+            # In parallel with the finest level, which takes three times as long as all others.
             begin(self.counts[:-1])
             for count in reversed(self.counts):
                 self.at(count)
-        return Levels(self.counts, _no_other, self._made)
+        return Levels(self.counts, _refuse_level, self._made)
 
     @contextmanager
     def in_background(
         self, threads: int | None = None
     ) -> Iterator[Callable[[Sequence[int]], None]]:
-        """Give what begins to make levels of so many sites, one by one, in another thread.
+        """Yield a function that starts to compute levels, by their counts, in another thread.
 
-        At the end of the block those are abandoned that nobody has waited for.
+        Levels that are not finished at the end of the block are abandoned.
         """
         if available_threads(threads) == 1:
             yield lambda counts: None
@@ -187,7 +187,7 @@ class Levels(Sequence[Level]):
 
     def _level(self, count: int, report: Reporter) -> Level:
         slot = self._made.setdefault(count, _Slot())
-        while not slot.lock.acquire(timeout=_POLL):
+        while not slot.lock.acquire(timeout=_POLL_S):
             report("sites", 0, None, f"{count:,} sites")
         try:
             if slot.level is None:
@@ -197,13 +197,13 @@ class Levels(Sequence[Level]):
             slot.lock.release()
 
 
-def _no_other(count: int, report: Reporter) -> Level:
+def _refuse_level(count: int, report: Reporter) -> Level:
     raise LookupError(f"there is no level of {count:,} sites")
 
 
 @dataclass
 class _Slot:
-    """A level that is being made, or is there."""
+    """A level, computed or in preparation."""
 
     lock: Any = field(default_factory=Lock, repr=False)
     level: Level | None = None
@@ -223,16 +223,16 @@ class SitePlan:
 
     @property
     def margin_width(self) -> int:
-        """Pixels by which the levels' coordinates exceed those of the image."""
+        """Offset in px of the levels' coordinates relative to the image's."""
         return 0 if self.margin is None else self.margin.width
 
     def within(self, values: FloatArray) -> FloatArray:
-        """Return the image's part of an array that covers what the levels cover."""
+        """Return the image's part of an array that covers image and margin."""
         return values if self.margin is None else self.margin.within(values)
 
 
 @njit(nogil=True, cache=True)
-def _accepted(source: FloatArray, shift: FloatArray, sites: FloatArray) -> None:
+def _reject_by_brightness(source: FloatArray, shift: FloatArray, sites: FloatArray) -> None:
     """Throw points of an even sequence at the source; keep them by its brightness."""
     # The positions are the Kronecker sequence of the real root of x³ = x + 1, which leaves
     # fewer gaps and clumps than independent random points; the golden ratio's decides
@@ -241,8 +241,8 @@ def _accepted(source: FloatArray, shift: FloatArray, sites: FloatArray) -> None:
     golden = 1.6180339887498949
     height, width = source.shape
     brightest = source.max()
-    kept = number = 0
-    while kept < len(sites):
+    accepted = number = 0
+    while accepted < len(sites):
         number += 1
         u = (shift[0] + number / root) % 1.0
         v = (shift[1] + number / root**2) % 1.0
@@ -250,16 +250,16 @@ def _accepted(source: FloatArray, shift: FloatArray, sites: FloatArray) -> None:
         y = u * height
         x = v * width
         if threshold * brightest < source[min(int(y), height - 1), min(int(x), width - 1)]:
-            sites[kept, 0] = y - 0.5
-            sites[kept, 1] = x - 0.5
-            kept += 1
+            sites[accepted, 0] = y - 0.5
+            sites[accepted, 1] = x - 0.5
+            accepted += 1
 
 
 def sample_sites(source: FloatArray, n_sites: int, seed: int = 0) -> FloatArray:
     """Deploy sites by rejection, in Hilbert order; the seed shifts the sequence of positions."""
     sites = np.empty((n_sites, 2))
     shift = np.random.default_rng(seed).random(3)
-    _accepted(np.ascontiguousarray(source, dtype=np.float64), shift, sites)
+    _reject_by_brightness(np.ascontiguousarray(source, dtype=np.float64), shift, sites)
     return np.ascontiguousarray(sites[hilbert_order(sites)])
 
 
@@ -272,11 +272,11 @@ def lloyd(
     threads: int | None = None,
     report: Callable[[int], None] | None = None,
 ) -> tuple[PowerDiagram, int]:
-    """Move each site to the centroid of its Voronoi cell, again and again.
+    """Move each site repeatedly to the centroid of its Voronoi cell.
 
     The triangulation, without weights, moves with the sites, until their r.m.s. distance from the
-    centroids is below the tolerance, in units of their mean spacing. The report is told the steps
-    made. Returns the diagram with moments, and the steps.
+    centroids is below the tolerance, in units of their mean spacing. `report` receives the
+    number of steps. Returns the diagram with moments, and the number of steps.
     """
     near = tolerance * _spacing(source.shape, len(triangulation.sites))
     step = 0
@@ -318,18 +318,18 @@ def plan_levels(
     def level(count: int, report: Reporter) -> Level:
         beam = density()
 
-        def tell(step: int) -> None:
+        def on_step(step: int) -> None:
             report("sites", step, lloyd_iterations, f"{count:,} sites, Lloyd relaxation")
 
         sites = sample_sites(source, count, seed)
-        triangulation = RegularTriangulation(sites, region=beam.region, alive=partial(tell, 0))
+        triangulation = RegularTriangulation(sites, region=beam.region, alive=partial(on_step, 0))
         diagram, steps = lloyd(
             triangulation,
             beam,
             iterations=lloyd_iterations,
             tolerance=lloyd_tolerance,
             threads=threads,
-            report=tell,
+            report=on_step,
         )
         if count == n_sites:
             density.cache_clear()  # it is large, and others are seldom made after the finest

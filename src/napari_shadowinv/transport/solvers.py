@@ -1,6 +1,6 @@
-"""Finding the weights of all levels, coarse to fine.
+"""Solution for the weights of all levels, coarse to fine.
 
-- with the solver, tolerance and limits that the options name: `solve`
+- with the solver, tolerance and limits of the options: `solve`
 - an answer of one level, with a smooth potential everywhere: `LevelSolution`
 - the problem of one level: `Target`
 - the factor on an image of unknown exposure: `fitted_flux`
@@ -35,13 +35,13 @@ __all__ = ["LevelSolution", "Target", "fitted_flux", "solve"]
 
 
 _COARSE_TOLERANCE = 3e-2
-_LIKELY = 20_000  # sites of the levels that hardly any accuracy can do without
-_LARGE = 50_000  # sites from which a surface is made again rather than kept
-_STALLED = 0.1  # a residual above this is no solution of anything
-_WARM_STEPS = 10
-_SITES_OF_FIT = 1500
-_STEPS_OF_FIT = (0.03, 0.01)
-_REACH_OF_FIT = 4.0  # steps
+_PREPARED_SITES = 20_000  # levels up to this size are needed for almost any accuracy
+_MAX_KEPT_SURFACE_SITES = 50_000  # larger surfaces are computed again rather than kept
+_STALLED_RESIDUAL = 0.1  # above this a level counts as unsolved
+_MAX_WARM_STEPS = 10
+_FIT_SITES = 1500
+_FIT_STEPS = (0.03, 0.01)
+_MAX_FIT_SHIFT = 4.0  # steps
 _SHORTEST_WARM_STEP = 0.1  # where steps must be shorter, starting afresh is faster
 
 
@@ -51,7 +51,7 @@ class LevelSolution(Solution):
 
     level: Level
     threads: int | None
-    flux: FloatArray  # (n,): what each cell holds of the image
+    flux: FloatArray  # (n,): the image's flux in each cell
     # (n, 2), px: centroid of each cell in the image minus that of the same site's cell in the
     # source. (The paper, in lines 21–23 of its algorithm, subtracts the site, which is the same
     # after enough Lloyd steps; with the centroid an image that equals its source gives zero.)
@@ -61,7 +61,7 @@ class LevelSolution(Solution):
     def of_level(
         cls, level: Level, objective: TransportObjective, solution: Solution
     ) -> LevelSolution:
-        """Add what the cells hold to a solution that `objective` has arrived at."""
+        """Add flux and centroids of the cells to a solution of `objective`."""
         diagram = objective.diagram(solution.weights, with_moments=True)
         return cls(
             **vars(solution),
@@ -72,7 +72,7 @@ class LevelSolution(Solution):
         )
 
     def forget_surface(self) -> None:
-        """Let go of the surface, which is large; it is made again if it is asked for."""
+        """Drop the surface, which is large; it is computed again on demand."""
         vars(self).pop("surface", None)
 
     @cached_property
@@ -95,7 +95,7 @@ class LevelSolution(Solution):
         )
 
 
-# Is told the solutions so far, and returns how many times as many sites would be enough.
+# From the solutions so far: the factor on the number of sites that would suffice.
 Needed = Callable[[Sequence[LevelSolution]], float]
 
 
@@ -114,10 +114,10 @@ def solve(
 
     The image, shape (H, W), is positive everywhere, and has the flux of the source unless there
     is a margin. With a `start` (weights of the finest level that solve a similar image) it solves
-    on the finest level alone, if that converges. After each coarser level it is asked how many
-    times as many sites are `needed`, and ended there if it is once; what was `solved` before is
-    not solved again. Returns one solution for each level that was tried, and for the finest one
-    tried afresh where a level led nowhere; the last is the answer.
+    on the finest level alone, if that converges. After each coarser level, `needed` returns the
+    factor on the number of sites that would suffice; at 1 or less the solution ends there. Levels
+    that are already `solved` are not solved again. Returns one solution for each level that was
+    tried. If a level stalls, the finest one is solved from zero weights. The last one counts.
     """
     if options.stages == "single":
         levels = levels[-1:]
@@ -127,10 +127,10 @@ def solve(
         if nearby is not None:
             return [nearby]
     with levels.in_background(options.threads) as begin:
-        return _climb(levels, target, report, needed, solved, begin)
+        return _solve_levels(levels, target, report, needed, solved, begin)
 
 
-def _climb(
+def _solve_levels(
     levels: Levels,
     target: Target,
     report: Reporter | None,
@@ -138,7 +138,7 @@ def _climb(
     solved: Sequence[LevelSolution],
     begin: Callable[[Sequence[int]], None],
 ) -> list[LevelSolution]:
-    """Solve level after level; `begin` makes those in the background that will be needed."""
+    """Solve level after level; `begin` prepares the next ones in the background."""
     options = target.options
     by_newton = options.solver == "newton"
     solutions = list(solved)
@@ -146,7 +146,7 @@ def _climb(
     fewest = len(solutions[-1].weights) if solutions else 0
     finer = [count for count in levels.counts if count > fewest]
     times = math.inf  # as many sites are needed as there are
-    begin(finer[::-1] if needed is None else [count for count in finer if count <= _LIKELY])
+    begin(finer[::-1] if needed is None else [count for count in finer if count <= _PREPARED_SITES])
     while finer:
         level = levels.at(finer.pop(0))
         finest = not finer
@@ -159,12 +159,12 @@ def _climb(
             weights = None
             if solutions:
                 weights = 2 * solutions[-1].surface(level.sites)
-                if len(solutions[-1].weights) > _LARGE:
+                if len(solutions[-1].weights) > _MAX_KEPT_SURFACE_SITES:
                     solutions[-1].forget_surface()
             solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
-        if by_newton and solution.residual > _STALLED and len(levels) > 1:
-            return [*solutions, _afresh(levels[-1], target, solution if finest else None, report)]
+        if by_newton and solution.residual > _STALLED_RESIDUAL and len(levels) > 1:
+            return [*solutions, _restart(levels[-1], target, solution if finest else None, report)]
         if needed is None or finest:
             continue
         times = needed(solutions)
@@ -186,10 +186,10 @@ def _climb(
     return solutions
 
 
-def _afresh(
+def _restart(
     level: Level, target: Target, stalled: Solution | None, report: Reporter | None
 ) -> LevelSolution:
-    """Solve the finest level without the coarser ones, which led nowhere."""
+    """Solve the finest level from zero weights, because a coarser one stalled."""
     solution = target.sharpened(level, target.options.tolerance, report)
     if stalled is not None and stalled.residual < solution.residual:
         solution = replace(stalled, iterations=solution.iterations)
@@ -205,11 +205,11 @@ def fitted_flux(
 ) -> float:
     """Find the factor on an image of unknown exposure that moves the flux at the edge least.
 
-    A wrong factor drives flux across the whole edge: the displacement there grows in
-    proportion to the error, on top of what the object does. Few sites suffice to see it.
-    The image comes with the flux of the source.
+    A wrong factor drives flux across the whole edge: it adds a displacement there in
+    proportion to the error. Few sites suffice to see it. The image must have the flux of the
+    source.
     """
-    few = levels[: max(1, sum(count <= _SITES_OF_FIT for count in levels.counts))]
+    few = levels[: max(1, sum(count <= _FIT_SITES for count in levels.counts))]
     at_edge = np.abs(margin.edge_distance(few[-1].sites).min(axis=-1)) < few[-1].spacing
 
     def move_at_edge(trial: FloatArray) -> float:
@@ -217,29 +217,29 @@ def fitted_flux(
         return float((solution.displacement[at_edge] ** 2).sum(axis=1).mean())
 
     factor = 1.0
-    for step in _STEPS_OF_FIT:
+    for step in _FIT_STEPS:
         trials = factor * (1 - step), factor, factor * (1 + step)
         moves = [move_at_edge(trial * image) for trial in trials]
         curvature = moves[0] - 2 * moves[1] + moves[2]
         lowest = 0.5 * (moves[0] - moves[2]) / curvature if curvature > 0 else 0.0
-        factor *= 1 + step * float(np.clip(lowest, -_REACH_OF_FIT, _REACH_OF_FIT))
+        factor *= 1 + step * float(np.clip(lowest, -_MAX_FIT_SHIFT, _MAX_FIT_SHIFT))
     return factor
 
 
 def _solve_from(
     start: FloatArray, level: Level, target: Target, report: Reporter | None
 ) -> LevelSolution | None:
-    """Solve one level from given weights, or return None where that gets nowhere soon."""
+    """Solve one level from similar weights; return None if that does not converge quickly."""
     options = target.options
     objective = target.objective(level)
     if options.solver == "newton":
-        shown = objective.triangulation.update(start, stop_when_hidden=True)
+        is_full = objective.triangulation.update(start, stop_when_hidden=True)
         solution = newton(
             objective,
             start,
-            fill=not shown,
+            fill=not is_full,
             tolerance=options.tolerance,
-            max_iterations=min(_WARM_STEPS, options.max_iterations),
+            max_iterations=min(_MAX_WARM_STEPS, options.max_iterations),
             shortest_step=_SHORTEST_WARM_STEP,
             report=report,
         )
@@ -250,7 +250,7 @@ def _solve_from(
 
 @dataclass(frozen=True)
 class Target:
-    """Where the flux goes: the image, and what is around it."""
+    """The image and its margin, in which the flux arrives."""
 
     density: Density
     margin: Margin | None
@@ -271,7 +271,7 @@ class Target:
         return TransportObjective(triangulation, level.mass, self.density, threads=threads)
 
     def softened(self, level: Level, blur: float, factor: int) -> TransportObjective:
-        """Pose it for pixels that were split, each side by a factor, then blurred by so many."""
+        """Pose it for pixels split by a factor along each side, then blurred by `blur` of them."""
         pixels = split_pixels(self.density.image, factor)
         margin = self.margin and self.margin.split(factor)
         decay_length = self.options.decay_length and factor * self.options.decay_length
@@ -297,7 +297,7 @@ def _solve_level(
     tolerance: float,
     report: Reporter | None,
 ) -> Solution:
-    """Run the solver that the options name on one level, from zero weights if none are given."""
+    """Run the solver of the options on one level, from zero weights by default."""
     most = options.max_iterations
     if weights is None:
         weights = np.zeros(len(objective.mass))
