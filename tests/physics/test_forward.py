@@ -78,10 +78,10 @@ def test_any_shift_shares_each_pixel_by_areas(shift: tuple[float, float]) -> Non
     field[0], field[1] = shift
     expected = np.pad(source, 5)
     for axis, distance in enumerate(shift):
-        whole = int(np.floor(distance))
-        part = distance - whole
-        expected = (1 - part) * np.roll(expected, whole, axis) + part * np.roll(
-            expected, whole + 1, axis
+        whole_pixels = int(np.floor(distance))
+        part = distance - whole_pixels
+        expected = (1 - part) * np.roll(expected, whole_pixels, axis) + part * np.roll(
+            expected, whole_pixels + 1, axis
         )
     np.testing.assert_allclose(synthetic_image(field, source), expected[5:-5, 5:-5], atol=1e-12)
 
@@ -111,13 +111,13 @@ def test_each_pixel_gets_what_the_landed_tiles_overlap_it(roughness: float) -> N
         first, second = corners[:, a, b : b + 2].T
         fourth, third = corners[:, a + 1, b : b + 2].T
         triangles = [Polygon([first, second, third]), Polygon([first, third, fourth])]
-        signs = [LinearRing(one.exterior.coords).is_ccw for one in triangles]
+        signs = [LinearRing(triangle.exterior.coords).is_ccw for triangle in triangles]
         areas = [triangles[0].area, triangles[1].area]
         # Of one density, unless a fold has turned one half of the tile over.
         shares = np.array(areas) / sum(areas) if signs[0] == signs[1] else [0.5, 0.5]
-        for one, area, share in zip(triangles, areas, shares, strict=True):
+        for triangle, area, share in zip(triangles, areas, shares, strict=True):
             for i, j in np.ndindex(shape):
-                overlap = one.intersection(box(i - 0.5, j - 0.5, i + 0.5, j + 0.5)).area
+                overlap = triangle.intersection(box(i - 0.5, j - 0.5, i + 0.5, j + 0.5)).area
                 expected[i, j] += source[a // 2, b // 2] / 4 * share * overlap / area
     image = synthetic_image(field, source, rays_per_pixel=4)
     np.testing.assert_allclose(image, expected, atol=1e-9)
@@ -166,9 +166,9 @@ def test_swapping_axes_swaps_the_image() -> None:
 
 def test_image_is_linear_in_the_source() -> None:
     field = folding_field((40, 40))
-    one, other = random_source((40, 40)), np.ones((40, 40))
-    together = synthetic_image(field, 2 * one + other)
-    apart = 2 * synthetic_image(field, one) + synthetic_image(field, other)
+    first_source, second_source = random_source((40, 40)), np.ones((40, 40))
+    together = synthetic_image(field, 2 * first_source + second_source)
+    apart = 2 * synthetic_image(field, first_source) + synthetic_image(field, second_source)
     np.testing.assert_allclose(together, apart, atol=1e-11)
 
 
@@ -254,16 +254,16 @@ def test_cubic_displacement_is_exact_up_to_the_border() -> None:
 
 def test_number_of_threads_changes_no_bit() -> None:
     field = folding_field((90, 70))
-    one = synthetic_image(field, random_source((90, 70)), threads=1)
+    single = synthetic_image(field, random_source((90, 70)), threads=1)
     for threads in (2, 5, None):
-        again = synthetic_image(field, random_source((90, 70)), threads=threads)
-        np.testing.assert_array_equal(one, again)
+        parallel = synthetic_image(field, random_source((90, 70)), threads=threads)
+        np.testing.assert_array_equal(single, parallel)
 
 
 def test_each_band_is_told_and_stopping_needs_no_further_one() -> None:
     field, steps = folding_field((90, 70)), []
-    whole = synthetic_image(field, on_progress=lambda news: steps.append(news.step / news.total))
-    np.testing.assert_array_equal(whole, synthetic_image(field))
+    image = synthetic_image(field, on_progress=lambda news: steps.append(news.step / news.total))
+    np.testing.assert_array_equal(image, synthetic_image(field))
     assert len(steps) > 20
     assert steps == sorted(steps)
     assert (steps[0], steps[-1]) == (0, 1)

@@ -105,10 +105,10 @@ def test_axes_of_an_ellipse() -> None:
 
 
 def test_phantoms_add_up() -> None:
-    one, other = PHANTOMS["toroid"], PHANTOMS["ellipse"]
-    both = one + other
-    np.testing.assert_array_equal(both.potential, one.potential + other.potential)
-    np.testing.assert_array_equal(both.displacement, one.displacement + other.displacement)
+    toroid, ellipse = PHANTOMS["toroid"], PHANTOMS["ellipse"]
+    both = toroid + ellipse
+    np.testing.assert_array_equal(both.potential, toroid.potential + ellipse.potential)
+    np.testing.assert_array_equal(both.displacement, toroid.displacement + ellipse.displacement)
 
 
 def test_ellipse_pair_has_no_symmetry_and_no_fold() -> None:
@@ -117,9 +117,9 @@ def test_ellipse_pair_has_no_symmetry_and_no_fold() -> None:
     assert determinant.min() > 0.4
     for turns in range(4):
         turned = np.rot90(pair.potential, turns)
-        for other in (turned, turned.T):
-            if turns or other is not turned:
-                assert np.abs(other - pair.potential).max() > 0.3 * np.ptp(pair.potential)
+        for symmetric in (turned, turned.T):
+            if turns or symmetric is not turned:
+                assert np.abs(symmetric - pair.potential).max() > 0.3 * np.ptp(pair.potential)
 
 
 def test_caustics_of_the_toroid_start_near_the_papers_value() -> None:

@@ -59,8 +59,13 @@ def test_magnetic_deflection_goes_with_one_over_the_momentum(field: np.ndarray) 
 
 
 def test_electric_deflection_goes_with_one_over_momentum_and_velocity(field: np.ndarray) -> None:
-    rest = REST["proton"]
-    ratio = momentum(14.7, rest) * velocity(14.7, rest) / momentum(3.0, rest) / velocity(3.0, rest)
+    rest_energy = REST["proton"]
+    ratio = (
+        momentum(14.7, rest_energy)
+        * velocity(14.7, rest_energy)
+        / momentum(3.0, rest_energy)
+        / velocity(3.0, rest_energy)
+    )
     moved = transferred_displacement(field, FAST, SLOW, deflector="electric field")
     np.testing.assert_allclose(moved, ratio * field, rtol=1e-9)
 
@@ -85,17 +90,17 @@ def test_electrons_are_deflected_against_protons(field: np.ndarray, deflector: s
 def test_the_line_integrated_field_is_what_both_have_in_common(
     field: np.ndarray, deflector: str
 ) -> None:
-    other = ProtonSetup(
+    other_setup = ProtonSetup(
         energy=3.0,
         source_object_distance=0.02,
         object_image_distance=0.3,
         detector_pixel_size=FAST.object_pixel_size * 16,
     )
-    assert other.object_pixel_size == pytest.approx(FAST.object_pixel_size, rel=1e-12)
-    moved = transferred_displacement(field, FAST, other, deflector=deflector, shape=SHAPE)
+    assert other_setup.object_pixel_size == pytest.approx(FAST.object_pixel_size, rel=1e-12)
+    moved = transferred_displacement(field, FAST, other_setup, deflector=deflector, shape=SHAPE)
     name = "path_integrated_b" if deflector == "magnetic field" else "path_integrated_e"
     np.testing.assert_allclose(
-        getattr(other, name)(moved),
+        getattr(other_setup, name)(moved),
         getattr(FAST, name)(field),
         rtol=1e-9,
         # The spline between pixels whose sizes differ by rounding.
@@ -104,9 +109,13 @@ def test_the_line_integrated_field_is_what_both_have_in_common(
 
 
 def test_there_and_back_is_exact(field: np.ndarray) -> None:
-    other = SLOW.model_copy(update={"object_image_distance": 0.5, "source_object_distance": 0.07})
-    there = transferred_displacement(field, FAST, other)
-    np.testing.assert_allclose(transferred_displacement(there, other, FAST), field, rtol=1e-13)
+    other_setup = SLOW.model_copy(
+        update={"object_image_distance": 0.5, "source_object_distance": 0.07}
+    )
+    transferred = transferred_displacement(field, FAST, other_setup)
+    np.testing.assert_allclose(
+        transferred_displacement(transferred, other_setup, FAST), field, rtol=1e-13
+    )
 
 
 def test_light_in_a_plasma_and_in_a_gas(field: np.ndarray) -> None:
@@ -122,7 +131,7 @@ def test_light_in_a_plasma_and_in_a_gas(field: np.ndarray) -> None:
 def test_other_pixels_see_the_same_field_in_metres(ratio: float) -> None:
     """Off-centre, asymmetric: an exact field drawn in both pixels."""
     pixel = ratio * FAST.object_pixel_size
-    other = FAST.model_copy(update={"pixel_size": pixel})
+    other_setup = FAST.model_copy(update={"pixel_size": pixel})
     shape = tuple(math.floor(n / ratio) for n in SHAPE)
     sigma = (9e-6, 13e-6)
     offset = np.array([4.0, -3.0])  # px of the first experiment, from the middle
@@ -131,11 +140,11 @@ def test_other_pixels_see_the_same_field_in_metres(ratio: float) -> None:
         center = (np.array(size) - 1) / 2 + offset / scale
         return toroid(size, setup, 40.0, sigma, tuple(center), 0.4).displacement
 
-    moved = transferred_displacement(drawn(FAST, SHAPE, 1.0), FAST, other)
-    expected = drawn(other, shape, ratio)
+    moved = transferred_displacement(drawn(FAST, SHAPE, 1.0), FAST, other_setup)
+    expected = drawn(other_setup, shape, ratio)
     assert moved.shape == expected.shape
     assert np.abs(moved - expected).max() < 1e-3 * np.abs(expected).max()
-    angle, true_angle = other.deflection_angle(moved), other.deflection_angle(expected)
+    angle, true_angle = other_setup.deflection_angle(moved), other_setup.deflection_angle(expected)
     np.testing.assert_allclose(angle, true_angle, atol=1e-3 * np.abs(true_angle).max())
 
 

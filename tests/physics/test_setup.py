@@ -79,11 +79,11 @@ def test_magnification_tends_to_one_as_the_source_recedes(proton: ProtonSetup) -
 
 def test_detector_pixels_are_smaller_in_the_object_plane(proton: ProtonSetup) -> None:
     on_detector = proton.pixel_size * proton.magnification
-    same = ProtonSetup(
+    by_detector = ProtonSetup(
         **{k: v for k, v in PROTON.items() if k != "pixel_size"}, detector_pixel_size=on_detector
     )
-    assert same.object_pixel_size == pytest.approx(1.5e-6)
-    assert same.potential(2.0) == pytest.approx(proton.potential(2.0))
+    assert by_detector.object_pixel_size == pytest.approx(1.5e-6)
+    assert by_detector.potential(2.0) == pytest.approx(proton.potential(2.0))
 
 
 def test_deflection_moves_the_ray_by_the_displacement_on_the_screen(proton: ProtonSetup) -> None:
@@ -167,7 +167,7 @@ def test_round_trip_of_the_electric_field(proton: ProtonSetup) -> None:
 
 def test_round_trips_of_the_line_integrals_of_light(optical: OpticalSetup) -> None:
     phi = np.random.default_rng(2).normal(size=(4, 5))
-    for there, back in (
+    for convert, invert in (
         (optical.line_integrated_log_index, optical.normalized_potential_from_log_index),
         (optical.line_integrated_density, optical.normalized_potential_from_density),
         (
@@ -175,7 +175,7 @@ def test_round_trips_of_the_line_integrals_of_light(optical: OpticalSetup) -> No
             lambda integral: optical.normalized_potential_from_modulation(integral, 1.65e25),
         ),
     ):
-        np.testing.assert_allclose(back(there(phi)), phi, rtol=1e-14)
+        np.testing.assert_allclose(invert(convert(phi)), phi, rtol=1e-14)
 
 
 def test_potential_in_metres_gives_the_displacement_in_pixels(proton: ProtonSetup) -> None:
@@ -342,12 +342,12 @@ NAMED_IN = {
 def test_a_kind_of_setup_is_named_where_it_is_defined_and_nowhere_else() -> None:
     source = Path(napari_shadowinv.__file__).parent
     kinds = re.compile("|".join(model.__name__ for model in SETUPS.values()))
-    found = {
+    mentioning = {
         path.relative_to(source).as_posix()
         for path in source.rglob("*.py*")
         if path.suffix in (".py", ".pyi") and kinds.search(path.read_text(encoding="utf-8"))
     }
-    assert {path for path in found if not path.startswith("physics/setup/")} == set(NAMED_IN)
+    assert {path for path in mentioning if not path.startswith("physics/setup/")} == set(NAMED_IN)
 
 
 class NeutralSetup(BeamSetup):

@@ -22,8 +22,8 @@ def test_peak_is_told_in_both_units(proton_setup: ProtonSetup) -> None:
     )
     (field,) = shown_fields([displacement], proton_setup)
     assert field.peak_text() == "peak |∫B×dz| 9.7 mT·m (97 MG·µm)"
-    told = field.peak_text(PeakError(2.1 / 97, "noise"))
-    assert told == "peak |∫B×dz| 9.70 ± 0.21 mT·m (97.0 ± 2.1 MG·µm) (noise)"
+    text = field.peak_text(PeakError(2.1 / 97, "noise"))
+    assert text == "peak |∫B×dz| 9.70 ± 0.21 mT·m (97.0 ± 2.1 MG·µm) (noise)"
 
 
 def test_peak_and_largest_leave_out_masked_pixels() -> None:

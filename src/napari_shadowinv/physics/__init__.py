@@ -1,4 +1,4 @@
-"""What a deflection means in SI units, and how an image comes about.
+"""Deflections in SI units, and the formation of an image.
 
 - the experiment and unit conversions: `setup`; units that are handy to read: `units`
 - the image that a displacement makes: `forward`

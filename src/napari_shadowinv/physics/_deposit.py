@@ -1,11 +1,10 @@
 """Kernels of `synthetic_image`: tiles of the source, and their shares of the image's pixels.
 
-A tile's flux is spread evenly over the quadrilateral between its four landed corners. What that
-covers of each pixel follows from its edges: to the right along a row of pixels, the density rises
-at an edge by what lies on its one side more than on its other. So an edge, which two tiles share,
-is looked at once, and running sums along the rows make the image. A tile that is nearly a line, or
-that a fold crosses, would leave rounding errors in the rest of its rows; its overlaps are worked
-out pixel by pixel.
+A tile's flux is spread evenly over the quadrilateral between its four landed corners. Its share of
+each pixel follows from its edges: to the right along a row of pixels, the density rises at an edge
+by the difference between its two sides. So an edge, which two tiles share, is processed once, and
+running sums along the rows give the image. A tile that is nearly a line, or that a fold crosses,
+would leave rounding errors in the rest of its rows; its overlaps are computed pixel by pixel.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _ONE = np.uint32(1)
 _SLIVER = 1e-9
 # Area relative to that in the source below which a tile is deposited pixel by pixel.
 _THIN = 1e-3
-# Flux relative to the brightest pixel's below which it is what rounding leaves of none.
+# Flux relative to the brightest pixel's below which it is a rounding error.
 _DUST = 1e-12
 
 
@@ -44,7 +43,7 @@ def deposit_band(
 ) -> None:
     """Add the image of the source's rows ``first`` to ``last`` to a window of the image.
 
-    `knots` and `weights` are those of the spline at each of the lines that cut a pixel.
+    `knots` and `weights` belong to the spline at each of the lines that cut a pixel.
     """
     # Positions count from the window's corner: its pixel (i, j) covers [i, i + 1] × [j, j + 1].
     tiles = knots.size
@@ -52,7 +51,7 @@ def deposit_band(
     upper, lower = np.empty((2, corners)), np.empty((2, corners))
     pixels_above, pixels = np.empty((2, corners), np.int32), np.empty((2, corners), np.int32)
     # Tile b lies between corners b and b + 1; before the first and after the last there is none.
-    above, here = np.zeros(corners + 1), np.zeros(corners + 1)
+    above, current = np.zeros(corners + 1), np.zeros(corners + 1)
     rises = np.zeros((window.shape[0], window.shape[1] + 1))
     for a in range(first * tiles, last * tiles + 1):
         upper, lower = lower, upper
@@ -60,12 +59,12 @@ def deposit_band(
         _land(coefficients, knots, weights, a, top, lower)
         _find_pixels(lower, window, pixels)
         if a > first * tiles:
-            above, here = here, above
-            _spread(flux[(a - 1) // tiles], tiles, upper, lower, window, here)
-            steps = above[1:-1] - here[1:-1]
+            above, current = current, above
+            _spread(flux[(a - 1) // tiles], tiles, upper, lower, window, current)
+            steps = above[1:-1] - current[1:-1]
             _add_edges(rises, steps, upper, pixels_above, upper, pixels_above, 1)
-            _add_edges(rises, here[1:] - here[:-1], upper, pixels_above, lower, pixels, 0)
-    _add_edges(rises, here[1:-1].copy(), lower, pixels, lower, pixels, 1)
+            _add_edges(rises, current[1:] - current[:-1], upper, pixels_above, lower, pixels, 0)
+    _add_edges(rises, current[1:-1].copy(), lower, pixels, lower, pixels, 1)
     _add_sums(rises, window)
 
 
@@ -125,19 +124,19 @@ def _spread(
         y1, x1 = upper[0, b + 1], upper[1, b + 1]
         y2, x2 = lower[0, b + 1], lower[1, b + 1]
         y3, x3 = lower[0, b], lower[1, b]
-        one = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
-        other = (x2 - x0) * (y3 - y0) - (y2 - y0) * (x3 - x0)
+        area_012 = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
+        area_023 = (x2 - x0) * (y3 - y0) - (y2 - y0) * (x3 - x0)
         out[b + 1] = 0.0
         if share <= 0:
             continue
-        if one * other < 0:
+        if area_012 * area_023 < 0:
             # A fold crosses it: its two triangles lie on top of each other.
-            _deposit(window, share / 2, one, (y0, x0, y1, x1, y2, x2, y2, x2))
-            _deposit(window, share / 2, other, (y0, x0, y2, x2, y3, x3, y3, x3))
-        elif abs(one + other) < thin:
-            _deposit(window, share, one + other, (y0, x0, y1, x1, y2, x2, y3, x3))
+            _deposit(window, share / 2, area_012, (y0, x0, y1, x1, y2, x2, y2, x2))
+            _deposit(window, share / 2, area_023, (y0, x0, y2, x2, y3, x3, y3, x3))
+        elif abs(area_012 + area_023) < thin:
+            _deposit(window, share, area_012 + area_023, (y0, x0, y1, x1, y2, x2, y3, x3))
         else:
-            out[b + 1] = 2 * share / (one + other)
+            out[b + 1] = 2 * share / (area_012 + area_023)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -150,7 +149,7 @@ def _add_edges(
     end_pixels: IntArray,
     ahead: int,
 ) -> None:
-    """Add what edges make the density rise: from corners b to b + `ahead`, by so many steps."""
+    """Add the rise of the density at edges, from corners b to b + `ahead`, by `steps`."""
     far = np.empty(steps.size, np.int64)
     count = 0
     for b in range(steps.size):
@@ -211,28 +210,28 @@ def _add_long_edge(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _add_in_row(row: FloatArray, flow: float, left: float, right: float) -> None:
-    """Add a part of an edge within a row of pixels; what is left of the image fills all of it."""
+def _add_in_row(row: FloatArray, flow: float, x_min: float, x_max: float) -> None:
+    """Add a part of an edge within a row of pixels; left of the image it fills the whole row."""
     width = row.size - 1
-    if right <= 0:
+    if x_max <= 0:
         row[0] += flow
         return
-    if left >= width:
+    if x_min >= width:
         return
-    rate = flow / (right - left) if right > left else 0.0
-    if left < 0:
-        row[0] -= rate * left
-        left = 0.0
-    for j in range(int(left), min(int(min(right, float(width))) + 1, width)):
-        part = flow if rate == 0 else rate * (min(right, j + 1.0) - max(left, float(j)))
-        later = part * (0.5 * (max(left, float(j)) + min(right, j + 1.0)) - j)
+    rate = flow / (x_max - x_min) if x_max > x_min else 0.0
+    if x_min < 0:
+        row[0] -= rate * x_min
+        x_min = 0.0
+    for j in range(int(x_min), min(int(min(x_max, float(width))) + 1, width)):
+        part = flow if rate == 0 else rate * (min(x_max, j + 1.0) - max(x_min, float(j)))
+        later = part * (0.5 * (max(x_min, float(j)) + min(x_max, j + 1.0)) - j)
         row[j] += part - later
         row[j + 1] += later
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _add_sums(rises: FloatArray, window: FloatArray) -> None:
-    """Add the running sums of the rises, without what rounding leaves where no flux landed."""
+    """Add the running sums of the rises, but no rounding errors where no flux landed."""
     brightest = 0.0
     for i in range(window.shape[0]):
         total = 0.0
@@ -251,36 +250,36 @@ def _deposit(window: FloatArray, share: float, double_area: float, corners: Corn
     """Share flux among the pixels by their overlap with a quadrilateral of uniform density."""
     y0, x0, y1, x1, y2, x2, y3, x3 = corners
     height, width = window.shape
-    top, bottom = min(y0, y1, y2, y3), max(y0, y1, y2, y3)
-    left, right = min(x0, x1, x2, x3), max(x0, x1, x2, x3)
-    if bottom <= 0 or top >= height or right <= 0 or left >= width:
+    y_min, y_max = min(y0, y1, y2, y3), max(y0, y1, y2, y3)
+    x_min, x_max = min(x0, x1, x2, x3), max(x0, x1, x2, x3)
+    if y_max <= 0 or y_min >= height or x_max <= 0 or x_min >= width:
         return
-    inside = top >= 0 and bottom <= height and left >= 0 and right <= width
-    i0 = math.floor(max(top, 0.0))
-    j0 = math.floor(max(left, 0.0))
-    i1 = max(math.ceil(min(bottom, height)) - 1, i0)
-    j1 = max(math.ceil(min(right, width)) - 1, j0)
+    inside = y_min >= 0 and y_max <= height and x_min >= 0 and x_max <= width
+    i0 = math.floor(max(y_min, 0.0))
+    j0 = math.floor(max(x_min, 0.0))
+    i1 = max(math.ceil(min(y_max, height)) - 1, i0)
+    j1 = max(math.ceil(min(x_max, width)) - 1, j0)
     if inside and i0 == i1 and j0 == j1:
         window[i0, j0] += share
         return
-    if abs(double_area) < _SLIVER * ((bottom - top) ** 2 + (right - left) ** 2):
+    if abs(double_area) < _SLIVER * ((y_max - y_min) ** 2 + (x_max - x_min) ** 2):
         _deposit_line(window, share, corners)
         return
 
     scale = 2 * share / double_area
-    rest = share
+    remainder = share
     for i in range(i0, i1 + 1):
         before = 0.0
-        if left < 0:
+        if x_min < 0:
             before = _area_left(i, 0.0, corners)
         for j in range(j0, j1 + 1):
             if inside and i == i1 and j == j1:
-                window[i, j] += rest
+                window[i, j] += remainder
                 return
             area = _area_left(i, j + 1.0, corners)
-            amount = min(max(scale * (area - before), 0.0), rest)
+            amount = min(max(scale * (area - before), 0.0), remainder)
             window[i, j] += amount
-            rest -= amount
+            remainder -= amount
             before = area
 
 

@@ -1,4 +1,4 @@
-"""From a displacement to the image that it makes.
+"""Image formation from a displacement.
 
 - the image of a source whose rays are displaced: `synthetic_image`
 - how much the map stretches each pixel: `jacobian_determinant`
@@ -6,7 +6,7 @@
 The source is cut into small tiles, a few per pixel. The corners of a tile are rays;
 the tile's flux lands in the quadrilateral between them and is shared among the
 pixels by exact overlap of areas. Neighbouring tiles have their corners in common, so
-the image has neither gaps nor ripples, and no blur beyond that of the pixels.
+the image has neither gaps nor ripples, and no blur beyond the pixels' own.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
 - the displacement in another experiment: `transferred_displacement`
 - the image there, from a displacement: `project`; from a potential in SI: `project_potential`
-- what bends the beam, and so what both experiments have in common: `Deflector`
+- the cause of the deflection, which both experiments have in common: `Deflector`
 
-A deflection angle, and with it the potential in m, belongs to a beam. What belongs to the object,
-and is the same for all beams, is a line integral:
+A deflection angle, and with it the potential in m, belongs to a beam. The object is described by a
+line integral, which is the same for all beams:
 
 =================  ===========================  ==========================================
 deflector          of the object                angle of a beam
@@ -146,12 +146,13 @@ def transferred_displacement(
     made_with, setup : Setup
         The experiment that the displacement belongs to, and the other one.
     deflector : {"magnetic field", "electric field", "plasma", "refractive index"}, optional
-        What bends the beam. Default: see `default_deflector`.
+        Cause of the deflection. Default: see `default_deflector`.
     dispersion : float, default 1
-        For a refractive index: ln η at the wavelength of `setup` over that of `made_with`.
+        For a refractive index: ln η at the wavelength of `setup`, divided by ln η at the
+        wavelength of `made_with`.
     shape : tuple of int, optional
-        Height and width of the other image in its own pixels. Default: as many as the known
-        field covers.
+        Height and width of the other image in its own pixels. Default: the area of the known
+        field.
 
     Returns
     -------
@@ -163,7 +164,7 @@ def transferred_displacement(
     ------
     InputError
         If one experiment uses particles and the other light, the deflector does not bend the
-        beam or has to be told, the displacement has another shape, or the other image is
+        beam or has to be specified, the displacement has another shape, or the other image is
         larger than the known field.
 
     Examples
@@ -189,11 +190,11 @@ def transferred_displacement(
 
 
 def default_deflector(made_with: Setup, setup: Setup) -> Deflector:
-    """What is taken to bend the beam if nobody says so.
+    """Return the default cause of the deflection.
 
-    A magnetic field for particles; for light a refractive index, if the wavelength is the same:
-    then a plasma comes to the same. An `InputError` if the wavelengths differ, or if one
-    experiment uses particles and the other light.
+    It is a magnetic field for particles, and a refractive index for light of the same wavelength,
+    for which a plasma gives the same result. An `InputError` is raised if the wavelengths differ,
+    or if one experiment uses particles and the other light.
     """
     _require_same_kind(made_with, setup)
     return setup.default_deflector(made_with)
@@ -244,7 +245,7 @@ def _checked_field(displacement: ArrayLike) -> FloatArray:
 
 
 def _shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
-    """As many pixels of the new size as lie within the old image."""
+    """Height and width in pixels of the new size that fit into the old image."""
     height, width = (math.floor(n / ratio + _SLACK) for n in old)
     if min(height, width) < _SMALLEST_SIDE:
         raise InputError(

@@ -121,11 +121,11 @@ def shown_fields(
     *,
     mask: BoolArray | None = None,
 ) -> list[ShownField]:
-    """Turn displacements in px into what an experimenter asks for, in one unit for all.
+    """Convert displacements in px to the field of interest, in one unit for all.
 
-    That is the main field of the setup's kind: the path-integrated magnetic field of particles,
-    or the deflection angle of light; without a setup, the displacement in px. If it is known that
-    the `deflector` is another one, such as an "electric field", its own path integral is shown.
+    It is the main field of the setup's kind: the path-integrated magnetic field of particles, or
+    the deflection angle of light; without a setup, the displacement in px. For another
+    `deflector`, such as an "electric field", it is the path integral of that field.
     Outside a `mask` of used pixels, shape (H, W), the fields are NaN.
     """
     if mask is not None and not mask.all():

@@ -6,8 +6,8 @@
 - a plasma wave, probed by light: `wakefield`, `wakefield_setup`, `plasma_wavelength`
 - building blocks, round or elliptical: `gaussian_blob`, `cosine_toroid`; phantoms are
   added with ``+``
-- an object that no flip, shift or swap of axes leaves as it is: `ellipse_pair`
-- what they are: `Phantom`
+- an object that every flip, shift or swap of axes changes: `ellipse_pair`
+- the class of all of them: `Phantom`
 
 All take `shape`, the image's height and width; magnetic fields also `setup`, the beam. `center`
 is (y, x) in px, may be fractional, and is the image's centre by default. `angle`, in rad, turns

@@ -138,11 +138,11 @@ def ellipse_pair(shape: tuple[int, int], strength: float = 1.0) -> Phantom:
     """
     height, width = shape
     unit = min(height, width) / 100
-    one, other = 45.0 * strength * unit**2, -15.0 * strength * unit**2
+    first_amplitude, second_amplitude = 45.0 * strength * unit**2, -15.0 * strength * unit**2
     first_place, second_place = (0.37 * height, 0.42 * width), (0.63 * height, 0.66 * width)
     blob = _shapes.gaussian_blob
-    first = blob(shape, one, (7.0 * unit, 12.0 * unit), first_place, 0.5)
-    return first + blob(shape, other, (10.0 * unit, 6.0 * unit), second_place, 0.3)
+    first = blob(shape, first_amplitude, (7.0 * unit, 12.0 * unit), first_place, 0.5)
+    return first + blob(shape, second_amplitude, (10.0 * unit, 6.0 * unit), second_place, 0.3)
 
 
 def _scene(
@@ -153,9 +153,9 @@ def _scene(
     _shapes.require_finite(strength=strength)
     _shapes.require_positive("smaller side of the image", min(shape), "px")
     side = min(shape) * setup.object_pixel_size
-    made = []
+    phantoms = []
     for peak, radii, share, angle in parts:
         lengths = (side * radii[0], side * radii[1]) if isinstance(radii, tuple) else side * radii
         center = share[0] * shape[0] - 0.5, share[1] * shape[1] - 0.5
-        made.append(make(shape, setup, strength * peak, lengths, center, angle))
-    return sum(made[1:], start=made[0])
+        phantoms.append(make(shape, setup, strength * peak, lengths, center, angle))
+    return sum(phantoms[1:], start=phantoms[0])

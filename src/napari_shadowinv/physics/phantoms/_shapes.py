@@ -1,4 +1,4 @@
-"""What a phantom is, and building blocks: one object each."""
+"""The class of a phantom, and building blocks: one object each."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""The experiment's geometry and probe, and what they make of a displacement.
+"""The experiment's geometry and probe, and the fields that follow from a displacement.
 
 - describe an experiment: `ProtonSetup`, `OpticalSetup`; any of them: `Setup`, by kind `SETUPS`
 - how a kind of setup is described: `BeamSetup`, `SIField`, `MainField`, `Deflector`
 - get it back from a file's content: `setup_from_dict`; with larger pixels: `binned_setup`
 - convert pixels to SI and back: methods of `BeamSetup`; path-integrated fields: of `ProtonSetup`;
   line integrals of the refractive index or the density: of `OpticalSetup`
-- whether its numbers can be meant: `setup_warnings`, `deflection_warnings`; for people to
+- whether its numbers are plausible: `setup_warnings`, `deflection_warnings`; for people to
   check: `geometry_text`, `field_of_view_text`
 - the gradient of a potential in pixels: `displacement_from_potential`
 - the same object in another experiment: `napari_shadowinv.physics.projection`
@@ -92,7 +92,7 @@ _EXPECTED = (
 
 
 def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
-    """Make the right setup from what a file holds.
+    """Create a setup of the right kind from the content of a file.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
     if kind is None:
         raise InputError(f"{where}: 'kind' is missing, {_EXPECTED}")
     if not isinstance(kind, str) or kind not in SETUPS:
-        raise InputError(f"{where}: 'kind' is {kind!r}, {_EXPECTED}{_meant(str(kind))}")
+        raise InputError(f"{where}: 'kind' is {kind!r}, {_EXPECTED}{_suggest_kind(str(kind))}")
     return validated(SETUPS[kind], mapping, where)
 
 
@@ -134,8 +134,8 @@ def binned_setup(setup: Setup, factor: int) -> Setup:
     return type(setup)(**values)
 
 
-def _meant(kind: str) -> str:
-    """What somebody may have meant who named another kind."""
+def _suggest_kind(kind: str) -> str:
+    """Suggest a kind or species for an unknown kind."""
     match = nearest(kind.lower(), list(dict.fromkeys([*SETUPS, *SPECIES])))
     if match is None or match in SETUPS:
         return f"; did you mean '{match}'?" if match else ""

@@ -1,4 +1,4 @@
-"""What every setup has, and how each kind of setup is described."""
+"""The base class of all setups, and the description of each kind of setup."""
 
 from __future__ import annotations
 
@@ -145,9 +145,9 @@ class BeamSetup(CheckedModel):
 
     @model_validator(mode="after")
     def _one_pixel_size(self) -> BeamSetup:
-        given = [self.pixel_size is not None, self.detector_pixel_size is not None]
-        if sum(given) != 1:
-            received = "both" if all(given) else "neither"
+        is_set = [self.pixel_size is not None, self.detector_pixel_size is not None]
+        if sum(is_set) != 1:
+            received = "both" if all(is_set) else "neither"
             raise ValueError(
                 "give either 'pixel_size' (m, in the object plane) or 'detector_pixel_size' "
                 f"(m, in the detector plane), received {received}"
@@ -187,7 +187,7 @@ class BeamSetup(CheckedModel):
 
     @property
     def object_pixel_size(self) -> float:
-        """Side p of a pixel in the object plane in m, whichever pixel size was given."""
+        """Side p of a pixel in the object plane in m."""
         if self.pixel_size is not None:
             return self.pixel_size
         assert self.detector_pixel_size is not None
@@ -225,8 +225,8 @@ class BeamSetup(CheckedModel):
     def field_in_si(self, name: str, values: ArrayLike) -> FloatArray:
         """One of `si_fields`, of the displacement (px) or the normalised potential (px²)."""
         (method,) = (field.method or name for field in self.si_fields if field.name == name)
-        made: FloatArray = getattr(self, method)(values)
-        return made
+        in_si: FloatArray = getattr(self, method)(values)
+        return in_si
 
     @property
     def max_source_distance(self) -> float:
@@ -254,7 +254,7 @@ class BeamSetup(CheckedModel):
 
     @abstractmethod
     def default_deflector(self, made_with: Any) -> str:
-        """What deflects the beam if nobody says so; an `InputError` if it has to be told."""
+        """Return the default cause of the deflection; an `InputError` if there is none."""
 
     @abstractmethod
     def angle_ratio(self, made_with: Any, deflector: str) -> float:
@@ -262,7 +262,7 @@ class BeamSetup(CheckedModel):
 
 
 def displacement_from_potential(potential: ArrayLike) -> FloatArray:
-    """Displacement d = -∇φ by central differences, where a file tells only the potential.
+    """Displacement d = -∇φ by central differences, for files with a potential only.
 
     Takes the normalised potential in px², shape (H, W); returns px, shape (2, H, W), of second
     order up to the border. An `InputError` if the potential is no plane, or smaller than 3 × 3.
