@@ -102,9 +102,9 @@ def test_field_is_shown_in_si(inversion: Inversion, proton_setup: ProtonSetup) -
     factor = {"T·m": 1, "mT·m": 1e3, "µT·m": 1e6}[unit]
     expected = np.hypot(*proton_setup.path_integrated_b(inversion.displacement)) * factor
     np.testing.assert_allclose(axes.images[0].get_array(), expected)
-    left, right, bottom, top = axes.images[0].get_extent()
-    assert (left, right) == pytest.approx((-0.5 * 1.5, 31.5 * 1.5))
-    assert (top, bottom) == pytest.approx((-0.5 * 1.5, 23.5 * 1.5))
+    x_min, x_max, y_max, y_min = axes.images[0].get_extent()
+    assert (x_min, x_max) == pytest.approx((-0.5 * 1.5, 31.5 * 1.5))
+    assert (y_min, y_max) == pytest.approx((-0.5 * 1.5, 23.5 * 1.5))
 
 
 def test_residual_limits_are_symmetric_in_percent(inversion: Inversion) -> None:
@@ -136,8 +136,8 @@ def test_masked_pixels_are_blank_in_all_pictures(make_inversion: Make) -> None:
     mask[4:9, 20:26] = False
     figure = report_figure(Inversion(**{**vars(calm), "mask": mask}))
     for panel in panels(figure)[:5]:
-        shown = panel.images[0].get_array()
-        np.testing.assert_array_equal(np.ma.getmaskarray(np.ma.masked_invalid(shown)), ~mask)
+        values = panel.images[0].get_array()
+        np.testing.assert_array_equal(np.ma.getmaskarray(np.ma.masked_invalid(values)), ~mask)
 
 
 def test_figure_has_the_headline_of_the_inversion(make_inversion: Make) -> None:
@@ -223,16 +223,20 @@ def test_a_fit_shows_each_image_its_explanation_and_the_field(
     make_fit: MakeFit, proton_setup: ProtonSetup
 ) -> None:
     fit = make_fit(setups=setups_of(proton_setup, 2))
-    shown = titles(fit_figure(fit))
-    assert shown == [
+    panel_titles = titles(fit_figure(fit))
+    assert panel_titles == [
         "Image 1: 3 MeV proton", "Re-projection", f"Residual: χ² {fit.chi2[0]:.3g}",
         "Image 2: 4 MeV proton", "Re-projection", f"Residual: χ² {fit.chi2[1]:.3g}",
         "Path-integrated field", "Standard deviation", "Cuts through the peak",
     ]  # fmt: skip
     # A beam that is not uniform comes first, and leaves room for the potential.
     beam = np.linspace(2, 4, fit.source.size).reshape(fit.source.shape)
-    shown = titles(fit_figure(dataclasses.replace(fit, source=beam)))
-    assert (shown[0], shown[4], shown[8]) == ("Beam", "Beam", "Deflection potential")
+    panel_titles = titles(fit_figure(dataclasses.replace(fit, source=beam)))
+    assert (panel_titles[0], panel_titles[4], panel_titles[8]) == (
+        "Beam",
+        "Beam",
+        "Deflection potential",
+    )
 
 
 def test_residuals_of_a_fit_are_in_units_of_the_noise(make_fit: MakeFit) -> None:
@@ -247,20 +251,20 @@ def test_fields_and_error_bars_of_a_fit_are_in_si(
     make_fit: MakeFit, proton_setup: ProtonSetup
 ) -> None:
     fit = make_fit(names=("B", "E"), setups=(proton_setup, proton_setup))
-    shown = panels(fit_figure(fit))
-    labels = [axes.child_axes[0].get_ylabel() for axes in shown[6:8] + shown[9:11]]
+    axes_list = panels(fit_figure(fit))
+    labels = [axes.child_axes[0].get_ylabel() for axes in axes_list[6:8] + axes_list[9:11]]
     assert labels == ["|∫B×dz| (µT·m)", "σ of |∫B×dz| (µT·m)", "|∫E dz| (kV)", "σ of |∫E dz| (kV)"]
     field = fit.fields[0]
     assert field.uncertainty is not None
     error = np.hypot(*proton_setup.path_integrated_b(field.uncertainty)) * 1e6
-    np.testing.assert_allclose(shown[7].images[0].get_array(), error)
+    np.testing.assert_allclose(axes_list[7].images[0].get_array(), error)
     # The band of the cut along x, at the peak: the error along the field.
     (in_si,) = shown_fields([field.displacement], proton_setup)
     row, column = in_si.peak
     direction = field.displacement[:, row, column] / np.hypot(*field.displacement[:, row, column])
     expected = np.hypot(*(direction * field.uncertainty[:, row, column]))
     expected *= proton_setup.path_integrated_b([[0.0], [1.0]])[0, 0] * -1e6
-    band = shown[8].collections[0].get_paths()[0].vertices
+    band = axes_list[8].collections[0].get_paths()[0].vertices
     place = column * proton_setup.object_pixel_size * 1e6
     heights = band[np.isclose(band[:, 0], place)][:, 1]
     assert np.ptp(heights) / 2 == pytest.approx(expected)
@@ -319,17 +323,17 @@ def test_each_image_left_out_has_its_prediction_and_its_residual(
     make_fit: MakeFit, proton_setup: ProtonSetup, count: int
 ) -> None:
     fit = make_fit(strengths=tuple(np.linspace(1, 2, count)))
-    found = left_out_of(fit, limit=0.5)
-    figure = left_out_figure(found, setups_of(proton_setup, count))
-    shown = titles(figure)
-    assert len(shown) == 3 * count
-    assert shown.count("Prediction") == count
+    left_out = left_out_of(fit, limit=0.5)
+    figure = left_out_figure(left_out, setups_of(proton_setup, count))
+    panel_titles = titles(figure)
+    assert len(panel_titles) == 3 * count
+    assert panel_titles.count("Prediction") == count
     for k in range(count):
-        place = shown.index(f"Image {k + 1}: {3 + k} MeV proton")
-        assert shown[place + 2].startswith(f"Residual: χ² {fit.chi2[k]:.3g}")
-        drawn = np.asarray(panels(figure)[place + 2].images[0].get_array())
-        np.testing.assert_allclose(drawn, fit.residual[k] / 0.05)
-    assert sum(title.endswith("not explained") for title in shown) == 1
+        place = panel_titles.index(f"Image {k + 1}: {3 + k} MeV proton")
+        assert panel_titles[place + 2].startswith(f"Residual: χ² {fit.chi2[k]:.3g}")
+        residual = np.asarray(panels(figure)[place + 2].images[0].get_array())
+        np.testing.assert_allclose(residual, fit.residual[k] / 0.05)
+    assert sum(title.endswith("not explained") for title in panel_titles) == 1
     assert "a sentence" in [text.get_text() for text in figure.texts]
     assert_nothing_overlaps(figure)
 
@@ -341,9 +345,9 @@ def test_fields_of_windows_are_side_by_side_on_one_scale(
     fits = tuple(make_fit(setups=setups[w : w + 2]) for w in range(3))
     windows = FitWindows(((0, 1), (1, 2), (2, 3)), fits, np.array([[1.0], [0.8], [0.5]]))
     figure = windows_figure(windows)
-    shown = titles(figure)
-    assert [title.split(",")[0] for title in shown[:3]] == ["3.5 MeV", "4.5 MeV", "5.5 MeV"]
-    assert shown[3].startswith("Cut at")
+    panel_titles = titles(figure)
+    assert [title.split(",")[0] for title in panel_titles[:3]] == ["3.5 MeV", "4.5 MeV", "5.5 MeV"]
+    assert panel_titles[3].startswith("Cut at")
     limits = {panel.images[0].get_clim() for panel in panels(figure)[:3]}
     assert len(limits) == 1
     # The weakest images have the strongest field.

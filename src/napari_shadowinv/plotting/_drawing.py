@@ -1,4 +1,4 @@
-"""What a panel of a figure shows: an image, a field, a residual, cuts."""
+"""Contents of a panel: an image, a field, a residual, cuts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _CUT_COLOURS = ("#1f9bff", "#18b368")
 _REFERENCE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.4, "alpha": 0.45}
-_CAUSTIC_DENSITY = 0.15  # where a caustic is outlined
+_CAUSTIC_DENSITY = 0.15  # level of the outline of a caustic
 
 
 def draw_intensity(
@@ -26,7 +26,7 @@ def draw_intensity(
     limits: tuple[float, float],
     label: str = "Intensity / mean source",
 ) -> None:
-    """Show an image, or what an answer predicts of it, in units of the mean source."""
+    """Show an image, or its prediction, in units of the mean source."""
     panel.show(plane, title, label, "gray", limits)
 
 
@@ -150,7 +150,7 @@ def draw_side_by_side(
 ) -> None:
     """Show fields on the first one's scale, and in the last panel a cut through its peak.
 
-    A `common` scale is that of the strongest.
+    A `common` scale is set by the strongest field.
     """
     *pictures, cuts = panels
     reference = next(iter(fields.values()))

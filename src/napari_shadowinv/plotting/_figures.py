@@ -124,12 +124,12 @@ def comparison_figure(
     shapes = sorted({array.shape for array in arrays})
     if len(shapes) != 1:
         raise InputError(f"fields have shapes {shapes}: expected one or more of the same shape")
-    shown = dict(zip(fields, shown_fields(arrays, setup), strict=True))
+    in_units = dict(zip(fields, shown_fields(arrays, setup), strict=True))
     shape = shapes[0][1], shapes[0][2]
-    grid = _panels.choose_grid(shape, panels=len(shown) + 1, foot=0.35, title=bool(title))
+    grid = _panels.choose_grid(shape, panels=len(in_units) + 1, foot=0.35, title=bool(title))
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), title)
-        draw_side_by_side(panels, shown)
+        draw_side_by_side(panels, in_units)
         _panels.write_footer(figure, [(caption, QUIET_COLOUR)], grid)
     return figure
 

@@ -19,21 +19,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLUMNS = 4
-_SMALL = 0.75  # of the usual size of a panel
-_LETTERS = 13  # in an inch of the header
-_FINE, _COARSE = 1.0, 20.0  # px: sizes of the structure in the overlay
+_PANEL_SHARE = 0.75  # of the usual size of a panel
+_LETTERS_PER_INCH = 13  # of the header
+_FINE_BLUR_PX = 1.0  # the overlay shows the structure between the two blurs
+_COARSE_BLUR_PX = 20.0
 
 
 def pack_figure(dataset: xarray.Dataset, *, title: str | None = None) -> Figure:
     """Show the dose of each film of a pack, and three neighbouring films in one picture.
 
-    Left-out pixels are light grey. In the last panel three films that lie on each other make
-    grey, and coloured fringes where they do not.
+    Masked pixels are light grey. In the last panel, three aligned films add up to grey;
+    misalignment gives coloured fringes.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        What `run_film` returns.
+        Result of `run_film`.
     title : str, optional
         A heading, such as the pack's name.
 
@@ -49,9 +50,9 @@ def pack_figure(dataset: xarray.Dataset, *, title: str | None = None) -> Figure:
     shape = sides[0], sides[1]
     panels_shown = count + (count >= 3)
     columns = min(_COLUMNS, panels_shown)
-    width, height = (_SMALL * side for side in _panels.panel_size(shape))
+    width, height = (_PANEL_SHARE * side for side in _panels.panel_size(shape))
     grid = Grid(-(-panels_shown // columns), columns, width, height, foot=0.1, head=0.0)
-    header = _header(dataset, int(grid.figure_size[0] * _LETTERS))
+    header = _header(dataset, int(grid.figure_size[0] * _LETTERS_PER_INCH))
     grid = Grid(grid.rows, columns, width, height, foot=0.1, head=0.52 + 0.18 * len(header))
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, Scale(1.0, "px"), title)
@@ -84,8 +85,8 @@ def _draw_dose(panel: Panel, dose: FloatArray, usable: BoolArray, title: str) ->
         panel.axes.set_axis_off()
         return
     middle = tuple(slice(side // 8, side - side // 8) for side in dose.shape)  # edges may be burnt
-    told = dose[middle][usable[middle]] if usable[middle].any() else dose[usable]
-    limits = [float(p) for p in np.percentile(told, (0.5, 99.7))]
+    reliable = dose[middle][usable[middle]] if usable[middle].any() else dose[usable]
+    limits = [float(p) for p in np.percentile(reliable, (0.5, 99.7))]
     high = limits[1] if limits[1] > limits[0] else limits[0] + 1.0
     panel.show(np.where(usable, dose, limits[0]), title, "Dose (Gy)", "magma", (limits[0], high))
     hidden: Any = np.ma.masked_array(np.ones(dose.shape), usable)
@@ -94,7 +95,7 @@ def _draw_dose(panel: Panel, dose: FloatArray, usable: BoolArray, title: str) ->
 
 
 def _draw_overlay(panel: Panel, doses: FloatArray, usable: BoolArray) -> None:
-    """The fine structure of three films as red, green and blue: those that show most of it."""
+    """Draw the fine structure of the three best correlated films as red, green and blue."""
     from scipy.ndimage import gaussian_filter
 
     logarithms = [
@@ -103,14 +104,19 @@ def _draw_overlay(panel: Panel, doses: FloatArray, usable: BoolArray) -> None:
         else np.zeros(dose.shape)
         for dose, used in zip(doses, usable, strict=True)
     ]
-    fine = [gaussian_filter(one, _FINE) - gaussian_filter(one, _COARSE) for one in logarithms]
-    inner = np.s_[fine[0].shape[0] // 8 : -(fine[0].shape[0] // 8)]
-    alike = [_correlation(one[inner], other[inner]) for one, other in pairwise(fine)]
-    first = int(np.argmax([min(alike[k : k + 2]) for k in range(len(alike) - 1)]))
+    structures = [
+        gaussian_filter(plane, _FINE_BLUR_PX) - gaussian_filter(plane, _COARSE_BLUR_PX)
+        for plane in logarithms
+    ]
+    inner = np.s_[structures[0].shape[0] // 8 : -(structures[0].shape[0] // 8)]
+    correlations = [
+        _correlation(plane[inner], neighbour[inner]) for plane, neighbour in pairwise(structures)
+    ]
+    first = int(np.argmax([min(correlations[k : k + 2]) for k in range(len(correlations) - 1)]))
     planes = []
     for k in range(first, first + 3):
-        size = float(np.percentile(np.abs(fine[k]), 98)) or 1.0
-        planes.append(np.clip(0.5 + fine[k] / size / 2, 0, 1))
+        size = float(np.percentile(np.abs(structures[k]), 98)) or 1.0
+        planes.append(np.clip(0.5 + structures[k] / size / 2, 0, 1))
     place: Any = {"extent": panel.scale.extent(doses.shape[1:]), "interpolation": "nearest"}
     panel.axes.imshow(np.stack(planes, axis=-1), aspect="equal", **place)
     panel.axes.set_title(f"Films {first + 1}, {first + 2}, {first + 3} in red, green, blue")
@@ -118,7 +124,7 @@ def _draw_overlay(panel: Panel, doses: FloatArray, usable: BoolArray) -> None:
     panel.few_ticks()
 
 
-def _correlation(one: FloatArray, other: FloatArray) -> float:
-    if not (one.any() and other.any()):
+def _correlation(plane: FloatArray, neighbour: FloatArray) -> float:
+    if not (plane.any() and neighbour.any()):
         return -1.0
-    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
+    return float(np.corrcoef(plane.ravel(), neighbour.ravel())[0, 1])

@@ -26,19 +26,19 @@ from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_C
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MOST_ROWS = 3  # images that have a row each; more have a column each
-_UNIFORM = 1e-6
-_LARGEST_RESIDUAL = 20.0  # σ
-_LETTERS = 13  # in an inch of the header
+_MAX_ROWS = 3  # up to this number of images, each has a row; more have a column each
+_UNIFORM_TOLERANCE = 1e-6
+_MAX_RESIDUAL_SIGMA = 20.0
+_LETTERS_PER_INCH = 13  # of the header
 
 
 def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
-    """Show all of a fit on a page, with its verdict on top.
+    """Show a whole fit on a page, with its verdict on top.
 
     For each image: the beam unless it is uniform, the image, its re-projection, and the residual
     in units of the noise's r.m.s. standard deviation. Below for each field: its potential where
     there is room, the field with arrows, the standard deviation that the noise leaves, and
-    profiles along the dashed lines on the field. White outlines are where rays have crossed in
+    profiles along the dashed lines on the field. White outlines mark where rays have crossed in
     any image.
 
     Parameters
@@ -59,15 +59,16 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     count, *sides = fit.images.shape
     shape = sides[0], sides[1]
     kinds = _kinds(fit)
-    upright = count > _MOST_ROWS
+    upright = count > _MAX_ROWS
     columns = count if upright else len(kinds)
     rows = len(kinds) if upright else count
-    shown = [_shown(fit, field) for field in fit.fields]
+    fields = [_field_in_units(fit, field) for field in fit.fields]
     width, height = _panels.panel_size(shape)
-    grid = Grid(rows + len(shown), columns, width, height, foot=0.0, head=0.0)
-    letters = int(grid.figure_size[0] * _LETTERS)
+    grid = Grid(rows + len(fields), columns, width, height, foot=0.0, head=0.0)
+    letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
     heading = title and textwrap.shorten(title, int(letters * 0.7), placeholder=" …")
-    header, footer = _header(fit, letters), _footer(fit, [one for one, _ in shown], letters)
+    header = _header(fit, letters)
+    footer = _footer(fit, [in_units for in_units, _ in fields], letters)
     grid = replace(grid, foot=0.12 + 0.18 * len(footer), head=0.52 + 0.18 * len(header))
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), heading)
@@ -75,7 +76,7 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
             for j, kind in enumerate(kinds):
                 place = j * columns + k if upright else k * columns + j
                 _draw_image(panels[place], fit, k, kind)
-        for m, (field, error) in enumerate(shown):
+        for m, (field, error) in enumerate(fields):
             row = panels[(rows + m) * columns : (rows + m + 1) * columns]
             _draw_fitted(row, fit, fit.fields[m], field, error)
         _panels.write_header(figure, header, grid)
@@ -85,19 +86,19 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
 
 def _kinds(fit: Fit) -> tuple[str, ...]:
     levels = fit.source.mean(axis=(1, 2), keepdims=True)
-    is_uniform = bool((np.abs(fit.source / levels - 1) < _UNIFORM).all())
+    is_uniform = bool((np.abs(fit.source / levels - 1) < _UNIFORM_TOLERANCE).all())
     usual = ("Image", "Re-projection", "Residual")
     return usual if is_uniform else ("Beam", *usual)
 
 
-def _shown(fit: Fit, field: FittedField) -> tuple[ShownField, ShownField | None]:
-    """A field and its standard deviation, each in a handy unit."""
+def _field_in_units(fit: Fit, field: FittedField) -> tuple[ShownField, ShownField | None]:
+    """Return a field and its standard deviation, each in a handy unit."""
     setup = fit.setups[0] if fit.setups else None
-    (shown,) = shown_fields([field.displacement], setup, FIELDS[field.name])
+    (in_units,) = shown_fields([field.displacement], setup, FIELDS[field.name])
     if field.uncertainty is None:
-        return shown, None
+        return in_units, None
     (error,) = shown_fields([field.uncertainty], setup, FIELDS[field.name])
-    return shown, error
+    return in_units, error
 
 
 def _draw_image(panel: Panel, fit: Fit, k: int, kind: str) -> None:
@@ -106,7 +107,7 @@ def _draw_image(panel: Panel, fit: Fit, k: int, kind: str) -> None:
         used = fit.residual[k][fit.mask[k]]
         noise = float(np.sqrt((used**2).mean() / fit.chi2[k])) if fit.chi2[k] > 0 else 1.0
         title = f"Residual: χ² {fit.chi2[k]:.3g}"
-        draw_differences(panel, fit.residual[k] / noise, title, "Residual (σ)", _LARGEST_RESIDUAL)
+        draw_differences(panel, fit.residual[k] / noise, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
         return
     plane = {"Beam": fit.source, "Image": fit.images, "Re-projection": fit.reprojection}[kind][k]
     probe = f": {fit.setups[k].probe}" if fit.setups else ""
@@ -119,36 +120,36 @@ def _draw_fitted(
     panels: list[Panel],
     fit: Fit,
     field: FittedField,
-    shown: ShownField,
+    in_units: ShownField,
     error: ShownField | None,
 ) -> None:
     """Fill a row of panels with a field; the potential comes first if there is room for it."""
-    title = shown.name if len(fit.fields) == 1 else f"{field.name}: {shown.symbol}"
-    wanted = ["potential", "field", "error", "cuts"]
+    title = in_units.name if len(fit.fields) == 1 else f"{field.name}: {in_units.symbol}"
+    contents = ["potential", "field", "error", "cuts"]
     if error is None:
-        wanted.remove("error")
-    wanted = wanted[-len(panels) :] if len(panels) < len(wanted) else wanted
-    for panel, what in zip(panels, wanted, strict=False):
-        if what == "potential":
+        contents.remove("error")
+    contents = contents[-len(panels) :] if len(panels) < len(contents) else contents
+    for panel, content in zip(panels, contents, strict=False):
+        if content == "potential":
             draw_potential(panel, field.potential, fit.setups[0] if fit.setups else None)
-        elif what == "field":
-            draw_field(panel, shown, title)
-            outline_caustics(panel, _crossed(fit))
-        elif what == "error" and error is not None:
+        elif content == "field":
+            draw_field(panel, in_units, title)
+            outline_caustics(panel, _crossed_rays(fit))
+        elif content == "error" and error is not None:
             limits = 0.0, error.largest or 1.0
-            label = f"σ of {shown.symbol} ({error.unit})"
+            label = f"σ of {in_units.symbol} ({error.unit})"
             panel.show(error.magnitude, "Standard deviation", label, "cividis", limits)
         else:
-            draw_cuts(panel, shown, _magnitude_error(fit, field))
-    for panel in panels[len(wanted) :]:
+            draw_cuts(panel, in_units, _magnitude_error(fit, field))
+    for panel in panels[len(contents) :]:
         panel.axes.remove()
 
 
-def _crossed(fit: Fit) -> BoolArray:
-    """Where rays have crossed others, in any image."""
-    found = np.stack([field.displacement for field in fit.fields])
-    moved = np.einsum("lm,mcyx->lcyx", fit.strengths, found)
-    return np.asarray(np.any([jacobian_determinant(one) < 0 for one in moved], axis=0))
+def _crossed_rays(fit: Fit) -> BoolArray:
+    """Return the pixels whose rays have crossed others in any image."""
+    displacements = np.stack([field.displacement for field in fit.fields])
+    moved = np.einsum("lm,mcyx->lcyx", fit.strengths, displacements)
+    return np.asarray(np.any([jacobian_determinant(total) < 0 for total in moved], axis=0))
 
 
 def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
@@ -158,10 +159,10 @@ def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
     length = np.sqrt((field.displacement**2).sum(axis=0))
     along = np.sqrt(((field.displacement * field.uncertainty) ** 2).sum(axis=0))
     pixels = along / np.maximum(length, 1e-12)
-    shown, _ = _shown(fit, field)
-    strongest = shown.peak
+    in_units, _ = _field_in_units(fit, field)
+    strongest = in_units.peak
     # Displacements become fields by a factor.
-    return np.asarray(pixels * shown.magnitude[strongest] / max(length[strongest], 1e-12))
+    return np.asarray(pixels * in_units.magnitude[strongest] / max(length[strongest], 1e-12))
 
 
 def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
@@ -174,8 +175,8 @@ def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
     return lines
 
 
-def _footer(fit: Fit, shown: list[ShownField], letters: int) -> list[tuple[str, str]]:
-    facts = [fit.peak_text(*each) for each in zip(fit.fields, shown, strict=True)]
+def _footer(fit: Fit, fields: list[ShownField], letters: int) -> list[tuple[str, str]]:
+    facts = [fit.peak_text(*each) for each in zip(fit.fields, fields, strict=True)]
     facts += [f"{name}: {text}" for name, text in fit.error_rows]
     facts.append(f"gains {', '.join(f'{gain:.3g}' for gain in fit.gains)}")
     if fit.folded:

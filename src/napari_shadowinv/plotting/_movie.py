@@ -29,11 +29,12 @@ if TYPE_CHECKING:
     import xarray
 
 _DOTS_PER_INCH = 120
-_OUTLIERS = 0.02  # share of the shots whose extremes may lie beyond the colour scale
-_COLOURS = "viridis"
-_QUALITY = 10  # constant rate factor of H.264: 0 is without loss, 51 the worst
-_GREYS = 56  # of the colours of a GIF, for what is written
-_LETTER, _LINE = 0.075, 0.15  # inches
+_OUTLIER_SHARE = 0.02  # share of the shots whose extremes may lie beyond the colour scale
+_COLOUR_MAP = "viridis"
+_RATE_FACTOR = 10  # of H.264: 0 is lossless, 51 the worst
+_GREYS = 56  # colours of a GIF that are reserved for text
+_LETTER_WIDTH_IN = 0.075
+_LINE_HEIGHT_IN = 0.15
 
 
 def stack_frames(
@@ -79,20 +80,20 @@ def stack_frames(
         factor, prefix = prefix_for(max(abs(low), abs(high)))
     label = f"{field.attrs.get('long_name', variable)} ({prefix}{display_unit(unit)})"
     shape = field.sizes["y"], field.sizes["x"]
-    draw = _Frame(shape, _scale_of_all(stack), label, (factor * low, factor * high))
+    draw = _Frame(shape, _common_setup(stack), label, (factor * low, factor * high))
     return (
         draw(factor * _plane(field, index), str(stack["name"].values[index]))
         for index in range(field.sizes["shot"])
     )
 
 
-def _scale_of_all(stack: xarray.Dataset) -> Any:
-    """A setup with the size of all shots' pixels; None if they differ, or there is none."""
+def _common_setup(stack: xarray.Dataset) -> Any:
+    """Return a setup with the pixel size of all shots; None if they differ, or without setups."""
     shots = (
         [stack] if "setup" not in stack else [stack.isel(shot=k) for k in range(stack.shot.size)]
     )
     setups = [setup_from_dataset(shot) for shot in shots]
-    sizes = {None if one is None else one.object_pixel_size for one in setups}
+    sizes = {None if setup is None else setup.object_pixel_size for setup in setups}
     return setups[0] if len(sizes) == 1 else None
 
 
@@ -104,15 +105,15 @@ def _plane(field: xarray.DataArray, index: int) -> FloatArray:
 def _limits(field: xarray.DataArray) -> tuple[float, float]:
     planes = (_plane(field, index) for index in range(field.sizes["shot"]))
     extremes = np.array([(plane.min(), plane.max()) for plane in planes])
-    low = float(np.quantile(extremes[:, 0], _OUTLIERS, method="lower"))
-    high = float(np.quantile(extremes[:, 1], 1 - _OUTLIERS, method="higher"))
+    low = float(np.quantile(extremes[:, 0], _OUTLIER_SHARE, method="lower"))
+    high = float(np.quantile(extremes[:, 1], 1 - _OUTLIER_SHARE, method="higher"))
     if "component" in field.dims:
         low = 0.0
     return low, high if high > low else low + 1.0
 
 
 class _Frame:
-    """A figure that is drawn again and again with other values."""
+    """A figure that is redrawn with new values."""
 
     def __init__(
         self, shape: tuple[int, int], setup: Any, label: str, limits: tuple[float, float]
@@ -121,11 +122,13 @@ class _Frame:
 
         with rc_context(STYLE):
             grid = choose_grid(shape, 1, title=False)
-            lines = textwrap.wrap(label, max(12, int(grid.height / _LETTER)))
-            grid = replace(grid, right=grid.right + _LINE * (len(lines) - 1))
+            lines = textwrap.wrap(label, max(12, int(grid.height / _LETTER_WIDTH_IN)))
+            grid = replace(
+                grid, right_margin=grid.right_margin + _LINE_HEIGHT_IN * (len(lines) - 1)
+            )
             self._figure, (panel,) = new_page(grid, image_scale(shape, setup), None)
             # Without values: the colour bar must not depend on the first shot.
-            panel.show(np.full(shape, limits[0]), "", "\n".join(lines), _COLOURS, limits)
+            panel.show(np.full(shape, limits[0]), "", "\n".join(lines), _COLOUR_MAP, limits)
         self._axes = panel.axes
         self._picture = panel.axes.images[0]
 
@@ -144,9 +147,9 @@ class _Frame:
 
 
 def in_few_colours(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Keep to colours of which a GIF has enough for all.
+    """Reduce the colours to a fixed palette that suits a GIF.
 
-    A program that chooses 256 colours by how often they occur leaves few for the bright parts.
+    A palette of the 256 most frequent colours would leave few for the bright parts.
 
     Takes and returns an ndarray of uint8, shape (rows, columns, 3); the colours are the nearest of
     the colour scale, and greys.
@@ -162,11 +165,11 @@ def in_few_colours(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=1)
 def _palette() -> tuple[Any, NDArray[np.uint8]]:
-    """What finds the nearest of a GIF's colours, and these."""
+    """Return a search tree of the palette, and the palette."""
     from matplotlib import colormaps
     from scipy.spatial import cKDTree
 
-    scale = 255 * colormaps[_COLOURS](np.linspace(0, 1, 256 - _GREYS))[:, :3]
+    scale = 255 * colormaps[_COLOUR_MAP](np.linspace(0, 1, 256 - _GREYS))[:, :3]
     greys = np.repeat(np.linspace(0, 255, _GREYS), 3).reshape(-1, 3)
     colours = np.concatenate([scale, greys]).round().astype(np.uint8)
     return cKDTree(colours), colours
@@ -196,27 +199,27 @@ def write_film(
             return _write_gif(temporary, frames, rate)
         try:
             return _write_mp4(temporary, frames, rate)
-        except _FFmpegFailed as error:
+        except _FFmpegError as error:
             raise FileFormatError(
                 f"{path} cannot be written (ffmpeg: {error}): free some disk space, choose "
                 "another folder, or write a .gif"
             ) from None
 
 
-class _FFmpegFailed(Exception):  # noqa: N818 - it is what happened
-    """What ffmpeg gave as its reason."""
+class _FFmpegError(Exception):
+    """Reason for a failure, as reported by ffmpeg."""
 
 
 def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int:
     from imageio_ffmpeg import count_frames_and_secs
 
-    rest = iter(frames)
-    first = next(rest)
+    remaining = iter(frames)
+    first = next(remaining)
     count = 0
-    with TemporaryFile() as said:
-        ffmpeg = _started_ffmpeg(path, first.shape, rate, said)
+    with TemporaryFile() as messages:
+        ffmpeg = _start_ffmpeg(path, first.shape, rate, messages)
         try:
-            for frame in chain([first], rest):
+            for frame in chain([first], remaining):
                 ffmpeg.stdin.write(frame.tobytes())
                 count += 1
             ffmpeg.communicate()
@@ -227,35 +230,35 @@ def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> 
                 ffmpeg.kill()
                 ffmpeg.wait()
         if ffmpeg.returncode:
-            said.seek(0)
-            raise _FFmpegFailed(_reason(said.read(), ffmpeg.returncode))
+            messages.seek(0)
+            raise _FFmpegError(_reason(messages.read(), ffmpeg.returncode))
     try:
-        found = count_frames_and_secs(str(path))[0]
+        n_readable = count_frames_and_secs(str(path))[0]
     except RuntimeError:
-        found = 0
-    if found != count:
-        raise _FFmpegFailed(f"{found} of {count} frames can be read back")
+        n_readable = 0
+    if n_readable != count:
+        raise _FFmpegError(f"{n_readable} of {count} frames can be read back")
     return count
 
 
-def _started_ffmpeg(path: Path, shape: tuple[int, ...], rate: float, said: Any) -> Any:
+def _start_ffmpeg(path: Path, shape: tuple[int, ...], rate: float, messages: Any) -> Any:
     from imageio_ffmpeg import get_ffmpeg_exe
 
     pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{shape[1]}x{shape[0]}"]
     frames = [*pixels, "-r", str(rate), "-i", "-"]
-    film = ["-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", str(_QUALITY)]
+    film = ["-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", str(_RATE_FACTOR)]
     return subprocess.Popen(
         [get_ffmpeg_exe(), "-v", "error", "-y", *frames, *film, str(path.absolute())],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
-        stderr=said,
+        stderr=messages,
         # Ctrl-C is for this process, which then ends the other.
         start_new_session=True,
     )
 
 
-def _reason(said: bytes, code: int) -> str:
-    lines = said.decode(errors="replace").splitlines()
+def _reason(messages: bytes, code: int) -> str:
+    lines = messages.decode(errors="replace").splitlines()
     # Without which of its parts speaks: "[out#0/mp4 @ 0x560c9438a4c0] ".
     return re.sub(r"^\[[^]]*\] ", "", lines[-1]) if lines else f"exit code {code}"
 

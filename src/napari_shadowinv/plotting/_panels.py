@@ -1,4 +1,4 @@
-"""A page of panels: where they are, and what each can show."""
+"""A page of panels: their layout, and the drawing of each."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ STYLE: Any = {
 
 @dataclass(frozen=True)
 class Scale:
-    """Lengths of the image's axes: how long a pixel is, and in which unit."""
+    """Length of a pixel along the image's axes, and its unit."""
 
     pixel: float
     unit: str
@@ -47,8 +47,8 @@ class Scale:
     def extent(self, shape: tuple[int, int]) -> tuple[float, float, float, float]:
         """Left, right, bottom and top edge, for images whose first row is on top."""
         edges = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
-        left, right, bottom, top = (edge * self.pixel for edge in edges)
-        return left, right, bottom, top
+        x_min, x_max, y_max, y_min = (edge * self.pixel for edge in edges)
+        return x_min, x_max, y_max, y_min
 
 
 def image_scale(shape: tuple[int, int], setup: Setup | None) -> Scale:
@@ -70,19 +70,19 @@ class Grid:
     height: float
     foot: float
     head: float
-    left: float = 0.68
-    right: float = 0.95
+    left_margin: float = 0.68
+    right_margin: float = 0.95
     below: float = 0.52
     above: float = 0.36
 
     @property
     def extra(self) -> float:
-        """What the last panel, with the profiles, is wider than a narrow image."""
+        """Extra width of the last panel, with the profiles, compared with a narrow image."""
         return max(0.0, 2.5 - self.width)
 
     @property
     def figure_size(self) -> tuple[float, float]:
-        cell_width = self.left + self.width + self.right
+        cell_width = self.left_margin + self.width + self.right_margin
         cell_height = self.below + self.height + self.above
         height = self.head + self.rows * cell_height + self.foot
         return self.columns * cell_width + self.extra, height
@@ -92,11 +92,11 @@ class Grid:
         is_last = index == self.rows * self.columns - 1
         row, column = divmod(index, self.columns)
         total_width, total_height = self.figure_size
-        left = column * (self.left + self.width + self.right) + self.left
-        top = self.head + row * (self.below + self.height + self.above) + self.above
+        left_edge = column * (self.left_margin + self.width + self.right_margin) + self.left_margin
+        top_edge = self.head + row * (self.below + self.height + self.above) + self.above
         return (
-            left / total_width,
-            1 - (top + self.height) / total_height,
+            left_edge / total_width,
+            1 - (top_edge + self.height) / total_height,
             (self.width + is_last * self.extra) / total_width,
             self.height / total_height,
         )
@@ -199,7 +199,7 @@ class Panel:
         self.axes.plot(np.arange(values.size) * self.scale.pixel, values, **style)
 
     def band(self, values: FloatArray, error: FloatArray, colour: str) -> None:
-        """Fill what lies within a standard deviation of a cut."""
+        """Fill the band within a standard deviation of a cut."""
         places = np.arange(values.size) * self.scale.pixel
         edges = np.maximum(values - error, 0), values + error
         self.axes.fill_between(places, *edges, color=colour, alpha=0.25, linewidth=0)
