@@ -93,7 +93,7 @@ def _copy_code(installed: Path, cache_folder: Path) -> None:
     """Copy the code that was compiled when the package was installed."""
     if any(cache_folder.glob("*.nbi")):
         return
-    # Numba does without what is missing.
+    # Missing files only cost numba another compilation.
     with suppress(OSError, shutil.Error):
         # The index of a kernel after its code, to which it refers.
         for path in sorted(installed.glob("*.nb[ci]")):

@@ -29,7 +29,7 @@ FLIPS = 4  # flips made
 LIMIT = 5  # flips allowed
 LAST = 6  # triangle where the next location starts
 RAISES = 7  # weights raised
-POLICY = 8  # what to do with a vertex that is proven hidden
+POLICY = 8  # for vertices that are proven hidden
 EVERYWHERE = 9  # 1 to look at all edges around a flip
 N_COUNTERS = 10
 

@@ -9,5 +9,5 @@
 
 import lazy_loader
 
-# Setups and units are needed where nobody waits for numba and scipy.
+# Setups and units must not wait for the import of numba and scipy.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

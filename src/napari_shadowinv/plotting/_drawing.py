@@ -97,7 +97,7 @@ def outline_caustics(panel: Panel, caustic: BoolArray) -> None:
     """Draw a line around the caustics."""
     from scipy.ndimage import gaussian_filter
 
-    # Noise breaks a caustic into specks; one line around them is what can be read.
+    # Noise breaks a caustic into specks; one line around them is readable.
     density = gaussian_filter(caustic.astype(np.float64), 1 + min(caustic.shape) / 200)
     if density.min() < _CAUSTIC_DENSITY < density.max():
         panel.contour(density, [_CAUSTIC_DENSITY], "white", linewidths=1.1)

@@ -46,7 +46,7 @@ class Solution:
 class TransportObjective:
     """The function f(w) for given sites, their source flux S_i, and an image of the same flux.
 
-    The triangulation of the sites follows the weights that are asked for.
+    The triangulation of the sites follows the weights of the last call.
     """
 
     def __init__(

@@ -236,7 +236,7 @@ def _reject_by_brightness(source: FloatArray, shift: FloatArray, sites: FloatArr
     """Throw points of an even sequence at the source; keep them by its brightness."""
     # The positions are the Kronecker sequence of the real root of x³ = x + 1, which leaves
     # fewer gaps and clumps than independent random points; the golden ratio's decides
-    # what to keep.
+    # which ones to keep.
     root = 1.3247179572447460
     golden = 1.6180339887498949
     height, width = source.shape

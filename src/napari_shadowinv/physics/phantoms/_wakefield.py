@@ -85,7 +85,7 @@ def wakefield(
 
         ∫Δn/n₀ dz = A exp(-ξ²/2ℓ²) Re[√(π/s) exp(i k_p ξ - s y²)].
 
-    The potential is that of a thin plasma, Φ = n₀/2n_c ∫Δn/n₀ dz, the first order of the
+    The potential belongs to a thin plasma, Φ = n₀/2n_c ∫Δn/n₀ dz, the first order of the
     paper's Eq. 11 (Section V) in n₀/n_c, which is 1 % for the paper's plasma and probe.
     """
     _shapes.require_finite(amplitude=amplitude)

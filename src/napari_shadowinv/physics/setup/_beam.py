@@ -31,7 +31,7 @@ class SIField:
     """A field in SI units: a variable of a dataset, made by a method of the setup.
 
     A vector is made of the displacement in px, a plane of the normalised potential in px².
-    The method has the name of the variable unless another one is given.
+    The method has the name of the variable by default.
     """
 
     name: str
@@ -89,8 +89,8 @@ class BeamSetup(CheckedModel):
     A dump holds no None and takes inf, so it can be written as TOML or JSON and read back.
     """
 
-    title: ClassVar[str]  # what the kind is called in a form
-    beam: ClassVar[str]  # what it is made of
+    title: ClassVar[str]  # of the kind in a form
+    beam: ClassVar[str]  # the particles or waves of the beam
     # What a result holds in SI units; `main_field` is the one of them that is shown.
     si_fields: ClassVar[tuple[SIField, ...]] = (
         SIField("potential_si", "m", "Deflection potential", method="potential"),
@@ -99,7 +99,7 @@ class BeamSetup(CheckedModel):
     main_field: ClassVar = MainField("deflection_angle", "Deflection angle", "|α|", ("αy", "αx"))
     # What is shown instead where it is known that something else deflects.
     other_fields: ClassVar[dict[str, MainField]] = {}
-    deflectors: ClassVar[tuple[str, ...]]  # what can deflect the beam; see `angle_ratio`
+    deflectors: ClassVar[tuple[str, ...]]  # causes of a deflection; see `angle_ratio`
     in_pradformat: ClassVar[bool] = False  # whether that format can describe the beam
     # Whether a small source magnifies the object onto a film or plate, as it does with particles.
     projects: ClassVar[bool] = False
