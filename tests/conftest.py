@@ -115,15 +115,15 @@ def fit_exactly(
     height, width = shape
     count = len(strengths)
     blob = gaussian_blob(shape, 12.0, 0.15 * min(shape), (0.4 * height, 0.6 * width))
-    matrix = np.array([[one ** (m + 1) for m in range(len(names))] for one in strengths])
+    matrix = np.array([[strength ** (m + 1) for m in range(len(names))] for strength in strengths])
     moved = [row.sum() * blob.displacement for row in matrix]
-    made = np.stack([3 * synthetic_image(displacement) for displacement in moved])
-    residual = rng.normal(0, 0.05, made.shape)
-    mask = np.ones(made.shape, bool)
+    images = np.stack([3 * synthetic_image(displacement) for displacement in moved])
+    residual = rng.normal(0, 0.05, images.shape)
+    mask = np.ones(images.shape, bool)
     mask[0, :4, :6] = False
     residual[~mask] = 0
-    found = {
-        "images": made + residual,
+    keywords = {
+        "images": images + residual,
         "mask": mask,
         "strengths": matrix,
         "fields": tuple(
@@ -136,12 +136,14 @@ def fit_exactly(
             )
             for name in names
         ),
-        "source": np.full(made.shape, 3.0),
+        "source": np.full(images.shape, 3.0),
         "gains": np.linspace(1, 1.1, count),
         "frames": rng.normal(0, 0.1, (count, 6)),
-        "reprojection": made,
+        "reprojection": images,
         "residual": residual,
-        "chi2": np.array([(one[use] ** 2).mean() for one, use in zip(residual, mask, strict=True)])
+        "chi2": np.array(
+            [(plane[use] ** 2).mean() for plane, use in zip(residual, mask, strict=True)]
+        )
         / 0.05**2,
         "basins": tuple(
             Basin(start, value, 1.01, away, rng.normal(size=(len(names), 2, 24, 32)))
@@ -153,7 +155,7 @@ def fit_exactly(
         "report": FitReport(100 / 3, 12, True, {"starts": 0.5, "full size": 1.5}, 0.02),
         "options": FitOptions(align="shift", threads=2),
     }
-    return Fit(**{**found, **changes})  # type: ignore[arg-type]
+    return Fit(**{**keywords, **changes})  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="session")

@@ -37,7 +37,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.pipeline import gathered, read_recipe
+from napari_shadowinv.pipeline import collect_inputs, read_recipe
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
@@ -99,7 +99,7 @@ def prepared(
 ) -> Radiograph:
     """Return a shot and its source after the steps that flags ask for."""
     recipe = recipe_of(flags, Recipe(mask=None if mask is None else Path(mask)), {})
-    return gathered(recipe, image, source=source).prepared()
+    return collect_inputs(recipe, image, source=source).prepared()
 
 
 def dataset(path: str | Path) -> xr.Dataset:

@@ -86,9 +86,9 @@ def test_doses_are_those_that_the_films_saw(truth: Truth, dataset) -> None:
         usable = dataset["usable"].values[layer]
         assert usable[20:-20, 20:-20].mean() > 0.85
         # As on the first film: behind it the same protons cover more.
-        told = dataset["dose"].values[layer] / scales[layer] ** 2
+        dose = dataset["dose"].values[layer] / scales[layer] ** 2
         error = dataset["dose_error"].values[layer] / dataset["dose"].values[layer]
-        ratio = (told / on_films(truth, dataset, truth.dose, layer))[usable]
+        ratio = (dose / on_films(truth, dataset, truth.dose, layer))[usable]
         assert ratio.mean() == pytest.approx(1, abs=0.005)
         assert (ratio - 1).std() == pytest.approx(np.sqrt((error[usable] ** 2).mean()), rel=0.3)
 
@@ -101,8 +101,8 @@ def test_fluences_are_those_of_the_beam(truth: Truth, dataset) -> None:
         true = on_films(truth, dataset, scene.fluence, layer) * scales[layer] ** 2
         away = dataset["fluence"].values[layer] - true
         assert abs(away[usable].mean()) < 0.02 * true.mean()
-        told = dataset["fluence_error"].values[layer]
-        assert (away / told)[usable].std() == pytest.approx(1, abs=0.35)
+        error = dataset["fluence_error"].values[layer]
+        assert (away / error)[usable].std() == pytest.approx(1, abs=0.35)
     np.testing.assert_allclose(dataset["peak"], scene.energies, rtol=1e-3)
     assert (dataset["energy_low"] < dataset["peak"]).all()
     assert (dataset["peak"] <= dataset["energy_high"]).all()
@@ -121,7 +121,7 @@ def test_films_lie_on_each_other(truth: Truth, dataset) -> None:
     slips = np.array([place.slip for place in truth.placements])
     assert np.abs(slips - slips.mean(axis=0)).max() > 1.5
     assert dataset["by_images"].values.all()
-    assert "which fields displace, too" in dataset.attrs["warnings"]
+    assert "fields shift that content too" in dataset.attrs["warnings"]
 
 
 def test_the_setups_know_energy_depth_and_pixel(truth: Truth, dataset, tmp_path: Path) -> None:
@@ -145,11 +145,15 @@ def test_the_setups_know_energy_depth_and_pixel(truth: Truth, dataset, tmp_path:
 def test_layers_in_pradformat_hold_their_setups(truth: Truth, dataset, tmp_path: Path) -> None:
     table = write_layers(dataset, tmp_path / "layers", form="pradformat")[-1]
     for layer, row in enumerate(rows_of(table, ShotRow)):
-        found = read(row.file)
+        layer_image = read(row.file)
         used = dataset["usable"].values[layer]
-        np.testing.assert_array_equal(found.image[used], dataset["fluence"].values[layer][used])
-        assert found.setup.energy == pytest.approx(dataset["energy"].values[layer])
-        assert found.setup.object_pixel_size == pytest.approx(truth.scene.pixel_size, rel=1e-3)
+        np.testing.assert_array_equal(
+            layer_image.image[used], dataset["fluence"].values[layer][used]
+        )
+        assert layer_image.setup.energy == pytest.approx(dataset["energy"].values[layer])
+        assert layer_image.setup.object_pixel_size == pytest.approx(
+            truth.scene.pixel_size, rel=1e-3
+        )
         assert row.setup is None
     bare = dataset.copy()
     del bare.attrs["setups"]
@@ -174,13 +178,13 @@ def test_one_scan_of_all_films(truth: Truth, dataset, changed) -> None:
         *[(f'file = "film_{k:02d}.tif"\n', "") for k in range(1, COUNT + 1)],
         first='scan = "all.tif"',
     )
-    whole = pack.parent / "all.tif"
+    joint_scan = pack.parent / "all.tif"
     dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
-    tifffile.imwrite(whole, np.concatenate(rows), photometric="rgb", **dots)
-    found = run_film(read_pack(pack))
+    tifffile.imwrite(joint_scan, np.concatenate(rows), photometric="rgb", **dots)
+    result = run_film(read_pack(pack))
     inner = np.s_[:, 20:-20, 20:-20]
-    one, other = found["dose"].values[inner], dataset["dose"].values[inner]
-    assert np.median(np.abs(one / other - 1)) < 0.01
+    from_joint, separate = result["dose"].values[inner], dataset["dose"].values[inner]
+    assert np.median(np.abs(from_joint / separate - 1)) < 0.01
     missing = pack.read_text().replace("[[layers]]", '[[layers]]\nfilm = "HDV2"\n\n[[layers]]', 1)
     pack.write_text(missing)
     with pytest.raises(InputError, match="shows 4 films, the pack has 5 layers"):
@@ -189,15 +193,15 @@ def test_one_scan_of_all_films(truth: Truth, dataset, changed) -> None:
 
 def test_a_lost_film_is_bridged(truth: Truth, dataset, changed) -> None:
     pack = read_pack(changed(('file = "film_02.tif"', "exclude = true")))
-    found = run_film(pack)
-    assert not found["usable"].values[1].any()
-    assert np.isnan(found["dose"].values[1]).all()
-    kept, bridged = dataset["fluence"].values[1], found["fluence"].values[1]
-    if len(kept) == len(bridged) + 1:  # films behind the first are smaller on it
-        kept = (kept[1:] + kept[:-1]) / 2
+    result = run_film(pack)
+    assert not result["usable"].values[1].any()
+    assert np.isnan(result["dose"].values[1]).all()
+    with_film, bridged = dataset["fluence"].values[1], result["fluence"].values[1]
+    if len(with_film) == len(bridged) + 1:  # films behind the first are smaller on it
+        with_film = (with_film[1:] + with_film[:-1]) / 2
     inner = np.s_[30:-30, 30:-30]
-    assert abs(np.median(bridged[inner] / kept[inner]) - 1) < 0.15
-    assert np.isnan(found["corners"].values[1]).all()
+    assert abs(np.median(bridged[inner] / with_film[inner]) - 1) < 0.15
+    assert np.isnan(result["corners"].values[1]).all()
 
 
 @pytest.mark.parametrize("way", [np.s_[::-1, ::-1], np.s_[:, ::-1]])
@@ -207,19 +211,19 @@ def test_films_laid_another_way_round(truth: Truth, dataset, changed, way) -> No
     (pack.parent / "film_02.tif").unlink()
     dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
     tifffile.imwrite(pack.parent / "film_02.tif", scan, photometric="rgb", **dots)
-    told = "turned = 180" if len(way) == 2 and way[0].step == -1 else "mirrored = true"
-    with pytest.raises(InputError, match=f"film [23] does not lie as film [12] does.*{told}"):
+    entry = "turned = 180" if len(way) == 2 and way[0].step == -1 else "mirrored = true"
+    with pytest.raises(InputError, match=f"film [23] does not lie as film [12] does.*{entry}"):
         run_film(read_pack(pack))
-    right = changed(('file = "film_02.tif"', f'file = "film_02.tif"\n{told}'))
-    found = run_film(read_pack(right))
-    np.testing.assert_allclose(found["dose"], dataset["dose"], rtol=1e-3)
+    right = changed(('file = "film_02.tif"', f'file = "film_02.tif"\n{entry}'))
+    result = run_film(read_pack(right))
+    np.testing.assert_allclose(result["dose"], dataset["dose"], rtol=1e-3)
     # Corners are those on the scan as it is.
     height, width = scan.shape[:2]
     sizes = np.array([height, width]) - 1
     flips = np.array([way[0].step == -1, True])
-    there = np.where(flips, sizes - found["corners"].values[1], found["corners"].values[1])
+    on_scan = np.where(flips, sizes - result["corners"].values[1], result["corners"].values[1])
     want = dataset["corners"].values[1]
-    gap = np.linalg.norm(there[:, None] - want[None], axis=-1).min(axis=1)
+    gap = np.linalg.norm(on_scan[:, None] - want[None], axis=-1).min(axis=1)
     assert gap.max() < 0.1
 
 
@@ -231,15 +235,15 @@ def test_corners_are_those_of_the_films_on_their_scans(truth: Truth, dataset) ->
 def test_corners_given_again_change_nothing(truth: Truth, dataset, changed, tmp_path: Path) -> None:
     again = dict(zip("1234", dataset["corners"].values, strict=True))
     write_corners(tmp_path / "corners.csv", again)
-    found = run_film(read_pack(changed(first='corners = "corners.csv"')))
+    result = run_film(read_pack(changed(first='corners = "corners.csv"')))
     # Shifts are found again, and so are the warnings that they bring.
-    np.testing.assert_allclose(found["shift"], dataset["shift"], atol=0.05)
-    assert "which fields displace, too" in found.attrs["warnings"]
-    assert len(found.attrs["warnings"]) == len(dataset.attrs["warnings"])
+    np.testing.assert_allclose(result["shift"], dataset["shift"], atol=0.05)
+    assert "fields shift that content too" in result.attrs["warnings"]
+    assert len(result.attrs["warnings"]) == len(dataset.attrs["warnings"])
 
 
 def test_a_corner_inside_the_film_is_refused(truth: Truth, changed, tmp_path: Path) -> None:
-    corners = {str(k + 1): one.copy() for k, one in enumerate(truth.corners)}
+    corners = {str(k + 1): film_corners.copy() for k, film_corners in enumerate(truth.corners)}
     corners["3"][2] -= 30
     write_corners(tmp_path / "corners.csv", corners)
     with pytest.raises(InputError, match=r"the corners of film 3 are up to \d+ px from those of a"):
@@ -253,29 +257,30 @@ def test_films_seen_from_the_detector_are_mirrored(truth: Truth, dataset, change
         scan = tifffile.imread(file)[:, ::-1]
         dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
         tifffile.imwrite(pack.parent / file.name, scan, photometric="rgb", **dots)
-    found = run_film(read_pack(pack))
-    np.testing.assert_allclose(found["dose"], dataset["dose"], rtol=1e-3)
-    assert "from the detector, mirrored" in found.attrs["seen_from"]
+    result = run_film(read_pack(pack))
+    np.testing.assert_allclose(result["dose"], dataset["dose"], rtol=1e-3)
+    assert "from the detector, mirrored" in result.attrs["seen_from"]
     # Corners are those on the scans as they are.
     width = scan.shape[1]
     expected = dataset["corners"].values[:, [1, 0, 3, 2]] * [1, -1] + [0, width - 1]
-    np.testing.assert_allclose(found["corners"], expected, atol=0.1)
+    np.testing.assert_allclose(result["corners"], expected, atol=0.1)
 
 
 def test_the_side_of_the_films_is_asked_for(truth: Truth, changed) -> None:
-    found = run_film(read_pack(changed(('seen_from = "source"\n', ""))))
-    assert "B has the wrong sign; give seen_from" in found.attrs["warnings"]
-    assert found.attrs["seen_from"] == "the source (assumed)"
+    result = run_film(read_pack(changed(('seen_from = "source"\n', ""))))
+    assert "B has the wrong sign; give seen_from" in result.attrs["warnings"]
+    assert result.attrs["seen_from"] == "the source (assumed)"
 
 
 def test_corners_from_a_table(truth: Truth, dataset, changed, tmp_path: Path) -> None:
     write_corners(
-        tmp_path / "corners.csv", {str(k + 1): one for k, one in enumerate(truth.corners)}
+        tmp_path / "corners.csv",
+        {str(k + 1): film_corners for k, film_corners in enumerate(truth.corners)},
     )
     pack = read_pack(changed(first='corners = "corners.csv"\nalign = "edges"'))
-    found = run_film(pack)
-    np.testing.assert_allclose(found["corners"], truth.corners, atol=0.01)
-    assert not found["by_images"].values.any()
+    result = run_film(pack)
+    np.testing.assert_allclose(result["corners"], truth.corners, atol=0.01)
+    assert not result["by_images"].values.any()
     write_corners(tmp_path / "corners.csv", {"7": truth.corners[0]})
     with pytest.raises(InputError, match="corners of a film '7': expected numbers of layers"):
         run_film(pack)
@@ -309,13 +314,13 @@ def places_of(truth: Truth, dataset) -> np.ndarray:
 
 def test_films_are_laid_on_each_other_by_fiducials(truth: Truth, changed, tmp_path: Path) -> None:
     write_fiducials(tmp_path / "fiducials.csv", truth, range(COUNT))
-    found = run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
-    places = places_of(truth, found)
+    result = run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
+    places = places_of(truth, result)
     assert (np.abs(places - places.mean(axis=0)) < [0.05, 0.05, 5e-4]).all()
-    assert (found["shift_error"].values < 0.5).all()
+    assert (result["shift_error"].values < 0.5).all()
     # They tell what fields displace from films that slipped.
-    assert not found["by_images"].values.any()
-    assert found.attrs["warnings"] == "[]"
+    assert not result["by_images"].values.any()
+    assert result.attrs["warnings"] == "[]"
 
 
 def test_deeper_films_are_magnified_about_the_axis(truth: Truth, changed, tmp_path: Path) -> None:
@@ -342,11 +347,14 @@ def test_deeper_films_are_magnified_about_the_axis(truth: Truth, changed, tmp_pa
 
 def test_films_without_fiducials_are_told(truth: Truth, changed, tmp_path: Path) -> None:
     write_fiducials(tmp_path / "fiducials.csv", truth, range(COUNT - 1))
-    found = run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
-    places = places_of(truth, found)[:-1]
+    result = run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
+    places = places_of(truth, result)[:-1]
     assert np.ptp(places[:, :2], axis=0).max() < 0.1
-    assert f"films {COUNT} have no fiducials: laid by their edges" in found.attrs["warnings"]
-    np.testing.assert_array_equal(found["shift"][-1], 0)
+    assert (
+        f"films {COUNT} have no fiducials and were aligned by their edges"
+        in result.attrs["warnings"]
+    )
+    np.testing.assert_array_equal(result["shift"][-1], 0)
 
 
 def test_fiducials_of_a_film_on_its_face(truth: Truth, changed, tmp_path: Path) -> None:
@@ -389,8 +397,8 @@ def test_layers_from_a_table(truth: Truth, dataset, changed) -> None:
         lines = csv.writer(file)
         lines.writerow(["film", "filters", "file"])
         lines.writerows(
-            [one["film"], "; ".join(one.get("filters", [])), one["file"]]
-            for one in entries["layers"]
+            [layer["film"], "; ".join(layer.get("filters", [])), layer["file"]]
+            for layer in entries["layers"]
         )
     text = pack.read_text()
     pack.write_text('layers = "layers.csv"\n' + text[: text.index("[[layers]]")])
@@ -437,10 +445,10 @@ def test_other_scans_are_told(truth: Truth, changed, spoil, message: str) -> Non
 
 def test_a_film_that_is_too_dark_is_told(truth: Truth, changed) -> None:
     table = 'calibration = "HDV2.csv"\ndose_range = [0.0, 300.0]'
-    found = run_film(read_pack(changed(('calibration = "HDV2.csv"', table))))
-    assert "film 1 is darker than its calibration reaches over" in found.attrs["warnings"]
-    inside = found["usable"].values[0]
-    assert found["dose"].values[0][inside].max() <= 301
+    result = run_film(read_pack(changed(('calibration = "HDV2.csv"', table))))
+    assert "of the pixels are darker than the calibration covers" in result.attrs["warnings"]
+    inside = result["usable"].values[0]
+    assert result["dose"].values[0][inside].max() <= 301
 
 
 @pytest.mark.parametrize(
@@ -472,8 +480,8 @@ def test_real_films_are_not_moved_by_lines_of_equal_dose(shared_data: Path) -> N
         {"film": "EBT3", "filters": "750 um Fe", "file": folder / f"RCF_18{letter}.tif"}
         for letter in "OPQ"
     ]
-    found = run_film(Pack.model_validate({"layers": layers, "films": {"EBT3": film}}))
+    result = run_film(Pack.model_validate({"layers": layers, "films": {"EBT3": film}}))
     # Edges and the slit that is cut into all of them agree within 2 px.
-    assert np.ptp(found["shift"].values, axis=0).max() < 2
-    assert np.ptp(found["turn"].values) < np.deg2rad(0.3)
-    assert (found["shift_error"].values > 2).all()
+    assert np.ptp(result["shift"].values, axis=0).max() < 2
+    assert np.ptp(result["turn"].values) < np.deg2rad(0.3)
+    assert (result["shift_error"].values > 2).all()

@@ -83,18 +83,18 @@ def test_without_steps_it_is_invert(image: FloatArray) -> None:
     beam = np.full_like(image, 90)
     mask = np.ones(SHAPE, bool)
     mask[5, 7] = False
-    found = run(Recipe(options=OPTIONS), image, source=beam, mask=mask)
-    assert_same(found, invert(image, source=beam, mask=mask, options=OPTIONS))
+    inversion = run(Recipe(options=OPTIONS), image, source=beam, mask=mask)
+    assert_same(inversion, invert(image, source=beam, mask=mask, options=OPTIONS))
 
 
 def test_steps_are_done_in_their_order(image: FloatArray) -> None:
-    one, two = BackgroundFilter(degree=1), LowPassFilter(width=2)
-    for steps in ((one, Bin(factor=2), two), (two, Bin(factor=2), one)):
+    background, smooth = BackgroundFilter(degree=1), LowPassFilter(width=2)
+    for steps in ((background, Bin(factor=2), smooth), (smooth, Bin(factor=2), background)):
         expected = image
         for step in steps:
-            if step is one:
+            if step is background:
                 expected = remove_background(expected, 1)
-            elif step is two:
+            elif step is smooth:
                 expected = low_pass(expected, 2.0)
             else:
                 expected = expected.reshape(20, 2, 26, 2).sum(axis=(1, 3))
@@ -116,14 +116,14 @@ def test_source_and_masks_go_through_the_same_steps(image: FloatArray) -> None:
     small = LowPassFilter(width=1).filtered(by_hand(image), usable)
     recipe = Recipe(steps=steps, source=PolynomialEstimate(degree=1), options=OPTIONS)
     source = polynomial_source(small, degree=1, mask=usable & by_hand(bare))
-    found = run(recipe, image, mask=mask, source_mask=bare)
+    inversion = run(recipe, image, mask=mask, source_mask=bare)
     # Sums of a turned array are rounded in another order.
     expected = invert(small, source=source, mask=usable, options=OPTIONS)
-    assert_same(found, expected, rtol=1e-9)
+    assert_same(inversion, expected, rtol=1e-9)
     measured = LowPassFilter(width=1).filtered(by_hand(1.1 * image + 9), usable)
-    found = run(Recipe(steps=steps, options=OPTIONS), image, source=1.1 * image + 9, mask=mask)
+    inversion = run(Recipe(steps=steps, options=OPTIONS), image, source=1.1 * image + 9, mask=mask)
     expected = invert(small, source=measured, mask=usable, options=OPTIONS)
-    assert_same(found, expected, rtol=1e-9)
+    assert_same(inversion, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("steps", MOVES)
@@ -152,19 +152,19 @@ def test_a_point_source_is_where_it_was_in_the_recorded_image(steps: tuple[Step,
     setup = paper_setup().model_copy(update={"pixel_size": 6.5e-6})
     for estimate in (IsotropicEstimate(), IsotropicEstimate(centre_y=4, centre_x=11.5)):
         recipe = Recipe(steps=steps, source=estimate, setup=setup, options=OPTIONS)
-        found = run(recipe, image)
-        whole = run(Recipe(source=estimate, setup=setup, options=OPTIONS), image).source
-        moved = recipe.moved(Radiograph(whole))
-        used = found.mask if moved.mask is None else found.mask & moved.mask
-        ratio = found.source[used] / moved.image[used]
+        inversion = run(recipe, image)
+        uncropped = run(Recipe(source=estimate, setup=setup, options=OPTIONS), image).source
+        moved = recipe.moved(Radiograph(uncropped))
+        used = inversion.mask if moved.mask is None else inversion.mask & moved.mask
+        ratio = inversion.source[used] / moved.image[used]
         # The source sees the same solid angle, up to the curvature within rotated pixels.
         np.testing.assert_allclose(ratio, ratio.mean(), rtol=2e-4)
 
 
 @given(arrays(bool, st.tuples(st.integers(4, 30), st.integers(4, 30))))
 def test_a_mask_is_kept_whole(mask: Any) -> None:
-    kept = Origin.model_validate_json(Origin.of_mask(mask).model_dump_json())
-    np.testing.assert_array_equal(kept.mask(), mask)
+    stored = Origin.model_validate_json(Origin.of_mask(mask).model_dump_json())
+    np.testing.assert_array_equal(stored.mask(), mask)
 
 
 def test_a_mask_too_complex_for_an_attribute_is_not_kept_in_part() -> None:
@@ -178,7 +178,7 @@ def changed(choice: type[Choice]) -> Choice:
     for name, field in choice.parameters().items():
         options = typing.get_args(field.annotation)
         if isinstance(field.default, str):
-            values[name] = next(one for one in options if one != field.default)
+            values[name] = next(option for option in options if option != field.default)
         elif isinstance(field.default, tuple):
             values[name] = (1, 9)
         else:
@@ -219,19 +219,19 @@ def test_every_parameter_has_a_flag() -> None:
     for name in InversionOptions.model_fields:
         assert name in flags
         flags.discard(name)
-    for step in (changed(one) for one in STEPS.values()):
+    for step in (changed(model) for model in STEPS.values()):
         assert isinstance(step, Step)
-        given = {
+        values = {
             (step.name() if name == step.primary else f"{step.name()}-{name}").replace("-", "_"): v
             for name, v in step.values().items()
         }
-        assert given.keys() <= flags
-        assert recipe_of(given, Recipe(), {}).steps == (step,)
-        flags -= given.keys()
-    for source in (changed(one) for one in ESTIMATES.values()):
-        given = {f"source_{name}": value for name, value in source.values().items()}
-        assert given.keys() <= flags
-        assert recipe_of({"source_from": source.name(), **given}, Recipe(), {}).source == source
+        assert values.keys() <= flags
+        assert recipe_of(values, Recipe(), {}).steps == (step,)
+        flags -= values.keys()
+    for source in (changed(model) for model in ESTIMATES.values()):
+        values = {f"source_{name}": value for name, value in source.values().items()}
+        assert values.keys() <= flags
+        assert recipe_of({"source_from": source.name(), **values}, Recipe(), {}).source == source
     assert {name for name in flags if not name.startswith("source_")} == set()
 
 
@@ -252,14 +252,16 @@ def test_what_moves_sites_is_in_their_key(image: FloatArray) -> None:
     for name, value in OTHER.items():
         free = name in ("margin", "decay_length", "flux")
         base = InversionOptions(n_sites=300, boundary="free" if free else "closed")
-        other = base.model_copy(update={name: value})
+        variant = base.model_copy(update={name: value})
         sites = [
-            plan_sites(image, one.model_copy(update={"n_sites": count}), mask=mask).levels[-1].sites
-            for one in (base, other)
-            for count in [number_of_sites(SHAPE, one)]
+            plan_sites(image, options.model_copy(update={"n_sites": count}), mask=mask)
+            .levels[-1]
+            .sites
+            for options in (base, variant)
+            for count in [number_of_sites(SHAPE, options)]
         ]
-        same = sites[0].shape == sites[1].shape and np.array_equal(*sites)
-        assert (base.site_key() == other.site_key()) == same, name
+        is_same = sites[0].shape == sites[1].shape and np.array_equal(*sites)
+        assert (base.site_key() == variant.site_key()) == is_same, name
 
 
 def test_a_cache_spares_sites_and_estimates_without_changing_results(image: FloatArray) -> None:
@@ -325,12 +327,12 @@ def test_a_source_beside_the_shot_in_its_file_is_found(tmp_path: Path, image: Fl
 
 def test_provenance_says_all_that_is_needed(image: FloatArray) -> None:
     recipe = Recipe(steps=(Bin(factor=2),), setup=paper_setup(), options=OPTIONS)
-    made = run(recipe, image).provenance
-    assert made is not None
-    told = json.loads(made.model_dump_json())
-    assert told["recipe"]["steps"] == [{"step": "bin", "factor": 2}]
-    assert told["recipe"]["source"] == {"method": "uniform"}
-    assert made.setup is not None
-    assert made.setup.object_pixel_size == 2 * paper_setup().object_pixel_size
-    assert made.notes == ("binned 2 × 2",)
-    assert_same(run(made.recipe, image), run(recipe, image))
+    provenance = run(recipe, image).provenance
+    assert provenance is not None
+    content = json.loads(provenance.model_dump_json())
+    assert content["recipe"]["steps"] == [{"step": "bin", "factor": 2}]
+    assert content["recipe"]["source"] == {"method": "uniform"}
+    assert provenance.setup is not None
+    assert provenance.setup.object_pixel_size == 2 * paper_setup().object_pixel_size
+    assert provenance.notes == ("binned 2 × 2",)
+    assert_same(run(provenance.recipe, image), run(recipe, image))

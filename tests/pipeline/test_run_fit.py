@@ -16,7 +16,7 @@ from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import FitShot, read_recipe, run_fit, write_recipe
-from napari_shadowinv.pipeline._fit import gathered_fit
+from napari_shadowinv.pipeline._fit import collect_fit_inputs
 from napari_shadowinv.preprocessing import (
     Bin,
     Crop,
@@ -67,7 +67,7 @@ def test_it_is_a_fit_of_what_the_steps_make(images: list[FloatArray]) -> None:
         FitShot(image, setup, source=source, mask=mask)
         for image, setup in zip(images, SETUPS, strict=True)
     ]
-    found = run_fit(Recipe(steps=STEPS, fit=choices), shots)
+    result = run_fit(Recipe(steps=STEPS, fit=choices), shots)
     after = [setup.model_copy(update={"pixel_size": 2e-5}) for setup in SETUPS]
     spread = 1e-5 * (1 - 1 / SETUPS[0].magnification) / 2e-5
     by_hand = fit(
@@ -80,8 +80,8 @@ def test_it_is_a_fit_of_what_the_steps_make(images: list[FloatArray]) -> None:
         gains="free",
         options=HASTY,
     )
-    assert_same_fields(found, by_hand)
-    assert found.setups == tuple(after)
+    assert_same_fields(result, by_hand)
+    assert result.setups == tuple(after)
 
 
 def test_provenance_is_complete_and_survives_its_file(
@@ -96,23 +96,23 @@ def test_provenance_is_complete_and_survives_its_file(
         FitShot(paths[1], SETUPS[1], mask=mask, noise="poisson", gain=1.5, psf=0.5),
     ]
     recipe = Recipe(steps=(Crop(y=(0, 40), x=(0, 48)),), fit=FitChoices(options=HASTY))
-    found = run_fit(recipe, shots, fiducials=[[5, 6, 0.1, 0.2, 0.5]])
-    write(tmp_path / "fit.shadowinv", found)
+    result = run_fit(recipe, shots, fiducials=[[5, 6, 0.1, 0.2, 0.5]])
+    write(tmp_path / "fit.shadowinv", result)
     again = Fit.from_dataset(read(tmp_path / "fit.shadowinv"))  # type: ignore[arg-type]
-    made = again.provenance
-    assert made is not None
-    assert made == found.provenance
-    assert made.recipe.fit == FitChoices(fields=("B",), options=HASTY)
-    assert made.recipe.steps == recipe.steps
-    assert [one.image.file for one in made.images] == ["a.tif", "b.tif"]
-    assert [one.gain for one in made.images] == [1.0, 1.5]
-    assert [one.psf for one in made.images] == [None, 0.5]
-    assert [one.noise for one in made.images] == ["poisson", "poisson"]
-    assert [one.setup for one in made.images] == SETUPS
+    provenance = again.provenance
+    assert provenance is not None
+    assert provenance == result.provenance
+    assert provenance.recipe.fit == FitChoices(fields=("B",), options=HASTY)
+    assert provenance.recipe.steps == recipe.steps
+    assert [origin.image.file for origin in provenance.images] == ["a.tif", "b.tif"]
+    assert [origin.gain for origin in provenance.images] == [1.0, 1.5]
+    assert [origin.psf for origin in provenance.images] == [None, 0.5]
+    assert [origin.noise for origin in provenance.images] == ["poisson", "poisson"]
+    assert [origin.setup for origin in provenance.images] == SETUPS
     # Kept once, because it is the same.
-    assert [one.mask for one in made.images] == [0, 0]
-    np.testing.assert_array_equal(made.masks[0].mask(), mask)
-    assert made.fiducial_rows == ((5, 6, 0.1, 0.2, 0.5),)
+    assert [origin.mask for origin in provenance.images] == [0, 0]
+    np.testing.assert_array_equal(provenance.masks[0].mask(), mask)
+    assert provenance.fiducial_rows == ((5, 6, 0.1, 0.2, 0.5),)
 
 
 def test_what_does_not_fit_into_an_attribute_is_not_kept_in_part() -> None:
@@ -122,18 +122,18 @@ def test_what_does_not_fit_into_an_attribute_is_not_kept_in_part() -> None:
         for k in (1.0, 2.0, 3.0)
     ]
     rows = np.column_stack([rng.uniform(0, 390, (900, 2)), np.zeros((900, 2)), np.ones(900)])
-    inputs = gathered_fit(Recipe(), shots, fiducials=rows)
-    made = inputs.provenance
-    assert [mask.pixels is None for mask in made.masks] == [False, True, True]
-    assert made.fiducial_rows is None
-    assert made.fiducials == Origin()
-    assert len(made.model_dump_json()) < 60_000
+    inputs = collect_fit_inputs(Recipe(), shots, fiducials=rows)
+    provenance = inputs.provenance
+    assert [mask.pixels is None for mask in provenance.masks] == [False, True, True]
+    assert provenance.fiducial_rows is None
+    assert provenance.fiducials == Origin()
+    assert len(provenance.model_dump_json()) < 60_000
     np.testing.assert_array_equal(inputs.keywords["mask"], [shot.mask for shot in shots])
 
 
 def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[FloatArray]) -> None:
     recipe = Recipe(steps=STEPS, source=LowPassEstimate(width=20))
-    inputs = gathered_fit(recipe, [FitShot(image, strength=(1.0,)) for image in images])
+    inputs = collect_fit_inputs(recipe, [FitShot(image, strength=(1.0,)) for image in images])
     expected = [low_pass_source(binned(image), width=20) for image in images]
     np.testing.assert_allclose(inputs.keywords["source"], expected)
     assert inputs.provenance.recipe.source == LowPassEstimate(width=20)
@@ -141,15 +141,15 @@ def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[Floa
 
 def test_an_unknown_beam_takes_no_source(images: list[FloatArray]) -> None:
     unknown = Recipe(fit=FitChoices(beam="unknown"))
-    inputs = gathered_fit(unknown, [FitShot(image, strength=(1.0,)) for image in images])
+    inputs = collect_fit_inputs(unknown, [FitShot(image, strength=(1.0,)) for image in images])
     assert inputs.keywords["source"] == "unknown"
-    said = gathered_fit(Recipe(), [FitShot(image, source="unknown") for image in images])
+    said = collect_fit_inputs(Recipe(), [FitShot(image, source="unknown") for image in images])
     assert said.choices.beam == "unknown"
     with pytest.raises(InputError, match="has no unknown source"):
-        gathered_fit(Recipe(), [FitShot(images[0], source="unknown"), FitShot(images[1])])
+        collect_fit_inputs(Recipe(), [FitShot(images[0], source="unknown"), FitShot(images[1])])
     both = unknown.model_copy(update={"source": LowPassEstimate()})
     with pytest.raises(InputError, match="a source and a fit with an unknown beam"):
-        gathered_fit(both, [images[0]])
+        collect_fit_inputs(both, [images[0]])
 
 
 CHOICES = (
@@ -168,8 +168,8 @@ def test_its_section_survives_a_file(tmp_path: Path, choices: FitChoices) -> Non
 
 
 def test_an_inversion_is_not_made_as_a_fit() -> None:
-    made: dict[str, Any] = {"provenance": '{"version": "1", "recipe": {}, "image": {}}'}
-    assert FitProvenance.of(made) is None
+    attributes: dict[str, Any] = {"provenance": '{"version": "1", "recipe": {}, "image": {}}'}
+    assert FitProvenance.of(attributes) is None
     assert FitProvenance.of({}) is None
 
 

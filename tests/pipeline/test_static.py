@@ -32,8 +32,8 @@ RECIPE = Recipe(fit=FitChoices(noise=NOISE, options=PLAIN))
 def shots_of(factors: tuple[float, ...], **changes: Any) -> list[FitShot]:
     noise = np.random.default_rng(5).normal(0, NOISE, (5, *SHAPE))
     return [
-        FitShot(synthetic_image(factor * strength * TRUTH) + one, setup, **changes)
-        for factor, strength, setup, one in zip(factors, STRENGTHS, SETUPS, noise, strict=False)
+        FitShot(synthetic_image(factor * strength * TRUTH) + plane, setup, **changes)
+        for factor, strength, setup, plane in zip(factors, STRENGTHS, SETUPS, noise, strict=False)
     ]
 
 
@@ -49,16 +49,16 @@ def windows() -> FitWindows:
 
 def test_windows_follow_the_strength_of_the_object(windows: FitWindows) -> None:
     assert windows.numbers == ((0, 1), (1, 2), (2, 3), (3, 4))
-    found = [share(one) for one in windows.displacement[:, 0]]
-    assert found[0] == pytest.approx(1, rel=0.02)
-    assert found[1] == pytest.approx(1, rel=0.02)
-    assert found[3] == pytest.approx(1.25, rel=0.02)
+    shares = [share(displacement) for displacement in windows.displacement[:, 0]]
+    assert shares[0] == pytest.approx(1, rel=0.02)
+    assert shares[1] == pytest.approx(1, rel=0.02)
+    assert shares[3] == pytest.approx(1.25, rel=0.02)
     # One field for both sides of the change explains neither.
-    assert 1 < found[2] < 1.25
+    assert 1 < shares[2] < 1.25
     assert windows.fits[2].verdict is Verdict.MISFIT
     assert [fit.verdict for fit in windows.fits].count(Verdict.DETERMINED) == 3
-    for one in (0, 1, 3):
-        np.testing.assert_allclose(windows.fits[one].chi2, 1, atol=0.1)
+    for window in (0, 1, 3):
+        np.testing.assert_allclose(windows.fits[window].chi2, 1, atol=0.1)
 
 
 def test_a_window_is_the_fit_of_its_images(windows: FitWindows) -> None:
@@ -67,9 +67,9 @@ def test_a_window_is_the_fit_of_its_images(windows: FitWindows) -> None:
     np.testing.assert_array_equal(
         windows.fits[1].fields[0].displacement, alone.fields[0].displacement
     )
-    made = windows.fits[1].provenance
-    assert made is not None
-    assert [one.setup for one in made.images] == SETUPS[1:3]
+    provenance = windows.fits[1].provenance
+    assert provenance is not None
+    assert [image.setup for image in provenance.images] == SETUPS[1:3]
 
 
 def test_windows_are_one_dataset_against_energy_and_time(windows: FitWindows) -> None:
@@ -87,21 +87,21 @@ def test_windows_are_one_dataset_against_energy_and_time(windows: FitWindows) ->
     np.testing.assert_array_equal(dataset["image_number"][2], [3, 4])
     assert str(dataset["verdict"].values[2]) == "does not fit"
     # A field at the strength of its own window is the same in SI units.
-    own = SETUPS[2].path_integrated_b(windows.fits[2].fields[0].displacement)
-    np.testing.assert_allclose(dataset["path_integrated_b"][2], own, rtol=1e-9)
+    own_field = SETUPS[2].path_integrated_b(windows.fits[2].fields[0].displacement)
+    np.testing.assert_allclose(dataset["path_integrated_b"][2], own_field, rtol=1e-9)
 
 
 def test_they_are_kept_in_the_file_of_a_fit_which_reads_as_before(
     tmp_path: Any, windows: FitWindows
 ) -> None:
-    whole = windows.fits[0]
-    write(tmp_path / "fit.shadowinv", windows.added_to(whole.to_dataset()))
+    first_fit = windows.fits[0]
+    write(tmp_path / "fit.shadowinv", windows.added_to(first_fit.to_dataset()))
     dataset = read(tmp_path / "fit.shadowinv")
     again = Fit.from_dataset(dataset)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(again.fields[0].displacement, whole.fields[0].displacement)
-    own = windows.to_dataset()
+    np.testing.assert_array_equal(again.fields[0].displacement, first_fit.fields[0].displacement)
+    content = windows.to_dataset()
     for name in ("displacement", "path_integrated_b", "chi2", "explanation", "energy"):
-        np.testing.assert_array_equal(dataset[f"window_{name}"], own[name])  # type: ignore[index]
+        np.testing.assert_array_equal(dataset[f"window_{name}"], content[name])  # type: ignore[index]
 
 
 def test_nothing_depends_on_the_order_of_images_or_on_threads() -> None:
@@ -110,12 +110,12 @@ def test_nothing_depends_on_the_order_of_images_or_on_threads() -> None:
         Recipe(fit=FitChoices(noise=NOISE, options=HASTY.model_copy(update={"threads": threads})))
         for threads in (1, 2)
     ]
-    given = list(zip(recipes, (shots, [shots[k] for k in order]), strict=True))
-    one, other = (run_leave_one_out(*each) for each in given)
-    assert other.explanation == one.explanation
+    calls = list(zip(recipes, (shots, [shots[k] for k in order]), strict=True))
+    first, second = (run_leave_one_out(*each) for each in calls)
+    assert second.explanation == first.explanation
     for name in ("predicted", "residual", "chi2", "alone", "limit", "rms", "gains"):
-        np.testing.assert_array_equal(getattr(other, name), getattr(one, name)[order])
-    film, again = (run_windows(*each, 2) for each in given)
+        np.testing.assert_array_equal(getattr(second, name), getattr(first, name)[order])
+    film, again = (run_windows(*each, 2) for each in calls)
     np.testing.assert_array_equal(film.displacement, again.displacement)
     assert (film.numbers, again.numbers) == (((0, 1), (1, 2)), ((1, 2), (2, 0)))
 
@@ -125,10 +125,10 @@ def test_strengths_take_the_place_of_energies() -> None:
         FitShot(shot.image, strength=(strength,))
         for shot, strength in zip(shots_of(FACTORS), STRENGTHS, strict=True)
     ]
-    found = run_windows(Recipe(fit=FitChoices(options=HASTY)), shots[::-1][:3], 2)
-    assert found.numbers == ((2, 1), (1, 0))
-    assert found.energies is None
-    dataset = found.to_dataset()
+    result = run_windows(Recipe(fit=FitChoices(options=HASTY)), shots[::-1][:3], 2)
+    assert result.numbers == ((2, 1), (1, 0))
+    assert result.energies is None
+    dataset = result.to_dataset()
     assert not {"energy", "time_of_flight"} & set(dataset.coords)
     third, fourth, fifth = np.array(STRENGTHS[2:]) / STRENGTHS[2]
     np.testing.assert_allclose(dataset["strength"], [(third + fourth) / 2, (fourth + fifth) / 2])

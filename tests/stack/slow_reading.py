@@ -30,9 +30,9 @@ def hang_once(path: Path) -> np.ndarray:
 
     While it waits there is a file ``hanging`` with the id of the process.
     """
-    named = path.with_name("hang.txt")
+    hanging = path.with_name("hang.txt")
     marker = path.with_name("hanging")
-    if named.exists() and named.read_text() == path.stem and not marker.exists():
+    if hanging.exists() and hanging.read_text() == path.stem and not marker.exists():
         draft = path.with_name("hanging.draft")
         draft.write_text(str(os.getpid()))
         draft.replace(marker)

@@ -134,9 +134,9 @@ def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
     resumed = batch("--setup", "setup.toml", "--resume")
     assert resumed.exit_code == 0
     assert "nothing to do" in flat(resumed.output)
-    other = batch("--resume")
-    assert other.exit_code == 2
-    assert "was started with a different setup" in flat(other.output)
+    second_run = batch("--resume")
+    assert second_run.exit_code == 2
+    assert "was started with a different setup" in flat(second_run.output)
     assert batch("--overwrite").exit_code == 0
 
 
@@ -269,8 +269,8 @@ def test_an_exported_tiff_tells_the_size_of_its_pixels(store):
             "export", store, "--format", "tiff", "--shots", "1", "--out", "tiffs", "--overwrite"
         )
         assert result.exit_code == 0, result.output
-        found = pixel_size("tiffs/0001_shot_1_potential.tif")
-        assert found == pytest.approx(in_object_plane, rel=1e-6)
+        size = pixel_size("tiffs/0001_shot_1_potential.tif")
+        assert size == pytest.approx(in_object_plane, rel=1e-6)
 
 
 def test_shots_are_exported_as_pradformat_if_the_setup_is_a_particle_beams(store):
@@ -284,10 +284,12 @@ def test_shots_are_exported_as_pradformat_if_the_setup_is_a_particle_beams(store
     with h5py.File(path) as file:
         assert file.attrs["radiograph_filename"] == "shot_4.npy"
     exported = read(path)
-    told, whole = Provenance.of(exported.attrs), Provenance.of(read(store).attrs)
-    assert told.image.file == "shot_4.npy"
-    assert told.image.sha256 == hashlib.sha256(Path("shots/shot_4.npy").read_bytes()).hexdigest()
-    assert told.recipe == whole.recipe
+    provenance, of_store = Provenance.of(exported.attrs), Provenance.of(read(store).attrs)
+    assert provenance.image.file == "shot_4.npy"
+    assert (
+        provenance.image.sha256 == hashlib.sha256(Path("shots/shot_4.npy").read_bytes()).hexdigest()
+    )
+    assert provenance.recipe == of_store.recipe
     np.testing.assert_allclose(exported.displacement, read(store).displacement[4], atol=1e-6)
 
 
@@ -466,12 +468,12 @@ def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch
             time.sleep(0.02)
         # As a terminal does: to the command and to its workers.
         os.killpg(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=60)
+        _, stderr = process.communicate(timeout=60)
     finally:
         process.kill()
     assert process.returncode == 130
-    assert "Repeat the command with --resume to continue" in flat(told)
-    assert "Traceback" not in told
+    assert "Repeat the command with --resume to continue" in flat(stderr)
+    assert "Traceback" not in stderr
     statuses = StackStore(out).statuses()
     assert set(statuses) == {DONE, PENDING}
     resumed = shadowinv(*command, "--resume", "--scheduler", "threads", "--quiet")
@@ -496,10 +498,10 @@ def interrupted(preparation: str, pause: float, *arguments: str) -> tuple[int, s
         assert process.stdout.readline() == "now\n"
         time.sleep(pause)
         os.killpg(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=60)
+        _, stderr = process.communicate(timeout=60)
     finally:
         process.kill()
-    return process.returncode, told
+    return process.returncode, stderr
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
@@ -516,9 +518,9 @@ def test_ctrl_c_while_workers_start_is_told_in_one_sentence(night, folder):
     """
     before = sorted(folder.rglob("*"))
     # When the workers are about to import what they need.
-    code, told = interrupted(starting, 0.6, "--workers", "1")
+    code, output = interrupted(starting, 0.6, "--workers", "1")
     assert code == 130
-    assert told.splitlines() == [
+    assert output.splitlines() == [
         "Cancelled: nothing written. Repeat the command with --resume to continue."
     ]
     assert sorted(folder.rglob("*")) == before
@@ -546,9 +548,9 @@ def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
         store._create_array = lambda *arguments: pool.submit(create_slowly, *arguments).result()
     """
     before = sorted(folder.rglob("*"))
-    code, told = interrupted(behind_our_back, 0.1, "--scheduler", "threads")
+    code, output = interrupted(behind_our_back, 0.1, "--scheduler", "threads")
     assert code == 130
-    assert "Cancelled: nothing written" in told
+    assert "Cancelled: nothing written" in output
     assert sorted(folder.rglob("*")) == before
 
 

@@ -69,9 +69,9 @@ def test_the_commands_work_as_shown(folder, night):
     result = runner.invoke(app, [*watching.split()[1:], "--idle", "0.2", "--n-sites", "100"])
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines()[0] == "Watching shots for *.tif; press Ctrl-C to stop."
-    others = [command for command in COMMANDS if not re.search("batch|watch", command)]
-    assert len(others) == 7
-    for command in others:
+    commands = [command for command in COMMANDS if not re.search("batch|watch", command)]
+    assert len(commands) == 7
+    for command in commands:
         result = runner.invoke(app, command.split()[1:])
         assert result.exit_code == 0, result.output
 

@@ -48,10 +48,10 @@ SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
 
 def wait_for(condition, what: str):
     end = time.monotonic() + PATIENCE
-    while not (found := condition()):
+    while not (value := condition()):
         assert time.monotonic() < end, f"waited {PATIENCE} s for {what}"
         time.sleep(0.02)
-    return found
+    return value
 
 
 @pytest.fixture(scope="module")
@@ -222,11 +222,11 @@ def test_a_lazy_stack_on_the_cluster_makes_its_sites_once_in_each_worker(make_ni
     expected = stack.potential.compute(scheduler="synchronous")
     with Client(cluster, set_as_default=False) as client:
         client.run(count_plans)
-        found = client.compute(stack.potential).result(timeout=PATIENCE)
-        made = client.run(plans_made)
-    np.testing.assert_array_equal(found, expected)
-    assert 1 <= sum(made.values()) <= 2
-    assert max(made.values()) == 1
+        potential = client.compute(stack.potential).result(timeout=PATIENCE)
+        plans = client.run(plans_made)
+    np.testing.assert_array_equal(potential, expected)
+    assert 1 <= sum(plans.values()) <= 2
+    assert max(plans.values()) == 1
 
 
 def test_a_shot_on_a_worker_gets_its_share_of_the_cores(cluster):
@@ -267,7 +267,7 @@ def test_workers_that_die_of_what_all_shots_share_end_the_run_and_blame_no_shot(
         engine.share(1, "beam-of-all")
         with pytest.raises(_engines.EngineError, match="crash before starting a shot"):
             engine.result(Future("beam-of-all"))
-        with pytest.raises(_engines.WorkerDied):
+        with pytest.raises(_engines.WorkerDiedError):
             engine.result(Future("a-shot"))
 
 
@@ -340,7 +340,7 @@ def test_the_scheduler_restarted_and_the_run_resumed(night, out, expected):
 
 
 def test_no_scheduler_answers(night, out, monkeypatch):
-    monkeypatch.setattr(_engines, "_CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr(_engines, "_CONNECT_TIMEOUT_S", 1.0)
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
@@ -350,11 +350,11 @@ def test_no_scheduler_answers(night, out, monkeypatch):
 
 
 def test_the_wait_for_a_scheduler_that_is_not_there_can_be_ended(night, out):
-    asked = []
+    calls = []
 
     def should_stop() -> bool:
-        asked.append(len(asked) >= 2)
-        return asked[-1]
+        calls.append(len(calls) >= 2)
+        return calls[-1]
 
     # It takes the call and says nothing.
     with socket.socket() as silent:
@@ -363,7 +363,7 @@ def test_the_wait_for_a_scheduler_that_is_not_there_can_be_ended(night, out):
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(InversionCancelled, match="run again to resume"):
             night.run(out, scheduler=address, should_stop=should_stop)
-    assert asked == [False, False, True]
+    assert calls == [False, False, True]
     assert not out.exists()
 
 
@@ -378,12 +378,12 @@ def test_the_disk_full_while_writing(make_night, small_disk):
     assert 0 < done.sum() < 40
     assert not (before.status == FAILED).any()
     assert np.isfinite(before.potential.values[done]).all()
-    kept = {name: text for name, text in content(out).items() if done[shot_of(name)]}
+    finished = {name: text for name, text in content(out).items() if done[shot_of(name)]}
     assert resize("16m")
     after = night.run(out)
     assert (after.status == DONE).all()
     assert np.isfinite(after.potential.values).all()
-    assert kept.items() <= content(out).items()
+    assert finished.items() <= content(out).items()
 
 
 def shot_of(name: str) -> int:
@@ -499,23 +499,23 @@ class TestLocks:
             wait_for(lambda: "elsewhere" not in lock.read_text(), "the first to sign")
             lock.write_text('{"host": "third", "pid": 8}')
 
-        other = threading.Thread(target=sign)
-        other.start()
+        thread = threading.Thread(target=sign)
+        thread.start()
         refused = pytest.raises(FileFormatError, match="process 8 on third")
         with refused, locked(tmp_path / "store"):
             pass
-        other.join()
+        thread.join()
         assert "third" in lock.read_text()
 
     def test_links_are_not_followed(self, tmp_path):
-        lock, other = tmp_path / ".store.lock", tmp_path / "other"
-        other.write_text("mine")
+        lock, second_lock = tmp_path / ".store.lock", tmp_path / "other"
+        second_lock.write_text("mine")
         for link in (lock.symlink_to, lock.hardlink_to):
-            link(other)
+            link(second_lock)
             refused = pytest.raises(FileFormatError, match="is a link or not a file")
             with refused, locked(tmp_path / "store"):
                 pass
-            assert other.read_text() == "mine"
+            assert second_lock.read_text() == "mine"
             lock.unlink()
         lock.symlink_to(tmp_path / "nowhere")
         with pytest.raises(FileFormatError, match="is a link"), locked(tmp_path / "store"):

@@ -60,9 +60,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         for name, strength, setup in (("low", 1.0, SETUPS[0]), ("high", RATIO, SETUPS[1])):
             tifffile.imwrite(f"{name}{index}.tif", image(index, strength).astype(np.float32))
             lines.append(f"s{index},{name}{index}.tif,{setup.energy},setup.toml")
-    known = {name: value for name, value in SETUPS[0].model_dump().items() if value is not None}
-    del known["energy"]
-    text = [f"{key} = {json.dumps(value)}" for key, value in known.items()]
+    entries = {name: value for name, value in SETUPS[0].model_dump().items() if value is not None}
+    del entries["energy"]
+    text = [f"{key} = {json.dumps(value)}" for key, value in entries.items()]
     Path("setup.toml").write_text("\n".join(text))
     Path("shots.csv").write_text("\n".join(lines))
     write_recipe(Path("r.toml"), Recipe(fit=CHOICES))
@@ -91,13 +91,13 @@ def test_each_shot_of_an_array_is_fitted_alone(images: Any, out: Path) -> None:
 
 def test_the_store_does_not_depend_on_workers(images: Any, tmp_path: Path) -> None:
     recipe = Recipe(steps=(Bin(factor=1),), fit=CHOICES)
-    found = []
+    contents = []
     for name, engine in (("one", "synchronous"), ("two", "threads")):
         path = tmp_path / f"{name}.shadowinv.zarr"
         run_stack(images, path, recipe=recipe, scheduler=engine, workers=2)
-        found.append({key: one for key, one in content(path).items() if "potential" in key})
-    assert found[0]
-    assert found[0] == found[1]
+        contents.append({key: data for key, data in content(path).items() if "potential" in key})
+    assert contents[0]
+    assert contents[0] == contents[1]
 
 
 def test_a_shot_fails_alone_and_the_rest_is_resumed(images: Any, out: Path) -> None:
@@ -108,20 +108,20 @@ def test_a_shot_fails_alone_and_the_rest_is_resumed(images: Any, out: Path) -> N
     assert first["status"].values.tolist() == [1, 2, 1]
     assert "no flux" in StackStore(out).report(1)["reason"]
     before = content(out)
-    seen: list[str] = []
+    names: list[str] = []
     again = run_stack(
         spoilt,
         out,
         recipe=recipe,
         scheduler="synchronous",
-        on_progress=lambda news: seen.append(news.engine),
+        on_progress=lambda news: names.append(news.engine),
     )
-    assert seen == ["nothing to do"]
+    assert names == ["nothing to do"]
     assert again["verdict"].values[1] == ""
     assert content(out) == before
-    other = Recipe(fit=CHOICES.model_copy(update={"psf": 1.0}))
+    other_recipe = Recipe(fit=CHOICES.model_copy(update={"psf": 1.0}))
     with pytest.raises(InputError, match=r"different fit \(psf: None there, 1.0 now\)"):
-        run_stack(spoilt, out, recipe=other, scheduler="synchronous")
+        run_stack(spoilt, out, recipe=other_recipe, scheduler="synchronous")
     with pytest.raises(InputError, match="different fit"):
         run_stack(spoilt, out, scheduler="synchronous", variables=("potential", "displacement"))
 
@@ -147,11 +147,11 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 def test_what_cannot_be_done_is_refused_before_anything_is_written(
     images: Any, out: Path, name: str
 ) -> None:
-    told, words = REFUSED[name]
-    fields, steps = told.pop("fields", None), told.pop("steps", ())
+    changes, words = REFUSED[name]
+    fields, steps = changes.pop("fields", None), changes.pop("steps", ())
     recipe = Recipe(steps=steps, fit=CHOICES.model_copy(update={"fields": fields}))
     with pytest.raises(InputError, match=words):
-        run_stack(images, out, recipe=recipe, scheduler="synchronous", **told)
+        run_stack(images, out, recipe=recipe, scheduler="synchronous", **changes)
     assert not out.exists()
 
 
@@ -177,7 +177,7 @@ def test_images_of_one_object_are_fitted_together(folder: Path, out: Path) -> No
         np.testing.assert_array_equal(field, alone.fields[0].displacement)
         assert np.abs(field - truth(index)).max() < 0.3
         report = StackStore(out).report(index)
-        assert [one["image"]["file"] for one in report["images"]] == [
+        assert [image["image"]["file"] for image in report["images"]] == [
             f"low{index}.tif",
             f"high{index}.tif",
         ]
@@ -233,10 +233,10 @@ def test_the_command_fits_tells_and_exports(folder: Path) -> None:
     verdicts = [report["verdict"] for report in store.reports()]
     assert result.exit_code == (0 if set(verdicts) == {"determined"} else 3)
     assert "verdicts" in result.stdout
-    told = flat(shadowinv("info", out).stdout)
-    assert "noise = 0.02" in told
-    assert "fields = ['B']" in told
-    assert f"{verdicts.count('determined')} determined" in told
+    output = flat(shadowinv("info", out).stdout)
+    assert "noise = 0.02" in output
+    assert "fields = ['B']" in output
+    assert f"{verdicts.count('determined')} determined" in output
     table = flat(shadowinv("status", out, "--all").stdout)
     assert "verdict" in table
     assert "χ²" in table

@@ -24,11 +24,11 @@ def hidden(night):
 
     def hide(*indices: int) -> None:
         for index in range(6):
-            here, away = night.path(index), night.folder / f"later_{index}"
-            if index in indices and here.exists():
-                here.rename(away)
+            shot_file, away = night.path(index), night.folder / f"later_{index}"
+            if index in indices and shot_file.exists():
+                shot_file.rename(away)
             elif index not in indices and away.exists():
-                away.rename(here)
+                away.rename(shot_file)
 
     return hide
 
@@ -47,9 +47,9 @@ def test_later_shots_are_appended_and_the_bytes_are_those_of_one_run(night, out,
     stamps = {name: (out / name).stat().st_mtime_ns for name in before}
     earlier = read(out)
     hidden()
-    told = []
-    grown = night.run(out, on_progress=told.append)
-    assert (told[0].done, told[0].total) == (4, 6)
+    progress = []
+    grown = night.run(out, on_progress=progress.append)
+    assert (progress[0].done, progress[0].total) == (4, 6)
     assert list(grown.status) == [DONE] * 6
     assert list(grown.name.values) == [f"shot_{i}.npy" for i in range(6)]
     assert list(grown.shot) == list(range(6))
@@ -200,13 +200,13 @@ def test_killed_at_any_moment_of_growing_it_is_as_before(night, out, whole, hidd
     begun = out.with_name("begun")
     shutil.copytree(out, begun)
     os_replace = os.replace
-    left = [0]
+    remaining = [0]
 
     def replace(*paths):
         """Put a file into its place, but only so many times."""
-        if not left[0]:
+        if not remaining[0]:
             raise Killed
-        left[0] -= 1
+        remaining[0] -= 1
         return os_replace(*paths)
 
     finished = False
@@ -215,7 +215,7 @@ def test_killed_at_any_moment_of_growing_it_is_as_before(night, out, whole, hidd
         shutil.rmtree(out)
         shutil.copytree(begun, out)
         hidden()
-        left[0] = moments
+        remaining[0] = moments
         with monkeypatch.context() as patch:
             patch.setattr(os, "replace", replace)
             with pytest.raises(Killed):

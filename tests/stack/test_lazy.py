@@ -27,15 +27,15 @@ def no_plans(monkeypatch):
 
 @pytest.fixture
 def plans_made(monkeypatch):
-    made = []
+    plans = []
 
     def plan_sites(source, options, **more):
-        made.append(source)
+        plans.append(source)
         return original(source, options, **more)
 
     original = _worker.plan_sites
     monkeypatch.setattr(_worker, "plan_sites", plan_sites)
-    return made
+    return plans
 
 
 @pytest.mark.parametrize("boundary", ["closed", "free"])
@@ -230,8 +230,8 @@ class TestInputs:
             dims=("y", "x", "shot"),
             coords={"shot": [3, 1, 4, 9, 5, 2]},
         )
-        for given in (shots, shots.to_dataset(name="image").assign(other=shots)):
-            stack = invert_stack(given, source=night.source, options=OPTIONS)
+        for labelled in (shots, shots.to_dataset(name="image").assign(other=shots)):
+            stack = invert_stack(labelled, source=night.source, options=OPTIONS)
             np.testing.assert_array_equal(stack.potential.sel(shot=4), expected[2])
 
     def test_a_list_of_images(self, night, expected):
@@ -297,12 +297,12 @@ def test_only_what_is_asked_for_is_made(night):
 def test_all_shots_at_once_never_have_more_threads_than_cores(monkeypatch, workers, cores, threads):
     monkeypatch.setattr(_worker, "available_threads", lambda _: cores)
     assert _worker.threads_here(workers) == threads
-    seen = []
+    counts = []
     with dask.config.set(num_workers=workers):
-        ask = threading.Thread(target=lambda: seen.append(_worker.threads_here()))
+        ask = threading.Thread(target=lambda: counts.append(_worker.threads_here()))
         ask.start()
         ask.join()
-    assert seen == [threads]
+    assert counts == [threads]
 
 
 def test_importing_the_package_imports_no_dask():

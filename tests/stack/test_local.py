@@ -66,13 +66,13 @@ def answers(address: str, **security: object) -> bool:
 def test_only_who_has_the_key_of_a_run_can_talk_to_it():
     stranger = ssl.create_default_context()
     stranger.check_hostname, stranger.verify_mode = False, ssl.CERT_NONE
-    other = Security.temporary().get_connection_args("client")
+    other_keys = Security.temporary().get_connection_args("client")
     with local_client(1) as client:
         (worker,) = client.scheduler_info()["workers"]
         for address in (client.scheduler.address, worker):
             assert not answers(address.replace("tls:", "tcp:"))
             assert not answers(address, ssl_context=stranger)
-            assert not answers(address, **other)
+            assert not answers(address, **other_keys)
             assert answers(address, **client.security.get_connection_args("client"))
         with Client(client.scheduler.address, security=client.security) as friend:
             assert friend.submit(sum, (1, 2)).result(timeout=30) == 3
@@ -109,8 +109,8 @@ def test_a_worker_killed_while_it_starts_is_told_in_one_sentence():
 
     killer = threading.Thread(target=kill)
     killer.start()
-    told = "1 process for the shots could not be started .* then run again to resume"
-    with pytest.raises(EngineError, match=told), engine_for("processes", 1):
+    message = "1 process for the shots could not be started .* then run again to resume"
+    with pytest.raises(EngineError, match=message), engine_for("processes", 1):
         pass
     killer.join()
     assert not [

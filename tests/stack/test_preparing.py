@@ -119,14 +119,14 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
     }
     night.run(out, **begun)
     assert (night.run(out, **begun).status == DONE).all()
-    for change, named in (
+    for change, message in (
         ({"filters": (LowPassFilter(width=1.5),)}, 'different steps .*"low-pass", "width": 1.0'),
         ({"filters": ()}, "different steps"),
         ({"source": LowPassEstimate(width=7)}, "different source image"),
         ({"source": None, "source_mask": None}, "different source image"),
         ({"source_mask": ~bare}, "different source mask image"),
     ):
-        with pytest.raises(InputError, match=named):
+        with pytest.raises(InputError, match=message):
             night.run(out, **{**begun, **change})
 
 
@@ -194,20 +194,20 @@ def test_a_batch_prepares_its_shots_as_an_inversion_of_one(
     (tmp_path / "recipe.toml").write_text(
         '[options]\nn_sites = 100\n[source]\nmethod = "polynomial"\ndegree = 1\n'
     )
-    same = [
+    flags = [
         "--recipe", "recipe.toml", "--mask", "usable.png", "--source-mask", "bare.png",
         "--low-pass", "0.8", "--hot-pixels", "6", "--bin", "2", "--quiet",
     ]  # fmt: skip
     out = ["--out", "n.shadowinv.zarr", "--scheduler", "threads"]
     shot = str(night.path(1))
     for command in (["batch", night.glob, *out], ["invert", shot, "--out", "one.shadowinv"]):
-        result = CliRunner().invoke(app, [*command, *same])
+        result = CliRunner().invoke(app, [*command, *flags])
         assert result.exit_code == 0, result.output
-    stack, one = read("n.shadowinv.zarr"), read("one.shadowinv")
-    np.testing.assert_array_equal(stack.potential[1], one.potential.astype(np.float32))
-    told = " ".join(CliRunner().invoke(app, ["status", "n.shadowinv.zarr"]).output.split())
-    assert 'estimated from each shot: {"method":"polynomial","degree":1}' in told
-    assert "low-pass (smooth), width 0.8" in told
+    stack, single = read("n.shadowinv.zarr"), read("one.shadowinv")
+    np.testing.assert_array_equal(stack.potential[1], single.potential.astype(np.float32))
+    output = " ".join(CliRunner().invoke(app, ["status", "n.shadowinv.zarr"]).output.split())
+    assert 'estimated from each shot: {"method":"polynomial","degree":1}' in output
+    assert "low-pass (smooth), width 0.8" in output
     refused = CliRunner().invoke(
         app, ["batch", night.glob, "--source", shot, "--source-from", "gaussian", *out]
     )
@@ -241,8 +241,8 @@ def test_doubts_of_a_source_are_in_the_report_of_each_shot(night, out):
             scheduler="synchronous",
         )
         for index in (0, 1):
-            told = str(StackStore(out).report(index)["warnings"])
-            assert words in told
-            assert ("'isotropic'" in told) == ("'isotropic'" in words)
+            warnings = str(StackStore(out).report(index)["warnings"])
+            assert words in warnings
+            assert ("'isotropic'" in warnings) == ("'isotropic'" in words)
     written = read_stack(out)["source"][1]
     np.testing.assert_allclose(written, isotropic_source(shots[1], near), rtol=1e-6)

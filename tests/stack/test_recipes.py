@@ -53,8 +53,8 @@ exec {sys.executable} -c "from napari_shadowinv.cli import app; app()" "$@"
 def block(word: str) -> str:
     """Return the block of the page in which a word is."""
     blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    (found,) = [text for text in blocks if word in text]
-    return found
+    (code,) = [text for text in blocks if word in text]
+    return code
 
 
 @pytest.fixture
@@ -105,9 +105,9 @@ def end_group(leader: int) -> None:
 def test_the_recipe_for_slurm_inverts_a_stack(project, slurm, tmp_path):
     pytest.importorskip("dask_jobqueue")
     recipe = block("SLURMCluster")
-    for there, here in (("/project", str(project)), ("32,", "2,"), ("64GB", "2GB")):
-        assert there in recipe
-        recipe = recipe.replace(there, here)
+    for theirs, ours in (("/project", str(project)), ("32,", "2,"), ("64GB", "2GB")):
+        assert theirs in recipe
+        recipe = recipe.replace(theirs, ours)
     # Small, as the machine of a test is; else as it stands there.
     recipe = recipe.replace("maximum_jobs=8", "maximum_jobs=1").replace(
         '"/tmp"', repr(str(tmp_path))
@@ -132,15 +132,15 @@ def test_the_recipe_without_dask_jobqueue(project, slurm, tmp_path):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     ours = "--host 127.0.0.1 --dashboard-address 127.0.0.1:0"
-    for there, here in (
+    for theirs, local in (
         ("/project", str(project)),
         ("dask scheduler", f"dask scheduler {ours} --port {port}"),
         ("dask worker", f"dask worker {ours}"),
         ("--nworkers 32", "--nworkers 1"),
         ("$(hostname):8786", f"127.0.0.1:{port}"),
     ):
-        assert there in lines
-        lines = lines.replace(there, here)
+        assert theirs in lines
+        lines = lines.replace(theirs, local)
     job = subprocess.Popen(
         ["sh", "-c", lines], env=slurm, cwd=tmp_path, start_new_session=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,

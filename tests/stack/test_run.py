@@ -26,7 +26,7 @@ from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import read_shot
-from napari_shadowinv.stack._sources import described_reader
+from napari_shadowinv.stack._sources import reader_text
 
 OPTIONS = InversionOptions(n_sites=100)
 
@@ -95,10 +95,10 @@ def test_what_is_stored_can_be_chosen_and_sites_are_stored_once(night, out, boun
 
 
 def test_the_bytes_do_not_depend_on_threads_or_order(night, out, tmp_path):
-    other = tmp_path / "other.shadowinv.zarr"
+    other_store = tmp_path / "other.shadowinv.zarr"
     night.run(out, shots=night.images, scheduler="synchronous")
-    run_stack(night.images, other, source=night.source, options=OPTIONS, workers=3)
-    assert content(out) == content(other)
+    run_stack(night.images, other_store, source=night.source, options=OPTIONS, workers=3)
+    assert content(out) == content(other_store)
 
 
 def test_a_run_goes_on_where_it_stopped(night, out):
@@ -119,10 +119,10 @@ def test_a_run_goes_on_where_it_stopped(night, out):
     assert np.isnan(pending.potential.values).all()
     first = content(out)
     reads = len(night.reads)
-    told = []
-    after = night.run(out, **arguments, on_progress=told.append)
+    progress = []
+    after = night.run(out, **arguments, on_progress=progress.append)
     assert (after.status == DONE).all()
-    assert (told[0].done, told[0].total) == (len(done), 6)
+    assert (progress[0].done, progress[0].total) == (len(done), 6)
     # What was done is neither read nor written again.
     assert not {f"shot_{i}" for i in done} & set(night.reads[reads:])
     assert first.items() <= content(out).items()
@@ -132,9 +132,9 @@ def test_a_run_goes_on_where_it_stopped(night, out):
 
 def test_a_finished_run_has_nothing_to_do(night, out):
     night.run(out, shots=night.images)
-    told = []
-    night.run(out, shots=night.images, on_progress=told.append)
-    assert [(p.engine, p.done, p.outcome) for p in told] == [("nothing to do", 6, None)]
+    progress = []
+    night.run(out, shots=night.images, on_progress=progress.append)
+    assert [(p.engine, p.done, p.outcome) for p in progress] == [("nothing to do", 6, None)]
 
 
 def spoil(night) -> dict[int, str]:
@@ -189,8 +189,8 @@ def test_a_warm_start_does_not_depend_on_where_a_run_stopped(night, out, tmp_pat
         "variables": ("weights",),
         "scheduler": "synchronous",
     }
-    other = tmp_path / "other.shadowinv.zarr"
-    run_stack(night.images, other, **arguments)
+    other_store = tmp_path / "other.shadowinv.zarr"
+    run_stack(night.images, other_store, **arguments)
     spoilt = night.images.copy()
     run_stack(spoilt, out, **arguments)
     # As if the run had been killed after the first shot of the second three.
@@ -199,7 +199,7 @@ def test_a_warm_start_does_not_depend_on_where_a_run_stopped(night, out, tmp_pat
         for path in (out / "weights" / "c" / str(index)).rglob("*"):
             path.write_bytes(b"torn")
     run_stack(spoilt, out, **arguments)
-    assert content(out, "weights") == content(other, "weights")
+    assert content(out, "weights") == content(other_store, "weights")
 
 
 @pytest.fixture(scope="module")
@@ -245,8 +245,8 @@ class TestRefusals:
 
     def test_a_shot_that_is_not_given_any_more(self, night, out):
         night.path(3).unlink()
-        told = r"different shots \(6 there, 5 given, without shot_3.npy"
-        with pytest.raises(InputError, match=told):
+        message = r"different shots \(6 there, 5 given, without shot_3.npy"
+        with pytest.raises(InputError, match=message):
             night.run(out)
 
     def test_another_order(self, night, out):
@@ -291,13 +291,13 @@ class TestRefusals:
 
 
 def test_the_first_run_ever_compiles_before_its_shots(night, out, monkeypatch):
-    told = []
+    progress = []
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
-    night.run(out, scheduler="synchronous", on_progress=told.append)
-    assert "minute" in told[0].preparing
-    assert told[0].engine == ""
-    assert not any(news.preparing for news in told[1:])
-    assert told[-1].done == 6
+    night.run(out, scheduler="synchronous", on_progress=progress.append)
+    assert "minute" in progress[0].preparing
+    assert progress[0].engine == ""
+    assert not any(news.preparing for news in progress[1:])
+    assert progress[-1].done == 6
     with pytest.raises(InversionCancelled):
         night.run(out, overwrite=True, should_stop=lambda: True)
     assert (read(out).status == DONE).all()
@@ -305,8 +305,10 @@ def test_the_first_run_ever_compiles_before_its_shots(night, out, monkeypatch):
 
 def test_overwriting_begins_anew(night, out):
     night.run(out, shots=night.images)
-    other = InversionOptions(n_sites=60)
-    written = run_stack(night.images[:2], out, source=night.source, options=other, overwrite=True)
+    other_options = InversionOptions(n_sites=60)
+    written = run_stack(
+        night.images[:2], out, source=night.source, options=other_options, overwrite=True
+    )
     assert written.sizes["shot"] == 2
     assert [path.name for path in out.parent.glob(".*")] == []
 
@@ -329,10 +331,10 @@ def test_store_with_truncated_names_is_refused(night, out):
 
 
 def test_a_reader_is_known_by_where_it_comes_from_and_its_choices():
-    assert described_reader(read_shot) == "napari_shadowinv.read_shot"
+    assert reader_text(read_shot) == "napari_shadowinv.read_shot"
     chosen = partial(read_shot, factor=2, channel="red")
-    assert described_reader(chosen) == "napari_shadowinv.read_shot(channel='red', factor=2)"
-    assert described_reader(np.load) == "numpy.load"
+    assert reader_text(chosen) == "napari_shadowinv.read_shot(channel='red', factor=2)"
+    assert reader_text(np.load) == "numpy.load"
 
 
 def test_fields_of_binned_shots_have_the_units_of_binned_pixels(night, out, optical_setup):

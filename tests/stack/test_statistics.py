@@ -39,10 +39,10 @@ def test_shots_that_failed_do_not_count(night, tmp_path):
     written = run_stack(images, out, source=night.source, options=OPTIONS, dtype="float64")
     good = [0, 1, 3, 4, 5]
     alone = invert_stack(night.images[good], source=night.source, options=OPTIONS)
-    found, expected = stack_statistics(written), stack_statistics(alone)
-    np.testing.assert_allclose(found.potential_mean, expected.potential_mean, rtol=1e-9)
-    np.testing.assert_allclose(found.potential_std, expected.potential_std, rtol=1e-9)
-    peaks = found.displacement_peak.values
+    statistics, expected = stack_statistics(written), stack_statistics(alone)
+    np.testing.assert_allclose(statistics.potential_mean, expected.potential_mean, rtol=1e-9)
+    np.testing.assert_allclose(statistics.potential_std, expected.potential_std, rtol=1e-9)
+    peaks = statistics.displacement_peak.values
     assert np.isnan(peaks[2])
     np.testing.assert_allclose(peaks[good], expected.displacement_peak, rtol=1e-12)
 

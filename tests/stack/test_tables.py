@@ -88,8 +88,8 @@ def test_one_field_at_three_energies_is_one_field_in_si(pack: Path, out: Path) -
     phantom = toroid(SHAPE, SETUP, PEAK, SIGMA)
     true = SETUP.path_integrated_b(phantom.displacement)
     strongest = np.hypot(*true).max()
-    for one in field:
-        assert np.hypot(*(one - true)).max() < 0.03 * strongest
+    for shot_field in field:
+        assert np.hypot(*(shot_field - true)).max() < 0.03 * strongest
     # In px they are as different as the momenta.
     peaks = np.hypot(*store["displacement"].values.swapaxes(0, 1)).max(axis=(1, 2))
     assert peaks[0] / peaks[2] == pytest.approx(at(30.0).momentum / at(5.0).momentum, rel=0.03)
@@ -117,18 +117,20 @@ def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
         source=beam(),
         mask=usable,
     )
-    other = run(recipe, "film1.npy", source="other.npy")
-    for k, expected in enumerate((alone, other)):
+    second = run(recipe, "film1.npy", source="other.npy")
+    for k, expected in enumerate((alone, second)):
         np.testing.assert_array_equal(store["displacement"][k], expected.displacement)
         in_si = expected.to_dataset()["path_integrated_b"]
         np.testing.assert_allclose(store["path_integrated_b"][k], in_si, rtol=1e-12)
-        made = Provenance.of({"provenance": json.dumps(StackStore(out).report(k)["provenance"])})
-        assert made is not None
-        assert made.setup == expected.setup
-        assert made.recipe.setup == at((5.0, 14.7)[k])
-        assert made.image.file == f"film{k}.npy"
-    assert made.source is not None
-    assert made.source.file == "other.npy"
+        provenance = Provenance.of(
+            {"provenance": json.dumps(StackStore(out).report(k)["provenance"])}
+        )
+        assert provenance is not None
+        assert provenance.setup == expected.setup
+        assert provenance.recipe.setup == at((5.0, 14.7)[k])
+        assert provenance.image.file == f"film{k}.npy"
+    assert provenance.source is not None
+    assert provenance.source.file == "other.npy"
     assert "source other.npy" in flat(shadowinv("status", out).stdout)
     first = StackStore(out).report(0)["provenance"]
     assert first["gain"] == 1.25
@@ -162,8 +164,8 @@ class TestResuming:
     def test_a_changed_energy_is_noticed(self, pack: Path, out: Path) -> None:
         inverted(pack, out)
         table("film0.npy,5", "film1.npy,14.7", "film2.npy,31")
-        told = r"row of shot 2 \(film2.npy\) \(energy: 30.0 there, 31.0 now\) has changed"
-        with pytest.raises(InputError, match=told):
+        message = r"row of shot 2 \(film2.npy\) \(energy: 30.0 there, 31.0 now\) has changed"
+        with pytest.raises(InputError, match=message):
             inverted(pack, out)
 
     def test_a_changed_setup_is_noticed(self, pack: Path, out: Path) -> None:
@@ -222,8 +224,8 @@ def test_a_fit_leaves_excluded_images_out(pack: Path) -> None:
 def test_columns_that_only_fits_use_are_told(pack: Path, out: Path) -> None:
     pack = table("film1.npy,14.7,1,poisson", header="file,energy,psf,noise")
     inverted(pack, out)
-    (told,) = StackStore(out).report(0)["warnings"]
-    assert told["text"] == (
+    (warning,) = StackStore(out).report(0)["warnings"]
+    assert warning["text"] == (
         "the table has psf, noise, which an inversion does not use: fit the image to use it"
     )
 
@@ -249,8 +251,8 @@ def test_a_store_has_the_units_of_one_kind_of_beam(pack: Path, out: Path) -> Non
     pack = table("film1.npy,setup.toml", "film2.npy,light.toml", header="file,setup")
     store = inverted(pack, out, setup=None)
     assert store["status"].values.tolist() == [DONE, FAILED]
-    told = StackStore(out).report(1)["reason"]
-    assert told.startswith("it has a setup of kind 'optical', and the first row of its table")
+    reason = StackStore(out).report(1)["reason"]
+    assert reason.startswith("it has a setup of kind 'optical', and the first row of its table")
 
 
 MISTAKES: dict[str, tuple[str, Sequence[str], tuple[str, ...]]] = {
@@ -295,12 +297,12 @@ def test_the_command_inverts_a_table(pack: Path, out: Path) -> None:
     assert [line.split()[4] for line in listed if "film" in line] == ["5", "14.7", "30"]
     assert shadowinv("export", out, "--format", "pradformat", "--out", "h5").exit_code == 0
     for index, energy in enumerate(ENERGIES):
-        found = read(Path(f"h5/{index:04d}_film{index}.h5"))
-        assert setup_from_dataset(found).energy == pytest.approx(energy)
-        made = Provenance.of(found.attrs)
-        assert made is not None
-        assert made.image.file == f"film{index}.npy"
-        assert made.recipe.setup == at(energy)
+        exported = read(Path(f"h5/{index:04d}_film{index}.h5"))
+        assert setup_from_dataset(exported).energy == pytest.approx(energy)
+        provenance = Provenance.of(exported.attrs)
+        assert provenance is not None
+        assert provenance.image.file == f"film{index}.npy"
+        assert provenance.recipe.setup == at(energy)
     assert shadowinv("export", out, "--format", "csv", "--out", "t.csv").exit_code == 0
     with Path("t.csv").open(encoding="utf-8") as file:
         assert [float(row["energy (MeV)"]) for row in csv.DictReader(file)] == list(ENERGIES)
@@ -328,14 +330,14 @@ def test_films_at_their_own_distance_have_pixels_of_their_own(pack: Path, out: P
 
 
 def test_a_row_is_made_again_by_its_provenance(pack: Path) -> None:
-    known = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
+    options = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
     pack = table("film0.npy,5,1.25,beam.npy", header="file,energy,gain,source")
     stack = describe_stack(
         pack,
         variables=None,
         source=None,
         mask=None,
-        recipe=Recipe(setup=SETUP, options=known),
+        recipe=Recipe(setup=SETUP, options=options),
         options=None,
         setup=None,
         filters=(),
@@ -363,9 +365,9 @@ def test_workers_elsewhere_are_told_all_of_a_row(pack: Path, out: Path) -> None:
     np.save("mask.npy", np.ones(SHAPE))
     pack = table("film0.npy,5,mask.npy", "film2.npy,30,", header="file,energy,mask")
     arguments = {"setup": SETUP, "options": OPTIONS, "source": beam(), "dtype": "float64"}
-    here = run_stack(pack, out, scheduler="synchronous", **arguments)
-    other = out.with_name("other.shadowinv.zarr")
-    there = run_stack(pack, other, scheduler="processes", workers=1, **arguments)
-    assert there["status"].values.tolist() == [DONE, DONE]
-    np.testing.assert_array_equal(there["displacement"], here["displacement"])
-    np.testing.assert_array_equal(there["path_integrated_b"], here["path_integrated_b"])
+    in_process = run_stack(pack, out, scheduler="synchronous", **arguments)
+    other_store = out.with_name("other.shadowinv.zarr")
+    in_worker = run_stack(pack, other_store, scheduler="processes", workers=1, **arguments)
+    assert in_worker["status"].values.tolist() == [DONE, DONE]
+    np.testing.assert_array_equal(in_worker["displacement"], in_process["displacement"])
+    np.testing.assert_array_equal(in_worker["path_integrated_b"], in_process["path_integrated_b"])

@@ -41,11 +41,11 @@ class Watched:
 
     def __init__(self, folder: Path, out: Path, **choices: Any) -> None:
         self.folder, self.out = folder, out
-        self.told: list[WatchProgress] = []
+        self.events: list[WatchProgress] = []
         self.error: Exception | None = None
         self._stop = threading.Event()
-        given = {"source": SOURCE, "options": OPTIONS, "pattern": "*.npy", "settle": SETTLE}
-        self._choices = given | choices
+        defaults = {"source": SOURCE, "options": OPTIONS, "pattern": "*.npy", "settle": SETTLE}
+        self._choices = defaults | choices
         self._thread = threading.Thread(target=self._watch)
 
     def _watch(self) -> None:
@@ -53,7 +53,7 @@ class Watched:
             self.result = watch_stack(
                 self.folder,
                 self.out,
-                on_progress=self.told.append,
+                on_progress=self.events.append,
                 should_stop=self._stop.is_set,
                 **self._choices,
             )
@@ -62,7 +62,7 @@ class Watched:
 
     def __enter__(self) -> Watched:
         self._thread.start()
-        self.until(lambda: any(not one.preparing for one in self.told) or self.error)
+        self.until(lambda: any(not event.preparing for event in self.events) or self.error)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -73,7 +73,7 @@ class Watched:
     def until(self, condition: Callable[[], Any]) -> None:
         end = time.monotonic() + 30
         while not condition():
-            assert time.monotonic() < end, self.told
+            assert time.monotonic() < end, self.events
             time.sleep(0.005)
 
     def ended(self, count: int) -> list[WatchProgress]:
@@ -85,7 +85,7 @@ class Watched:
 
     @property
     def shots(self) -> list[WatchProgress]:
-        return [one for one in self.told if one.outcome is not None]
+        return [event for event in self.events if event.outcome is not None]
 
 
 @pytest.fixture
@@ -97,8 +97,8 @@ def folder(tmp_path: Path, compiled: None) -> Path:
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """End at once when asked to."""
-    monkeypatch.setattr(_watch_loop, "_POLL", 0.02)
-    monkeypatch.setattr(_folder_events, "_CHECK_EVERY", 0.1)
+    monkeypatch.setattr(_watch_loop, "_POLL_S", 0.02)
+    monkeypatch.setattr(_folder_events, "_FOLDER_CHECK_S", 0.1)
 
 
 def put(folder: Path, *indices: int) -> None:
@@ -140,7 +140,7 @@ def test_what_is_there_comes_first_and_then_what_arrives_in_its_order(folder, ou
         with pytest.raises(FileFormatError, match="is being written by"), locked(out):
             pass
     names = [f"shot_{index}.npy" for index in (1, 2, 5, 0)]
-    assert [one.name for one in watch.shots] == names
+    assert [event.name for event in watch.shots] == names
     assert list(watch.result.name.values) == names
     assert watch.shots[0].total == 1
     assert watch.result.attrs["warm_start"] == "each shot from an earlier one, as they arrived"
@@ -174,10 +174,10 @@ def test_each_shot_starts_from_the_last_but_one_however_fast_they_come(folder, o
     fast = watched_once(folder, out, dtype="float64")
     np.testing.assert_array_equal(watch.result.displacement, fast.displacement)
     plan = plan_sites(SOURCE, OPTIONS)
-    found = None
+    inversion = None
     for index in (0, 2, 4):
-        found = invert(IMAGES[index], plan=plan, options=OPTIONS, start=found)
-        np.testing.assert_array_equal(fast.displacement[index], found.displacement)
+        inversion = invert(IMAGES[index], plan=plan, options=OPTIONS, start=inversion)
+        np.testing.assert_array_equal(fast.displacement[index], inversion.displacement)
 
 
 def test_the_accuracy_decides_once_how_many_sites_all_shots_get(folder, out):
@@ -193,9 +193,9 @@ def test_the_accuracy_decides_once_how_many_sites_all_shots_get(folder, out):
     from napari_shadowinv import run_stack
 
     files = [folder / f"shot_{index}.npy" for index in range(3)]
-    other = out.with_name("run.shadowinv.zarr")
-    run_stack(files, other, source=SOURCE, options=options)
-    assert StackStore(other).attributes["chosen_sites"] == chosen
+    run_store = out.with_name("run.shadowinv.zarr")
+    run_stack(files, run_store, source=SOURCE, options=options)
+    assert StackStore(run_store).attributes["chosen_sites"] == chosen
 
 
 def test_a_file_that_is_written_slowly_is_inverted_from_its_whole_content(folder, out):
@@ -285,7 +285,7 @@ def test_bad_files_fail_alone_and_the_next_in_their_lane_starts_afresh(folder, o
         watch.ended(7)
     result = watch.result
     assert list(result.status.values) == [FAILED] * 3 + [DONE, FAILED, DONE, DONE]
-    reasons = [one.outcome.reason for one in watch.shots]
+    reasons = [event.outcome.reason for event in watch.shots]
     assert "is empty" in reasons[0]
     assert "image has shape (10, 28), expected (24, 28)" in reasons[1]
     assert reasons[4] == StackStore(out).report(4)["reason"]
@@ -332,13 +332,13 @@ def test_it_goes_on_with_its_store_and_does_nothing_twice(folder, out):
 def test_a_batch_goes_on_with_a_store_only_if_shots_start_afresh(folder, out, tmp_path):
     np.save(tmp_path / "reference.npy", SOURCE)
     put(folder, 3, 4)
-    given = ["--source", tmp_path / "reference.npy", "--n-sites", 100, "--out", out]
-    watch = ["watch", folder, "--pattern", "*.npy", *given, "--settle", SETTLE, "--idle", 0.2]
+    flags = ["--source", tmp_path / "reference.npy", "--n-sites", 100, "--out", out]
+    watch = ["watch", folder, "--pattern", "*.npy", *flags, "--settle", SETTLE, "--idle", 0.2]
     assert shadowinv(*watch, "--no-warm-start").exit_code == 0
     put(folder, 1)
     assert shadowinv(*watch, "--no-warm-start").exit_code == 0
     put(folder, 0)
-    batch = ["batch", f"{folder}/*.npy", *given, "--scheduler", "threads"]
+    batch = ["batch", f"{folder}/*.npy", *flags, "--scheduler", "threads"]
     result = shadowinv(*batch, "--resume")
     assert result.exit_code == 0, result.output
     assert list(read(out).name.values) == [f"shot_{i}.npy" for i in (3, 4, 1, 0)]
@@ -362,14 +362,14 @@ def test_a_hundred_frames_cost_alike_and_leave_no_thread(folder, out, opened_pat
         watch.until(lambda: not watch._thread.is_alive())
     assert list(watch.result.status.values) == [DONE] * count
     assert list(watch.result.name.values) == [f"shot_{i:03d}.npy" for i in range(count)]
-    assert max(one.waiting for one in watch.shots) > 1
+    assert max(event.waiting for event in watch.shots) > 1
     assert watch.shots[-1].waiting == 0
     # Late shots open as many files as early ones.
     per_batch = np.diff(opened)
     assert per_batch[-1] <= 1.1 * per_batch[0]
-    left = [type(one).__module__ for one in threading.enumerate()]
-    assert not [module for module in left if module.startswith("watchdog")]
-    assert "lock" not in {one.name for one in threading.enumerate()}
+    modules = [type(thread).__module__ for thread in threading.enumerate()]
+    assert not [module for module in modules if module.startswith("watchdog")]
+    assert "lock" not in {thread.name for thread in threading.enumerate()}
 
 
 def test_it_ends_after_so_many_shots_or_when_nothing_arrives(folder, out):
@@ -377,12 +377,12 @@ def test_it_ends_after_so_many_shots_or_when_nothing_arrives(folder, out):
     with Watched(folder, out, shots=2) as watch:
         watch.until(lambda: not watch._thread.is_alive())
     assert len(watch.result.shot) == 2
-    assert watch.told[-1].waiting == 2
+    assert watch.events[-1].waiting == 2
     assert len(watched_once(folder, out).shot) == 4
 
 
 def test_by_looking_itself_it_waits_until_a_file_has_settled(folder, out, monkeypatch):
-    monkeypatch.setattr(_folder_events, "_LOOK_EVERY", 0.05)
+    monkeypatch.setattr(_folder_events, "_POLL_S", 0.05)
     put(folder, 0)
     data = whole(1)
     with Watched(folder, out, polling=True, settle=0.4) as watch:
@@ -400,12 +400,12 @@ def test_without_room_for_another_watch_it_looks_itself(folder, out, monkeypatch
     def full(_arrivals: Any) -> Any:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(_folder_events, "_started", full)
+    monkeypatch.setattr(_folder_events, "_start_observer", full)
     put(folder, 0)
     with Watched(folder, out) as watch:
         watch.ended(1)
-    (note,) = [one.note for one in watch.told if one.note]
-    assert note.startswith("the system does not watch another folder (No space left on device)")
+    (note,) = [event.note for event in watch.events if event.note]
+    assert note.startswith("the system cannot watch another folder (No space left on device)")
 
 
 def test_a_folder_that_is_gone_before_it_is_observed_leaves_no_thread(folder):
@@ -418,7 +418,7 @@ def test_a_folder_that_is_gone_before_it_is_observed_leaves_no_thread(folder):
     ):
         pass
     with pytest.raises(OSError, match="No such file"):
-        _folder_events._started(arrivals)
+        _folder_events._start_observer(arrivals)
     assert set(threading.enumerate()) == before
 
 
@@ -467,15 +467,15 @@ def test_the_command_tells_a_line_for_each_shot(folder, out, tmp_path, monkeypat
     result = shadowinv(*command)
     assert result.exit_code == 1
     lines = result.stdout.splitlines()
-    told = [line for line in lines if line.startswith("shot_")]
-    assert [line.split()[0] for line in told] == ["shot_0.npy", "shot_1.npy"]
-    assert all(" peak |d| " in line and " px  residual " in line for line in told)
-    assert all(len(line) <= 100 for line in told)
-    assert "2 waiting" in told[0]
+    shot_lines = [line for line in lines if line.startswith("shot_")]
+    assert [line.split()[0] for line in shot_lines] == ["shot_0.npy", "shot_1.npy"]
+    assert all(" peak |d| " in line and " px  residual " in line for line in shot_lines)
+    assert all(len(line) <= 100 for line in shot_lines)
+    assert "2 waiting" in shot_lines[0]
     # What casts doubt on a shot is said once, whatever its numbers.
     warning, failure = result.stderr.splitlines()
     assert warning.startswith("warning: shot_0.npy: the field reaches the image's edge")
-    assert all(line.endswith("doubtful, 1 warning") for line in told)
+    assert all(line.endswith("doubtful, 1 warning") for line in shot_lines)
     assert failure.startswith("failed: shot_2.npy: ")
     assert lines[-1].startswith("Stopped: 2 done, 1 failed; repeat the command to continue")
     assert shadowinv(*command, "--quiet").stdout == ""
@@ -509,9 +509,15 @@ def test_ctrl_c_is_the_normal_end_unless_files_wait(
         "--n-sites", 100, "--out", out,
     )  # fmt: skip
     assert result.exit_code == code
+<<<<<<< HEAD
     left = ", 2 not yet inverted" if files > 1 else ""
     (end,) = [line for line in result.output.splitlines() if line.startswith("Stopped")]
     assert end == f"Stopped: 1 done, 0 failed{left}; repeat the command to continue {out}."
+=======
+    remainder = ", 2 not yet inverted" if files > 1 else ""
+    (end,) = [line for line in result.output.splitlines() if line.startswith("Ended")]
+    assert end == (f"Ended: 1 done, 0 failed{remainder}; repeat the command to go on with {out}.")
+>>>>>>> ffd79d4 (Name the variables of pipeline and stack by what they hold)
     assert list(read(out).status.values) == [DONE]
     assert not list(tmp_path.glob(".*.lock"))
 
@@ -575,9 +581,9 @@ def test_file_opened_again_is_not_taken_until_closed(folder):
             file.write(whole(1)[:100])
             file.flush()
             until(lambda: arrivals.waiting == 0)
-            assert arrivals.take(0.2) is None
+            assert arrivals.next_name(0.2) is None
         until(lambda: arrivals.waiting == 1)
-        assert arrivals.take(0.2) == "shot_0.npy"
+        assert arrivals.next_name(0.2) == "shot_0.npy"
 
 
 def test_file_written_during_its_read_is_read_again(folder, out):
@@ -593,7 +599,7 @@ def test_file_written_during_its_read_is_read_again(folder, out):
     put(folder, 0)
     with Watched(folder, out, reader=load_and_change, dtype="float64") as watch:
         watch.ended(1)
-        watch.until(lambda: watch.told[-1].waiting == 0)
+        watch.until(lambda: watch.events[-1].waiting == 0)
     assert len(reads) > 1
     assert len(watch.shots) == 1
     expected = invert(IMAGES[4], plan=plan_sites(SOURCE, OPTIONS), options=OPTIONS)

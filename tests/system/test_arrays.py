@@ -30,7 +30,7 @@ from napari_shadowinv._system.arrays import coordinate_spacing, order_by_value
 from napari_shadowinv.fitting.measurements import measured
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import FitShot
-from napari_shadowinv.pipeline._fit import gathered_fit
+from napari_shadowinv.pipeline._fit import collect_fit_inputs
 from napari_shadowinv.preprocessing.estimates import uniform_source
 
 OPTIONS = InversionOptions(n_sites=300)
@@ -71,7 +71,7 @@ INVERT: dict[str, Callable[..., Any]] = {
     "fit": lambda image, mask=None: _measured(image, mask),
     "fit a list": lambda image, mask=None: _measured([image], mask),
     "run_fit": lambda image, mask=None: _measured(
-        **gathered_fit(Recipe(), [FitShot(image, mask=mask)]).keywords
+        **collect_fit_inputs(Recipe(), [FitShot(image, mask=mask)]).keywords
     ),
 }
 

@@ -1,10 +1,11 @@
-"""The one way from a shot to its result, for every face of the package.
+"""From a shot to its result by a recipe, for Python, commands and windows.
 
-- apply a recipe to a shot: `run`; what a window keeps between runs: `Cache`
-- the same in two parts, for stacks: `gathered`, `run_prepared`
-- fit several images of one object by a recipe: `run_fit`, of `FitShot`; which fields explain
-  them: `run_comparison`
-- whether one static field explains them: `run_leave_one_out`; a film of fields: `run_windows`
+- apply a recipe to a shot: `run`; sites and sources that a window reuses: `Cache`
+- the same in two parts, for stacks: `collect_inputs`, `run_prepared`
+- fit several images of one object by a recipe: `run_fit`, of `FitShot`; find the fields that
+  explain them: `run_comparison`
+- test whether one static field explains them: `run_leave_one_out`; a movie of fields:
+  `run_windows`
 - refine an inversion by a fit that starts from it: `run_refinement`
 - recipes as files: `read_recipe`, `write_recipe`
 """

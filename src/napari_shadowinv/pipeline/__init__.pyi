@@ -1,7 +1,7 @@
 from ._film import run_film
 from ._fit import FitShot, run_comparison, run_fit
 from ._refine import run_refinement
-from ._run import Inputs, gathered, run, run_prepared
+from ._run import Inputs, collect_inputs, run, run_prepared
 from ._static import run_leave_one_out, run_windows
 from .cache import Cache
 from .files import read_recipe, write_recipe
@@ -11,7 +11,7 @@ __all__ = [
     "Cache",
     "FitShot",
     "Inputs",
-    "gathered",
+    "collect_inputs",
     "read_pack",
     "read_recipe",
     "run",

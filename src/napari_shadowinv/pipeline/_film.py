@@ -35,7 +35,7 @@ from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.fitting.measurements import estimated_noise
 from napari_shadowinv.inversion.labels import PACK_FORMAT, PIXEL, place_coordinates
 from napari_shadowinv.io.scans import Scan
-from napari_shadowinv.pipeline._film_inputs import Film, as_it_lay, in_parallel, read_films
+from napari_shadowinv.pipeline._film_inputs import Film, in_parallel, read_films, to_scan_frame
 
 if TYPE_CHECKING:
     import xarray
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 
 __all__ = ["run_film"]
 
-_ODD_SIZE = 0.1  # of the usual one
-_ODD_PIXEL = 0.01
-_DARK = 0.01  # of a film's pixels
+_MAX_SIZE_DEVIATION = 0.1  # from the median size
+_MAX_PIXEL_DEVIATION = 0.01
+_MAX_DARK_SHARE = 0.01  # of a film's pixels
 _CUT_APART_PX = 3.0  # films whose sides differ by more were not cut together
 _PER_AREA = "1/(m² MeV)"
 _UNITS = {"dose": "Gy", "dose_error": "Gy", "fluence": _PER_AREA, "fluence_error": _PER_AREA}
@@ -62,7 +62,7 @@ ByLayer = dict[str, tuple[tuple[str, ...], Any]]
 
 @dataclass(frozen=True, eq=False)
 class _Doses:
-    """What one film tells, upright: Gy, standard deviation as a share, where it is usable."""
+    """Dose of one film, upright, in Gy, its relative standard deviation, and the usable pixels."""
 
     dose: FloatArray
     error: FloatArray
@@ -73,10 +73,10 @@ class _Doses:
 def run_film(
     pack: Pack, *, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
 ) -> xarray.Dataset:
-    """Turn the scans of a pack into doses, and these into fluences at each film's energy.
+    """Convert the scans of a pack to doses, and these to fluences at each film's energy.
 
-    Films are found on their scans, straightened, laid on each other, and their marks left out.
-    Doses are those by `combined_dose`, spectra those by `unfold`.
+    Films are located on their scans, straightened and aligned, and their marks are masked.
+    Doses are computed by `combined_dose`, spectra by `unfold`.
 
     Parameters
     ----------
@@ -90,14 +90,14 @@ def run_film(
     xarray.Dataset
         By layer, y and x: ``dose`` in Gy and ``fluence`` in protons per m² and MeV, both as on the
         first film, each with its standard deviation, and ``usable``. By layer: ``energy`` of the
-        protons that its fluence shows, that of the Bragg ``peak`` in its film and the band around
-        it (MeV); ``strength``, by which a magnetic field displaces these protons relative to
-        the first layer's; with a setup ``time_of_flight`` (s); the ``corners`` of the film on its
-        scan (px), and ``shift`` and ``shift_error`` (px) and ``turn`` (rad) by which the film was
-        moved from there, and whether ``by_images``.
-        Attribute ``warnings``: what one should know before trusting it. Films are seen from the
-        source, on which the sign of a magnetic field depends; attribute ``seen_from`` says how the
-        pack describes its scans.
+        protons that its fluence represents, the energy whose Bragg ``peak`` lies in its film, and
+        the band around it (MeV); ``strength``, the displacement of these protons by a magnetic
+        field relative to the first layer's; with a setup ``time_of_flight`` (s); the ``corners``
+        of the film on its scan (px); ``shift``, ``shift_error`` (px) and ``turn`` (rad) of its
+        alignment, and whether it was aligned ``by_images``.
+        Attribute ``warnings``: reasons to doubt the result. Films are shown as seen from the
+        source, which decides the sign of a magnetic field; attribute ``seen_from`` records how
+        the pack describes its scans.
 
     Raises
     ------
@@ -114,30 +114,31 @@ def run_film(
     films = read_films(pack, report)
     pixel = _pixel_size(pack, [film.scan for film in films])
     geometry = pack.setups(peaks, pixel)
-    magnifications = np.array([one.magnification for one in geometry] or np.ones(len(peaks)))
+    magnifications = np.array([setup.magnification for setup in geometry] or np.ones(len(peaks)))
     scales = magnifications / magnifications[0]
     shape = _common_shape(films, scales)
 
     def doses_of(film: Film) -> _Doses:
         report("dose", film.number - 1, len(pack.layers), film.name)
-        return _doses(film, shape, scales[film.number - 1], pack.rim)
+        return _film_doses(film, shape, scales[film.number - 1], pack.rim)
 
     cut = {film.number: film.corners for film in films}
-    # Marks through the pack lie behind each other, what the films show lies on rays.
+    # Marks through the pack lie behind each other, the image content lies on rays.
     marked = any(film.fiducials for film in films)
     if not marked:
-        films = _about_axis(films, pack, scales)
+        films = _scale_about_axis(films, pack, scales)
     edges = in_parallel(doses_of, films)
-    poses = _poses(films, edges, pack, scales, report)
-    laid = [
+    poses = _align_films(films, edges, pack, scales, report)
+    aligned = [
         replace(film, corners=moved_corners(film.corners, shift, turn, scales[film.number - 1]))
         for film, shift, turn in zip(films, poses.shifts, poses.turns, strict=True)
     ]
     if marked:
-        laid = _about_axis(laid, pack, scales)
-    moved = any((film.corners != one.corners).any() for film, one in zip(films, laid, strict=True))
-    doses = in_parallel(doses_of, laid) if moved else edges
-    planes = _planes(len(pack.layers), shape, laid, doses)
+        aligned = _scale_about_axis(aligned, pack, scales)
+    pairs = zip(films, aligned, strict=True)
+    moved = any((film.corners != shifted.corners).any() for film, shifted in pairs)
+    doses = in_parallel(doses_of, aligned) if moved else edges
+    planes = _stack_planes(len(pack.layers), shape, aligned, doses)
     # Per area of the first film: behind it the same protons cover more.
     planes["dose"] *= scales[:, None, None] ** 2
     spectra = unfold(
@@ -149,14 +150,14 @@ def run_film(
     )
     planes["dose_error"] *= planes["dose"]
     planes |= {"fluence": spectra.fluence, "fluence_error": spectra.error}
-    by_film = _by_film(pack, films, cut, poses)
-    warnings = _warnings(laid, doses, poses, pack)
+    by_film = _layer_variables(pack, films, cut, poses)
+    warnings = _warnings(aligned, doses, poses, pack)
     setups = pack.setups(spectra.energies, pixel)
     return _dataset(pack, response, spectra.energies, setups, pixel, planes, by_film, warnings)
 
 
-def _about_axis(films: list[Film], pack: Pack, scales: FloatArray) -> list[Film]:
-    """Films whose corners are moved so that their scales are about the axis."""
+def _scale_about_axis(films: list[Film], pack: Pack, scales: FloatArray) -> list[Film]:
+    """Move the corners of the films so that they are scaled about the axis."""
     if pack.axis is None:
         return films
     away = np.array(pack.axis) - (upright(films[0].corners)[2] - 1) / 2
@@ -171,27 +172,27 @@ def _about_axis(films: list[Film], pack: Pack, scales: FloatArray) -> list[Film]
 def _pixel_size(pack: Pack, scans: list[Scan]) -> float | None:
     if pack.pixel_size is not None:
         return pack.pixel_size
-    told = [scan.pixel_size for scan in scans if scan.pixel_size is not None]
-    if len(told) < len(scans):
+    sizes = [scan.pixel_size for scan in scans if scan.pixel_size is not None]
+    if len(sizes) < len(scans):
         if pack.setup is not None:
             raise InputError(
-                "the scans do not tell the size of their pixels: give pixel_size, in m (25.4 mm "
+                "the scans do not contain the size of their pixels: give pixel_size, in m (25.4 mm "
                 "over the dots per inch)"
             )
         return None
-    if max(told) > (1 + _ODD_PIXEL) * min(told):
+    if max(sizes) > (1 + _MAX_PIXEL_DEVIATION) * min(sizes):
         raise InputError(
-            f"the scans' pixels are {1e6 * min(told):.4g} to {1e6 * max(told):.4g} µm wide: "
+            f"the scans' pixels are {1e6 * min(sizes):.4g} to {1e6 * max(sizes):.4g} µm wide: "
             "expected all films scanned with the same resolution; scan them again"
         )
-    return told[0]
+    return sizes[0]
 
 
 def _common_shape(films: list[Film], scales: FloatArray) -> tuple[int, int]:
     sizes = np.array([upright(film.corners)[2] / scales[film.number - 1] for film in films])
     usual = np.median(sizes, axis=0)
     for film, size in zip(films, sizes, strict=True):
-        if (np.abs(size / usual - 1) > _ODD_SIZE).any():
+        if (np.abs(size / usual - 1) > _MAX_SIZE_DEVIATION).any():
             raise InputError(
                 f"{film.name} is {size[0]:.0f} × {size[1]:.0f} px, the others "
                 f"{usual[0]:.0f} × {usual[1]:.0f}: expected films of one size; correct its corners"
@@ -199,29 +200,29 @@ def _common_shape(films: list[Film], scales: FloatArray) -> tuple[int, int]:
     return common_shape(sizes)
 
 
-def _doses(film: Film, shape: tuple[int, int], scale: float, rim: int) -> _Doses:
+def _film_doses(film: Film, shape: tuple[int, int], scale: float, rim: int) -> _Doses:
     values = straightened(film.scan.pixels, film.corners, shape=shape, scale=scale)
-    found = combined_dose(values, film.calibration, background=film.background)
+    combined = combined_dose(values, film.calibration, background=film.background)
     usable = usable_pixels(values, film.calibration, background=film.background, rim=rim)
-    usable &= ~burnt_edges(found.dose)
+    usable &= ~burnt_edges(combined.dose)
     if film.mask is not None:
         if film.mask.shape != shape:
             raise InputError(
-                f"the mask of {film.name} has shape {film.mask.shape}: expected {shape}, that of "
+                f"the mask of {film.name} has shape {film.mask.shape}: expected {shape}, as "
                 "the upright films"
             )
         usable &= film.mask
-    dark = found.outside & usable & (found.dose > 0.999 * film.calibration.doses.max())
-    usable &= ~found.outside
-    error = found.error
+    dark = combined.outside & usable & (combined.dose > 0.999 * film.calibration.doses.max())
+    usable &= ~combined.outside
+    error = combined.error
     if usable.any():
-        # Grain is the same in all channels, which the calibration's films do not tell.
-        noise = estimated_noise(np.log(found.dose), usable)
+        # Grain is common to all channels, so the calibration does not include it.
+        noise = estimated_noise(np.log(combined.dose), usable)
         error = error * max(1.0, noise / float(np.median(error[usable])))
-    return _Doses(found.dose, error, usable, float(dark.mean()))
+    return _Doses(combined.dose, error, usable, float(dark.mean()))
 
 
-def _cuts(films: list[Film], kinds: Sequence[str]) -> list[tuple[object, ...]]:
+def _cut_groups(films: list[Film], kinds: Sequence[str]) -> list[tuple[object, ...]]:
     """Kind of each film, and the group of its height and width among films of that kind."""
     sizes = np.array([upright(film.corners)[2] for film in films])
     groups = np.zeros(sizes.shape, dtype=int)
@@ -237,15 +238,15 @@ def _cuts(films: list[Film], kinds: Sequence[str]) -> list[tuple[object, ...]]:
     return [(kind, *map(int, group)) for kind, group in zip(kinds, groups, strict=True)]
 
 
-def _poses(
+def _align_films(
     films: list[Film],
     doses: list[_Doses],
     pack: Pack,
     scales: FloatArray,
     report: Reporter,
 ) -> Poses:
-    usable = np.array([one.usable for one in doses])
-    logarithms = np.log(np.array([one.dose for one in doses]))
+    usable = np.array([film_doses.usable for film_doses in doses])
+    logarithms = np.log(np.array([film_doses.dose for film_doses in doses]))
     check_orientation(logarithms, usable, [film.name for film in films])
     if any(film.fiducials for film in films):
         return poses_by_fiducials(
@@ -256,26 +257,26 @@ def _poses(
         )
     if pack.align == "images":
         kinds = [pack.layers[film.number - 1].film for film in films]
-        return register(logarithms, usable, kinds=_cuts(films, kinds), report=report)
+        return register(logarithms, usable, kinds=_cut_groups(films, kinds), report=report)
     return Poses.by_edges(len(films))
 
 
-def _planes(
+def _stack_planes(
     count: int, shape: tuple[int, int], films: list[Film], doses: list[_Doses]
 ) -> dict[str, Any]:
-    """What the films tell, by layer; nothing where a layer is excluded."""
+    """Stack doses and errors by layer, with NaN for excluded layers."""
     planes: dict[str, Any] = {
         name: np.full((count, *shape), np.nan) for name in ("dose", "dose_error")
     }
     planes["usable"] = np.zeros((count, *shape), dtype=bool)
-    for film, one in zip(films, doses, strict=True):
-        planes["dose"][film.number - 1] = one.dose
-        planes["dose_error"][film.number - 1] = one.error
-        planes["usable"][film.number - 1] = one.usable
+    for film, film_doses in zip(films, doses, strict=True):
+        planes["dose"][film.number - 1] = film_doses.dose
+        planes["dose_error"][film.number - 1] = film_doses.error
+        planes["usable"][film.number - 1] = film_doses.usable
     return planes
 
 
-def _by_film(
+def _layer_variables(
     pack: Pack, films: list[Film], corners: Mapping[int, FloatArray], poses: Poses
 ) -> ByLayer:
     count = len(pack.layers)
@@ -295,7 +296,7 @@ def _by_film(
         values["by_images"][1][at] = poses.by_images[k]
         values["sha256"][1][at] = film.scan.checksum
         layer = pack.layers[at]
-        _, on_scan = as_it_lay(
+        _, on_scan = to_scan_frame(
             film.scan, corners[film.number], layer.turned, pack.is_mirrored(layer)
         )
         values["corners"][1][at] = on_scan
@@ -303,48 +304,48 @@ def _by_film(
 
 
 def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) -> list[Caution]:
-    found = [
+    cautions = [
         Caution(
             "film-range",
-            f"{film.name} is darker than its calibration reaches over {one.too_dark:.0%} of it: "
-            "left out",
+            f"{film.name}: {film_doses.too_dark:.0%} of the pixels are darker than the "
+            "calibration covers and were masked",
         )
-        for film, one in zip(films, doses, strict=True)
-        if one.too_dark > _DARK
+        for film, film_doses in zip(films, doses, strict=True)
+        if film_doses.too_dark > _MAX_DARK_SHARE
     ]
     at_edges = poses.errors >= EDGES
     if at_edges.any() and len(films) > 1:
-        loose = [film.number for film, one in zip(films, at_edges, strict=True) if one]
-        why = "show too little in common with those beside them"
+        loose = [film.number for film, by_edges in zip(films, at_edges, strict=True) if by_edges]
+        why = "share too little structure with their neighbours"
         if any(film.fiducials for film in films):
             why = "have no fiducials"
         elif pack.align == "edges":
-            why = "are not compared with each other"
+            why = "were not compared with each other"
         text = (
-            f"films {', '.join(map(str, loose))} {why}: laid by their edges, to some "
-            f"{poses.errors[at_edges].max():.0f} px"
+            f"films {', '.join(map(str, loose))} {why} and were aligned by their edges "
+            f"(± {poses.errors[at_edges].max():.0f} px)"
         )
-        found.append(Caution("film-alignment", text))
+        cautions.append(Caution("film-alignment", text))
     if any(film.fiducials for film in films) and not np.isfinite(poses.closure):
         text = (
-            "each film has one fiducial, so that nothing tells a mark that was read wrongly: give "
-            "two or more that go through all films"
+            "each film has one fiducial, so a misread mark cannot be detected: give two or more "
+            "that go through all films"
         )
-        found.append(Caution("film-alignment", text))
+        cautions.append(Caution("film-alignment", text))
     furthest = float(np.abs(poses.shifts).max())
     if furthest > 0 and poses.by_images.any():
         text = (
-            f"films were moved by up to {furthest:.1f} px by what they show, which fields "
-            "displace, too: a fit of E beside B by these layers can be wrong without a sign of it"
+            f"films were aligned on image content by up to {furthest:.1f} px; fields shift that "
+            "content too, so a joint fit of E and B may be wrong without a warning"
         )
-        found.append(Caution("film-alignment", text))
+        cautions.append(Caution("film-alignment", text))
     if pack.setup is not None and pack.seen_from is None:
         text = (
             "the pack does not say from which side its films are seen, and the source was assumed: "
             "if they are seen from the detector, B has the wrong sign; give seen_from"
         )
-        found.append(Caution("film-side", text))
-    return found
+        cautions.append(Caution("film-side", text))
+    return cautions
 
 
 def _dataset(
@@ -362,8 +363,8 @@ def _dataset(
     bands = response.bands
     variables: dict[str, Any] = {}
     for name, values in planes.items():
-        kept = values if name == "usable" else values.astype(np.float32)
-        variables[name] = (("layer", "y", "x"), kept, {"units": _UNITS[name]})
+        stored = values if name == "usable" else values.astype(np.float32)
+        variables[name] = (("layer", "y", "x"), stored, {"units": _UNITS[name]})
     for name, (dims, values) in by_film.items():
         variables[name] = (dims, values, {"units": _UNITS.get(name, PIXEL)})
     coordinates: dict[str, Any] = {
@@ -387,7 +388,7 @@ def _dataset(
     if pixel is not None:
         attributes["scan_pixel_size"] = pixel
     if setups:
-        flight = [one.time_of_flight for one in setups]
+        flight = [setup.time_of_flight for setup in setups]
         coordinates["time_of_flight"] = ("layer", flight, {"units": "s"})
-        attributes["setups"] = json.dumps([one.model_dump(mode="json") for one in setups])
+        attributes["setups"] = json.dumps([setup.model_dump(mode="json") for setup in setups])
     return xr.Dataset(variables, coordinates, attributes)

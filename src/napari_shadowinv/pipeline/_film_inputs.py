@@ -1,4 +1,4 @@
-"""The films of a pack as they were scanned, with all that is known of each: `read_films`."""
+"""The films of a pack as scanned, with corners, calibration and marks: `read_films`."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.scans import Scan, read_scan
 from napari_shadowinv.pipeline.shot_table import rows_of
 
-__all__ = ["Film", "as_it_lay", "in_parallel", "read_films"]
+__all__ = ["Film", "in_parallel", "read_films", "to_scan_frame"]
 
-_SAME_SCANNER = (0.98, 1.2)  # unexposed film over the lightest film of the table
+_UNEXPOSED_RANGE = (0.98, 1.2)  # unexposed film over the lightest film of the table
 # Films are cut at right angles, but by hand: by share of the diagonal, and in metres.
 _MAX_ASKEW_SHARE, _MAX_ASKEW_M = 0.015, 2e-3
 
 Item = TypeVar("Item")
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """The film of layer `number`: its scan as it should lie, its corners there, its calibration."""
+    """The film of layer `number`: its scan the right way round, corners and calibration."""
 
     number: int
     scan: Scan
@@ -65,15 +65,15 @@ class _Fiducial(CheckedModel):
     x: float
 
 
-def in_parallel(work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+def in_parallel(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     with ThreadPoolExecutor(available_threads(None)) as pool:
         return list(pool.map(work, items))
 
 
 def read_films(pack: Pack, report: Reporter) -> list[Film]:
-    """The films of all layers that are not excluded."""
-    known = {} if pack.corners is None else read_corners(pack.corners)
-    strange = set(known) - {str(number) for number in range(1, len(pack.layers) + 1)}
+    """Read the films of all layers that are not excluded."""
+    measured = {} if pack.corners is None else read_corners(pack.corners)
+    strange = set(measured) - {str(number) for number in range(1, len(pack.layers) + 1)}
     if strange:
         raise InputError(
             f"{pack.corners} has corners of a film '{min(strange)}': expected numbers of layers, "
@@ -82,8 +82,10 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
     used = [number for number, layer in enumerate(pack.layers, 1) if not layer.exclude]
     if not used:
         raise InputError("all layers of the pack are excluded: expected at least one film")
-    shared = _on_one_scan(pack, [k for k in used if pack.layers[k - 1].file is None], known)
-    fiducials = _fiducials(pack)
+    shared = _find_on_shared_scan(
+        pack, [k for k in used if pack.layers[k - 1].file is None], measured
+    )
+    fiducials = _read_marks(pack)
     calibrations = {layer.film: _calibration(pack, layer.film) for layer in pack.layers}
 
     def film(number: int) -> Film:
@@ -93,9 +95,9 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
             scan, corners = shared[number]
         else:
             scan = read_scan(layer.file)
-            given = known.get(str(number))
-            corners = _only_film(layer.file, scan) if given is None else given
-        if str(number) in known:
+            by_hand = measured.get(str(number))
+            corners = _find_single_film(layer.file, scan) if by_hand is None else by_hand
+        if str(number) in measured:
             _check_rectangle(number, corners, scan.pixel_size)
         calibration, background, bits = calibrations[layer.film]
         _check_bits(layer.file or pack.scan, scan, bits)
@@ -104,19 +106,19 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
         is_mirrored = pack.is_mirrored(layer)
         lay = scan, layer.turned, is_mirrored
         marks = {
-            one.name: _where_it_lay(np.array([one.y, one.x]), *lay)
-            for one in fiducials.get(number, [])
+            mark.name: _turned_places(np.array([mark.y, mark.x]), *lay)
+            for mark in fiducials.get(number, [])
         }
-        scan, corners = as_it_lay(scan, corners, layer.turned, is_mirrored)
+        scan, corners = to_scan_frame(scan, corners, layer.turned, is_mirrored)
         return Film(number, scan, corners, calibration, background, mask, marks)
 
     films = in_parallel(film, used)
-    _check_different(pack, films)
+    _check_distinct(pack, films)
     return films
 
 
 def _check_rectangle(number: int, corners: FloatArray, pixel_size: float | None) -> None:
-    """Reject corners that somebody gave and that are far from those of a rectangle."""
+    """Raise an `InputError` if measured corners are far from a rectangle."""
     axes, middle, size = upright(corners)
     signs = np.array([(-1, -1), (-1, 1), (1, 1), (1, -1)])
     away = np.hypot(*(corners - middle - signs * size / 2 @ axes).T).max()
@@ -126,31 +128,31 @@ def _check_rectangle(number: int, corners: FloatArray, pixel_size: float | None)
     if away > limit:
         raise InputError(
             f"the corners of film {number} are up to {away:.0f} px from those of a rectangle: "
-            "expected the four corners of the film itself; correct the one that lies inside or "
-            "beside the film"
+            "expected the four corners of the film itself; correct the one inside or outside the "
+            "film"
         )
 
 
-def _fiducials(pack: Pack) -> dict[int, list[_Fiducial]]:
-    """Marks through the pack, by the number of the film."""
-    found: dict[int, list[_Fiducial]] = {}
+def _read_marks(pack: Pack) -> dict[int, list[_Fiducial]]:
+    """Read the marks through the pack, by the number of the film."""
+    marks: dict[int, list[_Fiducial]] = {}
     for row in [] if pack.fiducials is None else rows_of(pack.fiducials, _Fiducial):
         if not 1 <= row.film <= len(pack.layers):
             raise InputError(
                 f"{pack.fiducials} has a mark on film {row.film}: expected numbers of layers, from "
                 f"1 to {len(pack.layers)}"
             )
-        if any(row.name == other.name for other in found.get(row.film, [])):
+        if any(row.name == mark.name for mark in marks.get(row.film, [])):
             raise InputError(
                 f"{pack.fiducials} has the mark '{row.name}' twice on film {row.film}: expected "
                 "another name for each"
             )
-        found.setdefault(row.film, []).append(row)
-    return found
+        marks.setdefault(row.film, []).append(row)
+    return marks
 
 
 def _check_on_scan(marks: Sequence[_Fiducial], scan: Scan, table: Path | None) -> None:
-    """Reject a mark that lies outside of its film's scan."""
+    """Raise an `InputError` if a mark lies outside its film's scan."""
     height, width = scan.pixels.shape[:2]
     for mark in marks:
         if not (-0.5 <= mark.y <= height - 0.5 and -0.5 <= mark.x <= width - 0.5):
@@ -160,23 +162,23 @@ def _check_on_scan(marks: Sequence[_Fiducial], scan: Scan, table: Path | None) -
             )
 
 
-def _check_different(pack: Pack, films: list[Film]) -> None:
-    """Reject a scan of one film that is given for two layers."""
-    seen: dict[str, Film] = {}
+def _check_distinct(pack: Pack, films: list[Film]) -> None:
+    """Raise an `InputError` if two layers have the same scan of a single film."""
+    by_checksum: dict[str, Film] = {}
     for film in films:
         file = pack.layers[film.number - 1].file
-        other = seen.setdefault(film.scan.checksum, film) if file is not None else film
-        if other is not film:
+        first = by_checksum.setdefault(film.scan.checksum, film) if file is not None else film
+        if first is not film:
             raise InputError(
-                f"{file} of {film.name} has the same content as the scan of {other.name}: expected "
+                f"{file} of {film.name} has the same content as the scan of {first.name}: expected "
                 "a scan of each film; exclude = true stands for a lost one"
             )
 
 
-def _on_one_scan(
-    pack: Pack, numbers: list[int], known: dict[str, FloatArray]
+def _find_on_shared_scan(
+    pack: Pack, numbers: list[int], measured: dict[str, FloatArray]
 ) -> dict[int, tuple[Scan, FloatArray]]:
-    """The films of some layers on the scan that shows all of them."""
+    """Locate the films of some layers on the scan that they share."""
     if not numbers:
         return {}
     if pack.scan is None:
@@ -185,30 +187,30 @@ def _on_one_scan(
             "if the film is lost"
         )
     scan = read_scan(pack.scan)
-    if all(str(number) in known for number in numbers):
-        return {number: (scan, known[str(number)]) for number in numbers}
-    found = find_films(scan.pixels)
-    if len(found) != len(numbers):
+    if all(str(number) in measured for number in numbers):
+        return {number: (scan, measured[str(number)]) for number in numbers}
+    all_corners = find_films(scan.pixels)
+    if len(all_corners) != len(numbers):
         raise InputError(
-            f"{pack.scan} shows {len(found)} films, the pack has {len(numbers)} layers without a "
-            "file of their own: expected one film for each, row by row; mark layers of lost films "
-            "with exclude = true, or give corners"
+            f"{pack.scan} shows {len(all_corners)} films, the pack has {len(numbers)} layers "
+            "without a file of their own: expected one film for each, row by row; mark layers of "
+            "lost films with exclude = true, or give corners"
         )
-    return {number: (scan, one) for number, one in zip(numbers, found, strict=True)}
+    return {number: (scan, corners) for number, corners in zip(numbers, all_corners, strict=True)}
 
 
-def _only_film(file: Path, scan: Scan) -> FloatArray:
-    found = find_films(scan.pixels)
-    if len(found) > 1:
+def _find_single_film(file: Path, scan: Scan) -> FloatArray:
+    all_corners = find_films(scan.pixels)
+    if len(all_corners) > 1:
         raise InputError(
-            f"{file} shows {len(found)} films, expected one: give its corners, or name the file "
-            "as the pack's 'scan' if it shows all films"
+            f"{file} shows {len(all_corners)} films, expected one: give its corners, or name the "
+            "file as the pack's 'scan' if it shows all films"
         )
-    return found[0]
+    return all_corners[0]
 
 
 def _calibration(pack: Pack, kind: str) -> tuple[Calibration, FloatArray, int | None]:
-    """How a type of film darkens, its unexposed pixel, and the bits of the scan of that."""
+    """Return the calibration of a type of film, its unexposed pixel, and the bits of its scan."""
     film = pack.kinds[kind]
     if film.calibration is None:
         raise InputError(
@@ -221,8 +223,8 @@ def _calibration(pack: Pack, kind: str) -> tuple[Calibration, FloatArray, int | 
     scan = read_scan(film.unexposed)
     background = unexposed_pixel(scan.pixels)
     lighter = background / calibration.background
-    if (lighter > _SAME_SCANNER[0]).all() and (lighter < _SAME_SCANNER[1]).all():
-        # Then no dose is no dose in both; the table's lightest film saw some.
+    if (lighter > _UNEXPOSED_RANGE[0]).all() and (lighter < _UNEXPOSED_RANGE[1]).all():
+        # Then zero dose is the same in both; the lightest film of the table has some dose.
         calibration = replace(calibration, background=background)
     return calibration, background, scan.pixels.dtype.itemsize * 8
 
@@ -237,11 +239,11 @@ def _check_bits(file: Path | None, scan: Scan, of_unexposed: int | None) -> None
         )
 
 
-def as_it_lay(
+def to_scan_frame(
     scan: Scan, corners: FloatArray, turned: int, mirrored: bool
 ) -> tuple[Scan, FloatArray]:
-    """Scan and corners of a film that was laid on the scanner another way round."""
-    pixels, corners = scan.pixels, _where_it_lay(corners, scan, turned, mirrored)
+    """Turn and mirror scan and corners of a film to the right way round, or back."""
+    pixels, corners = scan.pixels, _turned_places(corners, scan, turned, mirrored)
     if mirrored:
         pixels, corners = pixels[:, ::-1], corners[[1, 0, 3, 2]]
     if turned == 180:
@@ -249,8 +251,8 @@ def as_it_lay(
     return scan._replace(pixels=pixels), corners
 
 
-def _where_it_lay(places: FloatArray, scan: Scan, turned: int, mirrored: bool) -> FloatArray:
-    """Places (y, x) on the scan of such a film."""
+def _turned_places(places: FloatArray, scan: Scan, turned: int, mirrored: bool) -> FloatArray:
+    """Turn and mirror places (y, x) on a scan."""
     last = np.array(scan.pixels.shape[:2]) - 1
     if mirrored:
         places = places * [1, -1] + [0, last[1]]

@@ -1,7 +1,7 @@
 """From several images of one object to its fields by a recipe: `run_fit`, `run_comparison`.
 
-- one image, with what is known about it: `FitShot`
-- what a recipe's fit is made of, complete: `gathered_fit`
+- one image with its measurements: `FitShot`
+- the complete inputs of a fit: `collect_fit_inputs`
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.options import FIELDS, FitChoices, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import Setup, setup_warnings
-from napari_shadowinv.pipeline._run import Inputs, Shot, gathered, radiograph_of
+from napari_shadowinv.pipeline._run import Inputs, Shot, collect_inputs, radiograph_of
 from napari_shadowinv.pipeline.shot_table import fiducials_from
 from napari_shadowinv.preprocessing import (
     FIT_STEPS,
@@ -47,7 +47,7 @@ __all__ = [
     "FitInputs",
     "FitShot",
     "check_fit",
-    "gathered_fit",
+    "collect_fit_inputs",
     "run_comparison",
     "run_fit",
     "usual_fields",
@@ -59,7 +59,7 @@ COMPARED = (("B",), ("E",), ("B", "E"))
 
 @dataclass(frozen=True, eq=False)
 class FitShot:
-    """One image of a fit; what is None follows from the recipe, or from the image's file.
+    """One image of a fit; values of None follow from the recipe, or from the image's file.
 
     Attributes
     ----------
@@ -72,13 +72,13 @@ class FitShot:
     mask, source_mask : array_like of bool or path, optional
         True where a pixel can be used, and where the object is not; files are 0 elsewhere.
     strength : tuple of float, optional
-        Displacement by each field relative to the first image, in place of what the setups say.
+        Displacement by each field relative to the first image. Default: from the setups.
     gain : float, optional
         How many times brighter than its source the image is.
     psf : float, optional
         Standard deviation of the point spread in px after all steps.
     noise : float, "poisson" or "proportional", optional
-        Standard deviation in a pixel after all steps, that of counts, or a share of each pixel.
+        Standard deviation in a pixel after all steps, or Poisson noise, or a share of each pixel.
     """
 
     image: Shot
@@ -99,23 +99,23 @@ class FitShot:
 
 @dataclass(frozen=True, eq=False)
 class FitInputs:
-    """What a fit is made of.
+    """Inputs of a fit.
 
     Attributes
     ----------
-    given : tuple of FitShot
+    recorded : tuple of FitShot
         The images as recorded.
     shots : tuple of Radiograph
         The images after the recipe's steps, with setup, source and mask, on one grid of pixels.
     names : tuple of str
-        What messages call them.
+        Names of the images in messages.
     provenance : FitProvenance
-        Where all of it came from, and the recipe.
+        Origin of all inputs, and the recipe.
     fiducials : ndarray or None
         Known displacements in the first image.
     """
 
-    given: tuple[FitShot, ...]
+    recorded: tuple[FitShot, ...]
     shots: tuple[Radiograph, ...]
     names: tuple[str, ...]
     provenance: FitProvenance
@@ -130,13 +130,13 @@ class FitInputs:
     @cached_property
     def setups(self) -> tuple[Setup, ...] | None:
         """The setups of all images after the steps; None if there are none."""
-        return _of_all(self.names, [shot.setup for shot in self.shots], "setup")
+        return _common_values(self.names, [shot.setup for shot in self.shots], "setup")
 
     def only(self, numbers: Sequence[int]) -> FitInputs:
-        """Return what a fit of some of the images is made of, in this order; no fiducials."""
+        """Return the inputs of a fit of some of the images, in this order; no fiducials."""
         images = tuple(self.provenance.images[k] for k in numbers)
         return FitInputs(
-            tuple(self.given[k] for k in numbers),
+            tuple(self.recorded[k] for k in numbers),
             tuple(self.shots[k] for k in numbers),
             tuple(self.names[k] for k in numbers),
             self.provenance.model_copy(update={"images": images}),
@@ -145,7 +145,7 @@ class FitInputs:
 
     @property
     def options(self) -> FitOptions:
-        """The options; of a beam that is estimated from its image the variation is assumed."""
+        """The options; a variation is assumed for beams that are estimated from their images."""
         options, estimate = self.choices.options, self.provenance.recipe.estimate
         is_estimated = estimate is not None and self.choices.beam == "known"
         if options.beam_variation is not None or not is_estimated:
@@ -154,64 +154,66 @@ class FitInputs:
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """What `fit` and `compare` take of it, fields and options not among it."""
-        strengths = _of_all(self.names, [one.strength for one in self.given], "strength")
+        """Keywords of `fit` and `compare`, except fields and options."""
+        strengths = _common_values(
+            self.names, [shot.strength for shot in self.recorded], "strength"
+        )
         if strengths is not None and len(set(map(len, strengths))) > 1:
             raise InputError(
-                f"strengths have {', '.join(str(len(one)) for one in strengths)} numbers: expected "
+                f"strengths have {', '.join(str(len(row)) for row in strengths)} numbers: expected "
                 "one for each field in all images"
             )
-        factors = _of_all(self.names, [one.gain for one in self.given], "gain")
+        factors = _common_values(self.names, [shot.gain for shot in self.recorded], "gain")
         if factors is not None and self.choices.gains == "free":
             raise InputError("received gains, and that they are free: expected one of them")
-        known = {
+        keywords = {
             "images": np.stack([shot.image for shot in self.shots]),
             "strengths": strengths,
-            # The strengths that were given count, wherever they come from.
+            # Strengths take precedence over setups.
             "setups": self.setups if strengths is None else None,
             "source": self._source(),
             "noise": self._noise(),
-            "psf": [self._spread(k) for k in range(len(self.shots))],
+            "psf": [self._point_spread(k) for k in range(len(self.shots))],
             "mask": self._mask(),
             "gains": self.choices.gains if factors is None else factors,
             "fiducials": self.fiducials,
             "names": self.names,
         }
-        return {name: value for name, value in known.items() if value is not None}
+        return {name: value for name, value in keywords.items() if value is not None}
 
-    def told(self, found: Fit) -> Fit:
-        """Return a fit with its setups and its provenance; its fields are those of the recipe."""
-        names, options = tuple(field.name for field in found.fields), found.options
+    def with_provenance(self, result: Fit) -> Fit:
+        """Return a fit with its setups and its provenance; the recipe names its fields."""
+        names, options = tuple(field.name for field in result.fields), result.options
         choices = self.choices.model_copy(update={"fields": names, "options": options})
         recipe = self.provenance.recipe.model_copy(update={"fit": choices})
         provenance = self.provenance.model_copy(update={"recipe": recipe})
-        return replace(found, setups=self.setups or (), provenance=provenance)
+        return replace(result, setups=self.setups or (), provenance=provenance)
 
     def _source(self) -> Any:
         if self.choices.beam == "unknown":
             return "unknown"
-        beams = _of_all(self.names, [shot.source for shot in self.shots], "source")
+        beams = _common_values(self.names, [shot.source for shot in self.shots], "source")
         return None if beams is None else np.stack(beams)
 
     def _noise(self) -> Any:
-        usual = self.choices.noise
-        each = [usual if one.noise is None else one.noise for one in self.given]
-        known = _of_all(self.names, each, "noise")
-        if known is None:
+        default = self.choices.noise
+        of_images = [default if shot.noise is None else shot.noise for shot in self.recorded]
+        noises = _common_values(self.names, of_images, "noise")
+        if noises is None:
             return None
-        kinds = {repr(one) if isinstance(one, str) else "a number" for one in known}
+        kinds = {repr(noise) if isinstance(noise, str) else "a number" for noise in noises}
         if len(kinds) > 1:
             raise InputError(
                 f"noise is {' in some images and '.join(sorted(kinds))} in others: give the same "
                 "for all, or numbers"
             )
-        return known[0] if isinstance(known[0], str) else known
+        return noises[0] if isinstance(noises[0], str) else noises
 
-    def _spread(self, k: int) -> float:
+    def _point_spread(self, k: int) -> float:
         """Standard deviation of an image's point spread in px."""
-        choices, setup, own = self.choices, self.shots[k].setup, self.given[k].psf
-        if own is not None or (choices.source_size is None and choices.resolution is None):
-            return own if own is not None else choices.psf or 0.0
+        choices, setup, psf = self.choices, self.shots[k].setup, self.recorded[k].psf
+        if psf is not None or (choices.source_size is None and choices.resolution is None):
+            return psf if psf is not None else choices.psf or 0.0
         if setup is None:
             raise InputError(
                 f"{self.names[k]} has no setup, and source size and resolution are in m: give the "
@@ -236,25 +238,25 @@ def run_fit(
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Fit:
-    """Take a recipe's steps with several images of one object, and fit its fields to them.
+    """Apply a recipe's steps to several images of one object, and fit its fields to them.
 
     Parameters
     ----------
     recipe : Recipe
-        What is to be done; without a section `fit` its defaults count.
+        Steps and options; without a section `fit` the defaults apply.
     shots : sequence of FitShot, Radiograph, array_like or path
         The images, of one size after the steps.
     fiducials : array_like of shape (n, 5), or path of a table, optional
         As for `napari_shadowinv.fit`, in pixels after the steps.
     names : sequence of str, optional
-        What messages call the images. Default: their files, or their numbers.
+        Names of the images in messages. Default: their files, or their numbers.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.fit`.
 
     Returns
     -------
     Fit
-        With its `provenance`, by which it can be made again.
+        With its `provenance`, from which it can be reproduced.
 
     Raises
     ------
@@ -265,15 +267,17 @@ def run_fit(
     InversionCancelled
         If `should_stop` returned true.
     """
-    inputs = gathered_fit(recipe, shots, fiducials=fiducials, names=names, should_stop=should_stop)
-    found = fit(
+    inputs = collect_fit_inputs(
+        recipe, shots, fiducials=fiducials, names=names, should_stop=should_stop
+    )
+    result = fit(
         **inputs.keywords,
         fields=inputs.choices.fields or ("B",),
         options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
-    return inputs.told(found)
+    return inputs.with_provenance(result)
 
 
 def run_comparison(
@@ -285,18 +289,18 @@ def run_comparison(
     should_stop: ShouldStop | None = None,
 ) -> tuple[Fit, ...]:
     """Fit B alone, E alone and both, otherwise as `run_fit`; the likeliest comes first."""
-    inputs = gathered_fit(recipe, shots, fiducials=fiducials, should_stop=should_stop)
-    found = compare(
+    inputs = collect_fit_inputs(recipe, shots, fiducials=fiducials, should_stop=should_stop)
+    fits = compare(
         **inputs.keywords,
         choices=COMPARED,
         options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
-    return tuple(map(inputs.told, found))
+    return tuple(map(inputs.with_provenance, fits))
 
 
-def gathered_fit(
+def collect_fit_inputs(
     recipe: Recipe,
     shots: Sequence[FitShot | Shot],
     *,
@@ -304,43 +308,43 @@ def gathered_fit(
     names: Sequence[str] | None = None,
     should_stop: ShouldStop | None = None,
 ) -> FitInputs:
-    """Bring together what a fit is made of: read files, take the steps, fill in what follows."""
-    given = tuple(one if isinstance(one, FitShot) else FitShot(one) for one in shots)
-    if not given:
+    """Collect the inputs of a fit: read files, apply the steps, and fill in defaults."""
+    recorded = tuple(entry if isinstance(entry, FitShot) else FitShot(entry) for entry in shots)
+    if not recorded:
         raise InputError("received no image: expected one or several of one object")
     choices = recipe.fit or FitChoices()
     check_fit(recipe)
-    names = names or tuple(_name(one, k) for k, one in enumerate(given))
-    unknown = _beam_is_unknown(choices, given, names)
-    gathering = [
-        _gathered(recipe, one, name, unknown=unknown)
-        for one, name in zip(given, names, strict=True)
+    names = names or tuple(_shot_name(image, k) for k, image in enumerate(recorded))
+    unknown = _beam_is_unknown(choices, recorded, names)
+    collected = [
+        _collect_image(recipe, image, name, unknown=unknown)
+        for image, name in zip(recorded, names, strict=True)
     ]
     ready: list[Radiograph] = []
-    for inputs, name in zip(gathering, names, strict=True):
-        shot = _prepared(inputs, name, should_stop)
+    for inputs, name in zip(collected, names, strict=True):
+        shot = _prepare_image(inputs, name, should_stop)
         if ready and shot.shape != ready[0].shape:
             raise InputError(
                 f"{name} has shape {shot.shape}, {names[0]} {ready[0].shape}: expected images of "
                 "one size, on the same pixels; crop or bin them first"
             )
         ready.append(shot)
-    setups = _of_all(names, [shot.setup for shot in ready], "setup")
+    setups = _common_values(names, [shot.setup for shot in ready], "setup")
     fields = choices.fields or usual_fields(setups)
     beam = "unknown" if unknown else "known"
     resolved = choices.model_copy(update={"fields": fields, "beam": beam})
     source = recipe.estimate
     cleared = {"source": source, "mask": None, "source_mask": None, "setup": None, "fit": resolved}
-    table, origin = _fiducials(fiducials)
-    provenance = _provenance(recipe.model_copy(update=cleared), given, gathering, ready)
+    table, origin = _read_fiducials(fiducials)
+    provenance = _provenance(recipe.model_copy(update=cleared), recorded, collected, ready)
     rows = None if table is None else short_fiducials(table)
-    told = {"fiducials": origin, "fiducial_rows": rows}
-    kept = FitProvenance.model_validate({**dict(provenance), **told})
-    return FitInputs(given, tuple(ready), tuple(names), kept, table)
+    fiducial_entries = {"fiducials": origin, "fiducial_rows": rows}
+    complete = FitProvenance.model_validate({**dict(provenance), **fiducial_entries})
+    return FitInputs(recorded, tuple(ready), tuple(names), complete, table)
 
 
 def check_fit(recipe: Recipe) -> None:
-    """Reject with an `InputError` what no fit can do, before any image is read."""
+    """Raise an `InputError` if the recipe does not suit a fit, before any image is read."""
     for step in recipe.steps:
         if step.name() not in FIT_STEPS:
             raise InputError(
@@ -353,39 +357,43 @@ def check_fit(recipe: Recipe) -> None:
         )
 
 
-def _name(shot: FitShot, k: int) -> str:
+def _shot_name(shot: FitShot, k: int) -> str:
     image = shot.image
     path = image.path if isinstance(image, Radiograph) else image
     return str(path) if isinstance(path, (str, Path)) else f"image {k + 1}"
 
 
-def _beam_is_unknown(choices: FitChoices, given: Sequence[FitShot], names: Sequence[str]) -> bool:
-    """Whether a beam is fitted: said of all images, or by the recipe of those without a source."""
-    usual = choices.beam == "unknown"
-    asked = [one.beam_unknown or (usual and one.source is None) or None for one in given]
-    return _of_all(names, asked, "unknown source") is not None
+def _beam_is_unknown(choices: FitChoices, shots: Sequence[FitShot], names: Sequence[str]) -> bool:
+    """Return whether the beam is fitted, by choice of all images or of the recipe."""
+    by_default = choices.beam == "unknown"
+    flags = [shot.beam_unknown or (by_default and shot.source is None) or None for shot in shots]
+    return _common_values(names, flags, "unknown source") is not None
 
 
-def _gathered(recipe: Recipe, given: FitShot, name: str, *, unknown: bool) -> Inputs:
-    """An image as recorded, with its source and masks."""
-    image: Any = given.image
-    source: Any = None if given.beam_unknown else given.source
-    masks = {"mask": given.mask, "source_mask": given.source_mask}
-    files = {key: Path(one) for key, one in masks.items() if isinstance(one, (str, Path))}
-    arrays: Any = {key: one for key, one in masks.items() if one is not None and key not in files}
-    own = recipe.model_copy(update={**files, "setup": given.setup or recipe.setup, "fit": None})
+def _collect_image(recipe: Recipe, shot: FitShot, name: str, *, unknown: bool) -> Inputs:
+    """Collect an image as recorded, with its source and masks."""
+    image: Any = shot.image
+    source: Any = None if shot.beam_unknown else shot.source
+    masks = {"mask": shot.mask, "source_mask": shot.source_mask}
+    files = {key: Path(mask) for key, mask in masks.items() if isinstance(mask, (str, Path))}
+    arrays: Any = {
+        key: mask for key, mask in masks.items() if mask is not None and key not in files
+    }
+    shot_recipe = recipe.model_copy(
+        update={**files, "setup": shot.setup or recipe.setup, "fit": None}
+    )
     try:
         if unknown and isinstance(image, (Radiograph, str, Path)):
             image = replace(radiograph_of(image, "the image"), source=None)
-        inputs = gathered(own, image, source=source, **arrays)
+        inputs = collect_inputs(shot_recipe, image, source=source, **arrays)
         inputs.recipe.check(inputs.shot)
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     return inputs
 
 
-def _prepared(inputs: Inputs, name: str, should_stop: ShouldStop | None) -> Radiograph:
-    """An image after the steps, with its source if that is estimated."""
+def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) -> Radiograph:
+    """Apply the steps to an image, and estimate its source if the recipe does so."""
     try:
         shot = inputs.prepared(should_stop)
         doubts = image_warnings(shot.image, shot.source, shot.mask)
@@ -404,14 +412,14 @@ def _with_estimate(
     inputs: Inputs, shot: Radiograph, estimate: Estimate, should_stop: ShouldStop | None
 ) -> Radiograph:
     recorded = inputs.shot.shape
-    placed = estimate.placed(shot.setup, recorded, inputs.recipe.matrix(recorded))
+    positioned = estimate.placed(shot.setup, recorded, inputs.recipe.matrix(recorded))
     doubts: list[Caution] = []
-    source = estimated_source(placed, shot, should_stop, doubts.append)
+    source = estimated_source(positioned, shot, should_stop, doubts.append)
     return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
 
 
 def usual_fields(setups: Sequence[Setup] | None) -> tuple[str, ...]:
-    """Return the field that usually bends such beams."""
+    """Return the field that usually deflects such beams."""
     if not setups:
         return ("B",)
     names = {deflector: name for name, deflector in FIELDS.items()}
@@ -422,19 +430,19 @@ def usual_fields(setups: Sequence[Setup] | None) -> tuple[str, ...]:
     return (usual,)
 
 
-def _fiducials(given: ArrayLike | Path | None) -> tuple[FloatArray | None, Origin | None]:
-    if given is None:
+def _read_fiducials(fiducials: ArrayLike | Path | None) -> tuple[FloatArray | None, Origin | None]:
+    if fiducials is None:
         return None, None
-    if isinstance(given, Path):
-        origin = Origin(file=text_of(given.name), sha256=sha256(given))
-        return np.array(fiducials_from(given)), origin
-    return np.array(given, dtype=np.float64), Origin()
+    if isinstance(fiducials, Path):
+        origin = Origin(file=text_of(fiducials.name), sha256=sha256(fiducials))
+        return np.array(fiducials_from(fiducials)), origin
+    return np.array(fiducials, dtype=np.float64), Origin()
 
 
 def _provenance(
     recipe: Recipe,
-    given: Sequence[FitShot],
-    gathering: Sequence[Inputs],
+    recorded: Sequence[FitShot],
+    collected: Sequence[Inputs],
     ready: Sequence[Radiograph],
 ) -> FitProvenance:
     masks: list[Origin] = []
@@ -453,27 +461,30 @@ def _provenance(
             mask=place(inputs.provenance.mask),
             source_mask=place(inputs.provenance.source_mask),
             setup=inputs.shot.setup,
-            strength=one.strength,
-            gain=one.gain,
-            psf=one.psf,
-            noise=one.noise,
+            strength=row.strength,
+            gain=row.gain,
+            psf=row.psf,
+            noise=row.noise,
             notes=shot.notes,
             warnings=shot.warnings,
         )
-        for one, inputs, shot in zip(given, gathering, ready, strict=True)
+        for row, inputs, shot in zip(recorded, collected, ready, strict=True)
     )
     return FitProvenance(
         version=__version__, recipe=recipe, images=images, masks=short_masks(masks)
     )
 
 
-def _of_all(names: Sequence[str], values: Sequence[Any], what: str) -> tuple[Any, ...] | None:
-    """What all images have; None if none has it."""
+def _common_values(
+    names: Sequence[str], values: Sequence[Any], quantity: str
+) -> tuple[Any, ...] | None:
+    """Return the values of all images, or None if none has one."""
     without = [name for name, value in zip(names, values, strict=True) if value is None]
     if len(without) == len(names):
         return None
     if without:
         raise InputError(
-            f"{without[0]} has no {what}, other images have: expected it for all of them, or none"
+            f"{without[0]} has no {quantity}, other images have: expected it for all of them, or "
+            "none"
         )
     return tuple(values)

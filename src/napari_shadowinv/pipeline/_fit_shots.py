@@ -1,4 +1,4 @@
-"""Images, read as rows of a table or flags describe them: `read_rows`; their setup: `row_setup`."""
+"""Images of a table's rows or of flags: `read_rows`; their setup: `row_setup`."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def read_rows(
     Parameters
     ----------
     rows : sequence of ShotRow
-        What is known about each image.
+        Description of each image.
     recipe : Recipe
-        Its setup is that of images without one.
+        Its setup applies to images without one.
     channel, variable : str, optional
-        What to take of each file; the channel of sources, too.
+        Part of each file to read; the channel also applies to sources.
     """
     return tuple(_read(row, recipe, channel, variable) for row in rows)
 
@@ -51,16 +51,16 @@ def _read(row: ShotRow, recipe: Recipe, channel: str | None, variable: str | Non
 
 
 def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
-    """Return the setup of an image: that of its row, of the recipe, or of its file, in this order.
+    """Return the setup of an image from its row, the recipe, or its file, in this order.
 
-    An `InputError` if the row gives an energy and none of them the rest.
+    An `InputError` is raised if the row has an energy and there is no setup to complete it.
     """
     changes = {} if row.energy is None else {"energy": row.energy}
     if row.setup is not None:
         return setup_from(row.setup, shot.metadata.get("geometry"), changes)
-    known = recipe.setup or shot.setup
-    if known is not None:
-        return setup_from_dict({**known.model_dump(), **changes}, str(row.file))
+    setup = recipe.setup or shot.setup
+    if setup is not None:
+        return setup_from_dict({**setup.model_dump(), **changes}, str(row.file))
     if not changes:
         return None
     raise InputError(

@@ -28,7 +28,7 @@ def run_refinement(
     Parameters
     ----------
     inversion : Inversion
-        The fit starts from its potential, too.
+        Its potential is one of the starts of the fit.
     setup : Setup or None
         The experiment, with the pixels of the inversion.
     choices : FitChoices
@@ -48,7 +48,7 @@ def run_refinement(
     InversionCancelled
         If `should_stop` returned true.
     """
-    found = fit(
+    result = fit(
         inversion.image,
         setups=None if setup is None else [setup],
         fields=choices.fields or ("B",),
@@ -62,12 +62,12 @@ def run_refinement(
         should_stop=should_stop,
     )
     if inversion.provenance is None:
-        return found
-    return replace(found, provenance=_provenance(inversion.provenance, setup, choices))
+        return result
+    return replace(result, provenance=_provenance(inversion.provenance, setup, choices))
 
 
 def _options(inversion: Inversion, options: FitOptions) -> FitOptions:
-    """The options, with the beam's variation in the error budget of the inversion."""
+    """Return the options, with the beam's variation from the error budget of the inversion."""
     errors = inversion.errors
     if options.beam_variation is not None or errors is None or errors.beam is None:
         return options
@@ -75,7 +75,7 @@ def _options(inversion: Inversion, options: FitOptions) -> FitOptions:
 
 
 def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0.0) -> FitChoices:
-    """Return what follows from an inversion: the field that bends such beams, edge and seed."""
+    """Return the choices that follow from an inversion: field, edge and seed."""
     bends = (FIELDS["B"],) if setup is None else setup.deflectors
     (field, *_) = (key for key, deflector in FIELDS.items() if deflector in bends)
     edge = "free" if inversion.options.boundary == "free" else "fading"

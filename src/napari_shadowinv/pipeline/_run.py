@@ -1,7 +1,7 @@
 """From a shot to its field by a recipe: `run`.
 
-- what a recipe is applied to, complete: `gathered`
-- the inversion of a shot whose steps were done: `run_prepared`
+- the complete inputs of a recipe: `collect_inputs`
+- the inversion of a shot after the steps: `run_prepared`
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from napari_shadowinv.preprocessing import (
 )
 from napari_shadowinv.preprocessing.isotropic import centre_within
 
-__all__ = ["PREVIEW_PIXELS", "PREVIEW_SITES", "Inputs", "gathered", "run", "run_prepared"]
+__all__ = ["PREVIEW_PIXELS", "PREVIEW_SITES", "Inputs", "collect_inputs", "run", "run_prepared"]
 
 PREVIEW_SITES = 5_000
 PREVIEW_PIXELS = 10_000
@@ -58,7 +58,7 @@ Shot = Radiograph | ArrayLike | str | Path
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What a recipe is applied to.
+    """Inputs of a recipe.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Inputs:
     shot : Radiograph
         The shot as recorded, with its source and masks.
     provenance : Provenance
-        Where all of it came from.
+        Origin of all inputs.
     """
 
     recipe: Recipe
@@ -96,15 +96,15 @@ def run(
     Parameters
     ----------
     recipe : Recipe
-        What is to be done.
+        Steps and options.
     shot : Radiograph, array_like of shape (H, W), or path
-        The image, with what is known about it.
+        The image, with its metadata.
     source : Radiograph, array_like of shape (H, W), or path, optional
-        The undisturbed beam. Default: what the recipe says, or the shot's file holds.
+        The undisturbed beam. Default: from the recipe, or from the shot's file.
     mask : array_like of bool, shape (H, W), optional
         True where a pixel of the shot can be used. Default: as for `source`.
     source_mask : array_like of bool, shape (H, W), optional
-        True where the object is not. Default: what the recipe says.
+        True where the object is not. Default: from the recipe.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.invert`.
     cache : Cache, optional
@@ -115,7 +115,7 @@ def run(
     Returns
     -------
     Inversion
-        With its `provenance`, by which it can be made again.
+        With its `provenance`, from which it can be reproduced.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def run(
     report = Reporter(on_progress, should_stop)
     clock = time.perf_counter()
     report("prepare", 0, None, "image and source")
-    inputs = gathered(recipe, shot, source=source, mask=mask, source_mask=source_mask)
+    inputs = collect_inputs(recipe, shot, source=source, mask=mask, source_mask=source_mask)
     inputs.recipe.check(inputs.shot)
     ready = inputs.prepared(should_stop)
     inversion = run_prepared(
@@ -164,7 +164,7 @@ def run_prepared(
     start: Inversion | None = None,
     began: float | None = None,
 ) -> Inversion:
-    """Invert a shot whose steps were done, otherwise as `run`.
+    """Invert a shot after the recipe's steps, otherwise as `run`.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def run_prepared(
     clock = time.perf_counter() if began is None else began
     report("prepare", 0, None)
     doubts: list[Caution] = []
-    # Before an estimate is made, and before sites are spread: a mistake is told at once.
+    # Before an estimate is made, and before sites are spread: mistakes are reported at once.
     if shot.source is None:
         prepare(shot.image, None, options, shot.mask)
     source = _source(inputs, shot, report, should_stop, cache, doubts, preview=preview)
@@ -203,7 +203,7 @@ def run_prepared(
         shot.image,
         plan=plan,
         options=options,
-        # What is kept must not depend on what was tried before it.
+        # The final result must not depend on earlier previews.
         start=cache.solved(plan) if preview else start,
         on_progress=on_progress,
         should_stop=should_stop,
@@ -236,7 +236,7 @@ def _source(
     *,
     preview: bool,
 ) -> FloatArray:
-    """The undisturbed beam of a shot after its steps."""
+    """Return the undisturbed beam of a shot after its steps."""
     recorded = inputs.shot.shape
     matrix = inputs.recipe.matrix(recorded)
     estimate = inputs.recipe.estimate
@@ -249,11 +249,11 @@ def _source(
     assert estimate is not None
     estimate = estimate.placed(shot.setup, recorded, matrix)
     report("source", 0, None, estimate.title)
-    kept = partial(cache.source, estimate, most_pixels=PREVIEW_PIXELS if preview else None)
-    return estimated_source(estimate, shot, should_stop, doubts.append, by=kept)
+    cached = partial(cache.source, estimate, most_pixels=PREVIEW_PIXELS if preview else None)
+    return estimated_source(estimate, shot, should_stop, doubts.append, by=cached)
 
 
-def gathered(
+def collect_inputs(
     recipe: Recipe,
     shot: Shot,
     *,
@@ -261,57 +261,57 @@ def gathered(
     mask: ArrayLike | None = None,
     source_mask: ArrayLike | None = None,
 ) -> Inputs:
-    """Bring together what a recipe is applied to: read files, fill in defaults of the shot."""
-    whole = radiograph_of(shot, "the image")
-    setup = whole.setup if recipe.setup is None else recipe.setup
-    beam, wanted = None, recipe.source
+    """Collect the inputs of a recipe: read files, and fill in defaults of the shot."""
+    radiograph = radiograph_of(shot, "the image")
+    setup = radiograph.setup if recipe.setup is None else recipe.setup
+    beam, kind = None, recipe.source
     if source is not None:
         beam = radiograph_of(source, "the source")
-    elif isinstance(wanted, MeasuredSource) and (file := _source_file(wanted, whole)) is not None:
-        beam = read_radiograph(file, variable=wanted.variable)
-    elif whole.source is not None and recipe.estimate is None:
-        beam = replace(whole, image=whole.source, source=None, mask=None)
+    elif isinstance(kind, MeasuredSource) and (file := _source_file(kind, radiograph)) is not None:
+        beam = read_radiograph(file, variable=kind.variable)
+    elif radiograph.source is not None and recipe.estimate is None:
+        beam = replace(radiograph, image=radiograph.source, source=None, mask=None)
         if any(step.flattens for step in recipe.steps):
             raise InputError(
-                f"{whole.path or 'the shot'} contains its own source, but a filter would flatten "
-                "the image: leave the filter out, or choose the source 'uniform'"
+                f"{radiograph.path or 'the shot'} contains its own source, but a filter would "
+                "flatten the image: leave the filter out, or choose the source 'uniform'"
             )
     if setup is not None:
         check_spacing(shot, "the image", setup.pixel_sizes)
         check_spacing(source, "the source", setup.pixel_sizes)
-    usable = _mask(mask, recipe.mask, "mask", whole) or _Mask(whole.mask, None)
+    usable = _mask(mask, recipe.mask, "mask", radiograph) or _Mask(radiograph.mask, None)
     usable = _without_masked(usable, shot, source)
-    bare = _mask(source_mask, recipe.source_mask, "source mask", whole)
-    bare = bare or _Mask(whole.source_mask, None)
-    if wanted is None:
-        wanted = UniformEstimate() if beam is None else MeasuredSource()
-    elif isinstance(wanted, MeasuredSource):
-        wanted = MeasuredSource()
+    bare = _mask(source_mask, recipe.source_mask, "source mask", radiograph)
+    bare = bare or _Mask(radiograph.source_mask, None)
+    if kind is None:
+        kind = UniformEstimate() if beam is None else MeasuredSource()
+    elif isinstance(kind, MeasuredSource):
+        kind = MeasuredSource()
     resolved = recipe.model_copy(
         update={
-            "source": wanted,
+            "source": kind,
             "mask": None,
             "source_mask": None,
             "setup": setup,
         }
     )
-    dark = _dark_frame(recipe, whole)
+    dark = _dark_frame(recipe, radiograph)
     if dark is not None:
         resolved = resolved.with_dark_file(Path(_origin(dark).file))
     provenance = Provenance(
         version=__version__,
         recipe=resolved,
-        image=_origin(whole),
+        image=_origin(radiograph),
         source=None if beam is None else _origin(beam),
         dark=None if dark is None else _origin(dark),
         mask=usable.origin,
         source_mask=bare.origin,
     )
     complete = replace(
-        whole,
+        radiograph,
         source=None if beam is None else beam.image,
         setup=resolved.setup,
-        warnings=(*whole.warnings, *(() if beam is None else beam.warnings)),
+        warnings=(*radiograph.warnings, *(() if beam is None else beam.warnings)),
         mask=usable.pixels,
         source_mask=bare.pixels,
         dark=None if dark is None else dark.image,
@@ -320,7 +320,7 @@ def gathered(
 
 
 def _dark_frame(recipe: Recipe, shot: Radiograph) -> Radiograph | None:
-    """Image of the detector without light that the recipe subtracts, if it names a file."""
+    """Read the dark frame that the recipe subtracts, if it names a file."""
     file = recipe.dark_file
     if file is None:
         return None
@@ -335,9 +335,9 @@ def _dark_frame(recipe: Recipe, shot: Radiograph) -> Radiograph | None:
     return frame
 
 
-def _source_file(wanted: MeasuredSource, shot: Radiograph) -> Path | None:
-    """File of a measured source; a variable without a file is in that of the shot."""
-    return wanted.file if wanted.file is not None or wanted.variable is None else shot.path
+def _source_file(kind: MeasuredSource, shot: Radiograph) -> Path | None:
+    """Return the file of a measured source; a variable alone refers to the shot's file."""
+    return kind.file if kind.file is not None or kind.variable is None else shot.path
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,13 +352,13 @@ class _Mask:
         packed = Origin.of_mask(self.pixels)
         if self.file is None:
             return packed
-        told = {"file": text_of(self.file.name), "sha256": sha256(self.file)}
-        return packed.model_copy(update=told)
+        file_origin = {"file": text_of(self.file.name), "sha256": sha256(self.file)}
+        return packed.model_copy(update=file_origin)
 
 
-def _mask(given: ArrayLike | None, file: Path | None, name: str, shot: Radiograph) -> _Mask | None:
-    if given is not None:
-        pixels = np.asarray(unpack_mask(given, name))
+def _mask(values: ArrayLike | None, file: Path | None, name: str, shot: Radiograph) -> _Mask | None:
+    if values is not None:
+        pixels = np.asarray(unpack_mask(values, name))
         if pixels.dtype != np.bool_:
             raise InputError(
                 f"{name} has values of type {pixels.dtype}, expected booleans: compare it with "
@@ -376,7 +376,7 @@ def _mask(given: ArrayLike | None, file: Path | None, name: str, shot: Radiograp
 
 
 def _without_masked(mask: _Mask, *images: Any) -> _Mask:
-    """Leave the masked pixels of arrays out of a mask, whatever else it leaves out."""
+    """Remove the masked pixels of arrays from a mask."""
     masks = [unpack_array(image, "image")[1] for image in images if not _is_file(image)]
     if all(usable is None for usable in masks):
         return mask
@@ -388,23 +388,23 @@ def _is_file(image: Any) -> bool:
 
 
 def picture_mask(path: Path) -> BoolArray:
-    """Read a mask from a picture that is 0 where a pixel is not to be used."""
+    """Read a mask from a picture that is 0 at unusable pixels."""
     mask: BoolArray = read_radiograph(path, channel="mean").image != 0
     return mask
 
 
-def radiograph_of(given: Shot, name: str) -> Radiograph:
-    """Return one image with what is known about it, read from its file if it is a path."""
-    if isinstance(given, Radiograph):
-        return given
-    if isinstance(given, (str, Path)):
-        return read_radiograph(Path(given))
-    values, usable = unpack_array(given, name)
+def radiograph_of(image: Shot, name: str) -> Radiograph:
+    """Return an image with its metadata, read from its file if it is a path."""
+    if isinstance(image, Radiograph):
+        return image
+    if isinstance(image, (str, Path)):
+        return read_radiograph(Path(image))
+    values, usable = unpack_array(image, name)
     return Radiograph(plane_of(values, name), mask=usable)
 
 
 def plane_of(values: Any, name: str) -> FloatArray:
-    """Return one image as floats, or say why it is none."""
+    """Return an image as floats; an `InputError` if it is none."""
     array = np.asarray(values)
     if array.ndim != 2:
         raise InputError(
@@ -418,11 +418,11 @@ def plane_of(values: Any, name: str) -> FloatArray:
 
 
 def _origin(image: Radiograph) -> Origin:
-    told = image.metadata
+    metadata = image.metadata
     return Origin(
         file="" if image.path is None else text_of(image.path.name),
-        sha256=str(told.get("sha256", "")),
-        variable=told.get("variable"),
-        channel=told.get("channel"),
+        sha256=str(metadata.get("sha256", "")),
+        variable=metadata.get("variable"),
+        channel=metadata.get("channel"),
         shape=image.shape,
     )

@@ -1,7 +1,6 @@
 """Whether one static field explains several images: `run_leave_one_out`, `run_windows`.
 
-Images are taken in order of energy, whatever order they are given in, so that results do not
-depend on it.
+Images are processed in order of energy, so results do not depend on their order in the call.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import FitWindows, LeaveOneOut, fit, leave_one_out
 from napari_shadowinv.fitting.agreement import check_count
 from napari_shadowinv.fitting.measurements import strengths_of
-from napari_shadowinv.pipeline._fit import FitInputs, FitShot, gathered_fit
+from napari_shadowinv.pipeline._fit import FitInputs, FitShot, collect_fit_inputs
 from napari_shadowinv.pipeline._run import Shot
 from napari_shadowinv.preprocessing import Recipe
 
@@ -37,7 +36,7 @@ def run_leave_one_out(
     Parameters
     ----------
     recipe : Recipe
-        What is to be done; without a section `fit` its defaults count.
+        Steps and options; without a section `fit` the defaults apply.
     shots : sequence of FitShot, Radiograph, array_like or path
         Three images or more, of one size after the steps.
     names, on_progress, should_stop
@@ -46,7 +45,7 @@ def run_leave_one_out(
     Returns
     -------
     LeaveOneOut
-        Its images are in the order in which they were given.
+        Its images are in the order of `shots`.
 
     Raises
     ------
@@ -58,16 +57,16 @@ def run_leave_one_out(
         If `should_stop` returned true.
     """
     check_count(len(shots))
-    inputs = gathered_fit(recipe, shots, names=names, should_stop=should_stop)
-    order = _by_energy(inputs)
-    found = leave_one_out(
+    inputs = collect_fit_inputs(recipe, shots, names=names, should_stop=should_stop)
+    order = _order_by_energy(inputs)
+    left_out = leave_one_out(
         **inputs.only(order).keywords,
         fields=inputs.choices.fields or ("B",),
         options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
-    return found.only([int(place) for place in np.argsort(order)])
+    return left_out.only([int(place) for place in np.argsort(order)])
 
 
 def run_windows(
@@ -81,7 +80,7 @@ def run_windows(
 ) -> FitWindows:
     """Fit groups of neighbouring images, in order of energy, one after another, as `run_fit`.
 
-    Slower particles pass the object later: the fields of all groups are a film of it.
+    Slower particles pass the object later: the fields of all groups are a movie of it.
 
     Parameters
     ----------
@@ -93,7 +92,7 @@ def run_windows(
     Returns
     -------
     FitWindows
-        The first group has the images that are displaced most, those of the lowest energies.
+        The first group has the images of the lowest energies, which are displaced most.
 
     Raises
     ------
@@ -105,32 +104,32 @@ def run_windows(
         If `should_stop` returned true.
     """
     check_window(size, len(shots))
-    inputs = gathered_fit(recipe, shots, names=names, should_stop=should_stop)
-    order = _by_energy(inputs)
+    inputs = collect_fit_inputs(recipe, shots, names=names, should_stop=should_stop)
+    order = _order_by_energy(inputs)
     strengths = _strengths(inputs.only(order))[: len(order) - size + 1]
     groups = [order[first : first + size] for first in range(len(strengths))]
     fits = []
     for number, group in enumerate(groups, 1):
 
-        def tell(progress: Progress) -> None:
+        def on_fit_progress(progress: Progress) -> None:
             if on_progress is not None:
                 stage = f"window {number} of {len(groups)}"  # noqa: B023
                 on_progress(replace(progress, stage=stage))
 
         part = inputs.only(group)
-        found = fit(
+        result = fit(
             **part.keywords,
             fields=part.choices.fields or ("B",),
             options=part.options,
-            on_progress=tell,
+            on_progress=on_fit_progress,
             should_stop=should_stop,
         )
-        fits.append(part.told(found))
+        fits.append(part.with_provenance(result))
     return FitWindows(tuple(map(tuple, groups)), tuple(fits), strengths)
 
 
 def check_window(size: int, count: int) -> None:
-    """Reject with an `InputError` groups of no image, or of more than there are."""
+    """Raise an `InputError` if groups would have no image, or more than there are."""
     if not 1 <= size <= count:
         raise InputError(
             f"received {count} image{'s' * (count != 1)} and windows of {size}: expected windows "
@@ -138,8 +137,8 @@ def check_window(size: int, count: int) -> None:
         )
 
 
-def _by_energy(inputs: FitInputs) -> list[int]:
-    """The images in order of energy, those displaced most first."""
+def _order_by_energy(inputs: FitInputs) -> list[int]:
+    """Sort the images by energy, the most displaced first."""
     sizes = np.abs(_strengths(inputs)[:, 0])
     images = [shot.image.tobytes() for shot in inputs.shots]
     return sorted(range(len(images)), key=lambda k: (-sizes[k], images[k]))
@@ -147,9 +146,9 @@ def _by_energy(inputs: FitInputs) -> list[int]:
 
 def _strengths(inputs: FitInputs) -> FloatArray:
     """Displacement of each image by each field, relative to the first image."""
-    given = inputs.keywords.get("strengths")
-    if given is None:
+    strengths = inputs.keywords.get("strengths")
+    if strengths is None:
         fields = inputs.choices.fields or ("B",)
         return strengths_of(inputs.setups, fields, len(inputs.shots), inputs.names)
-    matrix = np.array(given, dtype=np.float64)
+    matrix = np.array(strengths, dtype=np.float64)
     return np.asarray(matrix / matrix[0])

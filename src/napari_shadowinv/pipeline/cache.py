@@ -1,4 +1,4 @@
-"""What a window keeps between runs: sites and sources that need not be made again."""
+"""Sites and sources that a window reuses between runs: `Cache`."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class Cache:
         *,
         measured: bool = True,
     ) -> SitePlan:
-        """Return the sites for a source, made anew only if anything about them changed."""
+        """Return the sites for a source, computed only if anything about them has changed."""
         key = f"{options.site_key()}{measured}"
         if self._plan is not None:
             last_key, last_source, last_mask, plan = self._plan
-            if key == last_key and _alike(source, last_source) and same_array(mask, last_mask):
+            if key == last_key and _is_close(source, last_source) and same_array(mask, last_mask):
                 self.hits += 1
                 return plan
         plan = plan_sites(
@@ -61,12 +61,12 @@ class Cache:
         return plan
 
     def solved(self, plan: SitePlan) -> Inversion | None:
-        """Return what `keep` was last given, if it was made with these sites."""
+        """Return the last inversion passed to `keep`, if it has these sites."""
         solved = self._solved
         return solved[1] if solved is not None and solved[0] is plan else None
 
     def keep(self, plan: SitePlan, inversion: Inversion) -> None:
-        """Remember an inversion made with these sites, to start the next one from."""
+        """Store an inversion with these sites as start of the next one."""
         self._solved = plan, inversion
 
     def source(
@@ -84,8 +84,8 @@ class Cache:
         doubts: list[Caution] = []
         if self._estimated is not None:
             last_key, last_image, last_mask, last_source, last_doubts = self._estimated
-            same = same_array(image, last_image) and same_array(mask, last_mask)
-            if key == last_key and same:
+            is_same = same_array(image, last_image) and same_array(mask, last_mask)
+            if key == last_key and is_same:
                 source, doubts = last_source, last_doubts
         if source is None:
             if most_pixels is None:
@@ -110,7 +110,7 @@ def quick_source(
     on_caution: OnCaution | None = None,
 ) -> FloatArray:
     """Estimate a source from an image whose pixels are merged until there are few enough."""
-    # Linear between the middles of the merged pixels; its flux is that of the image.
+    # Linear between the middles of the merged pixels, with the flux of the image.
     factor = int(np.ceil(np.sqrt(image.size / most_pixels)))
     if factor == 1 or min(image.shape) < 8 * factor:
         return estimate.source(image, mask, should_stop, on_caution)
@@ -122,23 +122,23 @@ def quick_source(
     usable = np.ones(image.shape, bool) if mask is None else mask
     share = merged(usable.astype(float), (factor, factor))
     sums = merged(np.where(usable, image, 0.0), (factor, factor))
-    known = share > 0
-    coarse = np.where(known, sums / np.where(known, share, 1.0), 0.0)
+    filled = share > 0
+    coarse = np.where(filled, sums / np.where(filled, share, 1.0), 0.0)
     coarser = estimate.coarser(factor)
-    beam = coarser.source(coarse, None if known.all() else known, should_stop, on_caution)
+    beam = coarser.source(coarse, None if filled.all() else filled, should_stop, on_caution)
     middle = (factor - 1) / 2
     places = np.meshgrid(*((np.arange(n) - middle) / factor for n in image.shape), indexing="ij")
     fine = map_coordinates(beam, places, order=1, mode="nearest")
     return np.asarray(fine * (image[usable].sum() / fine[usable].sum()))
 
 
-def same_array(one: AnyArray | None, other: AnyArray | None) -> bool:
-    """Whether two arrays hold the same, or both are none."""
-    if one is None or other is None:
-        return one is other
-    return one is other or np.array_equal(one, other)
+def same_array(first: AnyArray | None, second: AnyArray | None) -> bool:
+    """Return whether two arrays are equal, or both are None."""
+    if first is None or second is None:
+        return first is second
+    return first is second or np.array_equal(first, second)
 
 
-def _alike(one: FloatArray, other: FloatArray) -> bool:
+def _is_close(first: FloatArray, second: FloatArray) -> bool:
     # A filter keeps the mean of a uniform source to rounding only.
-    return one.shape == other.shape and bool(np.allclose(one, other, rtol=1e-9, atol=0))
+    return first.shape == second.shape and bool(np.allclose(first, second, rtol=1e-9, atol=0))

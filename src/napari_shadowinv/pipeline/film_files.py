@@ -1,7 +1,7 @@
 """A film pack as a file, and its layers as files for other commands.
 
-- read what describes a pack: `read_pack`
-- write its layers as images with a table of them: `write_layers`
+- read the description of a pack: `read_pack`
+- write its layers as images with a table: `write_layers`
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _COLUMNS = ("file", "mask", "setup", "strength", "exclude")
 
 
 def read_pack(path: Path) -> Pack:
-    """Read a pack; files that it names are looked for from its own folder.
+    """Read a pack; file names in it are relative to its folder.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def read_pack(path: Path) -> Pack:
     FileFormatError
         If a file cannot be read.
     InputError
-        If an entry is not understood; the message names it.
+        If an entry is invalid; the message names it.
     """
     path = Path(path).absolute()
     entries = read_toml(path)
@@ -56,7 +56,7 @@ def read_pack(path: Path) -> Pack:
         entries["layers"] = [row.model_dump() for row in rows]
     if isinstance(entries.get("setup"), str):
         entries["setup"] = read_toml(path.parent / entries["setup"])
-    return _with_files(validated(Pack, entries, str(path)), path.parent.joinpath)
+    return _map_files(validated(Pack, entries, str(path)), path.parent.joinpath)
 
 
 def write_layers(
@@ -68,29 +68,29 @@ def write_layers(
 ) -> list[Path]:
     """Write the fluence of each layer as an image, its mask, its setup, and a table of them.
 
-    The table, ``layers.csv``, is one for `shadowinv fit` and `shadowinv batch`. Without a setup it
-    tells how strongly a magnetic field displaces the protons of each layer, relative to the first.
+    The table, ``layers.csv``, is for `shadowinv fit` and `shadowinv batch`. Without a setup it
+    contains the displacement of each layer's protons by a magnetic field, relative to the first.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        What `run_film` returns.
+        Result of `run_film`.
     folder : Path
-        Made if it is not there.
+        Created if it does not exist.
     form : {"tiff", "pradformat"}
-        Of the images. Those of pradformat hold their setups.
+        Format of the images. Files in pradformat contain their setups.
 
     Returns
     -------
     list of Path
-        What was written, the table last.
+        The files, the table last.
 
     Raises
     ------
     FileFormatError
         If a file exists, unless `overwrite`, or cannot be written.
     InputError
-        If the dataset is not that of a film pack, or has no setup, which pradformat needs.
+        If the dataset does not come from a film pack, or has no setup, which pradformat needs.
     """
     if not is_pack(dataset.attrs):
         raise InputError("expected the dataset of a film pack, as shadowinv film writes it")
@@ -100,7 +100,7 @@ def write_layers(
         raise FileFormatError(
             f"{folder} cannot be created as a folder ({error.strerror}): choose another name"
         ) from None
-    setups = [setup_from_dict(one) for one in json.loads(dataset.attrs.get("setups", "[]"))]
+    setups = [setup_from_dict(entry) for entry in json.loads(dataset.attrs.get("setups", "[]"))]
     if form == "pradformat" and not setups:
         raise InputError("pradformat needs a setup: give the pack's distances, or write TIFF")
     written, rows = [], []
@@ -144,16 +144,22 @@ def _write_setup(path: Path, content: dict[str, Any], overwrite: bool) -> Path:
     return path
 
 
-def _with_files(pack: Pack, moved: Callable[[Path], Path]) -> Pack:
-    def of(model: Any, *names: str) -> Any:
-        named = {name: getattr(model, name) for name in names}
+def _map_files(pack: Pack, move: Callable[[Path], Path]) -> Pack:
+    def with_moved(model: Any, *names: str) -> Any:
+        files = {name: getattr(model, name) for name in names}
         return model.model_copy(
-            update={name: moved(file) for name, file in named.items() if file is not None}
+            update={name: move(file) for name, file in files.items() if file is not None}
         )
 
     changes = {
-        "films": {name: of(one, "calibration", "unexposed") for name, one in pack.films.items()},
-        "materials": {name: of(one, "table") for name, one in pack.materials.items()},
-        "layers": tuple(of(layer, "file", "mask") for layer in pack.layers),
+        "films": {
+            name: with_moved(film, "calibration", "unexposed") for name, film in pack.films.items()
+        },
+        "materials": {
+            name: with_moved(material, "table") for name, material in pack.materials.items()
+        },
+        "layers": tuple(with_moved(layer, "file", "mask") for layer in pack.layers),
     }
-    return Pack.model_validate({**dict(of(pack, "scan", "corners", "fiducials")), **changes})
+    return Pack.model_validate(
+        {**dict(with_moved(pack, "scan", "corners", "fiducials")), **changes}
+    )

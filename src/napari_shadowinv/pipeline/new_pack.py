@@ -1,8 +1,7 @@
 """A first description of a film pack from a folder of scans.
 
-- the layers in the order of the scans' names, with what the folder shows of calibrations:
-  `draft_pack`
-- what is still to be added: `missing_entries`
+- the layers in the order of the scans' names, and the calibrations of the folder: `draft_pack`
+- the entries still to be added: `missing_entries`
 - the same as a file: `write_new_pack`
 """
 
@@ -88,17 +87,17 @@ def draft_pack(
         raise InputError(f"{folder} has no scans of films: expected images in colour, such as TIFF")
     tables = [path for path in files if path.suffix.lower() in SITES.suffixes]
     calibrations = [path for path in tables if _is_calibration(path)]
-    shown = layers or [
-        {"film": _type_in(path, types) or facts.film, "filters": [], "file": path.name}
+    layer_entries = layers or [
+        {"film": _film_type_of(path, types) or facts.film, "filters": [], "file": path.name}
         for path in scans
     ]
     films: dict[str, dict[str, str]] = {}
-    for kind in sorted({str(layer["film"]) for layer in shown}):
+    for kind in sorted({str(layer["film"]) for layer in layer_entries}):
         parts = {"calibration": calibrations, "unexposed": unexposed}
         films[kind] = {
             part: path.name
             for part, candidates in parts.items()
-            if (path := _belonging_to(kind, candidates, types)) is not None
+            if (path := _file_for_type(kind, candidates, types)) is not None
         }
     entries: dict[str, Any] = {}
     if facts.seen_from is not None:
@@ -111,12 +110,12 @@ def draft_pack(
     elif any(value is not None for value in distances.values()):
         raise InputError("only one of two distances is given: give both, or none")
     return {**entries, "films": {kind: parts for kind, parts in films.items() if parts}} | {
-        "layers": [dict(layer) for layer in shown]
+        "layers": [dict(layer) for layer in layer_entries]
     }
 
 
 def missing_entries(entries: Mapping[str, Any]) -> list[str]:
-    """Return what a pack still needs, or should say, one clause for each."""
+    """Return the missing and recommended entries of a pack, one clause for each."""
     missing = []
     if not any(layer["filters"] for layer in entries["layers"]):
         missing.append("filters: those in front of each film, such as 13 um Al; 25 um Fe")
@@ -138,7 +137,7 @@ def write_new_pack(folder: Path, entries: Mapping[str, Any], *, overwrite: bool 
     FileFormatError
         If the file exists, unless `overwrite`, or cannot be written.
     InputError
-        If the entries are no pack; the message names what is wrong.
+        If the entries do not describe a pack; the message names the reason.
     """
     import tomli_w
 
@@ -155,14 +154,14 @@ def _natural_key(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
-def _type_in(path: Path, types: tuple[str, ...]) -> str | None:
+def _film_type_of(path: Path, types: tuple[str, ...]) -> str | None:
     return next((kind for kind in types if kind.lower() in path.stem.lower()), None)
 
 
-def _belonging_to(kind: str, candidates: list[Path], types: tuple[str, ...]) -> Path | None:
-    """File for a type of film: one named after it, or else one named after none."""
-    named = [path for path in candidates if _type_in(path, types) == kind]
-    return next(iter(named or [p for p in candidates if _type_in(p, types) is None]), None)
+def _file_for_type(kind: str, candidates: list[Path], types: tuple[str, ...]) -> Path | None:
+    """Return a file named after a type of film, or else one named after none."""
+    matching = [path for path in candidates if _film_type_of(path, types) == kind]
+    return next(iter(matching or [p for p in candidates if _film_type_of(p, types) is None]), None)
 
 
 def _is_calibration(path: Path) -> bool:

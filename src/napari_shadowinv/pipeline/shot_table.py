@@ -1,6 +1,6 @@
-"""What is told about each image and each fiducial: rows of a table, or flags.
+"""Descriptions of images and fiducials, from rows of a table or from flags.
 
-- one image: `ShotRow`; those of a fit: `shot_rows`, or `rows_by_shot` for a table of many shots
+- one image: `ShotRow`; all of a fit: `shot_rows`, or `rows_by_shot` for a table of many shots
 - the images of a table that are inverted one by one: `rows_to_invert`
 - whether a file is such a table: `is_table`; all its rows: `table_rows`; write one: `write_table`
 - known displacements: `fiducials_from`
@@ -36,8 +36,8 @@ __all__ = [
     "write_table",
 ]
 
-_EXPECTED = "a table as comma-separated values"
-_LONGEST_HEADER = 100_000  # bytes
+_EXPECTED_FORMAT = "a table as comma-separated values"
+_MAX_HEADER_BYTES = 100_000
 _CONFIG = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -60,7 +60,7 @@ def _is_number(text: str) -> bool:
 
 
 class ShotRow(CheckedModel):
-    """One image, and what is known about it."""
+    """One image and its description."""
 
     model_config = _CONFIG
     file: Path = Field(title="Image", description="Its file.")
@@ -121,20 +121,20 @@ class ShotRow(CheckedModel):
 
     @property
     def files(self) -> dict[str, Path]:
-        """What is read for it, by the names of the columns."""
-        known = {"file": self.file, "setup": self.setup, "mask": self.mask}
-        found = {**known, "source": self.source_file}
-        return {name: path for name, path in found.items() if path is not None}
+        """Files of the image, by the names of the columns."""
+        columns = {"file": self.file, "setup": self.setup, "mask": self.mask}
+        complete = {**columns, "source": self.source_file}
+        return {name: path for name, path in complete.items() if path is not None}
 
     @property
-    def described(self) -> dict[str, Any]:
-        """What it says, without folders, which may be moved."""
-        said = self.model_dump(mode="json", exclude_none=True, exclude={"exclude"})
-        return {**said, **{name: text_of(path.name) for name, path in self.files.items()}}
+    def summary(self) -> dict[str, Any]:
+        """Entries of the row, without folders, which may be moved."""
+        entries = self.model_dump(mode="json", exclude_none=True, exclude={"exclude"})
+        return {**entries, **{name: text_of(path.name) for name, path in self.files.items()}}
 
 
-_FILES = ("file", "setup", "mask", "source")
-_FOR_FITS = ("strength", "psf", "noise")
+_FILE_COLUMNS = ("file", "setup", "mask", "source")
+_FIT_COLUMNS = ("strength", "psf", "noise")
 
 
 class _Fiducial(CheckedModel):
@@ -156,15 +156,15 @@ def shot_rows(
     images : sequence of Path
         Images, or one table with a row for each.
     shared : mapping
-        What holds for all images that do not say otherwise, by the names of the columns.
+        Defaults for all images, by the names of the columns.
     lists : mapping of str to str
         Numbers separated by commas, one for each image, by the names of the columns.
     """
-    given = {name: text for name, text in lists.items() if text is not None}
+    texts = {name: text for name, text in lists.items() if text is not None}
     if len(images) == 1 and is_table(images[0]):
-        for name in given:
+        for name in texts:
             raise InputError(
-                f"received a list for each image, {given[name]}, beside the table {images[0]}: "
+                f"received a list for each image, {texts[name]}, and the table {images[0]}: "
                 f"write it into its column '{name}'"
             )
         rows = list(_used_rows(images[0], shared).values())
@@ -174,17 +174,17 @@ def shot_rows(
                 "shadowinv batch --fit"
             )
         return rows
-    columns = {name: [part.strip() for part in text.split(",")] for name, text in given.items()}
+    columns = {name: [part.strip() for part in text.split(",")] for name, text in texts.items()}
     for name, parts in columns.items():
         if len(parts) != len(images):
             raise InputError(
                 f"received {len(images)} images and {len(parts)} values of {name} "
-                f"({given[name]}): expected one for each image, separated by commas"
+                f"({texts[name]}): expected one for each image, separated by commas"
             )
     return [
         validated(
             ShotRow,
-            _known({"file": image, **shared, **{name: columns[name][k] for name in columns}}),
+            _drop_none({"file": image, **shared, **{name: columns[name][k] for name in columns}}),
             str(image),
         )
         for k, image in enumerate(images)
@@ -192,20 +192,20 @@ def shot_rows(
 
 
 def rows_by_shot(table: Path, shared: Mapping[str, Any]) -> dict[str, tuple[ShotRow, ...]]:
-    """Rows of a table with the images of many shots, by the names of the shots, in their order."""
-    found: dict[str, tuple[ShotRow, ...]] = {}
+    """Return the rows of a table with the images of many shots, by shot, in their order."""
+    by_shot: dict[str, tuple[ShotRow, ...]] = {}
     for number, row in _used_rows(table, shared).items():
         if row.shot is None:
             raise InputError(
                 f"{table}, row {number} does not say which shot its image belongs to: give the "
                 "column 'shot', the same for all images of one object"
             )
-        found[row.shot] = (*found.get(row.shot, ()), row)
-    return found
+        by_shot[row.shot] = (*by_shot.get(row.shot, ()), row)
+    return by_shot
 
 
 def rows_to_invert(table: Path | Sequence[ShotRow]) -> tuple[list[ShotRow], tuple[str, ...]]:
-    """Rows, or those of a table, whose images are inverted one by one; columns only for fits."""
+    """Return the rows to invert one by one, and the columns that only fits use."""
     rows = _used_rows(table, {})
     for number, row in rows.items():
         if row.source == "unknown":
@@ -214,38 +214,40 @@ def rows_to_invert(table: Path | Sequence[ShotRow]) -> tuple[list[ShotRow], tupl
                 "find: name an image, or leave the cell empty"
             )
     used = list(rows.values())
-    given = (name for name in _FOR_FITS if any(getattr(row, name) is not None for row in used))
-    return used, tuple(given)
+    filled = (name for name in _FIT_COLUMNS if any(getattr(row, name) is not None for row in used))
+    return used, tuple(filled)
 
 
 def table_rows(table: Path) -> list[ShotRow]:
-    """All rows of a table of shots, those that are excluded among them."""
+    """Return all rows of a table of shots, including excluded ones."""
     return rows_of(table, ShotRow)
 
 
 def write_table(path: Path, rows: Sequence[ShotRow]) -> None:
-    """Write a table of shots, in place of one that is there; files relative to its folder."""
+    """Write or replace a table of shots; file names become relative to its folder."""
     folder = path.parent.absolute()
-    told = [row.model_dump(mode="json", exclude_none=True, exclude_defaults=True) for row in rows]
-    for cells, row in zip(told, rows, strict=True):
+    table_cells = [
+        row.model_dump(mode="json", exclude_none=True, exclude_defaults=True) for row in rows
+    ]
+    for cells, row in zip(table_cells, rows, strict=True):
         files = row.files.items()
         cells |= {name: os.path.relpath(file.absolute(), folder) for name, file in files}
         if row.strength is not None:
-            cells["strength"] = " ".join(f"{one:.17g}" for one in row.strength)
+            cells["strength"] = " ".join(f"{value:.17g}" for value in row.strength)
         if row.exclude:
             cells["exclude"] = "yes"
-    columns = [name for name in ShotRow.model_fields if any(name in cells for cells in told)]
+    columns = [name for name in ShotRow.model_fields if any(name in cells for cells in table_cells)]
     with (
         replacing(path, overwrite=True) as draft,
         Path(draft).open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
-        writer.writerows(told)
+        writer.writerows(table_cells)
 
 
 def _used_rows(table: Path | Sequence[ShotRow], shared: Mapping[str, Any]) -> dict[int, ShotRow]:
-    """The rows that are not excluded, by number."""
+    """Return the rows that are not excluded, by number."""
     rows = rows_of(table, ShotRow, shared) if isinstance(table, Path) else table
     used = {number: row for number, row in enumerate(rows, 1) if not row.exclude}
     if not used:
@@ -261,31 +263,31 @@ def _name_of(table: Path | Sequence[ShotRow]) -> str:
 
 
 def fiducials_from(path: Path) -> list[tuple[float, ...]]:
-    """Known displacements from a table: rows of y, x, dy, dx and their σ, in px."""
-    return [(one.y, one.x, one.dy, one.dx, one.sigma) for one in rows_of(path, _Fiducial)]
+    """Read known displacements from a table: rows of y, x, dy, dx and their σ, in px."""
+    return [(row.y, row.x, row.dy, row.dx, row.sigma) for row in rows_of(path, _Fiducial)]
 
 
-def _known(values: Mapping[str, Any]) -> dict[str, Any]:
+def _drop_none(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
 def is_table(path: Path) -> bool:
-    """Tell whether a file is a table with names of columns, and no image as numbers."""
+    """Return whether a file is a table with column names, not an image as text."""
     if path.suffix.lower() not in SITES.suffixes:
         return False
-    check_regular(path, _EXPECTED)
+    check_regular(path, _EXPECTED_FORMAT)
     with path.open("rb") as file:  # an image may be large
-        head = file.read(_LONGEST_HEADER).decode("utf-8-sig", errors="replace")
-    lines = _filled(head)
+        head = file.read(_MAX_HEADER_BYTES).decode("utf-8-sig", errors="replace")
+    lines = _content_lines(head)
     return bool(lines) and not any(map(_is_number, _cells(path, lines[0])))
 
 
 def _lines(path: Path) -> list[str]:
-    return _filled(small_text(path, _EXPECTED, "utf-8-sig"))
+    return _content_lines(small_text(path, _EXPECTED_FORMAT, "utf-8-sig"))
 
 
-def _filled(text: str) -> list[str]:
-    """Lines of a table that are neither empty nor a comment."""
+def _content_lines(text: str) -> list[str]:
+    """Return the lines of a table that are neither empty nor comments."""
     return [line for line in text.splitlines() if line.strip(" ,;\t") and line.strip()[0] != "#"]
 
 
@@ -309,7 +311,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def rows_of(path: Path, model: type[Model], shared: Mapping[str, Any] | None = None) -> list[Model]:
-    """Return rows of a table as models; files that it names are looked for from its own folder."""
+    """Return the rows of a table as models; file names are relative to its folder."""
     lines = _lines(path)
     header = _cells(path, lines[0]) if lines else []
     _check_header(path, header, model)
@@ -323,24 +325,28 @@ def rows_of(path: Path, model: type[Model], shared: Mapping[str, Any] | None = N
                 f"{path}, row {number} has {len(cells)} values, expected {len(header)}: "
                 f"{', '.join(header)}"
             )
-        told = {name: cell for name, cell in zip(header, cells, strict=False) if cell}
-        for name in told.keys() & set(_FILES):
-            if told[name] != "unknown":
-                told[name] = str(path.parent / told[name])
-        rows.append(validated(model, {**_known(shared or {}), **told}, f"{path}, row {number}"))
+        entries = {name: cell for name, cell in zip(header, cells, strict=False) if cell}
+        for name in entries.keys() & set(_FILE_COLUMNS):
+            if entries[name] != "unknown":
+                entries[name] = str(path.parent / entries[name])
+        rows.append(
+            validated(model, {**_drop_none(shared or {}), **entries}, f"{path}, row {number}")
+        )
     return rows
 
 
 def _check_header(path: Path, header: list[str], model: type[BaseModel]) -> None:
-    known = list(model.model_fields)
+    columns = list(model.model_fields)
     for name in header:
-        if name not in known:
-            meant = nearest(name.lower(), known)
-            hint = f"did you mean '{meant}'?" if meant else f"known are {', '.join(known)}"
+        if name not in columns:
+            suggestion = nearest(name.lower(), columns)
+            hint = (
+                f"did you mean '{suggestion}'?" if suggestion else f"known are {', '.join(columns)}"
+            )
             raise InputError(f"{path} has a column '{name}': {hint}")
-    for one, other in pairwise(sorted(header)):
-        if one == other:
-            raise InputError(f"{path} has the column '{one}' twice: expected it once")
+    for column, following in pairwise(sorted(header)):
+        if column == following:
+            raise InputError(f"{path} has the column '{column}' twice: expected it once")
     needed = [name for name, field in model.model_fields.items() if field.is_required()]
     missing = [name for name in needed if name not in header]
     if missing:

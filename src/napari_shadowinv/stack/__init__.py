@@ -1,10 +1,9 @@
 """Many shots: lazily with dask, or into one store that survives a crash.
 
-- describe the inversion of many shots and let dask do it: `invert_stack`
-- write them shot by shot to ``name.shadowinv.zarr``, inverted or fitted, and go on after a crash:
-  `run_stack`
-- read a shot's file with a colour channel chosen, or binned: `read_shot`
-- watch a folder and invert each shot as soon as it is there: `watch_stack`
+- describe the inversion of many shots for dask: `invert_stack`
+- invert or fit shots one by one into ``name.shadowinv.zarr``, and resume after a crash: `run_stack`
+- read a shot's file, or one of its colour channels: `read_shot`
+- watch a folder and invert each shot as soon as it arrives: `watch_stack`
 - mean, spread and peaks across shots: `stack_statistics`
 """
 

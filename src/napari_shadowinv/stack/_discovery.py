@@ -27,8 +27,8 @@ from napari_shadowinv.stack._sources import Reader, Shot, read_shot
 if TYPE_CHECKING:
     import xarray
 
-_MAGIC = re.compile(r"[*?\[]")
-_LOOKED_AT = 3  # files that are asked for the shape of all
+_GLOB = re.compile(r"[*?\[]")
+_MAX_SHAPE_READS = 3  # shots that are read for the shape of all
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Shots:
         name = self.names[index]
         return f"shot {index}" if name == str(index) else f"shot {index} ({name})"
 
-    def chosen(self, order: Sequence[int]) -> Shots:
+    def reordered(self, order: Sequence[int]) -> Shots:
         """Return these shots in another order."""
         if list(order) == list(range(len(self))):
             return self
@@ -68,7 +68,7 @@ class Shots:
 def find_shots(
     shots: Any, *, reader: Reader = read_shot, shape: tuple[int, int] | None = None
 ) -> Shots:
-    """Turn whatever holds shots into references to them."""
+    """Return references to the shots of an array, of files or of a list."""
     if isinstance(shots, Shots):
         return replace(shots, shape=shape or usual_shape(shots.items))
     if isinstance(shots, (str, Path)):
@@ -102,13 +102,13 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
     # Path.is_dir raises an error if a name is too long.
     if os.path.isdir(path):
         raise InputError(f"{text} is a folder: specify the files, such as '{text}/*.tif'")
-    if _MAGIC.search(text) and not os.path.exists(path):
-        found = in_counting_order(map(Path, glob.glob(text, recursive=True)))
-        if not found:
+    if _GLOB.search(text) and not os.path.exists(path):
+        paths = in_counting_order(map(Path, glob.glob(text, recursive=True)))
+        if not paths:
             raise InputError(
                 f"no file matches {text}: expected shots; check the folder and pattern"
             )
-        return _from_files(found, reader, shape)
+        return _from_files(paths, reader, shape)
     pages = _page_count(path, reader)
     if pages == 1:
         return _from_files([path], reader, shape)
@@ -118,7 +118,7 @@ def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shot
 
 
 def _page_count(path: Path, reader: Reader) -> int:
-    """Pages of a TIFF that the reader can tell apart."""
+    """Return the number of pages of a TIFF, if the reader can select them."""
     knows_pages = "page" in inspect.signature(reader).parameters
     return tiff_pages(path) if knows_pages and kind_of(path) == "tiff" else 1
 
@@ -150,7 +150,7 @@ def usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
             shapes[shot.shape()] += 1
         except (OSError, ValueError) as error:
             first_error = first_error or error
-        if shapes.total() == _LOOKED_AT:
+        if shapes.total() == _MAX_SHAPE_READS:
             break
     if not shapes:
         raise FileFormatError(f"none of {len(items)} shots can be read, the first: {first_error}")
@@ -200,7 +200,7 @@ def _from_array(shots: Any, coordinate: Any = None) -> Shots:
 
 
 def _common_mask(shots: Any) -> BoolArray | None:
-    """The pixels that all shots of a masked array have in use."""
+    """Return the pixels that no shot of a masked array masks."""
     if isinstance(getattr(shots, "_meta", None), np.ma.MaskedArray):
         raise InputError(
             "shots are a dask array of masked arrays: give the mask as mask=, and the values as "
@@ -211,8 +211,8 @@ def _common_mask(shots: Any) -> BoolArray | None:
     masked: BoolArray = np.ma.getmaskarray(shots)
     if (masked != masked[0]).any():
         raise InputError(
-            "shots have different masks, expected the same in all: mask what is masked in any "
-            "(mask=~shots.mask.any(axis=0)), or describe them in a table with a mask each"
+            "shots have different masks, expected the same in all: mask pixels that are masked in "
+            "any (mask=~shots.mask.any(axis=0)), or describe them in a table with a mask each"
         )
     common: BoolArray = ~masked[0]
     return common
@@ -237,15 +237,15 @@ class _Blocks(Sequence[Shot]):
         if isinstance(index, slice):
             return _Blocks(self._array[index])
         dask: Any = import_module("dask")
-        # Without the tasks of other shots, which would travel with it.
+        # Without the tasks of other shots, which would be sent with it.
         return _sources.BlockShot(dask.optimize(self._array.blocks[index])[0])
 
 
 def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots | None:
-    """Turn whatever holds the undisturbed beam into one image, or into many."""
+    """Return the undisturbed beam as one image, or as many."""
     if source is None:
         return None
-    single = isinstance(source, (str, Path)) and not _MAGIC.search(str(source))
+    single = isinstance(source, (str, Path)) and not _GLOB.search(str(source))
     if single and _page_count(Path(source), reader) == 1:
         return _sources.FileShot(Path(source).absolute(), reader).load()[0]
     if getattr(source, "ndim", None) == 2:

@@ -1,4 +1,4 @@
-"""Where shots are inverted: in this process, in others, on a cluster; see `engine_for`."""
+"""Engines that invert shots: threads, processes or a cluster; see `engine_for`."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.stack._local import local_client
 from napari_shadowinv.stack._sources import BlockShot, Shot
 
-_CONNECT_SECONDS = 10.0
-_POLL = 0.1  # seconds between two looks at `should_stop` while connecting
-_ASKED_AGAIN_AFTER = 2.0  # seconds: clusters grow and shrink
-_AHEAD = 2  # tasks for each slot: one that runs, one that waits for it to end
-_AHEAD_OF_FILES = 64  # references to files are small; a cluster that grows wants to see work
+_CONNECT_TIMEOUT_S = 10.0
+_POLL_S = 0.1  # between two looks at `should_stop` while connecting
+_REFRESH_S = 2.0  # clusters grow and shrink
+_TASKS_PER_SLOT = 2  # tasks for each slot: one that runs, one that waits for it to end
+_MIN_FILE_TASKS = 64  # references are small, and adaptive clusters grow by their queue
 
 
 class EngineError(OSError):
     """The cluster is gone: the run must end, and can be resumed."""
 
 
-class WorkerDied(Exception):  # noqa: N818 - it is what happened to a shot
-    """A shot was tried several times and each time the worker died."""
+class WorkerDiedError(Exception):
+    """All attempts at a shot ended with the death of the worker."""
 
 
 class _Threads:
-    """Threads of this process; what the methods promise, those of `_Cluster` do too."""
+    """Threads of this process; `_Cluster` has the same methods."""
 
     stop: threading.Event | None  # set to end tasks that run, if they share this process
-    workers: int | None  # on this machine, if it is known that all of them are
+    workers: int | None  # if all of them are on this machine
 
     def __init__(self, pool: ThreadPoolExecutor, workers: int) -> None:
         self.name = f"{workers} thread{'s' if workers > 1 else ''}"
@@ -46,11 +46,11 @@ class _Threads:
         self._pool = pool
 
     def window(self, *, files: bool) -> int:
-        """Return how many tasks to hand over at once."""
-        return _AHEAD * (self.workers or 1)
+        """Return the number of tasks to submit ahead."""
+        return _TASKS_PER_SLOT * (self.workers or 1)
 
     def share(self, value: Any, name: str) -> Any:
-        """Bring a value to where the tasks are, and return what stands for it."""
+        """Send a value to the workers, and return its representative for tasks."""
         return value
 
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
@@ -58,9 +58,9 @@ class _Threads:
         return self._pool.submit(task, shots, *args)
 
     def result(self, future: Any) -> Any:
-        """Return what a task returned, or None if its worker died since and it is done again.
+        """Return the result of a task, or None if its worker died and it is repeated.
 
-        Raises `WorkerDied`, or `EngineError` if all is lost.
+        Raises `WorkerDiedError`, or `EngineError` if all is lost.
         """
         return future.result()
 
@@ -79,40 +79,40 @@ class _Cluster:
         self.workers = workers
         self._client = client
         self._shared: list[Any] = []
-        self._asked = -_ASKED_AGAIN_AFTER
-        self._known = 0
+        self._queried = -_REFRESH_S
+        self._n_threads = 0
 
     def window(self, *, files: bool) -> int:
-        return max(_AHEAD * self._slots(), _AHEAD_OF_FILES if files else _AHEAD)
+        return max(_TASKS_PER_SLOT * self._slots(), _MIN_FILE_TASKS if files else _TASKS_PER_SLOT)
 
     def _slots(self) -> int:
         if self.workers is not None:
             return self.workers
-        if time.monotonic() > self._asked + _ASKED_AGAIN_AFTER:
-            self._asked = time.monotonic()
+        if time.monotonic() > self._queried + _REFRESH_S:
+            self._queried = time.monotonic()
             try:
-                self._known = sum(self._client.nthreads().values())
+                self._n_threads = sum(self._client.nthreads().values())
             except (OSError, ValueError, TimeoutError):
                 self.check()
-        return self._known
+        return self._n_threads
 
     def share(self, value: Any, name: str) -> Any:
-        # A task and not scattered data: it is made again when the worker that had it dies.
-        with self._connected_or_lost():
-            future = self._client.submit(_same, value, key=name)
+        # A task instead of scattered data: it is repeated if its worker dies.
+        with self._as_engine_error():
+            future = self._client.submit(_identity_task, value, key=name)
         self._shared.append(future)
         if self._slots():
             distributed: Any = import_module("distributed")
-            # To all workers at once, because dask gives tasks to those that have it first. Only
-            # to save time: a worker or scheduler that dies meanwhile shows where it matters.
+            # To all workers at once, because dask prefers workers that have it. This only saves
+            # time: errors of workers or scheduler are handled with the tasks.
             with suppress(Exception), self._client.as_current():
-                distributed.wait([future], timeout=_CONNECT_SECONDS)
+                distributed.wait([future], timeout=_CONNECT_TIMEOUT_S)
                 self._client.replicate([future])
         return future
 
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
         # A dask array may live on the cluster already, so its blocks are the cluster's tasks.
-        with self._connected_or_lost():
+        with self._as_engine_error():
             handed = [
                 self._client.compute(shot.block.to_delayed().ravel()[0])
                 if isinstance(shot, BlockShot)
@@ -125,8 +125,8 @@ class _Cluster:
         from distributed.scheduler import KilledWorker
 
         try:
-            with self._connected_or_lost(), suppress(TimeoutError):
-                return future.result(timeout=_CONNECT_SECONDS)
+            with self._as_engine_error(), suppress(TimeoutError):
+                return future.result(timeout=_CONNECT_TIMEOUT_S)
             self.check()
         except KilledWorker as error:
             if str(error.task) in {shared.key for shared in self._shared}:
@@ -134,7 +134,7 @@ class _Cluster:
                     f"the workers of {self.name} crash before starting a shot: give them more "
                     "memory, or check their logs, then run again to resume"
                 ) from error
-            raise WorkerDied(
+            raise WorkerDiedError(
                 "the worker crashed on every attempt: it may have too little memory for this "
                 "shot, or its machine may have gone down"
             ) from error
@@ -150,8 +150,8 @@ class _Cluster:
         )
 
     @contextmanager
-    def _connected_or_lost(self) -> Iterator[None]:
-        """Turn all the ways in which dask says that the scheduler is gone into one."""
+    def _as_engine_error(self) -> Iterator[None]:
+        """Convert all of dask's errors of a lost scheduler to an `EngineError`."""
         from distributed import CancelledError as Cancelled
         from distributed.comm.core import CommClosedError
 
@@ -164,7 +164,7 @@ class _Cluster:
 Engine = _Threads | _Cluster
 
 
-def _same(value: Any) -> Any:
+def _identity_task(value: Any) -> Any:
     return value
 
 
@@ -172,10 +172,10 @@ def _same(value: Any) -> Any:
 def engine_for(
     scheduler: Any = None, workers: int | None = None, should_stop: ShouldStop | None = None
 ) -> Iterator[Engine]:
-    """Make or find an engine; what was made here is taken down at the end."""
+    """Start or find an engine; an engine that was started here is closed at the end."""
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}: expected 1 or more")
-    scheduler = _chosen(scheduler)
+    scheduler = _resolve_scheduler(scheduler)
     count = workers or available_threads(None)
     if scheduler in ("threads", "synchronous"):
         yield from _threads(1 if scheduler == "synchronous" else count)
@@ -207,14 +207,14 @@ def _quiet_dask() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def is_here(scheduler: Any) -> bool:
-    """Whether `engine_for` makes an engine on this machine of this."""
-    chosen = _chosen(scheduler)
+def is_local(scheduler: Any) -> bool:
+    """Return whether `engine_for` starts an engine on this machine."""
+    chosen = _resolve_scheduler(scheduler)
     return isinstance(chosen, str) and chosen in ("threads", "synchronous", "processes")
 
 
-def _chosen(scheduler: Any) -> Any:
-    """What is meant: by default dask's current client, else threads."""
+def _resolve_scheduler(scheduler: Any) -> Any:
+    """Return the scheduler; by default dask's current client, else threads."""
     if scheduler is None and "distributed" in sys.modules:
         distributed: Any = sys.modules["distributed"]
         with suppress(ValueError):
@@ -249,14 +249,14 @@ def _processes(count: int) -> Iterator[Engine]:
 
 
 def _last_cause(error: BaseException) -> str:
-    """What dask wraps in what it says itself."""
+    """Return the original error that dask has wrapped."""
     while error.__cause__ is not None:
         error = error.__cause__
     return str(error).rstrip(".") or type(error).__name__
 
 
 def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:
-    """Connect in a thread: only so can the wait for a scheduler that is not there be ended."""
+    """Connect in a thread, so that the wait for a missing scheduler can be cancelled."""
     distributed: Any = import_module("distributed")
     if isinstance(scheduler, str) and scheduler.startswith("tls://"):
         keys = distributed.Security().get_connection_args("client")
@@ -270,7 +270,7 @@ def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:
     def connect() -> None:
         try:
             answer.set_result(
-                distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+                distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
             )
         except BaseException as error:
             answer.set_exception(error)
@@ -281,7 +281,7 @@ def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:
 
     threading.Thread(target=connect, name="connect", daemon=True).start()
     try:
-        while not wait([answer], timeout=_POLL).done:
+        while not wait([answer], timeout=_POLL_S).done:
             if should_stop is not None and should_stop():
                 raise InversionCancelled("stopped on request; run again to resume")
     except BaseException:

@@ -1,4 +1,4 @@
-"""What a worker does with a shot that is fitted: `FitWork`."""
+"""Task of a worker for a shot to fit: `FitWork`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 @dataclass(frozen=True, eq=False)
 class FitWork:
-    """What is done with every shot of a stack that is fitted."""
+    """Task of every shot of a stack to fit."""
 
     recipe: Recipe
     shape: tuple[int, int]  # of the fields
@@ -41,29 +41,29 @@ class FitWork:
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Fit:
-        """Fit a shot: an image as recorded, or several of one object; none starts from another."""
+        """Fit a shot: an image as recorded, or several of one object; `start` is ignored."""
         if isinstance(content, tuple):
             shots: Sequence[FitShot] = content
         else:
             image = Radiograph(np.asarray(content, dtype=np.float64))
             shots = [FitShot(image, self.recipe.setup)]
         common = beam.source if source is None and beam is not None else source
-        completed = [self._completed(one, common) for one in shots]
-        found = run_fit(self._recipe, completed, should_stop=should_stop)
-        shape = found.fields[0].potential.shape
+        completed = [self._completed(shot, common) for shot in shots]
+        fit = run_fit(self._recipe, completed, should_stop=should_stop)
+        shape = fit.fields[0].potential.shape
         if shape != self.shape:
             raise InputError(f"the field has shape {shape}, expected {self.shape} as the others")
-        setup = found.setups[0] if found.setups else None
+        setup = fit.setups[0] if fit.setups else None
         if setup != self.setup:
             raise InputError(
                 "the setup of its first image differs from that of the other shots' first images, "
                 "and a store has one: write these shots into another store"
             )
-        return found
+        return fit
 
     @property
     def _recipe(self) -> Recipe:
-        """The recipe for a worker: shots that are fitted at once share the cores."""
+        """The recipe for a worker; simultaneous fits share the cores."""
         choices = self.recipe.fit or FitChoices()
         options = choices.options
         if options.threads is None:
@@ -72,32 +72,34 @@ class FitWork:
         return self.recipe.model_copy(update={"fit": alone, "setup": None})
 
     def _completed(self, shot: FitShot, source: AnyArray | None) -> FitShot:
-        """An image with the source and the masks of the stack, where it has none of its own."""
-        own = {
+        """Complete an image with source and masks of the stack."""
+        completed = {
             "source": shot.source if shot.source is not None else source,
             "mask": self.mask if shot.mask is None else shot.mask,
             "source_mask": self.source_mask if shot.source_mask is None else shot.source_mask,
         }
-        return dataclasses.replace(shot, **own)  # type: ignore[arg-type]
+        return dataclasses.replace(shot, **completed)  # type: ignore[arg-type]
 
     def arrays(self, fit: Fit) -> dict[str, AnyArray]:
         """Return the variables by name, fields in SI units among them."""
         (field,) = fit.fields
-        found = {
+        planes = {
             "potential": field.potential,
             "displacement": field.displacement,
             "displacement_uncertainty": field.uncertainty,
         }
-        arrays: dict[str, Any] = {name: one for name, one in found.items() if one is not None}
-        if set(self.variables) - found.keys():
+        arrays: dict[str, Any] = {
+            name: plane for name, plane in planes.items() if plane is not None
+        }
+        if set(self.variables) - planes.keys():
             in_si = dataset_from_field(field.displacement, field.potential, self.setup)
             arrays |= {str(name): in_si[name].values for name in in_si.data_vars}
         return {name: arrays[name] for name in self.variables if name in arrays}
 
     def report(self, fit: Fit) -> dict[str, Any]:
-        """Return what is told of a shot."""
+        """Return the report of a shot."""
         report, doubt = dataclasses.asdict(fit.report), fit.verdict_caution
-        told = {
+        entries = {
             "verdict": str(fit.verdict),
             "explanation": fit.explanation,
             "chi2": float(fit.chi2.max()),
@@ -112,11 +114,11 @@ class FitWork:
             "warnings": [] if doubt is None else [dataclasses.asdict(doubt)],
         }
         if np.isfinite(fit.report.uncertainty):
-            told["uncertainty"] = fit.report.uncertainty
-        made = fit.provenance
-        if made is not None and any(one.image.file for one in made.images):
-            told["images"] = [
-                one.model_dump(mode="json", exclude_none=True, exclude={"mask", "source_mask"})
-                for one in made.images
+            entries["uncertainty"] = fit.report.uncertainty
+        provenance = fit.provenance
+        if provenance is not None and any(image.image.file for image in provenance.images):
+            entries["images"] = [
+                image.model_dump(mode="json", exclude_none=True, exclude={"mask", "source_mask"})
+                for image in provenance.images
             ]
-        return told
+        return entries

@@ -1,6 +1,6 @@
-"""Files that arrive in a folder: `Arrivals` hands out each once it is completely written.
+"""Files that arrive in a folder: `Arrivals` returns each once it is completely written.
 
-`observing` asks the system to tell of changes, or looks itself where the system cannot tell.
+`observing` subscribes to file-system events, or polls the folder where there are none.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
 from napari_shadowinv.stack._sources import stamp
 
-_LOOK_EVERY = 1.0  # seconds between two looks at a folder of which the system tells nothing
-_CHECK_EVERY = 1.0  # seconds between two looks whether the folder is still there
-# File systems on which files may be written elsewhere, of which this system hears nothing.
-_SHARES = {
+_POLL_S = 1.0  # between two looks at a folder without file-system events
+_FOLDER_CHECK_S = 1.0  # between two checks that the folder still exists
+# File systems on which other machines may write files without events on this one.
+_NETWORK_FILE_SYSTEMS = {
     *("9p", "afs", "beegfs", "ceph", "cifs", "drvfs", "fuse.glusterfs", "fuse.sshfs", "gpfs"),
     *("lustre", "nfs", "nfs4", "prl_fs", "smb3", "smbfs", "vboxsf"),
 }
@@ -51,9 +51,9 @@ def checked_folder(folder: str | Path, pattern: str) -> Path:
 class Arrivals:
     """Names of complete files, in order of arrival; only names are kept.
 
-    A file is complete once it was closed after writing, or moved here. Where the system does not
-    tell that, and of files of which nothing was heard, once it has not changed for `settle`
-    seconds. It is handed out again when it has been written to again.
+    A file is complete once it was closed after writing, or moved here. Without such events it is
+    complete once it has not changed for `settle` seconds. It is returned again after it has been
+    written to again.
     """
 
     def __init__(
@@ -64,44 +64,44 @@ class Arrivals:
         self._changed = threading.Condition()
         self._ready: dict[str, None] = {}  # in order
         self._settling: dict[str, tuple[Stamp, float]] = {}  # as last seen, and since when
-        self._tells_closing = False
-        self._same = _identity(folder)
+        self._reports_closing = False
+        self._folder_id = _identity(folder)
         self._gone = self._woken = False
-        self._checked = self.heard = time.monotonic()  # `heard`: the last sign of a file
+        self._checked = self.last_event = time.monotonic()  # `last_event`: of any file
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no file waits, or may soon be complete."""
+        """Whether no file is waiting or being written."""
         return not (self._ready or self._settling)
 
     @property
     def waiting(self) -> int:
-        """How many files are complete and were not handed out yet."""
+        """Number of complete files that were not returned yet."""
         return len(self._ready)
 
-    def open(self, *, tells_closing: bool) -> None:
-        """Take in what is there, once the folder is observed."""
-        self._tells_closing = tells_closing
+    def open(self, *, reports_closing: bool) -> None:
+        """Add the existing files, once the folder is observed."""
+        self._reports_closing = reports_closing
         try:
             with os.scandir(self.folder) as entries:
-                there = [Path(entry.name) for entry in entries if self._matches(entry.name)]
+                names = [Path(entry.name) for entry in entries if self._matches(entry.name)]
         except OSError as error:
-            raise self._lost(error) from None
+            raise self._folder_error(error) from None
         now = time.time()
-        for name in map(str, in_counting_order(there)) if self._existing else ():
-            seen = self._stamp(name)
-            if seen is None:
+        for name in map(str, in_counting_order(names)) if self._existing else ():
+            stamp_now = self._stamp(name)
+            if stamp_now is None:
                 continue
-            age = now - seen["mtime_ns"] / 1e9
+            age = now - stamp_now["mtime_ns"] / 1e9
             with self._changed:
-                # Who is writing it right now began before anyone listened.
-                if tells_closing and age > self._settle:
+                # A recent file may still be written, and its events began before the observer.
+                if reports_closing and age > self._settle:
                     self._ready.setdefault(name)
                 elif name not in self._ready:
-                    self._settling[name] = (seen, time.monotonic())
+                    self._settling[name] = (stamp_now, time.monotonic())
 
-    def take(self, timeout: float) -> str | None:
-        """Return the name of the next complete file; None without one for so long, or if woken."""
+    def next_name(self, timeout: float) -> str | None:
+        """Return the name of the next complete file; None after the timeout, or if woken."""
         end = time.monotonic() + timeout
         with self._changed:
             while True:
@@ -114,10 +114,10 @@ class Arrivals:
                     name = next(iter(self._ready))
                     del self._ready[name]
                     return name
-                left = min(end, due) - time.monotonic()
+                remaining = min(end, due) - time.monotonic()
                 if time.monotonic() >= end:
                     return None
-                self._changed.wait(max(left, 0.0))
+                self._changed.wait(max(remaining, 0.0))
 
     def wake(self) -> None:
         """End the wait for a file, or the next one."""
@@ -126,27 +126,27 @@ class Arrivals:
             self._changed.notify_all()
 
     def peek(self, count: int) -> list[str]:
-        """Return the names of the first files that wait, without handing them out."""
+        """Return the names of the first waiting files, and keep them."""
         with self._changed:
             return list(self._ready)[:count]
 
     def put_back(self, name: str) -> None:
-        """Wait for a file again that changed while it was read."""
+        """Wait again for a file that changed while it was read."""
         with self._changed:
             self._settle_later(name)
 
     def check(self) -> None:
-        """Raise an error if the folder is no longer there."""
+        """Raise an error if the folder no longer exists."""
         with self._changed:
             self._checked = -1.0
             self._check()
 
-    # What the observer calls, in its own thread
+    # Called by the observer, in its own thread
 
     def dispatch(self, event: Any) -> None:
-        """Take one event of `watchdog`."""
+        """Handle one event of `watchdog`."""
         kind = event.event_type
-        source, target = (os.fsdecode(one or "") for one in (event.src_path, event.dest_path))
+        source, target = (os.fsdecode(path or "") for path in (event.src_path, event.dest_path))
         with self._changed:
             if kind in ("deleted", "moved") and Path(source) == self.folder:
                 self._gone = True
@@ -154,35 +154,35 @@ class Arrivals:
             elif event.is_directory:
                 return
             elif kind == "moved":
-                self._forget(source)
-                self._on_name(target, self._complete)
+                self._drop(source)
+                self._on_name(target, self._on_complete)
             elif kind == "deleted":
-                self._forget(source)
+                self._drop(source)
             elif kind == "closed":
-                self._on_name(source, self._complete)
+                self._on_name(source, self._on_complete)
             elif kind in ("created", "modified"):
-                self._on_name(source, self._being_written)
+                self._on_name(source, self._on_writing)
 
-    def _on_name(self, path: str, what: Callable[[str], None]) -> None:
+    def _on_name(self, path: str, handle: Callable[[str], None]) -> None:
         folder, name = os.path.split(path)
         if Path(folder) == self.folder and self._matches(name):
-            self.heard = time.monotonic()
-            what(name)
+            self.last_event = time.monotonic()
+            handle(name)
             self._changed.notify_all()
 
-    def _complete(self, name: str) -> None:
+    def _on_complete(self, name: str) -> None:
         self._settling.pop(name, None)
         if self._stamp(name) is not None:
             self._ready.setdefault(name)
 
-    def _being_written(self, name: str) -> None:
+    def _on_writing(self, name: str) -> None:
         self._ready.pop(name, None)
         self._settling.pop(name, None)
-        # Nobody will close what was only linked here.
-        if not self._tells_closing or _is_link(self.folder / name):
+        # A file that was linked here is never closed.
+        if not self._reports_closing or _is_link(self.folder / name):
             self._settle_later(name)
 
-    def _forget(self, path: str) -> None:
+    def _drop(self, path: str) -> None:
         name = os.path.basename(path)
         self._ready.pop(name, None)
         self._settling.pop(name, None)
@@ -190,25 +190,25 @@ class Arrivals:
     # With the lock held
 
     def _settle_later(self, name: str) -> None:
-        seen = self._stamp(name)
-        if seen is not None:
-            self._settling[name] = (seen, time.monotonic())
+        stamp_now = self._stamp(name)
+        if stamp_now is not None:
+            self._settling[name] = (stamp_now, time.monotonic())
 
     def _settle_some(self) -> float:
-        """Let files that have not changed for long enough be complete; return when to look next."""
+        """Complete files that have not changed for long enough; return the next time to check."""
         now = time.monotonic()
-        due = now + _CHECK_EVERY
-        for name, (seen, since) in list(self._settling.items()):
+        due = now + _FOLDER_CHECK_S
+        for name, (earlier, since) in list(self._settling.items()):
             if now < since + self._settle:
                 due = min(due, since + self._settle)
                 continue
             del self._settling[name]
-            found = self._stamp(name)
-            if found == seen:
+            stamp_now = self._stamp(name)
+            if stamp_now == earlier:
                 self._ready.setdefault(name)
-            elif found is not None:
-                self.heard = now
-                self._settling[name] = (found, now)
+            elif stamp_now is not None:
+                self.last_event = now
+                self._settling[name] = (stamp_now, now)
                 due = min(due, now + self._settle)
         return due
 
@@ -216,7 +216,7 @@ class Arrivals:
         return not name.startswith(".") and fnmatch.fnmatch(name, self._pattern)
 
     def _stamp(self, name: str) -> Stamp | None:
-        """Size and time of a file; None of what is no file, or has gone."""
+        """Return size and time of a file; None if it is no file, or was removed."""
         path = self.folder / name
         with suppress(OSError):
             return stamp(path) if stat.S_ISREG(path.stat().st_mode) else None
@@ -224,17 +224,17 @@ class Arrivals:
 
     def _check(self) -> None:
         now = time.monotonic()
-        if now < self._checked + _CHECK_EVERY and not self._gone:
+        if now < self._checked + _FOLDER_CHECK_S and not self._gone:
             return
         self._checked = now
         try:
-            if self._gone or _identity(self.folder) != self._same:
+            if self._gone or _identity(self.folder) != self._folder_id:
                 raise FileNotFoundError(2, "it was removed, or moved")
             os.scandir(self.folder).close()
         except OSError as error:
-            raise self._lost(error) from None
+            raise self._folder_error(error) from None
 
-    def _lost(self, error: OSError) -> FileFormatError:
+    def _folder_error(self, error: OSError) -> FileFormatError:
         return FileFormatError(
             f"the folder {self.folder} can no longer be read ({error.strerror}): bring it back, "
             "then watch again to go on"
@@ -242,8 +242,8 @@ class Arrivals:
 
 
 def _identity(folder: Path) -> tuple[int, int]:
-    found = folder.stat()
-    return found.st_dev, found.st_ino
+    status = folder.stat()
+    return status.st_dev, status.st_ino
 
 
 def _is_link(path: Path) -> bool:
@@ -256,84 +256,84 @@ def _is_link(path: Path) -> bool:
 def observing(
     arrivals: Arrivals, *, polling: bool, on_note: Callable[[str], None]
 ) -> Iterator[None]:
-    """Let a folder's changes be told to `arrivals` in a block, and take in what is there."""
+    """Report a folder's changes to `arrivals` within a block, starting with existing files."""
     arrivals.check()
-    share = _share_of(arrivals.folder)
+    share = _network_file_system(arrivals.folder)
     if share and not polling:
         on_note(
-            f"{arrivals.folder} is on a network file system ({share}), which does not tell of "
-            "new files: it is looked at every second"
+            f"{arrivals.folder} is on a network file system ({share}) without events for "
+            "new files: it is polled once a second"
         )
-    observer, tells_closing = None, False
+    observer, reports_closing = None, False
     if not (share or polling):
         try:
-            observer, tells_closing = _started(arrivals)
+            observer, reports_closing = _start_observer(arrivals)
         except OSError as error:
             on_note(
-                f"the system does not watch another folder ({error.strerror or error}): "
-                f"{arrivals.folder} is looked at every second"
+                f"the system cannot watch another folder ({error.strerror or error}): "
+                f"{arrivals.folder} is polled once a second"
             )
     if observer is None:
-        observer = _polling(arrivals)
+        observer = _start_polling(arrivals)
     try:
-        arrivals.open(tells_closing=tells_closing)
+        arrivals.open(reports_closing=reports_closing)
         yield
     finally:
-        _end(observer)
+        _stop_observer(observer)
 
 
-def _started(arrivals: Arrivals) -> tuple[Any, bool]:
-    """An observer that the system tells of changes, and whether it tells of files closed."""
+def _start_observer(arrivals: Arrivals) -> tuple[Any, bool]:
+    """Start an observer of file-system events; return it and whether it reports closing."""
     from watchdog.observers import Observer
 
-    made: Any = Observer
-    tells_closing = made.__module__.endswith("inotify")
-    # In full, what is moved here from elsewhere differs from what is only created.
-    observer = made(generate_full_events=True) if tells_closing else made()
-    return _scheduled(observer, arrivals), tells_closing
+    observer_class: Any = Observer
+    reports_closing = observer_class.__module__.endswith("inotify")
+    # With full events, a file moved here from elsewhere differs from a created one.
+    observer = observer_class(generate_full_events=True) if reports_closing else observer_class()
+    return _schedule(observer, arrivals), reports_closing
 
 
-def _polling(arrivals: Arrivals) -> Any:
+def _start_polling(arrivals: Arrivals) -> Any:
     from watchdog.observers.polling import PollingObserver
 
-    return _scheduled(PollingObserver(timeout=_LOOK_EVERY), arrivals)
+    return _schedule(PollingObserver(timeout=_POLL_S), arrivals)
 
 
-def _scheduled(observer: Any, arrivals: Arrivals) -> Any:
+def _schedule(observer: Any, arrivals: Arrivals) -> Any:
     from watchdog import events
 
-    # Not of files opened and closed by those who only read, such as this process.
-    wanted = [
+    # No events of files opened and closed for reading, such as by this process.
+    event_types = [
         *(events.FileCreatedEvent, events.FileModifiedEvent, events.FileClosedEvent),
         *(events.FileMovedEvent, events.FileDeletedEvent),
         *(events.DirDeletedEvent, events.DirMovedEvent),
     ]
     try:
-        observer.schedule(arrivals, str(arrivals.folder), event_filter=wanted)
+        observer.schedule(arrivals, str(arrivals.folder), event_filter=event_types)
         observer.start()
     except BaseException:
-        _end(observer)
+        _stop_observer(observer)
         raise
     return observer
 
 
-def _end(observer: Any) -> None:
+def _stop_observer(observer: Any) -> None:
     observer.stop()
     if observer.is_alive():
         observer.join()
 
 
-def _share_of(folder: Path) -> str:
-    """The kind of network file system on which a folder lies; empty if on none that is known."""
+def _network_file_system(folder: Path) -> str:
+    """Return the kind of network file system of a folder; empty if it is not a known one."""
     try:
         lines = Path("/proc/self/mounts").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return ""
     best, kind = "", ""
     place = str(resolved_path(folder))
-    for _, point, found, *_ in (line.split() for line in lines if line.count(" ") >= 3):
+    for _, point, file_system, *_ in (line.split() for line in lines if line.count(" ") >= 3):
         mount = point.replace("\\040", " ")
         inside = place == mount or place.startswith(mount.rstrip("/") + "/")
         if inside and len(mount) >= len(best):
-            best, kind = mount, found
-    return kind if kind in _SHARES else ""
+            best, kind = mount, file_system
+    return kind if kind in _NETWORK_FILE_SYSTEMS else ""

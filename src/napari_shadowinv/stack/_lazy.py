@@ -1,4 +1,4 @@
-"""A stack as a lazy dataset: one dask task inverts one shot, when it is needed."""
+"""A stack as a lazy dataset: one dask task inverts one shot, on demand."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Step
 
-# One number for each shot, beside the arrays of an inversion.
-_NUMBERS = {name: kind for name, (kind, _) in SUMMARY.items() if name != "seconds"}
+# Scalar results of each shot.
+_SUMMARY_TYPES = {name: kind for name, (kind, _) in SUMMARY.items() if name != "seconds"}
 
 
 def invert_stack(
@@ -47,7 +47,7 @@ def invert_stack(
     warm_start: int = 1,
     variables: Collection[str] | None = None,
 ) -> xarray.Dataset:
-    """Describe the inversion of many shots; dask does the work where and when it is asked for.
+    """Describe the inversion of many shots, which dask computes on demand.
 
     The values do not depend on scheduler, chunks, order or number of workers.
 
@@ -60,45 +60,45 @@ def invert_stack(
         gain, mask and source. Files are read by the tasks that invert them.
     source : array (y, x), path, Estimate, or as `shots`, optional
         The undisturbed beam, one for all shots or one for each, or an estimate of
-        `napari_shadowinv.preprocessing` by which it is estimated from each shot. Default: uniform,
-        and then intensities in the result are relative to each shot's mean.
+        `napari_shadowinv.preprocessing` from each shot. Default: uniform, with intensities in the
+        result relative to each shot's mean.
     mask : array_like of bool, shape (H, W), optional
         The pixels that can be used in all shots; see `napari_shadowinv.invert`.
     options : InversionOptions, optional
-        Choices. Without `threads`, all shots that are inverted at once share the cores.
+        Choices. Without `threads`, shots that are inverted simultaneously share the cores.
     setup : Setup, optional
         Adds fields in SI units.
     recipe : Recipe, optional
-        Everything that is done to each shot, in place of `options`, `setup` and `filters`.
+        Recipe of each shot, instead of `options`, `setup` and `filters`.
     filters : sequence of Step, optional
-        Steps for each shot and a measured source; what flattens the image takes no such source.
+        Steps for each shot and a measured source; steps that flatten the image exclude a source.
     source_mask : array_like of bool, shape (H, W), optional
-        Pixels where the object never is; an estimate of the source looks at no others.
+        Pixels without the object; an estimate of the source uses only these.
     variables : collection of str, optional
-        Which of a result's variables to make. Default: all.
+        Variables to compute. Default: all.
     reader : callable, optional
-        Makes an image of a path; one with a keyword ``page`` reads TIFFs with many pages, too.
+        Returns the image of a path; with a keyword ``page`` it also reads multi-page TIFFs.
         `functools.partial(read_shot, channel="red")` reads one channel of colour images.
     warm_start : int, optional
-        Initialise from the previous shot, in groups of this many, one after the other:
-        for alike shots that share their source. The answers agree within the tolerance.
+        Size of groups in which each shot is initialised from the previous one, for similar shots
+        with a common source. Results agree within the tolerance.
 
     Returns
     -------
     xarray.Dataset
         The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
         chunk, and ``converged``, ``flux_residual``, ``image_residual``, ``noise_error``,
-        ``discretisation_error`` and ``iterations``; nothing is computed yet, but for the first
-        shots where they decide how many sites all need for the accuracy. Sites have no dimension
-        ``shot`` where all shots share a source, and are left out where their number differs: with
-        a source for each shot and a free boundary or no given number, or with own masks. Of a
-        table, ``setup`` has that of each shot as JSON.
+        ``discretisation_error`` and ``iterations``. Nothing is computed yet, except the first
+        shots if they decide the number of sites for the accuracy. Sites have no dimension
+        ``shot`` if all shots share a source. They are omitted if their number differs: with
+        a source for each shot and a free boundary or an automatic number of sites, or with
+        different masks. For a table, ``setup`` contains the setup of each shot as JSON.
 
     Raises
     ------
     InputError
         If there are no shots, or source, mask and shots do not fit together. A shot that cannot
-        be inverted raises it when it is computed; `run_stack` goes on without it.
+        be inverted raises it when it is computed; `run_stack` continues without it.
     FileFormatError
         If the source, or all of the first shots, cannot be read.
 
@@ -143,7 +143,7 @@ def _invert(
     previous: dict[str, Any] | None = None,
     keep: bool = False,
 ) -> dict[str, Any]:
-    """Task of one shot: its variables by name, and if the next shot starts there the inversion."""
+    """Invert one shot; return its variables, and the inversion if the next shot starts from it."""
     try:
         image = shot[0] if isinstance(shot, np.ndarray) else shot.load()[0]
         start = None if previous is None else previous["inversion"]
@@ -155,7 +155,7 @@ def _invert(
         raise InputError(f"{label}: {error}") from error
     return {
         **work.arrays(inversion),
-        **{name: _NUMBERS[name](value) for name, value in numbers_of(inversion).items()},
+        **{name: _SUMMARY_TYPES[name](value) for name, value in numbers_of(inversion).items()},
         **({"inversion": inversion} if keep else {}),
     }
 
@@ -166,7 +166,7 @@ def _pick(record: dict[str, Any], name: str, with_shot: bool) -> AnyArray:
 
 
 class _Graph:
-    """The tasks of a stack: one for each shot, one that takes each variable out of it."""
+    """Tasks of a stack: one for each shot, and one for each of its variables."""
 
     def __init__(self, stack: Stack) -> None:
         from dask.base import tokenize
@@ -220,22 +220,22 @@ class _Graph:
             if name not in stack.variables:
                 continue
             if stack.is_shared(name):
-                variables[name] = (dims, self._shared(name, dims), labels)
+                variables[name] = (dims, self._shared_array(name, dims), labels)
             else:
-                variables[name] = (("shot", *dims), self._of_each(name, dims), labels)
+                variables[name] = (("shot", *dims), self._per_shot_array(name, dims), labels)
         setups = stack.setups
         if setups is not None:
             da: Any = import_module("dask.array")
             variables["setup"] = (("shot",), da.from_array(np.array(setups, "O"), 1), SETUPS_LABEL)
-        for name in _NUMBERS:
+        for name in _SUMMARY_TYPES:
             dtype, labels = SUMMARY[name]
-            variables[name] = (("shot",), self._of_each(name, (), dtype), labels)
+            variables[name] = (("shot",), self._per_shot_array(name, (), dtype), labels)
         dataset = xr.Dataset(
             variables, coords=_plan.coordinates_of(stack), attrs=_plan.attributes_of(stack)
         )
         return dataset if setups is None else with_places(dataset)
 
-    def _of_each(self, name: str, dims: tuple[str, ...], dtype: Any = None) -> Any:
+    def _per_shot_array(self, name: str, dims: tuple[str, ...], dtype: Any = None) -> Any:
         from dask.highlevelgraph import HighLevelGraph
 
         sizes = self._stack.sizes
@@ -253,7 +253,7 @@ class _Graph:
         chunks = ((1,) * sizes["shot"], *((sizes[dim],) for dim in dims))
         return da.Array(graph, layer, chunks, dtype=dtype or _plan.dtype_of(name))
 
-    def _shared(self, name: str, dims: tuple[str, ...]) -> Any:
+    def _shared_array(self, name: str, dims: tuple[str, ...]) -> Any:
         from dask.delayed import delayed
 
         beam = delayed(_plan.values_of_beam, pure=True)(self._beam, self._stack.recipe.options)

@@ -1,7 +1,7 @@
 """Worker processes on this machine: `local_client` starts some, connected.
 
-Anyone who can talk to a dask scheduler or worker can have it run any code. So these talk among
-themselves only: encrypted, with a key that is made for the run and exists nowhere but in them.
+Anyone who can connect to a dask scheduler or worker can make it run any code. So these processes
+accept only each other: connections are encrypted with a key that exists only for the run.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ def local_client(count: int) -> Iterator[Any]:
     dask: Any = import_module("dask")
     with ExitStack() as opened:
         environment = dask.config.get(_ENVIRONMENT)
-        opened.enter_context(dask.config.set(_settings(environment)))
-        opened.enter_context(_forgotten(_TRIMMING, environment.get(_TRIMMING)))
+        opened.enter_context(dask.config.set(_dask_settings(environment)))
+        opened.enter_context(_without_variable(_TRIMMING, environment.get(_TRIMMING)))
         # Data spilled to disk when memory is short could be exchanged for code.
-        own = str(opened.enter_context(temporary_folder("shadowinv")))
-        opened.enter_context(dask.config.set({"temporary-directory": own}))
-        # A cluster that is half made cannot be closed.
+        spill_folder = str(opened.enter_context(temporary_folder("shadowinv")))
+        opened.enter_context(dask.config.set({"temporary-directory": spill_folder}))
+        # A partly started cluster cannot be closed.
         with interrupts_put_off(), _hidden_from_workers():
             cluster = distributed.LocalCluster(
                 n_workers=count,
@@ -45,7 +45,7 @@ def local_client(count: int) -> Iterator[Any]:
                 security=distributed.Security.temporary(),
                 dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
-                local_directory=own,
+                local_directory=spill_folder,
                 # Workers that die are reported by the shots they were working on.
                 silence_logs=logging.CRITICAL,
                 preload=[__name__],
@@ -55,36 +55,35 @@ def local_client(count: int) -> Iterator[Any]:
         yield client
 
 
-def _settings(environment: dict[str, Any]) -> dict[str, Any]:
-    """What differs from dask's own settings."""
+def _dask_settings(environment: dict[str, Any]) -> dict[str, Any]:
+    """Return the changes to dask's configuration."""
     return {
-        # They tell all the machine what is at work, to nobody's use.
+        # They show the work to all users of the machine, and nobody needs them.
         "distributed.scheduler.http.routes": [],
         "distributed.worker.http.routes": [],
-        # Its records grow by megabytes a minute, and nobody would look at them.
+        # Its records grow by megabytes a minute, and nobody needs them.
         "distributed.worker.profile.enabled": False,
-        # Dask looks at itself fifty times a second in each process, and writes down what it sees:
-        # a twentieth of two cores.
+        # Dask monitors each process fifty times a second, which takes a twentieth of two cores.
         "distributed.admin.tick.interval": "500ms",
         "distributed.admin.system-monitor.interval": "5s",
         "distributed.worker.memory.monitor-interval": "500ms",
-        # Dask has every array given back to the system at once. One of the same size is wanted
-        # in the next moment: that takes an eighth of the time of a shot.
+        # Dask returns the memory of each array to the system at once, although the next array
+        # has the same size: that takes an eighth of the time of a shot.
         _ENVIRONMENT: {name: value for name, value in environment.items() if name != _TRIMMING},
     }
 
 
 @contextmanager
-def _forgotten(name: str, value: Any) -> Iterator[None]:
-    """Take a variable out of the environment if an earlier cluster has left it there."""
+def _without_variable(name: str, value: Any) -> Iterator[None]:
+    """Remove a variable from the environment if an earlier cluster has left it there."""
     if os.environ.get(name) != str(value):
         yield
         return
-    kept = os.environ.pop(name)
+    value_before = os.environ.pop(name)
     try:
         yield
     finally:
-        os.environ.setdefault(name, kept)
+        os.environ.setdefault(name, value_before)
 
 
 @contextmanager
@@ -93,7 +92,7 @@ def _hidden_from_workers() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    # They inherit the mask. Whatever starts the first process of all lifts it: let it be now.
+    # They inherit the mask. Starting the very first process unblocks it, so that happens here.
     resource_tracker.ensure_running()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -1,4 +1,4 @@
-"""What is known about a stack before any shot is inverted: `describe_stack` gives a `Stack`."""
+"""Description of a stack before any shot is inverted: `describe_stack` returns a `Stack`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from napari_shadowinv.inversion.normalise import checked_mask, checked_source
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.options import FitChoices, InversionOptions
-from napari_shadowinv.pipeline import Inputs, gathered
+from napari_shadowinv.pipeline import Inputs, collect_inputs
 from napari_shadowinv.pipeline._fit import check_fit
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
 from napari_shadowinv.preprocessing import (
@@ -42,21 +42,21 @@ from napari_shadowinv.stack._discovery import Shots, find_shots, find_source, us
 from napari_shadowinv.stack._shots import FitStack, Stack, TableStack
 from napari_shadowinv.stack._sources import (
     Reader,
-    described_reader,
     read_shot,
+    reader_text,
 )
 from napari_shadowinv.stack._table_shots import (
     RowShot,
     first_image,
+    object_shots,
     row_shots,
-    shots_of_table,
 )
 from napari_shadowinv.stack._worker import Beam, shared_plan, threads_here
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
-# What is stored of an inversion, and of a fit, unless it is said.
+# Variables that are stored of an inversion, and of a fit, by default.
 STORED = ("potential", "displacement", "caustic")
 FITTED = ("potential", "displacement", "displacement_uncertainty")
 
@@ -75,32 +75,38 @@ def describe_stack(
     reader: Reader,
     warm_start: int,
 ) -> Stack:
-    """Check everything that can be checked before a shot is read."""
+    """Describe a stack, and check everything that can be checked before a shot is read."""
     if warm_start < 1:
         raise InputError(
             f"warm_start is {warm_start}: expected a number of shots, or 1 to disable it"
         )
-    wanted = _recipe(recipe, options, setup, filters)
+    resolved = _recipe(recipe, options, setup, filters)
     if isinstance(source, Estimate):
-        wanted = wanted.model_copy(update={"source": source})
+        resolved = resolved.model_copy(update={"source": source})
         source = None
-    found, inputs, sources = _described(shots, wanted, source, mask, source_mask, reader)
-    own = sources if isinstance(sources, Shots) else None
-    if own is not None and isinstance(shots, Shots):
+    stack_shots, inputs, sources = _describe_inputs(
+        shots, resolved, source, mask, source_mask, reader
+    )
+    shot_sources = sources if isinstance(sources, Shots) else None
+    if shot_sources is not None and isinstance(shots, Shots):
         raise InputError(
-            f"got {len(own)} sources, and the shots are still to arrive: expected one for all"
+            f"got {len(shot_sources)} sources, and the shots are still to arrive: expected one for "
+            "all"
         )
-    if own is not None and len(own) != len(found):
+    if shot_sources is not None and len(shot_sources) != len(stack_shots):
         raise InputError(
-            f"got {len(own)} sources for {len(found)} shots: expected one, or one for each shot"
+            f"got {len(shot_sources)} sources for {len(stack_shots)} shots: expected one, or one "
+            "for each shot"
         )
-    named = described_reader(reader)
-    if wanted.fit is not None:
-        return _fit_stack(found, inputs, sources, wanted, variables, warm_start, named)
-    rows = [shot.row for shot in found.items if isinstance(shot, RowShot)]
+    reader_name = reader_text(reader)
+    if resolved.fit is not None:
+        return _fit_stack(
+            stack_shots, inputs, sources, resolved, variables, warm_start, reader_name
+        )
+    rows = [shot.row for shot in stack_shots.items if isinstance(shot, RowShot)]
     own_masks = any(row.mask is not None for row in rows)
-    alone = own_masks or any(row.source is not None for row in rows)
-    beam = None if alone else _shared_beam(inputs, sources)
+    per_shot = own_masks or any(row.source is not None for row in rows)
+    beam = None if per_shot else _shared_beam(inputs, sources)
     if beam is None and warm_start > 1:
         raise InputError(
             f"warm_start is {warm_start} and each shot has its own source or mask: the previous "
@@ -111,24 +117,34 @@ def describe_stack(
     ragged = own_masks or (beam is None and (options.boundary == "free" or options.is_adaptive))
     chosen = _checked_variables(variables, inputs.recipe, ragged=ragged)
     if not rows:
-        return Stack(found, inputs, beam, own, chosen, warm_start, named)
-    common = None if sources is None or own is not None else np.asarray(sources, np.float64)
-    guess = wanted.estimate
+        return Stack(stack_shots, inputs, beam, shot_sources, chosen, warm_start, reader_name)
+    common = (
+        None if sources is None or shot_sources is not None else np.asarray(sources, np.float64)
+    )
+    guess = resolved.estimate
     return TableStack(
-        found, inputs, beam, own, chosen, warm_start, named, common=common, estimate=guess
+        stack_shots,
+        inputs,
+        beam,
+        shot_sources,
+        chosen,
+        warm_start,
+        reader_name,
+        common=common,
+        estimate=guess,
     )
 
 
-def _described(
+def _describe_inputs(
     shots: Any,
-    wanted: Recipe,
+    recipe: Recipe,
     source: Any,
     mask: ArrayLike | None,
     source_mask: ArrayLike | None,
     reader: Reader,
 ) -> tuple[Shots, Inputs, Any]:
-    """Return the shots, the recipe with its masks, and the source of all or that of each."""
-    measured = wanted.source if isinstance(wanted.source, MeasuredSource) else MeasuredSource()
+    """Return the shots, the recipe with its masks, and the common source or one for each."""
+    measured = recipe.source if isinstance(recipe.source, MeasuredSource) else MeasuredSource()
     source = measured.file if source is None else source
     source_reader = reader
     if measured.variable is not None:
@@ -139,91 +155,95 @@ def _described(
     sources = find_source(source, reader=source_reader)
     if isinstance(sources, Shots):
         lit = sources.mask
-    if sources is None and isinstance(wanted.source, MeasuredSource):
+    if sources is None and isinstance(recipe.source, MeasuredSource):
         raise InputError(
             "the recipe asks for a measured source, but names no file: name one, or give a source"
         )
     mask, source_mask = unpack_mask(mask), unpack_mask(source_mask, "source mask")
-    # Where the source tells it, no shot needs to be read for its shape.
+    # With a source, no shot needs to be read for its shape.
     shape = (() if mask is None else np.shape(mask)) if sources is None else sources.shape
-    known = (shape[0], shape[1]) if len(shape) == 2 else None
-    table = _table_of(shots)
+    image_shape = (shape[0], shape[1]) if len(shape) == 2 else None
+    table = _find_table(shots)
     if table is not None:
-        found, first = _shots_of(table, wanted, reader, known)
-        wanted = wanted.model_copy(update={"setup": first})
+        stack_shots, first = _describe_table(table, recipe, reader, image_shape)
+        recipe = recipe.model_copy(update={"setup": first})
     else:
-        found = find_shots(shots, reader=reader, shape=known)
-    if sources is not None and sources.shape != found.shape:
-        raise InputError(f"source has shape {sources.shape}, shots {found.shape}: they must match")
-    mask = join_masks(mask, found.mask, lit)
-    usable = None if mask is None else checked_mask(mask, found.shape)
-    bare = None if source_mask is None else checked_mask(source_mask, found.shape)
-    if wanted.setup is not None:
-        check_spacing(shots, "shots", wanted.setup.pixel_sizes)
-    nothing = np.ones(found.shape)
-    inputs = gathered(
-        wanted.model_copy(update={"source": wanted.estimate}),
-        Radiograph(nothing),
-        source=None if sources is None else nothing,
+        stack_shots = find_shots(shots, reader=reader, shape=image_shape)
+    if sources is not None and sources.shape != stack_shots.shape:
+        raise InputError(
+            f"source has shape {sources.shape}, shots {stack_shots.shape}: they must match"
+        )
+    mask = join_masks(mask, stack_shots.mask, lit)
+    usable = None if mask is None else checked_mask(mask, stack_shots.shape)
+    bare = None if source_mask is None else checked_mask(source_mask, stack_shots.shape)
+    if recipe.setup is not None:
+        check_spacing(shots, "shots", recipe.setup.pixel_sizes)
+    blank = np.ones(stack_shots.shape)
+    inputs = collect_inputs(
+        recipe.model_copy(update={"source": recipe.estimate}),
+        Radiograph(blank),
+        source=None if sources is None else blank,
         mask=usable,
         source_mask=bare,
     )
     inputs.recipe.check(inputs.shot)
     if inputs.recipe.estimate is not None:
-        inputs.recipe.estimate.placed(inputs.recipe.setup, found.shape)  # refuses a wrong setup
+        inputs.recipe.estimate.placed(
+            inputs.recipe.setup, stack_shots.shape
+        )  # refuses a wrong setup
     if isinstance(source, (str, Path)):
         origin = Origin(file=text_of(Path(source).name))
         provenance = inputs.provenance.model_copy(update={"source": origin})
         inputs = replace(inputs, provenance=provenance)
-    return found, replace(inputs, shot=replace(inputs.shot, source=None)), sources
+    return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
 
 
-def _table_of(shots: Any) -> Path | Sequence[ShotRow] | None:
-    """The table that describes the shots, or its rows, if it is one."""
-    if isinstance(shots, Sequence) and shots and all(isinstance(one, ShotRow) for one in shots):
+def _find_table(shots: Any) -> Path | Sequence[ShotRow] | None:
+    """Return the table of the shots, or its rows; None if they are no table."""
+    if isinstance(shots, Sequence) and shots and all(isinstance(row, ShotRow) for row in shots):
         return shots
-    alone = shots[0] if isinstance(shots, (list, tuple)) and len(shots) == 1 else shots
-    if not isinstance(alone, (str, Path)) or not os.path.isfile(alone):
+    single = shots[0] if isinstance(shots, (list, tuple)) and len(shots) == 1 else shots
+    if not isinstance(single, (str, Path)) or not os.path.isfile(single):
         return None
-    return Path(alone) if is_table(Path(alone)) else None
+    return Path(single) if is_table(Path(single)) else None
 
 
-def _shots_of(
+def _describe_table(
     table: Path | Sequence[ShotRow],
     recipe: Recipe,
     reader: Reader,
     shape: tuple[int, int] | None,
 ) -> tuple[Shots, Setup | None]:
-    """The shots of a table, and the setup of the first image."""
+    """Return the shots of a table, and the setup of the first image."""
     part = getattr(reader, "keywords", {})
     if getattr(reader, "func", reader) is not read_shot:
         raise InputError(
             f"received a reader for the table {table}, which names files: leave the reader out"
         )
-    chosen = part.get("channel"), part.get("variable")
+    parts = part.get("channel"), part.get("variable")
     if recipe.fit is None:
-        rows = row_shots(table, recipe, *chosen)
+        rows = row_shots(table, recipe, *parts)
         items = list(rows.values())
         return Shots(items, tuple(rows), shape or usual_shape(items)), items[0].setup
     if not isinstance(table, Path):
         raise InputError("received rows of a table to fit, expected its file: write it first")
-    named = shots_of_table(table, recipe, *chosen)
-    first = first_image(list(named.values()))
+    by_name = object_shots(table, recipe, *parts)
+    first = first_image(list(by_name.values()))
     assert isinstance(first.image, Radiograph)
-    return Shots(list(named.values()), tuple(named), first.image.shape), first.setup
+    return Shots(list(by_name.values()), tuple(by_name), first.image.shape), first.setup
 
 
 def _fit_stack(
-    found: Shots,
+    stack_shots: Shots,
     inputs: Inputs,
     sources: Any,
-    wanted: Recipe,
+    recipe: Recipe,
     variables: Collection[str] | None,
     warm_start: int,
     reader: str,
 ) -> FitStack:
-    check_fit(wanted)
-    choices = wanted.fit or FitChoices()
+    check_fit(recipe)
+    choices = recipe.fit or FitChoices()
     if warm_start > 1:
         raise InputError(f"warm_start is {warm_start}: fits start on their own; leave it out")
     if choices.fields is not None and len(choices.fields) > 1:
@@ -231,23 +251,23 @@ def _fit_stack(
             f"the recipe fits the fields {', '.join(choices.fields)}, and a store holds one: fit "
             "one field, or each shot alone with shadowinv fit"
         )
-    own = sources if isinstance(sources, Shots) else None
-    image = None if sources is None or own is not None else np.asarray(sources, np.float64)
-    # Estimates, and beams of their own, are those of each shot.
-    alone = own is not None or inputs.recipe.estimate not in (None, UniformEstimate())
-    beam = None if alone else Beam.of(found.shape, image, None)
-    stack = FitStack(found, inputs, beam, own, (), 1, reader, given=wanted)
-    known = stack.labels
+    shot_sources = sources if isinstance(sources, Shots) else None
+    image = None if sources is None or shot_sources is not None else np.asarray(sources, np.float64)
+    # An estimate or a list of sources gives each shot its own beam.
+    per_shot = shot_sources is not None or inputs.recipe.estimate not in (None, UniformEstimate())
+    beam = None if per_shot else Beam.of(stack_shots.shape, image, None)
+    stack = FitStack(stack_shots, inputs, beam, shot_sources, (), 1, reader, fit_recipe=recipe)
+    labels = stack.labels
     if choices.options.samples < 2:
-        known.pop("displacement_uncertainty")
+        labels.pop("displacement_uncertainty")
     for name in variables or ():
-        if name not in known:
+        if name not in labels:
             raise InputError(
                 f"there is no variable {name!r} of a fit: expected one or more of "
-                f"{', '.join(known)}"
+                f"{', '.join(labels)}"
             )
-    usual = tuple(name for name in FITTED if name in known)
-    return replace(stack, variables=tuple(variables or usual))
+    defaults = tuple(name for name in FITTED if name in labels)
+    return replace(stack, variables=tuple(variables or defaults))
 
 
 def _recipe(
@@ -256,20 +276,20 @@ def _recipe(
     setup: Setup | None,
     filters: Sequence[Step],
 ) -> Recipe:
-    """The recipe that was given, or that the other keywords make up."""
+    """Return the recipe, or a recipe of the other keywords."""
     check_instance(recipe, Recipe, "recipe")
     if recipe is None:
         options = as_model(InversionOptions, options, "options")
         return Recipe(steps=tuple(filters), setup=setup, options=options)
-    given = {"options": options, "setup": setup, "filters": tuple(filters) or None}
-    for name, value in given.items():
+    keywords = {"options": options, "setup": setup, "filters": tuple(filters) or None}
+    for name, value in keywords.items():
         if value is not None:
             raise InputError(f"got a recipe and {name}: say so in the recipe")
     return recipe
 
 
 def _shared_beam(inputs: Inputs, sources: Any) -> Beam | None:
-    """Source, after all steps, and mask that the shots share; None if each has its own source."""
+    """Return the common source after all steps, and mask; None if each shot has its own source."""
     moved = inputs.recipe.moved(inputs.shot)
     if isinstance(inputs.recipe.source, UniformEstimate):
         return Beam.of(moved.shape, None, moved.mask)
@@ -283,14 +303,14 @@ def _shared_beam(inputs: Inputs, sources: Any) -> Beam | None:
 
 
 def _checked_variables(
-    wanted: Collection[str] | None, recipe: Recipe, *, ragged: bool
+    names: Collection[str] | None, recipe: Recipe, *, ragged: bool
 ) -> tuple[str, ...]:
-    """Names of the variables that a stack shall have; shots may differ in the number of sites."""
+    """Return the variables of a stack; shots may differ in their number of sites if `ragged`."""
     labels = variable_labels(recipe.setup)
-    # By as many as the masks hide, or as the source shines into the margin.
-    known = tuple(name for name, (dims, _) in labels.items() if not (ragged and "site" in dims))
-    for name in wanted or ():
-        if name in known:
+    # The number depends on the masked area, or on the flux of the source in the margin.
+    available = tuple(name for name, (dims, _) in labels.items() if not (ragged and "site" in dims))
+    for name in names or ():
+        if name in available:
             continue
         hint = " (it needs a setup)" if recipe.setup is None else ""
         if name in labels:
@@ -299,15 +319,15 @@ def _checked_variables(
                 "given number of sites, or with masks of their own)"
             )
         raise InputError(
-            f"there is no variable {name!r}{hint}: expected one or more of {', '.join(known)}"
+            f"there is no variable {name!r}{hint}: expected one or more of {', '.join(available)}"
         )
-    return known if wanted is None else tuple(wanted)
+    return available if names is None else tuple(names)
 
 
 def coordinates_of(stack: Stack) -> dict[str, Any]:
-    own = isinstance(stack, TableStack)
+    is_table = isinstance(stack, TableStack)
     # Where setups differ, so may the pixels' size.
-    plane = dataset_from_field(np.zeros((2, *stack.shape)), None, None if own else stack.setup)
+    plane = dataset_from_field(np.zeros((2, *stack.shape)), None, None if is_table else stack.setup)
     shots = stack.shots
     numbers = np.arange(len(shots)) if shots.coordinate is None else shots.coordinate
     coords: dict[str, Any] = {str(name): value for name, value in plane.coords.items()}
@@ -324,12 +344,12 @@ def attributes_of(stack: Stack) -> dict[str, str]:
         **attributes,
         "options": stack.recipe.options.model_dump_json(),
         "provenance": provenance.model_dump_json(exclude_none=True),
-        **({"fields": json.dumps([stack.bends])} if isinstance(stack, FitStack) else {}),
+        **({"fields": json.dumps([stack.fitted_field])} if isinstance(stack, FitStack) else {}),
     }
 
 
 def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
-    """Return the variables that all shots share, by name; a task, too."""
+    """Return the variables that all shots share, by name; also a task of dask."""
     if options.threads is None:
         options = options.model_copy(update={"threads": threads_here()})
     plan = shared_plan(beam, options)
@@ -345,5 +365,5 @@ def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
 
 
 def dtype_of(name: str) -> Any:
-    """Type of a variable as an inversion has it."""
+    """Return the type of a variable in an inversion."""
     return np.dtype(bool) if name in ("caustic", "mask") else np.dtype(np.float64)

@@ -1,4 +1,4 @@
-"""The store of a run: what a new one holds, what may go on in one that is there."""
+"""The store of a run: contents of a new one, checks and order of one to be continued."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from napari_shadowinv.stack._plan import dtype_of
 from napari_shadowinv.stack._shots import CHAINED, Stack
 from napari_shadowinv.stack._sources import checksum
 
-_CHOSEN = "chosen_sites"  # attribute: how many sites the first shots needed for the accuracy
-_APPENDED = "appended_at"  # attribute: where later runs began to append shots
-NUMBERED_AS_ARRIVED = {"order": "as they arrived"}  # attribute: names do not tell the order
-_INSTEAD = "use the same, overwrite the store, or choose another name"
+_CHOSEN_SITES = "chosen_sites"  # attribute: number of sites from the accuracy and the first shots
+_APPENDED = "appended_at"  # attribute: numbers of the first shots appended by later runs
+NUMBERED_AS_ARRIVED = {
+    "order": "as they arrived"
+}  # attribute: the order does not follow from the names
+_ALTERNATIVES = "use the same, overwrite the store, or choose another name"
 
 
 def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
@@ -31,7 +33,7 @@ def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
     if stack.as_arrived:
         attributes |= NUMBERED_AS_ARRIVED
     if stack.sites_chosen:
-        attributes[_CHOSEN] = stack.recipe.options.n_sites
+        attributes[_CHOSEN_SITES] = stack.recipe.options.n_sites
     return Contents(stack.sizes, _variables(stack, dtype), _coordinates(stack), attributes)
 
 
@@ -59,22 +61,22 @@ def _stored_coordinate(coordinate: Any) -> Variable:
 
 
 def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
-    found: dict[str, Variable] = {}
+    variables: dict[str, Variable] = {}
     for name, (dims, labels) in stack.labels.items():
         if name not in stack.variables:
             continue
         exact = dtype_of(name).kind != "f" or "site" in dims
-        kept = dtype_of(name) if exact else dtype
+        stored = dtype_of(name) if exact else dtype
         if stack.beam is not None and stack.is_shared(name):
             values = np.asarray(_plan.values_of_beam(stack.beam, stack.recipe.options)[name])
-            found[name] = Variable(dims, kept, labels, values)
+            variables[name] = Variable(dims, stored, labels, values)
         else:
-            found[name] = Variable(("shot", *dims), kept, labels, None)
-    return found
+            variables[name] = Variable(("shot", *dims), stored, labels, None)
+    return variables
 
 
 def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> dict[str, str]:
-    """What must be the same for a store to be continued; of so many of its shots."""
+    """Return the attributes that must agree for a store with `shots` shots to be continued."""
     height, width = stack.shape
     recipe, shot = stack.recipe, stack.inputs.shot
     return {
@@ -82,9 +84,9 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
         "options": stack.options_text,
         **stack.setup_texts,
         "source_image": stack.source_text(shots),
-        "mask_image": _sum_of(shot.mask) or "none",
+        "mask_image": _mask_text(shot.mask) or "none",
         "steps": json.dumps([step.model_dump() for step in recipe.steps]) if recipe.steps else "",
-        "source_mask_image": _sum_of(shot.source_mask),
+        "source_mask_image": _mask_text(shot.source_mask),
         "image_size": f"{width} × {height} px",
         "stored": f"{', '.join(stack.variables)} as {dtype}",
         "reader": stack.reader,
@@ -92,19 +94,19 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
     }
 
 
-def _sum_of(mask: BoolArray | None) -> str:
+def _mask_text(mask: BoolArray | None) -> str:
     return "" if mask is None else f"sha256 {checksum(mask)}"
 
 
 def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
-    """Return the stack in the order of its store, new shots last; refuse what does not belong."""
+    """Return the stack in the order of its store, new shots last; an `InputError` if it differs."""
     if store.attributes.get("warm_start") == CHAINED and not stack.as_arrived:
         raise InputError(
             f"{store.path} was written by watching a folder, where each shot starts from the one "
             "before: continue with shadowinv watch, overwrite the store, or choose another name"
         )
-    stack = stack.chosen(_order(store, stack.shots.names))
-    stack = made_alike(store, stack, dtype)
+    stack = stack.reordered(_order(store, stack.shots.names))
+    stack = match_store(store, stack, dtype)
     for index in np.flatnonzero(store.statuses() == DONE):
         changed = stack.changed(int(index), store.report(int(index)))
         if changed:
@@ -135,24 +137,24 @@ def reopen_damaged(store: StackStore) -> StackStore:
     return store
 
 
-def made_alike(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
-    """Return the stack with as many sites as its store has; refuse what was made otherwise."""
-    if stack.chooses_sites and _CHOSEN in store.attributes:
-        stack = stack.with_sites(int(store.attributes[_CHOSEN]))
-    found = _identity(stack, dtype, len(store.names))
-    for name, value in {**found, "package_version": __version__}.items():
+def match_store(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
+    """Return the stack with the store's number of sites; an `InputError` if they do not match."""
+    if stack.chooses_sites and _CHOSEN_SITES in store.attributes:
+        stack = stack.with_sites(int(store.attributes[_CHOSEN_SITES]))
+    identity = _identity(stack, dtype, len(store.names))
+    for name, value in {**identity, "package_version": __version__}.items():
         before = str(store.attributes.get(name, ""))
         if before != value:
             article = "" if name.endswith("s") else "a "
             raise InputError(
                 f"{store.path} was started with {article}different {name.replace('_', ' ')} "
-                f"({_difference(before, value)}): {_INSTEAD}"
+                f"({_difference(before, value)}): {_ALTERNATIVES}"
             )
     return stack
 
 
 def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
-    """Places of the store's shots among those that are given, then of the new ones."""
+    """Return the positions of the store's shots among `names`, then of the new ones."""
     # A shot keeps its number for good, so new ones go to the end wherever their names sort.
     count = len(store.names)
     if names[:count] == store.names:
@@ -163,20 +165,22 @@ def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
         missing = (
             f"{count} there, {len(names)} given, without {lost[0]}" if lost else "different order"
         )
-        raise InputError(f"{store.path} was started with different shots ({missing}): {_INSTEAD}")
-    known = [places[name] for name in store.names]
+        raise InputError(
+            f"{store.path} was started with different shots ({missing}): {_ALTERNATIVES}"
+        )
+    known_places = [places[name] for name in store.names]
     if NUMBERED_AS_ARRIVED.items() <= store.attributes.items():
-        return [*known, *sorted(set(range(len(names))) - set(known))]
-    # What came in one run keeps its order; later runs may have brought what sorts before it.
+        return [*known_places, *sorted(set(range(len(names))) - set(known_places))]
+    # Shots of a run keep their order; names of later runs may sort before them.
     ends = [0, *store.attributes.get(_APPENDED, []), count]
     for first, last in pairwise(ends):
         for index in range(first + 1, last):
-            if known[index] < known[index - 1]:
+            if known_places[index] < known_places[index - 1]:
                 raise InputError(
                     f"{store.path} was started with the shots in a different order "
-                    f"({store.names[index - 1]} before {store.names[index]}): {_INSTEAD}"
+                    f"({store.names[index - 1]} before {store.names[index]}): {_ALTERNATIVES}"
                 )
-    return [*known, *sorted(set(range(len(names))) - set(known))]
+    return [*known_places, *sorted(set(range(len(names))) - set(known_places))]
 
 
 def _difference(before: str, now: str) -> str:
@@ -189,7 +193,7 @@ def _difference(before: str, now: str) -> str:
 
 
 def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackStore:
-    """Append shots that arrived since the last run, pending, to the store that `resume` saw."""
+    """Append shots that arrived since the last run, as pending, to the store."""
     coordinates = {
         name: np.asarray(coordinate.values)
         for name, coordinate in _coordinates(stack).items()
@@ -197,5 +201,5 @@ def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack
     }
     begins = [*store.attributes.get(_APPENDED, []), len(store.names)]
     source = _identity(stack, dtype)["source_image"]
-    told = {"source_image": source, _APPENDED: begins}
-    return grow_store(store.path, len(stack.shots), coordinates, told)
+    attributes = {"source_image": source, _APPENDED: begins}
+    return grow_store(store.path, len(stack.shots), coordinates, attributes)

@@ -1,4 +1,4 @@
-"""A run: every shot of a stack into one store, whatever happens on the way."""
+"""A run: every shot of a stack into one store, robust against errors and interruptions."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_s
 from napari_shadowinv.io.store_layout import create_store, remove_unfinished
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.stack._engines import Engine, WorkerDied, engine_for, is_here
+from napari_shadowinv.stack._engines import Engine, WorkerDiedError, engine_for, is_local
 from napari_shadowinv.stack._plan import STORED, describe_stack
 from napari_shadowinv.stack._resume import append_shots, contents_of, reopen_damaged, resume
 from napari_shadowinv.stack._shots import Stack
 from napari_shadowinv.stack._site_count import choose_sites
 from napari_shadowinv.stack._sources import Reader, read_shot
-from napari_shadowinv.stack._worker import Settings, ShotOutcome, run_shots
+from napari_shadowinv.stack._worker import ShotOutcome, TaskContext, run_shots
 
 if TYPE_CHECKING:
     import xarray
@@ -38,23 +38,23 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Step
 
-_POLL = 0.25  # seconds between two looks at the engine and at `should_stop`
+_POLL_S = 0.25  # between two looks at the engine and at `should_stop`
 
 
 @dataclass(frozen=True)
 class RunProgress:
-    """A sign of life from a run.
+    """Progress of a run.
 
     Attributes
     ----------
     total, done, failed : int
-        Shots of the stack, with those of earlier runs.
+        Numbers of shots, including earlier runs.
     engine : str
-        Where the work is done.
+        Name of the engine that inverts the shots.
     name, outcome : str, ShotOutcome or None
-        The shot that has just ended, if one has, and what became of it.
+        The shot that has just ended, if any, and its outcome.
     preparing : str
-        Before all shots: what is being done.
+        Current stage of the preparation, before all shots.
     """
 
     total: int
@@ -91,42 +91,42 @@ def run_stack(
     on_progress: OnRunProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> xarray.Dataset:
-    """Invert, or fit, every shot into one store; run again, it goes on where it stopped.
+    """Invert, or fit, every shot into one store; another call resumes it.
 
     With a recipe that has a section `fit`, the forward model is fitted to each shot. A shot that
-    cannot be inverted fails alone, with its reason. What is written of a shot counts once it is
-    complete, so a run may be interrupted or killed at any time. Shots that have arrived since the
-    store was begun are appended, whatever their names: a shot keeps its number.
+    cannot be inverted fails alone, with its reason. A shot counts only once it is written
+    completely, so a run may be interrupted or killed at any time. Shots that have arrived since the
+    store was created are appended, whatever their names: a shot keeps its number.
 
     Parameters
     ----------
     shots, source, mask, recipe, options, setup, filters, source_mask, reader, warm_start
-        As for `invert_stack`. They and earlier shots must be those of a store that is resumed. In
+        As for `invert_stack`. To resume a store, they and earlier shots must be the same. In
         a table of shots to fit, rows with the same ``shot`` are images of one object.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
     variables : collection of str, optional
-        What to store. Default: potential, displacement and caustic, at a million pixels 13 MB a
-        shot before compression; the rest can be computed from them and the image. Of a fit
+        Variables to store. Default: potential, displacement and caustic, at a million pixels 13 MB
+        a shot before compression; the rest can be computed from them and the image. For a fit:
         potential, displacement and its error bars.
     dtype : {"float32", "float64"}, optional
-        Type of stored images; sites, weights and numbers of a shot keep 64 bits.
+        Type of stored images; sites, weights and scalars keep 64 bits.
     scheduler : str, distributed.Client, cluster or None, optional
         ``"threads"``, ``"processes"``, ``"synchronous"``, the address of a scheduler, a client or
-        a cluster. Default: dask's current client, else threads. The values do not depend on it.
+        a cluster. Default: dask's current client, else threads. The results do not depend on it.
     workers : int, optional
-        Shots that are inverted at once, on this machine. Default: as many as cores.
+        Shots that are inverted simultaneously on this machine. Default: the number of cores.
     overwrite, redo_failed : bool, optional
-        Throw away what the store holds; try shots again that failed before.
+        Discard the content of the store; repeat shots that failed before.
     on_progress : callable, optional
-        Receives a `RunProgress` at the start and when a shot has ended.
+        Receives a `RunProgress` at the start and after each shot.
     should_stop : callable, optional
-        Asked now and then; when it returns true the run ends.
+        Called regularly; the run ends when it returns true.
 
     Returns
     -------
     xarray.Dataset
-        The store, opened lazily; `status` tells what became of each shot.
+        The store, opened lazily; `status` has the outcome of each shot.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def run_stack(
         If `should_stop` returned true; the store can be resumed.
     """
     path = check_store_path(out)
-    kept = stored_type(dtype)
+    stored = stored_type(dtype)
     stack = describe_stack(
         shots,
         variables=stored_variables(variables, recipe, mask),
@@ -156,39 +156,39 @@ def run_stack(
     )
     again = (PENDING, FAILED) if redo_failed else (PENDING,)
 
-    def prepare(what: str) -> None:
+    def prepare(stage: str) -> None:
         if on_progress is not None:
-            on_progress(RunProgress(len(stack.shots), 0, 0, "", preparing=what))
+            on_progress(RunProgress(len(stack.shots), 0, 0, "", preparing=stage))
 
-    if is_here(scheduler):
-        # Once for all workers, which would each be at it during their first shot.
+    if is_local(scheduler):
+        # Once, instead of in all workers during their first shot.
         ensure_compiled(lambda news: prepare(f"compiling, {news.message}"), should_stop)
     with clear_up_when_terminated(), locked(path):
         remove_unfinished(path)
         store = StackStore(path) if path.exists() and not overwrite else None
         arrived = False
         if store is not None:
-            stack = resume(store, stack, kept)
+            stack = resume(store, stack, stored)
             store = reopen_damaged(store)
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
-                _Run(stack, store, (), on_progress, should_stop).tell("nothing to do")
+                _Run(stack, store, (), on_progress, should_stop).report("nothing to do")
                 return read_stack(path)
-        # Before a store is made: a scheduler that does not answer shall leave nothing behind.
+        # Before the store is created: a scheduler that does not respond must leave nothing behind.
         with engine_for(scheduler, workers, should_stop) as engine:
             if store is None:
                 if stack.chooses_sites:
                     prepare("how many sites the first shots need")
                 stack = choose_sites(stack, should_stop)
-                store = create_store(path, contents_of(stack, kept), overwrite=overwrite)
+                store = create_store(path, contents_of(stack, stored), overwrite=overwrite)
             elif arrived:
-                store = append_shots(store, stack, kept)
-            _Run(stack, store, again, on_progress, should_stop).on(engine)
+                store = append_shots(store, stack, stored)
+            _Run(stack, store, again, on_progress, should_stop).run_on(engine)
     return read_stack(path)
 
 
 def stored_type(dtype: str) -> np.dtype[Any]:
-    """Return the type of stored images that was asked for."""
+    """Return the type of stored images, checked."""
     if dtype not in ("float32", "float64"):
         raise InputError(f"dtype is {dtype!r}: expected 'float32' or 'float64'")
     return np.dtype(dtype)
@@ -197,7 +197,7 @@ def stored_type(dtype: str) -> np.dtype[Any]:
 def stored_variables(
     variables: Collection[str] | None, recipe: Recipe | None, mask: ArrayLike | None
 ) -> Collection[str] | None:
-    """Return what is stored of each shot; None for what is usual of a fit."""
+    """Return the variables to store; None for the defaults of a fit."""
     check_instance(recipe, Recipe, "recipe")
     is_fit = recipe is not None and recipe.fit is not None
     if variables is not None or is_fit:
@@ -208,7 +208,7 @@ def stored_variables(
 
 
 class _Run:
-    """Hands shots to an engine and keeps the books."""
+    """A run: submits shots to an engine, and counts their outcomes."""
 
     def __init__(
         self,
@@ -229,7 +229,7 @@ class _Run:
             for status in (DONE, FAILED)
         }
 
-    def tell(self, engine: str, outcome: ShotOutcome | None = None) -> None:
+    def report(self, engine: str, outcome: ShotOutcome | None = None) -> None:
         if outcome is not None:
             self._counts[outcome.status] += 1
         if self._on_progress is not None:
@@ -238,8 +238,8 @@ class _Run:
             done, failed = self._counts[DONE], self._counts[FAILED]
             self._on_progress(RunProgress(len(shots), done, failed, engine, name, outcome))
 
-    def on(self, engine: Engine) -> None:
-        """Invert all shots that are to be inverted, and gather what their reports say."""
+    def run_on(self, engine: Engine) -> None:
+        """Invert all pending shots, and summarise their reports."""
         try:
             self._work_on(engine)
         except BaseException:
@@ -249,8 +249,8 @@ class _Run:
         self._store.summarise()
 
     def _work_on(self, engine: Engine) -> None:
-        self.tell(engine.name)
-        settings, beam = self._shared(engine)
+        self.report(engine.name)
+        context, beam = self._shared(engine)
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         running: dict[Any, list[int]] = {}
         batches = self._batches()
@@ -259,7 +259,7 @@ class _Run:
             window = engine.window(files=is_file)
             while True:
                 while len(running) < window and (batch := next(batches, None)) is not None:
-                    future = self._start(engine, batch, beam, settings)
+                    future = self._start(engine, batch, beam, context)
                     running[future] = batch
                     future.add_done_callback(ended.put)
                 if not running:
@@ -279,44 +279,44 @@ class _Run:
 
     def _shared(self, engine: Engine) -> tuple[Any, Any]:
         stack = self._stack
-        own = tuple(name for name in stack.variables if not stack.is_shared(name))
-        settings = Settings(self._store.writer, stack.work(own), engine.workers)
-        # A name that no earlier run has used: what dask has under a name it does not take again.
+        per_shot = tuple(name for name in stack.variables if not stack.is_shared(name))
+        context = TaskContext(self._store.writer, stack.work(per_shot), engine.workers)
+        # A name that no earlier run has used: dask would reuse the earlier value.
         name = f"settings-{self._store.attributes['store_id']}-{time.time_ns()}"
         beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")
-        return engine.share(settings, name), beam
+        return engine.share(context, name), beam
 
     def _batches(self) -> Iterator[list[int]]:
-        """Yield the shots that go to one task: one, or a run that starts from each other."""
+        """Yield the shots of a task: one, or a group in which each starts from the previous."""
         run = self._stack.warm_start
         for first in range(0, len(self._stack.shots), run):
             batch = range(first, min(first + run, len(self._stack.shots)))
-            wanted = [index for index in batch if index in self._todo]
-            if wanted:
+            pending = [index for index in batch if index in self._todo]
+            if pending:
                 # From its beginning, so that the values do not depend on where a run stopped.
-                yield list(range(first, wanted[-1] + 1))
+                yield list(range(first, pending[-1] + 1))
 
-    def _start(self, engine: Engine, batch: list[int], beam: Any, settings: Any) -> Any:
+    def _start(self, engine: Engine, batch: list[int], beam: Any, context: Any) -> Any:
         shots = self._stack.shots
         labels = [(index, index in self._todo, self._stack.source_of(index)) for index in batch]
         items = [shots.items[index] for index in batch]
-        return engine.submit(run_shots, items, labels, beam, settings, engine.stop)
+        return engine.submit(run_shots, items, labels, beam, context, engine.stop)
 
     def _wait(self, engine: Engine, ended: queue.SimpleQueue[Any]) -> Any:
-        """Return a task that has ended, or None after a while."""
+        """Return a finished task, or None after a timeout."""
         if self._should_stop is not None and self._should_stop():
             raise InversionCancelled("stopped on request; run again to resume")
         try:
-            return ended.get(timeout=_POLL)
+            return ended.get(timeout=_POLL_S)
         except queue.Empty:
             engine.check()
             return None
 
     def _end(self, engine: Engine, future: Any, batch: list[int]) -> bool:
-        """Count the shots of a task, or return False if it is being done again."""
+        """Count the shots of a task, or return False if the task is repeated."""
         try:
             outcomes = engine.result(future)
-        except WorkerDied as error:
+        except WorkerDiedError as error:
             lost = [index for index in batch if index in self._todo]
             outcomes = [ShotOutcome(index, FAILED, 0.0, str(error)) for index in lost]
             for index in lost:
@@ -325,5 +325,5 @@ class _Run:
             return False
         for outcome in outcomes:
             self._todo.discard(outcome.index)
-            self.tell(engine.name, outcome)
+            self.report(engine.name, outcome)
         return True

@@ -1,4 +1,4 @@
-"""What is known of many shots before any is worked on: `Stack`, `TableStack`, `FitStack`."""
+"""Many shots with all inputs of their inversion: `Stack`, `TableStack`, `FitStack`."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ CHAINED = "each shot from an earlier one, as they arrived"
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Everything about a stack that is known before any shot is inverted."""
+    """Shots, and everything that their inversions share."""
 
     shots: Shots
-    inputs: Inputs  # recipe, masks, and where they came from
+    inputs: Inputs  # recipe, masks, and their origin
     beam: Beam | None  # source, after all steps, and mask of all shots; None if each has its own
     sources: Shots | None  # one for each shot, if these were measured
     variables: tuple[str, ...]
     warm_start: int = 1  # shots in a group, each initialised from the one before
-    reader: str = ""  # name of what reads the files
+    reader: str = ""  # name of the reader of the files
     sites_chosen: bool = False  # whether the number of sites follows from the accuracy
     as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
     chained: bool = False  # whether each shot starts from an earlier one, without groups
 
     @property
     def warm_start_text(self) -> str:
-        """Which shots start from others."""
+        """Description of the shots that start from others."""
         return CHAINED if self.chained else str(self.warm_start)
 
     @property
@@ -53,11 +53,11 @@ class Stack:
 
     @property
     def chooses_sites(self) -> bool:
-        """Whether the accuracy has still to decide how many sites all shots share."""
+        """Whether the number of sites still has to be derived from the accuracy."""
         return self.beam is not None and self.recipe.options.is_adaptive
 
     def with_sites(self, n_sites: int) -> Stack:
-        """Return the stack with the number of sites that the accuracy has led to."""
+        """Return the stack with the number of sites derived from the accuracy."""
         options = self.recipe.options.model_copy(update={"n_sites": n_sites})
         provenance = self.inputs.provenance
         recipe = provenance.recipe.model_copy(update={"options": options})
@@ -84,7 +84,7 @@ class Stack:
     @cached_property
     def sizes(self) -> dict[str, int]:
         height, width = self.shape
-        # Where each shot has its own, there are sites only if they do not depend on it.
+        # Sites of shots with their own beams are stored only if they do not depend on the beam.
         beam = self.beam or Beam.of(self.shape, None, self.moved.mask)
         sites = count_sites(beam.image, self.recipe.options, mask=beam.mask)
         return {"shot": len(self.shots), "y": height, "x": width, "component": 2, "site": sites}
@@ -96,7 +96,7 @@ class Stack:
 
     @property
     def options_text(self) -> str:
-        """The options as they were given, without what does not affect the results."""
+        """The options as JSON, except those that do not affect the results."""
         options = self.recipe.options
         if self.sites_chosen:
             options = options.model_copy(update={"n_sites": None})
@@ -104,12 +104,12 @@ class Stack:
 
     @property
     def fit_text(self) -> str:
-        """The choices of a fit, but for its options; empty where shots are inverted."""
+        """The choices of a fit as JSON, except its options; empty for inversions."""
         return ""
 
     @property
     def setup_texts(self) -> dict[str, str]:
-        """The setup that all shots share, or that each has its own."""
+        """Description of the setup, for the store's identity."""
         setup = "" if self.setup is None else self.setup.model_dump_json()
         return {OWN_SETUPS: "", "setup": setup}
 
@@ -119,7 +119,7 @@ class Stack:
         return None
 
     def source_text(self, shots: int | None) -> str:
-        """The source of so many shots."""
+        """Describe the source of the first shots."""
         estimate = self.recipe.estimate
         if self.sources is not None:
             return f"one for each shot: {', '.join(self.sources.names[:shots])}"
@@ -130,7 +130,7 @@ class Stack:
         return "uniform"
 
     def is_shared(self, name: str) -> bool:
-        """Whether all shots have one such variable together."""
+        """Return whether all shots share a variable."""
         return (
             self.beam is not None
             and name in ("sites", "site_mass", "source", "mask")
@@ -141,17 +141,17 @@ class Stack:
         """Reference to the measured source of one shot; None if it is shared, or estimated."""
         return None if self.sources is None else self.sources.items[index]
 
-    def chosen(self, order: Sequence[int]) -> Stack:
+    def reordered(self, order: Sequence[int]) -> Stack:
         """Return the stack with its shots, and their sources, in another order."""
-        sources = None if self.sources is None else self.sources.chosen(order)
-        return replace(self, shots=self.shots.chosen(order), sources=sources)
+        sources = None if self.sources is None else self.sources.reordered(order)
+        return replace(self, shots=self.shots.reordered(order), sources=sources)
 
     def work(self, variables: tuple[str, ...]) -> Work | FitWork:
-        """Return what the task of each shot needs to know to make some variables."""
+        """Return the task of each shot, which computes some variables."""
         return Work(self.shots.shape, self.inputs, variables, self.sites_chosen)
 
     def changed(self, index: int, origin: dict[str, Any]) -> str:
-        """Name what of a shot is not what its report says; empty if nothing."""
+        """Name the part of a shot that differs from its report; empty if none does."""
         if not self.shots.items[index].unchanged(origin):
             return self.shots.label(index)
         source = None if self.sources is None else self.source_of(index)
@@ -164,8 +164,8 @@ class Stack:
 class TableStack(Stack):
     """A stack of rows of a table: shots may have their own setup, source and mask.
 
-    The beam is that of rows without source and mask, and None if any has one. Nothing is shared, as
-    a row that is added later may have its own; `setup`, of the first row, gives the units.
+    The beam belongs to rows without source and mask, and is None if any has one. Nothing is shared,
+    because a row that is added later may have its own; the setup of the first row sets the units.
     """
 
     common: AnyArray | None = None  # measured source of rows without one, as recorded
@@ -216,9 +216,9 @@ class TableStack(Stack):
 
 @dataclass(frozen=True, eq=False)
 class FitStack(Stack):
-    """A stack that is fitted; its beam is as recorded, as the fit takes the steps itself."""
+    """A stack to fit; its beam is as recorded, because the fit applies the steps itself."""
 
-    given: Recipe = field(default_factory=Recipe)  # with setup and choices as they were given
+    fit_recipe: Recipe = field(default_factory=Recipe)  # with the original setup and choices
 
     @property
     def chooses_sites(self) -> bool:
@@ -226,11 +226,11 @@ class FitStack(Stack):
 
     @property
     def choices(self) -> FitChoices:
-        return self.given.fit or FitChoices()
+        return self.fit_recipe.fit or FitChoices()
 
     @property
-    def bends(self) -> str:
-        """The field that is fitted to each shot."""
+    def fitted_field(self) -> str:
+        """Name of the field that is fitted to each shot."""
         setups = None if self.setup is None else [self.setup]
         (name,) = self.choices.fields or usual_fields(setups)
         return name
@@ -242,7 +242,7 @@ class FitStack(Stack):
 
     @property
     def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-        return fit_labels(self.bends, self.setup)
+        return fit_labels(self.fitted_field, self.setup)
 
     @property
     def options_text(self) -> str:
@@ -257,7 +257,12 @@ class FitStack(Stack):
 
     def work(self, variables: tuple[str, ...]) -> FitWork:
         shot = self.inputs.shot
-        choices = self.choices.model_copy(update={"fields": (self.bends,)})
-        cleared = {"source": self.given.estimate, "mask": None, "source_mask": None, "fit": choices}
-        recipe = self.given.model_copy(update=cleared)
+        choices = self.choices.model_copy(update={"fields": (self.fitted_field,)})
+        cleared = {
+            "source": self.fit_recipe.estimate,
+            "mask": None,
+            "source_mask": None,
+            "fit": choices,
+        }
+        recipe = self.fit_recipe.model_copy(update=cleared)
         return FitWork(recipe, self.shape, self.setup, variables, shot.mask, shot.source_mask)

@@ -1,4 +1,4 @@
-"""One shot of a stack: a reference, `Shot`, that is read when it is needed."""
+"""One shot of a stack: a reference, `Shot`, that is read on demand."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ Reader = Callable[..., ArrayLike]
 
 
 class Shot:
-    """One image that is read when it is asked for; it can be sent to a worker."""
+    """One image that is read on demand; it can be sent to a worker."""
 
     def load(self) -> tuple[AnyArray, dict[str, Any]]:
         """Return the image and its ``sha256``, with ``warnings`` for the shot's report if any."""
         raise NotImplementedError
 
     def shape(self) -> tuple[int, ...]:
-        """Return the shape of the image, which is read for it."""
+        """Return the shape of the image, which has to be read."""
         return np.shape(self.load()[0])
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Whether it is still the image of which `load` said this."""
+        """Return whether the image still agrees with the metadata from `load`."""
         return bool(self.load()[1]["sha256"] == origin.get("sha256"))
 
 
@@ -49,7 +49,7 @@ def read_shot(
     variable: str | None = None,
     warnings: list[Caution] | None = None,
 ) -> FloatArray:
-    """Read the image of a shot; this is the reader where none is given.
+    """Read the image of a shot; this is the default reader.
 
     Parameters
     ----------
@@ -67,33 +67,36 @@ def read_shot(
     if page is None:
         shot = read_radiograph(path, channel=channel, variable=variable)
     else:
-        image, told = read_tiff_page(path, page, channel=channel)
-        shot = Radiograph(image, warnings=told)
+        image, file_warnings = read_tiff_page(path, page, channel=channel)
+        shot = Radiograph(image, warnings=file_warnings)
     if warnings is not None:
-        warnings.extend(doubts_of_file(shot))
+        warnings.extend(file_doubts(shot))
     return shot.image
 
 
-def doubts_of_file(shot: Radiograph) -> list[Caution]:
-    """Reasons to doubt the image of a file in a stack."""
+def file_doubts(shot: Radiograph) -> list[Caution]:
+    """Return the reasons to doubt the image of a file in a stack."""
     ignored = [name for name in ("source", "mask") if getattr(shot, name) is not None]
-    told = f"the file contains its own {' and '.join(ignored)}, which a stack ignores: pass one"
     if not ignored:
         return list(shot.warnings)
-    return [*shot.warnings, Caution("file", f"{told} for the whole stack")]
+    text = (
+        f"the file contains its own {' and '.join(ignored)}, which a stack ignores: pass one for "
+        "the whole stack"
+    )
+    return [*shot.warnings, Caution("file", text)]
 
 
-def _read(reader: Reader, path: Path, **chosen: int) -> tuple[AnyArray, dict[str, Any]]:
-    """Image of a file, and warnings if the reader can tell some."""
+def _read(reader: Reader, path: Path, **options: int) -> tuple[AnyArray, dict[str, Any]]:
+    """Read the image of a file, and warnings if the reader supports them."""
     if "warnings" not in inspect.signature(reader).parameters:
-        return _plain(reader(path, **chosen)), {}
+        return _plain_image(reader(path, **options)), {}
     warnings: list[Caution] = []
-    image = _plain(reader(path, **chosen, warnings=warnings))
+    image = _plain_image(reader(path, **options, warnings=warnings))
     return image, {"warnings": warnings} if warnings else {}
 
 
-def _plain(image: Any) -> AnyArray:
-    """Image without labels; a mask of its own is refused, as all shots share one."""
+def _plain_image(image: Any) -> AnyArray:
+    """Return an image without labels; an `InputError` if it has its own mask."""
     values, usable = unpack_array(image, "the shot")
     if usable is not None:
         raise InputError(
@@ -111,27 +114,27 @@ class FileShot(Shot):
     reader: Reader = read_shot
 
     def __dask_tokenize__(self) -> tuple[Any, ...]:
-        # A file that changed is another input, and what dask has of it another result.
+        # A changed file is another input, so dask must not reuse its result.
         from dask.base import normalize_token
 
-        known = stamp(self.path) if self.path.exists() else {}
-        return (str(self.path), normalize_token(self.reader), *known.values())
+        file_stamp = stamp(self.path) if self.path.exists() else {}
+        return (str(self.path), normalize_token(self.reader), *file_stamp.values())
 
     def load(self) -> tuple[AnyArray, dict[str, Any]]:
-        image, told = _read(self.reader, self.path)
-        return image, {**stamp(self.path), "sha256": sha256(self.path), **told}
+        image, metadata = _read(self.reader, self.path)
+        return image, {**stamp(self.path), "sha256": sha256(self.path), **metadata}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare size and time, and only where these differ the checksum."""
         if not self.path.exists():
-            return True  # put away after it was inverted
+            return True  # removed after it was inverted
         if stamp(self.path).items() <= origin.items():
             return True
         return bool(sha256(self.path) == origin.get("sha256"))
 
 
 def stamp(path: Path) -> dict[str, int]:
-    """Return size and time of a file, by which it is taken for the same."""
+    """Return size and time of a file, which identify its content."""
     status = path.stat()
     return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
 
@@ -145,8 +148,8 @@ class PageShot(Shot):
     reader: Reader = read_shot
 
     def load(self) -> tuple[AnyArray, dict[str, Any]]:
-        image, told = _read(self.reader, self.path, page=self.page)
-        return image, {"sha256": checksum(image), **told}
+        image, metadata = _read(self.reader, self.path, page=self.page)
+        return image, {"sha256": checksum(image), **metadata}
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +169,7 @@ class BlockShot(Shot):
     block: Any = field(repr=False)
 
     def load(self) -> tuple[AnyArray, dict[str, Any]]:
-        return ArrayShot(_plain(self.block.compute()[0])).load()
+        return ArrayShot(_plain_image(self.block.compute()[0])).load()
 
 
 def checksum(array: AnyArray) -> str:
@@ -176,12 +179,12 @@ def checksum(array: AnyArray) -> str:
     return digest.hexdigest()
 
 
-def described_reader(reader: Reader) -> str:
-    """Name a reader, so that a store is not continued with another."""
+def reader_text(reader: Reader) -> str:
+    """Return the name of a reader, so that a store is not continued with another."""
     if isinstance(reader, functools.partial):
-        named = ", ".join(f"{name}={value!r}" for name, value in sorted(reader.keywords.items()))
-        return f"{described_reader(reader.func)}({named})"
+        keywords = ", ".join(f"{name}={value!r}" for name, value in sorted(reader.keywords.items()))
+        return f"{reader_text(reader.func)}({keywords})"
     module, name = reader.__module__, getattr(reader, "__qualname__", type(reader).__qualname__)
-    own = __name__.partition(".")[0]
-    # Where ours lie may change; the stores that were begun with them go on.
-    return f"{own}.{name}" if module.startswith(f"{own}.") else f"{module}.{name}"
+    package = __name__.partition(".")[0]
+    # Modules of this package may move; existing stores can still be continued.
+    return f"{package}.{name}" if module.startswith(f"{package}.") else f"{module}.{name}"

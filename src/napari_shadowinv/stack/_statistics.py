@@ -1,4 +1,4 @@
-"""What all shots of a stack have in common, and how they differ."""
+"""Mean, spread and peaks across the shots of a stack."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
     xarray.Dataset
         Lazy. For each field ``name``, by component: ``name_mean`` and ``name_std`` (y, x), the
         standard deviation of one shot (divided by shots - 1; NaN for a single shot), and
-        ``name_peak`` (shot), the largest magnitude of each shot, without masked pixels where the
-        stack has its ``mask``, as a store of masked shots does.
+        ``name_peak`` (shot), the largest magnitude of each shot, without masked pixels if the
+        stack contains a ``mask``, as a store of masked shots does.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
             "the dataset has no fields of a series of shots: expected one from invert_stack, "
             "run_stack or a .shadowinv.zarr store"
         )
-    found: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     for name in names:
         field = stack[name]
         done = field
@@ -64,14 +64,16 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
             # By selection: NaN in their place would make every pixel of a mean a special case.
             done = field.isel(shot=np.flatnonzero(stack["status"].values == DONE))
         done = done.astype(np.float64)
-        found[f"{name}_mean"] = _labelled(done.mean("shot", skipna=False), field, "mean of shots")
+        variables[f"{name}_mean"] = _labelled(
+            done.mean("shot", skipna=False), field, "mean of shots"
+        )
         spread = done.std("shot", ddof=1, skipna=False)
         if done.sizes["shot"] < 2:
             spread = spread * np.nan
-        found[f"{name}_std"] = _labelled(spread, field, "standard deviation of shots")
+        variables[f"{name}_std"] = _labelled(spread, field, "standard deviation of shots")
         peak = _peak(field, stack.get("mask"))
-        found[f"{name}_peak"] = _labelled(peak, field, "largest magnitude")
-    return xr.Dataset(found, attrs={**stack.attrs, "shots": stack.sizes["shot"]})
+        variables[f"{name}_peak"] = _labelled(peak, field, "largest magnitude")
+    return xr.Dataset(variables, attrs={**stack.attrs, "shots": stack.sizes["shot"]})
 
 
 def _peak(field: xarray.DataArray, mask: xarray.DataArray | None) -> xarray.DataArray:
@@ -85,6 +87,6 @@ def _peak(field: xarray.DataArray, mask: xarray.DataArray | None) -> xarray.Data
     return largest**0.5
 
 
-def _labelled(values: xarray.DataArray, field: xarray.DataArray, what: str) -> xarray.DataArray:
+def _labelled(values: xarray.DataArray, field: xarray.DataArray, quantity: str) -> xarray.DataArray:
     name = str(field.attrs.get("long_name", field.name))
-    return values.assign_attrs(units=field.attrs.get("units", "1"), long_name=f"{name}, {what}")
+    return values.assign_attrs(units=field.attrs.get("units", "1"), long_name=f"{name}, {quantity}")

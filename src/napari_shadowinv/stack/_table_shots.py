@@ -1,7 +1,7 @@
-"""Shots that a table describes: `ObjectShot`, several images of one object; `RowShot`, one image.
+"""Shots of a table: `ObjectShot`, several images of one object; `RowShot`, one image.
 
-- what is fitted: `shots_of_table`; what is inverted, a row each: `row_shots`
-- what a worker does with the image of a row: `RowWork`
+- shots to fit: `object_shots`; shots to invert, a row each: `row_shots`
+- the inversion of a row by a worker: `RowWork`
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.formats import PRADFORMAT, TEXT, kind_of
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
-from napari_shadowinv.pipeline import FitShot, Inputs, gathered
+from napari_shadowinv.pipeline import FitShot, Inputs, collect_inputs
 from napari_shadowinv.pipeline._fit_shots import read_rows, row_setup
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, rows_to_invert
 from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe
 from napari_shadowinv.stack._discovery import names_of
-from napari_shadowinv.stack._sources import Shot, doubts_of_file, stamp
+from napari_shadowinv.stack._sources import Shot, file_doubts, stamp
 from napari_shadowinv.stack._worker import Beam, Work
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectShot(Shot):
-    """Several images of one object, as rows of a table describe them."""
+    """Several images of one object, from rows of a table."""
 
     rows: tuple[ShotRow, ...]
     recipe: Recipe
@@ -42,35 +42,35 @@ class ObjectShot(Shot):
     variable: str | None = None
 
     def load(self) -> tuple[Any, dict[str, Any]]:
-        """Return the images as `FitShot`, and what they were read from."""
+        """Return the images as `FitShot`, and the files of their rows."""
         shots = read_rows(self.rows, self.recipe, channel=self.channel, variable=self.variable)
         files = {
             f"{name} {number}": {**stamp(path), "sha256": sha256(path)}
             for number, row in enumerate(self.rows, 1)
             for name, path in row.files.items()
         }
-        return shots, {"files": files, "rows": self._described()}
+        return shots, {"files": files, "rows": self._summaries()}
 
     def shape(self) -> tuple[int, ...]:
         return read_part(self.rows[0].file, self.channel, self.variable).shape
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Compare the rows, and the files that are there by size and time or checksum."""
-        if self._described() != origin.get("rows"):
+        """Compare the rows, and existing files by size and time or checksum."""
+        if self._summaries() != origin.get("rows"):
             return False
         return all(
-            _is_same(path, origin.get("files", {}).get(f"{name} {number}", {}))
+            _is_unchanged(path, origin.get("files", {}).get(f"{name} {number}", {}))
             for number, row in enumerate(self.rows, 1)
             for name, path in row.files.items()
         )
 
-    def _described(self) -> list[dict[str, Any]]:
-        return [row.described for row in self.rows]
+    def _summaries(self) -> list[dict[str, Any]]:
+        return [row.summary for row in self.rows]
 
 
 @dataclass(frozen=True, eq=False)
 class RowShot(ObjectShot):
-    """One image that is inverted, as a row of a table describes it."""
+    """One image to invert, from a row of a table."""
 
     setup: Setup | None = None  # of the image as recorded
     unused: tuple[str, ...] = ()  # columns that only fits use
@@ -80,37 +80,37 @@ class RowShot(ObjectShot):
         return self.rows[0]
 
     def __dask_tokenize__(self) -> tuple[Any, ...]:
-        # A file that changed is another input, and what dask has of it another result.
+        # A changed file is another input, so dask must not reuse its result.
         files = {name: str(path) for name, path in self.row.files.items()}
-        known = [stamp(path) for path in self.row.files.values() if path.exists()]
+        stamps = [stamp(path) for path in self.row.files.values() if path.exists()]
         setup = "" if self.setup is None else self.setup.model_dump_json()
-        told = json.dumps([self.row.described, files, known])
-        return told, setup, str(self.channel), str(self.variable)
+        content = json.dumps([self.row.summary, files, stamps])
+        return content, setup, str(self.channel), str(self.variable)
 
     def load(self) -> tuple[Any, dict[str, Any]]:
         (shot,), origin = super().load()
-        warnings = doubts_of_file(shot.image)
+        warnings = file_doubts(shot.image)
         if self.unused:
             text = (
                 f"the table has {', '.join(self.unused)}, which an inversion does not use: fit the "
                 "image to use it"
             )
             warnings.append(Caution("file", text))
-        told = {**origin["files"]["file 1"], **origin, "warnings": warnings}
-        return dataclasses.replace(shot, setup=self.setup), told
+        metadata = {**origin["files"]["file 1"], **origin, "warnings": warnings}
+        return dataclasses.replace(shot, setup=self.setup), metadata
 
     def difference(self, origin: dict[str, Any]) -> str:
-        """Name what differs from the row, or the setup, of which a report tells."""
+        """Describe the difference from the row, or the setup, in a report."""
         (before,) = origin.get("rows") or ({},)
-        if before != self.row.described:
-            return _differences(before, self.row.described)
-        made = origin.get("provenance", {}).get("recipe", {}).get("setup")
-        old = None if made is None else setup_from_dict(made)
-        # A row whose image was put away may not tell its setup any more.
-        if old == self.setup or (self.setup is None and not self.row.file.exists()):
+        if before != self.row.summary:
+            return _differences(before, self.row.summary)
+        entries = origin.get("provenance", {}).get("recipe", {}).get("setup")
+        setup_before = None if entries is None else setup_from_dict(entries)
+        # The setup of a row may have been in an image that was removed.
+        if setup_before == self.setup or (self.setup is None and not self.row.file.exists()):
             return ""
-        told = [{} if one is None else one.model_dump() for one in (old, self.setup)]
-        return _differences(*told)
+        setups = (setup_before, self.setup)
+        return _differences(*({} if setup is None else setup.model_dump() for setup in setups))
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
@@ -121,18 +121,18 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     )
 
 
-def _is_same(path: Path, before: Mapping[str, Any]) -> bool:
+def _is_unchanged(path: Path, before: Mapping[str, Any]) -> bool:
     if not path.exists():
         return True  # put away after it was fitted
     return stamp(path).items() <= before.items() or sha256(path) == before.get("sha256")
 
 
-def shots_of_table(
+def object_shots(
     table: Path, recipe: Recipe, channel: str | None, variable: str | None
 ) -> dict[str, ObjectShot]:
-    """Return the shots that a table describes and that are fitted, by name."""
+    """Return the shots of a table to fit, by name."""
     return {
-        name: ObjectShot(tuple(map(_absolute, rows)), recipe, channel, variable)
+        name: ObjectShot(tuple(map(_with_absolute_paths, rows)), recipe, channel, variable)
         for name, rows in rows_by_shot(table, {}).items()
     }
 
@@ -140,18 +140,18 @@ def shots_of_table(
 def row_shots(
     table: Path | Sequence[ShotRow], recipe: Recipe, channel: str | None, variable: str | None
 ) -> dict[str, RowShot]:
-    """Return the shots that a table describes, or its rows, and that are inverted, by name."""
+    """Return the shots of a table, or of its rows, to invert, by name."""
     rows, unused = rows_to_invert(table)
     names = names_of([row.file for row in rows])
-    found = {}
-    for name, row in zip(names, map(_absolute, rows), strict=True):
-        setup = row_setup(row, _known_of(row, channel, variable), recipe)
-        found[name] = RowShot((row,), recipe, channel, variable, setup, unused)
-    return found
+    shots = {}
+    for name, row in zip(names, map(_with_absolute_paths, rows), strict=True):
+        setup = row_setup(row, _read_geometry(row, channel, variable), recipe)
+        shots[name] = RowShot((row,), recipe, channel, variable, setup, unused)
+    return shots
 
 
-def _known_of(row: ShotRow, channel: str | None, variable: str | None) -> Radiograph:
-    """An image, if its file may tell a geometry and can be read; else one that tells nothing."""
+def _read_geometry(row: ShotRow, channel: str | None, variable: str | None) -> Radiograph:
+    """Read an image if its file may contain a geometry; return an empty one otherwise."""
     try:
         if kind_of(row.file) in (PRADFORMAT.name, TEXT.name):
             return read_part(row.file, channel, variable)
@@ -160,8 +160,8 @@ def _known_of(row: ShotRow, channel: str | None, variable: str | None) -> Radiog
     return Radiograph(np.zeros((1, 1)))
 
 
-def _absolute(row: ShotRow) -> ShotRow:
-    """A row whose files a worker elsewhere finds."""
+def _with_absolute_paths(row: ShotRow) -> ShotRow:
+    """Return a row with absolute paths, for workers elsewhere."""
     return row.model_copy(update={name: path.absolute() for name, path in row.files.items()})
 
 
@@ -179,11 +179,11 @@ def first_image(shots: Sequence[ObjectShot]) -> FitShot:
 
 @dataclass(frozen=True, eq=False)
 class RowWork(Work):
-    """What is done with every row of a table that is inverted."""
+    """Task of every row of a table to invert."""
 
     estimate: Estimate | None = None  # of the source of rows without one
 
-    def gathered(self, content: Any, beam: Beam | None, source: AnyArray | None) -> Inputs:
+    def collect_inputs(self, content: Any, beam: Beam | None, source: AnyArray | None) -> Inputs:
         """Return the image of a row, divided by its gain, with its own source, mask and setup."""
         row: FitShot = content
         common = self.inputs
@@ -198,41 +198,41 @@ class RowWork(Work):
             source_mask=None,
             warnings=(),
         )
-        known = source if row.source is None else row.source
+        row_source = source if row.source is None else row.source
         recipe = common.recipe.model_copy(
             update={
-                # What all shots share is in the beam already.
+                # A common source is already in the beam.
                 "source": self.estimate if beam is None else common.recipe.source,
                 "setup": row.setup,
                 "mask": row.mask,
             }
         )
         usable = common.shot.mask if row.mask is None else None
-        inputs = gathered(
-            recipe, bare, source=known, mask=usable, source_mask=common.shot.source_mask
+        inputs = collect_inputs(
+            recipe, bare, source=row_source, mask=usable, source_mask=common.shot.source_mask
         )
         if beam is None:
             inputs.recipe.check(inputs.shot)
-        told: dict[str, Any] = {"gain": row.gain}
+        entries: dict[str, Any] = {"gain": row.gain}
         if row.source is None:
-            told["source"] = common.provenance.source
-        provenance = inputs.provenance.model_copy(update=told)
+            entries["source"] = common.provenance.source
+        provenance = inputs.provenance.model_copy(update=entries)
         return dataclasses.replace(inputs, provenance=provenance)
 
     def report(self, inversion: Inversion) -> dict[str, Any]:
-        """Return what is told of a shot: its own provenance and energy, too."""
-        made = inversion.provenance
-        assert made is not None
-        told = {"provenance": json.loads(made.model_dump_json(exclude_none=True))}
-        energy = getattr(made.setup, "energy", None)
-        return {**super().report(inversion), **told, **({"energy": energy} if energy else {})}
+        """Return the report of a shot, with its own provenance and energy."""
+        provenance = inversion.provenance
+        assert provenance is not None
+        entries = {"provenance": json.loads(provenance.model_dump_json(exclude_none=True))}
+        energy = getattr(provenance.setup, "energy", None)
+        return {**super().report(inversion), **entries, **({"energy": energy} if energy else {})}
 
     def _check_setup(self, setup: Setup | None) -> None:
         first = self.inputs.recipe.setup
-        kinds = [None if one is None else one.kind for one in (setup, first)]
+        kinds = [None if setup is None else setup.kind, None if first is None else first.kind]
         if kinds[0] != kinds[1]:
-            own, usual = (f"a setup of kind '{kind}'" if kind else "no setup" for kind in kinds)
+            texts = [f"a setup of kind '{kind}'" if kind else "no setup" for kind in kinds]
             raise InputError(
-                f"it has {own}, and the first row of its table {usual}: a store has the units of "
-                "one kind of setup; give all rows such a setup, or use two tables"
+                f"it has {texts[0]}, and the first row of its table {texts[1]}: a store has the "
+                "units of one kind of setup; give all rows such a setup, or use two tables"
             )

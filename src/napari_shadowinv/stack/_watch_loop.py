@@ -1,7 +1,7 @@
-"""What is done with each file that arrives while a folder is watched: `Watch`.
+"""The loop over files that arrive in a watched folder: `Watch`.
 
-- a sign of life, and who is told: `WatchProgress`, `Books`
-- what all shots share, as soon as it is known: `StackMaker`
+- progress and its callback: `WatchProgress`, `RunStatus`
+- the description of the stack from its first files: `StackMaker`
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from napari_shadowinv.io.store_growing import GrowingStore
 from napari_shadowinv.io.store_layout import create_store
 from napari_shadowinv.stack._discovery import Shots
 from napari_shadowinv.stack._folder_events import Arrivals
-from napari_shadowinv.stack._resume import NUMBERED_AS_ARRIVED, contents_of, made_alike
+from napari_shadowinv.stack._resume import NUMBERED_AS_ARRIVED, contents_of, match_store
 from napari_shadowinv.stack._run import RunProgress
 from napari_shadowinv.stack._shots import FitStack, Stack
-from napari_shadowinv.stack._site_count import TRIED, shares_needed, with_chosen
+from napari_shadowinv.stack._site_count import MAX_TRIED_SHOTS, needed_shares, with_enough_sites
 from napari_shadowinv.stack._sources import FileShot, Reader, Shot, stamp
-from napari_shadowinv.stack._worker import ShotOutcome, Tried, reason_of, try_shot, write_shot
+from napari_shadowinv.stack._worker import Attempt, ShotOutcome, failure_text, try_shot, write_shot
 
 if TYPE_CHECKING:
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
 
-# Shots at once. It is fixed, because each starts from the one so many before, and what is found
-# shall not depend on the machine.
-_ABREAST = 2
-_TICK = 2.0  # seconds in which times of files may be the same, on any file system
-_POLL = 0.25  # seconds between two looks at `should_stop` while nothing arrives
+# Simultaneous shots. The number is fixed, because each starts from the last one in its lane, and
+# results must not depend on the machine.
+_LANES = 2
+_CLOCK_RESOLUTION_S = 2.0  # of file times, on any file system
+_POLL_S = 0.25  # between two looks at `should_stop` while nothing arrives
 
 
 @dataclass(frozen=True)
 class WatchProgress(RunProgress):
-    """A sign of life from a folder that is watched; see also `RunProgress`.
+    """Progress of a watched folder; see also `RunProgress`.
 
     Attributes
     ----------
@@ -57,9 +57,9 @@ class WatchProgress(RunProgress):
     again : bool
         Whether the shot was inverted before and its file has changed since.
     result : Inversion, Fit or None
-        What came of the shot that has just ended; do not keep it.
+        Result of the shot that has just ended; do not keep a reference.
     note : str
-        Something the user should know of, in a sentence.
+        A sentence for the user.
     """
 
     waiting: int = 0
@@ -71,25 +71,25 @@ class WatchProgress(RunProgress):
 OnWatchProgress = Callable[[WatchProgress], None]
 
 
-class Books:
-    """What has come of the shots, and who is told of it."""
+class RunStatus:
+    """Status of the shots, and the callback that reports it."""
 
     def __init__(self, arrivals: Arrivals, on_progress: OnWatchProgress | None) -> None:
         self._arrivals = arrivals
         self._on_progress = on_progress
         self.store: GrowingStore | None = None
-        # What failed before the first good shot, which makes the store or shows that it fits.
+        # Failures before the first good shot, which creates the store or proves that it fits.
         self.early: dict[str, dict[str, Any]] = {}
         self.in_work = 0  # shots that are being inverted
 
-    def prepare(self, what: str) -> None:
-        self.tell(preparing=what)
+    def report_stage(self, stage: str) -> None:
+        self.report(preparing=stage)
 
-    def note(self, sentence: str) -> None:
-        self.tell(note=sentence)
+    def report_note(self, sentence: str) -> None:
+        self.report(note=sentence)
 
-    def tell(self, **news: Any) -> None:
-        """Tell how many shots there are, and some news."""
+    def report(self, **news: Any) -> None:
+        """Report the numbers of shots, and some news."""
         if self._on_progress is None:
             return
         early, store = len(self.early), self.store
@@ -97,53 +97,53 @@ class Books:
         done = 0 if store is None else store.count(DONE)
         failed = early + (0 if store is None else store.count(FAILED))
         waiting = self._arrivals.waiting + self.in_work
-        told: dict[str, Any] = {"engine": "watching", "waiting": waiting, **news}
-        self._on_progress(WatchProgress(total, done, failed, **told))
+        progress: dict[str, Any] = {"engine": "watching", "waiting": waiting, **news}
+        self._on_progress(WatchProgress(total, done, failed, **progress))
 
 
-def _unchanged(shot: FileShot, known: dict[str, Any], seen: dict[str, int]) -> bool:
-    """Whether a file is still the one of which this is known."""
-    # Within a tick of the file system's clock it may have changed without looking so.
-    if time.time() - seen["mtime_ns"] / 1e9 < _TICK and "sha256" in known:
-        return bool(sha256(shot.path) == known["sha256"])
-    return shot.unchanged(known)
+def _is_unchanged(shot: FileShot, report: dict[str, Any], stamp_now: dict[str, int]) -> bool:
+    """Return whether a file still agrees with its report."""
+    # Within the resolution of file times it may have changed at the same time.
+    if time.time() - stamp_now["mtime_ns"] / 1e9 < _CLOCK_RESOLUTION_S and "sha256" in report:
+        return bool(sha256(shot.path) == report["sha256"])
+    return shot.unchanged(report)
 
 
-class _ShapeUnknown(Exception):  # noqa: N818 - nothing is wrong yet
-    """No shot has arrived that could tell its shape."""
+class _ShapeUnknownError(Exception):
+    """The shape is unknown until a shot has arrived."""
 
 
 class _NoShot(Shot):
-    """Stands for the shots while there are none."""
+    """Placeholder before any shot has arrived."""
 
     def shape(self) -> tuple[int, ...]:
-        raise _ShapeUnknown
+        raise _ShapeUnknownError
 
 
 @dataclass(frozen=True)
 class StackMaker:
-    """Describes what the shots of a folder share."""
+    """Describes the stack of a folder's shots."""
 
     describe: Callable[[Shots], Stack]
     folder: Path
     reader: Reader
-    chained: bool  # whether each shot shall start from an earlier one
+    chained: bool  # whether each shot starts from an earlier one
 
     def shot(self, name: str) -> FileShot:
         return FileShot(self.folder / name, self.reader)
 
     def before_any(self) -> Stack | None:
-        """Return what is known before a shot has arrived; None without its shape."""
+        """Return the stack before a shot has arrived; None if its shape is unknown."""
         try:
-            return self._made([_NoShot()], [""])
-        except _ShapeUnknown:
+            return self._describe([_NoShot()], [""])
+        except _ShapeUnknownError:
             return None
 
     def of(self, names: Sequence[str]) -> Stack:
-        """Return what the shots share, the first of which can be read."""
-        return self._made([self.shot(name) for name in names], names)
+        """Return the stack of some shots, the first of which can be read."""
+        return self._describe([self.shot(name) for name in names], names)
 
-    def _made(self, items: Sequence[Shot], names: Sequence[str]) -> Stack:
+    def _describe(self, items: Sequence[Shot], names: Sequence[str]) -> Stack:
         stack = self.describe(Shots(items, tuple(map(text_of, names)), (0, 0)))
         # Shots start from each other only on the same sites.
         chained = self.chained and stack.beam is not None and not isinstance(stack, FitStack)
@@ -151,20 +151,20 @@ class StackMaker:
 
 
 @dataclass(frozen=True, eq=False)
-class _Attempt:
-    """A shot that is being inverted."""
+class _RunningShot:
+    """A shot in work, with its attempt."""
 
     name: str
     shot: FileShot
-    seen: dict[str, int]  # of its file, before it was read
+    stamp_before: dict[str, int]  # of its file, before it was read
     lane: int
-    tried: Future[Tried]
+    attempt: Future[Attempt]
 
 
 class Watch:
     """Takes file after file, inverts two at once, and writes them in the order of arrival.
 
-    Shots begin in the two lanes by turns; each starts from what came of the last one in its lane.
+    Shots alternate between two lanes; each starts from the last result in its lane.
     """
 
     def __init__(
@@ -173,24 +173,24 @@ class Watch:
         dtype: np.dtype[Any],
         stacks: StackMaker,
         arrivals: Arrivals,
-        books: Books,
+        status: RunStatus,
         should_stop: ShouldStop | None,
     ) -> None:
         self._path, self._dtype, self._stacks = path, dtype, stacks
-        self._arrivals, self._books, self._should_stop = arrivals, books, should_stop
+        self._arrivals, self._status, self._should_stop = arrivals, status, should_stop
         self._overwrite = False
         self._stack: Stack | None = None
-        self._work: Any = None  # known once the number of sites is
-        self._pool = ThreadPoolExecutor(_ABREAST)
+        self._work: Any = None  # once the number of sites is known
+        self._pool = ThreadPoolExecutor(_LANES)
         self._abandoned = Event()
-        self._attempts: deque[_Attempt] = deque()
-        self._lanes: list[Inversion | Fit | None] = [None] * _ABREAST
+        self._running: deque[_RunningShot] = deque()
+        self._lanes: list[Inversion | Fit | None] = [None] * _LANES
         self._redo: set[str] = set()
         self._begun = self._ended = 0
         self._last = time.monotonic()
 
     def open(self, *, overwrite: bool, redo_failed: bool) -> None:
-        """Refuse what cannot work before anything arrives, as far as that is known by then."""
+        """Open or check the store before any shot arrives, as far as possible."""
         self._overwrite = overwrite
         self._stack = self._stacks.before_any()
         if overwrite or not self._path.exists():
@@ -198,183 +198,187 @@ class Watch:
         store = StackStore(self._path)
         again = (PENDING, FAILED) if redo_failed else (PENDING,)
         self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
-        self._books.store = GrowingStore(store, NUMBERED_AS_ARRIVED)
+        self._status.store = GrowingStore(store, NUMBERED_AS_ARRIVED)
         if self._stack is not None:
-            self._use(made_alike(store, self._stack, self._dtype))
+            self._use_stack(match_store(store, self._stack, self._dtype))
 
     def run(self, idle: float | None = None, most: int | None = None) -> None:
-        """Invert what is there and what arrives, until it is over."""
+        """Invert existing and arriving files until the watch ends."""
         for name in sorted(self._redo):
             self._arrivals.put_back(name)
-        self._books.tell()
+        self._status.report()
         try:
             while not self._is_over(idle, most):
-                self._go_on(most)
+                self._advance(most)
         except InversionCancelled:
             pass
         finally:
             self._abandoned.set()
             self._pool.shutdown(cancel_futures=True)
-            self._books.tell()
+            self._status.report()
 
     def _is_over(self, idle: float | None, most: int | None) -> bool:
         if most is not None and self._ended >= most:
             return True
         if self._should_stop is not None and self._should_stop():
             return True
-        quiet = time.monotonic() - max(self._arrivals.heard, self._last)
-        is_quiet = self._arrivals.is_quiet and not self._attempts
+        quiet = time.monotonic() - max(self._arrivals.last_event, self._last)
+        is_quiet = self._arrivals.is_quiet and not self._running
         return idle is not None and quiet > idle and is_quiet
 
     def _is_stopped(self) -> bool:
-        asked = self._should_stop is not None and self._should_stop()
-        return asked or self._abandoned.is_set()
+        requested = self._should_stop is not None and self._should_stop()
+        return requested or self._abandoned.is_set()
 
-    def _go_on(self, most: int | None) -> None:
-        """Write the oldest shot once it is done, or begin the next one."""
-        begun = len(self._attempts)
-        is_full = begun == _ABREAST or (most is not None and self._ended + begun == most)
-        if begun and (is_full or self._attempts[0].tried.done()):
+    def _advance(self, most: int | None) -> None:
+        """Write the oldest shot once it is done, or start the next one."""
+        begun = len(self._running)
+        is_full = begun == _LANES or (most is not None and self._ended + begun == most)
+        if begun and (is_full or self._running[0].attempt.done()):
             self._finish()
             return
-        arrived = self._arrivals.take(_POLL)
+        arrived = self._arrivals.next_name(_POLL_S)
         if arrived is not None:
             self._begin(arrived)
 
     def _begin(self, name: str) -> None:
-        while any(name == one.name for one in self._attempts):
+        while any(name == running.name for running in self._running):
             self._finish()  # it may have changed since it was read
         shot = self._stacks.shot(name)
         try:
-            seen = stamp(shot.path)
-            known = self._known(text_of(name))
-            if known is not None and _unchanged(shot, known, seen):
+            stamp_now = stamp(shot.path)
+            report = self._previous_report(text_of(name))
+            if report is not None and _is_unchanged(shot, report, stamp_now):
                 if not self._arrivals.waiting:
-                    self._books.tell()
+                    self._status.report()
                 return
         except OSError:
             self._arrivals.check()
             return  # removed before its turn
-        lane = self._begun % _ABREAST
+        lane = self._begun % _LANES
         self._begun += 1
-        self._books.in_work += 1
-        tried = self._trying(name, shot, lane)
-        tried.add_done_callback(lambda _: self._arrivals.wake())
-        self._attempts.append(_Attempt(name, shot, seen, lane, tried))
-        self._books.tell()
+        self._status.in_work += 1
+        attempt = self._submit(name, shot, lane)
+        attempt.add_done_callback(lambda _: self._arrivals.wake())
+        self._running.append(_RunningShot(name, shot, stamp_now, lane, attempt))
+        self._status.report()
 
     def _finish(self) -> None:
-        """Wait for the oldest attempt, and write what came of it."""
-        attempt = self._attempts[0]
-        tried, seen = attempt.tried.result(), attempt.seen
-        self._attempts.popleft()
-        self._books.in_work -= 1
-        changed = {**seen, **tried.origin}
+        """Wait for the oldest attempt, and write its outcome."""
+        running = self._running[0]
+        attempt, stamp_before = running.attempt.result(), running.stamp_before
+        self._running.popleft()
+        self._status.in_work -= 1
+        stamp_after = {**stamp_before, **attempt.origin}
         with suppress(OSError):
-            changed = stamp(attempt.shot.path) if tried.failure else changed
-        if not seen.items() <= changed.items():
-            self._arrivals.put_back(attempt.name)  # it was written to while it was read
+            stamp_after = stamp(running.shot.path) if attempt.failure else stamp_after
+        if not stamp_before.items() <= stamp_after.items():
+            self._arrivals.put_back(running.name)  # it was written to while it was read
             return
-        if tried.failure:
+        if attempt.failure:
             self._arrivals.check()
-        name = text_of(attempt.name)
-        again = self._known(name) is not None
+        name = text_of(running.name)
+        again = self._previous_report(name) is not None
         with interrupts_put_off():
-            outcome = self._write(name, replace(tried, origin={**seen, **tried.origin}))
+            outcome = self._write(name, replace(attempt, origin={**stamp_before, **attempt.origin}))
         self._redo.discard(name)
-        self._lanes[attempt.lane] = self._start_for_next(tried)
+        self._lanes[running.lane] = self._start_for_next(attempt)
         self._ended += 1
         self._last = time.monotonic()
-        self._books.tell(name=name, outcome=outcome, result=tried.result, again=again)
+        self._status.report(name=name, outcome=outcome, result=attempt.result, again=again)
 
-    def _known(self, name: str) -> dict[str, Any] | None:
-        """What was told of a shot that has ended before; None of one that has not."""
-        store = self._books.store
+    def _previous_report(self, name: str) -> dict[str, Any] | None:
+        """Return the report of a shot that has ended before; None if it has not."""
+        store = self._status.store
         index = None if store is None else store.number(name)
-        if store is None or index is None or name in self._books.early:
-            return self._books.early.get(name)
+        if store is None or index is None or name in self._status.early:
+            return self._status.early.get(name)
         pending = name in self._redo or store.status(index) == PENDING
         return None if pending else store.report(index)
 
-    def _trying(self, name: str, shot: FileShot, lane: int) -> Future[Tried]:
+    def _submit(self, name: str, shot: FileShot, lane: int) -> Future[Attempt]:
         failed = self._prepare(name, shot) if self._work is None else None
         if failed is not None:
-            known: Future[Tried] = Future()
-            known.set_result(failed)
-            return known
+            done: Future[Attempt] = Future()
+            done.set_result(failed)
+            return done
         stack = self._stack
         assert stack is not None
         source, start = stack.source_of(0), self._lanes[lane]
         # Alone, it has all the cores.
-        workers = _ABREAST if self._attempts or self._arrivals.waiting else 1
+        workers = _LANES if self._running or self._arrivals.waiting else 1
         return self._pool.submit(
             try_shot, self._work, shot, stack.beam, source, start, workers, self._is_stopped
         )
 
-    def _prepare(self, name: str, shot: FileShot) -> Tried | None:
-        """Find out what all shots share by the first one; or why that one tells nothing."""
+    def _prepare(self, name: str, shot: FileShot) -> Attempt | None:
+        """Describe the stack by its first shot; return a failed attempt if that is impossible."""
         began = time.perf_counter()
-        names = [name, *self._arrivals.peek(TRIED - 1)]
+        names = [name, *self._arrivals.peek(MAX_TRIED_SHOTS - 1)]
         stack = self._stack
         if stack is None:
             try:
                 shot.shape()
             except Exception as error:
-                return Tried(began, time.perf_counter() - began, {}, failure=reason_of(error))
-            store = self._books.store
+                return Attempt(began, time.perf_counter() - began, {}, failure=failure_text(error))
+            store = self._status.store
             if store is not None:
-                # Earlier shots know better how large an image is.
-                there = (one for one in store.done() if self._stacks.shot(one).path.exists())
-                names = [*islice(there, TRIED), *names]
+                # Earlier shots are a better reference for the size of the images.
+                existing = (
+                    earlier for earlier in store.done() if self._stacks.shot(earlier).path.exists()
+                )
+                names = [*islice(existing, MAX_TRIED_SHOTS), *names]
             stack = self._stacks.of(names)
             if store is not None:
-                self._use(made_alike(StackStore(self._path), stack, self._dtype))
+                self._use_stack(match_store(StackStore(self._path), stack, self._dtype))
                 return None
         if stack.chooses_sites:
-            self._books.prepare("how many sites the first shots need")
+            self._status.report_stage("how many sites the first shots need")
             shots = self._stacks.of(names).shots
-            shares = shares_needed(replace(stack, shots=shots), self._should_stop)
+            shares = needed_shares(replace(stack, shots=shots), self._should_stop)
             if not shares:
-                # It fails the same way, and a later one decides.
+                # It fails the same way, and a later shot decides.
                 return try_shot(stack.work(()), shot, stack.beam, None, None, 1, self._should_stop)
-            stack = with_chosen(stack, shares)
-        self._use(stack)
+            stack = with_enough_sites(stack, shares)
+        self._use_stack(stack)
         return None
 
-    def _use(self, stack: Stack) -> None:
+    def _use_stack(self, stack: Stack) -> None:
         self._stack = stack
-        own = tuple(name for name in stack.variables if not stack.is_shared(name))
-        self._work = stack.work(own)
+        per_shot = tuple(name for name in stack.variables if not stack.is_shared(name))
+        self._work = stack.work(per_shot)
 
-    def _write(self, name: str, tried: Tried) -> ShotOutcome:
-        early = self._books.early
-        if tried.result is None and (self._work is None or self._books.store is None):
-            early[name] = {**tried.origin, "reason": tried.failure, "seconds": tried.seconds}
-            return ShotOutcome(len(early) - 1, FAILED, tried.seconds, tried.failure)
-        store = self._books.store or self._made([*early, name])
-        for other in list(early):
-            index = store.number(other)
-            report = early.pop(other)
-            if other != name:
-                store.fail(store.append(other) if index is None else index, report)
-        found = store.number(name)
-        index = store.append(name) if found is None else found
+    def _write(self, name: str, attempt: Attempt) -> ShotOutcome:
+        early = self._status.early
+        if attempt.result is None and (self._work is None or self._status.store is None):
+            early[name] = {**attempt.origin, "reason": attempt.failure, "seconds": attempt.seconds}
+            return ShotOutcome(len(early) - 1, FAILED, attempt.seconds, attempt.failure)
+        store = self._status.store or self._create_store([*early, name])
+        for early_name in list(early):
+            index = store.number(early_name)
+            report = early.pop(early_name)
+            if early_name != name:
+                store.fail(store.append(early_name) if index is None else index, report)
+        number = store.number(name)
+        index = store.append(name) if number is None else number
         if store.status(index) == DONE:
             store.reopen(index)
-        return write_shot(store, self._work, index, tried)
+        return write_shot(store, self._work, index, attempt)
 
-    def _made(self, names: Sequence[str]) -> GrowingStore:
-        """Make the store with its first shots."""
+    def _create_store(self, names: Sequence[str]) -> GrowingStore:
+        """Create the store with its first shots."""
         assert self._stack is not None
         first = tuple(dict.fromkeys(names))
         shots = replace(self._stack.shots, items=[_NoShot()] * len(first), names=first)
         stack = replace(self._stack, shots=shots)
-        made = create_store(self._path, contents_of(stack, self._dtype), overwrite=self._overwrite)
+        created = create_store(
+            self._path, contents_of(stack, self._dtype), overwrite=self._overwrite
+        )
         self._overwrite = False
-        self._books.store = GrowingStore(made, NUMBERED_AS_ARRIVED)
-        return self._books.store
+        self._status.store = GrowingStore(created, NUMBERED_AS_ARRIVED)
+        return self._status.store
 
-    def _start_for_next(self, tried: Tried) -> Inversion | Fit | None:
+    def _start_for_next(self, attempt: Attempt) -> Inversion | Fit | None:
         chained = self._stack is not None and self._stack.chained
-        good = tried.result is not None and tried.result.report.converged
-        return tried.result if chained and good else None
+        good = attempt.result is not None and attempt.result.report.converged
+        return attempt.result if chained and good else None

@@ -1,8 +1,7 @@
-"""What a worker does: `Work` inverts one shot, `run_shots` some and writes each.
+"""Tasks of a worker: `Work` inverts one shot, `run_shots` several and writes each.
 
-The parts of it are `try_shot` and `write_shot`.
-
-`FitWork` takes the place of `Work` in a stack that is fitted, and has the same methods.
+`run_shots` consists of `try_shot` and `write_shot`. For stacks to fit, `FitWork` replaces `Work`
+and has the same methods.
 """
 
 from __future__ import annotations
@@ -37,8 +36,8 @@ from napari_shadowinv.stack._fit_work import FitWork
 from napari_shadowinv.stack._sources import Shot, checksum
 from napari_shadowinv.transport.sites import SitePlan
 
-_ASKED_AGAIN_AFTER = 10.0  # seconds: workers come and go, but asking takes milliseconds
-_PLANS_KEPT = 2  # a worker that changes between two sources makes each once
+_REFRESH_S = 10.0  # workers come and go, but asking takes milliseconds
+_MAX_PLANS = 2  # a worker that changes between two sources makes each once
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,7 @@ class Beam:
     shape: tuple[int, int]
     source: AnyArray | None = field(default=None, repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
-    key: str = ""  # checksum of the others
+    key: str = ""  # checksum of the other fields
 
     @property
     def image(self) -> AnyArray:
@@ -64,7 +63,7 @@ class Beam:
 
 @dataclass
 class _Entry:
-    """A plan that is being made, or is there."""
+    """A plan, complete or in preparation."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     plan: SitePlan | None = None
@@ -81,12 +80,12 @@ def shared_plan(
     measured: bool = True,
     should_stop: ShouldStop | None = None,
 ) -> SitePlan:
-    """Return the sites for a beam; the first in this process who asks makes them."""
+    """Return the sites for a beam; the first call in this process computes them."""
     key = f"{beam.key}{options.site_key()}{measured}"
     with _entries_lock:
         entry = _entries.setdefault(key, _Entry())
         _entries.move_to_end(key)
-        while len(_entries) > _PLANS_KEPT:
+        while len(_entries) > _MAX_PLANS:
             _entries.popitem(last=False)
     with entry.lock:
         if entry.plan is None:
@@ -118,7 +117,7 @@ class _SharedSites(Cache):
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What is done with every shot of a stack, wherever it is."""
+    """Task of every shot of a stack."""
 
     shape: tuple[int, int]  # of the shots as recorded
     inputs: Inputs  # without an image; shots inverted at once share the cores
@@ -137,13 +136,13 @@ class Work:
     ) -> Inversion:
         """Apply the recipe to a shot as recorded, and to its source if it has its own."""
         image = getattr(content, "image", content)
-        found = getattr(image, "shape", None) or np.shape(image)
-        if found != self.shape:
-            others = "the others" if beam is None or beam.source is None else "the source"
-            raise InputError(f"image has shape {found}, expected {self.shape} as {others}")
+        shape = getattr(image, "shape", None) or np.shape(image)
+        if shape != self.shape:
+            reference = "the others" if beam is None or beam.source is None else "the source"
+            raise InputError(f"image has shape {shape}, expected {self.shape} as {reference}")
         if source is not None and np.shape(source) != self.shape:
             raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
-        inputs = self.gathered(content, beam, source)
+        inputs = self.collect_inputs(content, beam, source)
         recipe = inputs.recipe
         ready = recipe.prepared(inputs.shot, should_stop)
         if beam is None and isinstance(recipe.source, UniformEstimate):
@@ -151,33 +150,33 @@ class Work:
         if beam is not None:
             ready = replace(ready, source=beam.image)
             if beam.source is None:
-                ready = replace(ready, image=_relative(ready.image, ready.mask))
+                ready = replace(ready, image=_divide_by_mean(ready.image, ready.mask))
         options = recipe.options
         if options.threads is None:
             options = options.model_copy(update={"threads": threads_here(workers)})
         inputs = replace(inputs, recipe=recipe.model_copy(update={"options": options}))
         sites = _SharedSites(beam=beam)
-        found = run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
-        return _as_chosen(found) if self.sites_chosen else found
+        inversion = run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
+        return _with_sites_reason(inversion) if self.sites_chosen else inversion
 
-    def gathered(self, content: Any, beam: Beam | None, source: AnyArray | None) -> Inputs:
-        """Return what the recipe is applied to."""
+    def collect_inputs(self, content: Any, beam: Beam | None, source: AnyArray | None) -> Inputs:
+        """Return the inputs of the recipe."""
         values = np.asarray(content, dtype=np.float64)
         return replace(self.inputs, shot=replace(self.inputs.shot, image=values, source=source))
 
     def arrays(self, inversion: Inversion) -> dict[str, AnyArray]:
         """Return the variables by name, fields in SI units among them."""
-        own = variable_labels()
-        arrays = {name: getattr(inversion, name) for name in self.variables if name in own}
+        labels = variable_labels()
+        arrays = {name: getattr(inversion, name) for name in self.variables if name in labels}
         if len(arrays) < len(self.variables):
             fields = dataset_from_field(
                 inversion.displacement, inversion.potential, inversion.setup
             )
-            arrays |= {name: fields[name].values for name in self.variables if name not in own}
+            arrays |= {name: fields[name].values for name in self.variables if name not in labels}
         return arrays
 
     def report(self, inversion: Inversion) -> dict[str, Any]:
-        """Return what is told of a shot."""
+        """Return the report of a shot."""
         headline = inversion.headline
         return {
             **dataclasses.asdict(inversion.report),
@@ -188,8 +187,8 @@ class Work:
         }
 
 
-def _as_chosen(inversion: Inversion) -> Inversion:
-    """Tell of a shot that the first ones have decided on its sites, and whether these suffice."""
+def _with_sites_reason(inversion: Inversion) -> Inversion:
+    """Add the reason for the number of sites, and a warning if it does not suffice."""
     caution, errors = None, inversion.errors
     if errors is not None:
         why = "with the sites of the first shots"
@@ -203,7 +202,7 @@ def _as_chosen(inversion: Inversion) -> Inversion:
 
 
 def numbers_of(inversion: Inversion) -> dict[str, Any]:
-    """Return the numbers of a shot that stand beside its arrays, by the store's names."""
+    """Return the scalar results of a shot by the store's names."""
     report, errors = inversion.report, inversion.errors
     return {
         "converged": report.converged,
@@ -215,11 +214,11 @@ def numbers_of(inversion: Inversion) -> dict[str, Any]:
     }
 
 
-def _relative(image: AnyArray, mask: BoolArray | None) -> AnyArray:
+def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:
     """Divide by the mean, because a uniform beam that all shots share is 1 everywhere."""
     values = np.asarray(image, dtype=np.float64)
     used = values if mask is None else values[mask]
-    # An image that cannot be inverted is left alone: the error shall tell of it as it was.
+    # An invalid image is left unchanged: the error should refer to the original.
     if not np.isfinite(used).all():
         return values
     mean = float(np.maximum(used, 0).mean())
@@ -244,10 +243,10 @@ def _threads_of_cluster() -> int | None:
     from distributed.comm.addressing import get_address_host
 
     try:
-        here = get_address_host(get_worker().address)
+        host = get_address_host(get_worker().address)
     except ValueError:
         return None
-    return _threads_on(here, int(time.monotonic() / _ASKED_AGAIN_AFTER))
+    return _threads_on(host, int(time.monotonic() / _REFRESH_S))
 
 
 @functools.lru_cache(maxsize=1)
@@ -271,7 +270,7 @@ def _threads_of_pool(cores: int) -> int:
 
 @dataclass(frozen=True)
 class ShotOutcome:
-    """What became of one shot.
+    """Outcome of one shot.
 
     Attributes
     ----------
@@ -291,8 +290,8 @@ class ShotOutcome:
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What the task of every shot needs to know."""
+class TaskContext:
+    """Context that the tasks of all shots share."""
 
     writer: ShotWriter
     work: Work | FitWork
@@ -303,28 +302,28 @@ def run_shots(
     shots: list[Any],
     labels: list[tuple[int, bool, Shot | None]],
     beam: Beam | None,
-    settings: Settings,
+    context: TaskContext,
     stop: Any = None,
 ) -> list[ShotOutcome]:
     """Task: invert, or fit, some shots one after the other and write each."""
     should_stop = None if stop is None else stop.is_set
     previous: Inversion | Fit | None = None
     outcomes = []
-    for shot, (index, wanted, source) in zip(shots, labels, strict=True):
-        tried = try_shot(settings.work, shot, beam, source, previous, settings.workers, should_stop)
-        previous = tried.result
-        if wanted:
-            outcomes.append(write_shot(settings.writer, settings.work, index, tried))
+    for shot, (index, is_pending, source) in zip(shots, labels, strict=True):
+        attempt = try_shot(context.work, shot, beam, source, previous, context.workers, should_stop)
+        previous = attempt.result
+        if is_pending:
+            outcomes.append(write_shot(context.writer, context.work, index, attempt))
     return outcomes
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
-    """What came of the attempt to invert, or fit, a shot; it has a result or a failure."""
+class Attempt:
+    """An attempt to invert or fit a shot, with a result or a failure."""
 
     began: float  # value of `time.perf_counter`
     seconds: float
-    origin: dict[str, Any]  # what is known of its file
+    origin: dict[str, Any]  # metadata of its file
     result: Inversion | Fit | None = None
     failure: str = ""
 
@@ -337,47 +336,47 @@ def try_shot(
     start: Any = None,
     workers: int | None = None,
     should_stop: ShouldStop | None = None,
-) -> Tried:
-    """Read and invert, or fit, one shot; all but a cancellation is its own failure."""
+) -> Attempt:
+    """Read and invert, or fit, one shot; all errors but a cancellation become its failure."""
     began = time.perf_counter()
     origin: dict[str, Any] = {}
     result, failure = None, ""
     try:
-        image, origin = _loaded(shot)
-        own = None
+        image, origin = _load_shot(shot)
+        shot_source = None
         if source is not None:
-            own, origin["source"] = source.load()
+            shot_source, origin["source"] = source.load()
         result = work.invert(
-            image, beam, own, start=start, workers=workers, should_stop=should_stop
+            image, beam, shot_source, start=start, workers=workers, should_stop=should_stop
         )
     except InversionCancelled:
         raise
     except Exception as error:
-        # Whatever a reader or a solver stumbles over, the other shots shall go on.
-        failure = reason_of(error)
-    return Tried(began, time.perf_counter() - began, origin, result, failure)
+        # No error of a reader or a solver may stop the other shots.
+        failure = failure_text(error)
+    return Attempt(began, time.perf_counter() - began, origin, result, failure)
 
 
 def write_shot(
-    writer: ShotWriter | GrowingStore, work: Any, index: int, tried: Tried
+    writer: ShotWriter | GrowingStore, work: Any, index: int, attempt: Attempt
 ) -> ShotOutcome:
-    """Write what came of a shot."""
-    made = tried.result
-    cautions = [dataclasses.asdict(caution) for caution in tried.origin.get("warnings", ())]
-    if made is None:
-        failed = {"reason": tried.failure, "seconds": tried.seconds}
-        writer.fail(index, {**tried.origin, **failed, "warnings": cautions})
-        return ShotOutcome(index, FAILED, tried.seconds, tried.failure)
-    told = work.report(made)
-    warnings = {"warnings": [*told["warnings"], *cautions]}
-    report = {**told, "seconds": tried.seconds, **tried.origin, **warnings}
-    writer.write(index, work.arrays(made), report)
-    spent = time.perf_counter() - tried.began
-    return ShotOutcome(index, DONE, spent, converged=made.report.converged)
+    """Write the result or the failure of a shot."""
+    result = attempt.result
+    cautions = [dataclasses.asdict(caution) for caution in attempt.origin.get("warnings", ())]
+    if result is None:
+        failed = {"reason": attempt.failure, "seconds": attempt.seconds}
+        writer.fail(index, {**attempt.origin, **failed, "warnings": cautions})
+        return ShotOutcome(index, FAILED, attempt.seconds, attempt.failure)
+    entries = work.report(result)
+    warnings = {"warnings": [*entries["warnings"], *cautions]}
+    report = {**entries, "seconds": attempt.seconds, **attempt.origin, **warnings}
+    writer.write(index, work.arrays(result), report)
+    spent = time.perf_counter() - attempt.began
+    return ShotOutcome(index, DONE, spent, converged=result.report.converged)
 
 
-def reason_of(error: Exception) -> str:
-    """Say why a shot failed."""
+def failure_text(error: Exception) -> str:
+    """Return the reason of a failure."""
     if isinstance(error, MemoryError):
         return "there is not enough memory for this shot on its worker"
     kind = type(error).__name__
@@ -386,8 +385,8 @@ def reason_of(error: Exception) -> str:
     return f"{kind}: {error}"
 
 
-def _loaded(shot: Any) -> tuple[AnyArray, dict[str, Any]]:
-    """Image of a shot; a block of a dask array on a cluster has been computed already."""
+def _load_shot(shot: Any) -> tuple[AnyArray, dict[str, Any]]:
+    """Load a shot; a block of a dask array on a cluster has been computed already."""
     if isinstance(shot, np.ndarray):
         return shot[0], {"sha256": checksum(shot[0])}
     loaded: tuple[AnyArray, dict[str, Any]] = shot.load()

@@ -1,4 +1,4 @@
-"""A folder watched: each shot into the store as soon as it has arrived, see `watch_stack`."""
+"""Watch a folder and invert each shot into a store as soon as it arrives: `watch_stack`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, obse
 from napari_shadowinv.stack._plan import describe_stack
 from napari_shadowinv.stack._run import stored_type, stored_variables
 from napari_shadowinv.stack._sources import Reader, read_shot
-from napari_shadowinv.stack._watch_loop import Books, OnWatchProgress, StackMaker, Watch
+from napari_shadowinv.stack._watch_loop import OnWatchProgress, RunStatus, StackMaker, Watch
 
 if TYPE_CHECKING:
     import xarray
@@ -60,46 +60,44 @@ def watch_stack(
 ) -> xarray.Dataset | None:
     """Invert, or fit, each file that arrives in a folder as soon as it is completely written.
 
-    Files that are there already come first, in counting order of their names, then new ones in
-    the order in which they were completed; each gets the next number of the store. A file that
-    cannot be inverted fails alone, with its reason. One that is written again later is inverted
-    again, under the same number. Watch again with the same store, and it goes on: shots that are
-    there are not done again.
+    Existing files come first, in counting order of their names, then new ones in the order in
+    which they were completed; each gets the next number of the store. A file that cannot be
+    inverted fails alone, with its reason. A file that is written again later is inverted again,
+    under the same number. Another call with the same store resumes it, without repeating shots.
 
     Parameters
     ----------
     folder : str or Path
-        Folder in which the files appear. Those in folders inside it are not looked at.
+        Folder in which the files appear. Its subfolders are ignored.
     out : str or Path
-        The store, ``name.shadowinv.zarr``, made when the first shot has been inverted.
+        The store, ``name.shadowinv.zarr``, created when the first shot has been inverted.
     pattern : str, optional
-        What names of shots look like; names that begin with a dot are never shots.
+        Pattern of the file names of shots; names that begin with a dot are ignored.
     source, mask, recipe, options, setup, filters, source_mask, reader
         As for `run_stack`; one source for all shots. Without a number of sites, the first shots
-        decide how many all of them get: up to three that are there at the start, or the first
-        that arrives.
+        decide it for all: up to three that exist at the start, or the first that arrives.
     warm_start : bool, optional
-        Initialise each shot from the last but one, as two are inverted at once, unless that failed
-        or did not converge. Shots with a source estimated from each, and fits, always start
-        afresh.
+        Initialise each shot from the last but one, because two are inverted simultaneously, unless
+        that one failed or did not converge. Fits, and shots with estimated sources, always start
+        from zero.
     variables, dtype, overwrite, redo_failed
         As for `run_stack`.
     skip_existing : bool, optional
-        Leave out files that are there at the start.
+        Ignore files that exist at the start.
     settle : float, optional
-        Seconds without a change after which a file is complete where the system does not tell
-        when a file is closed: on network file systems, and other systems than Linux.
+        Seconds without a change after which a file is complete if the system does not report
+        closed files: on network file systems, and on systems other than Linux.
     polling : bool, optional
-        Look at the folder every second instead of being told by the system.
+        Poll the folder once a second instead of relying on file-system events.
     idle : float, optional
-        Return when nothing has arrived for so many seconds.
+        Return after this many seconds without a new file.
     shots : int, optional
-        Return when so many shots have ended.
+        Return after this many shots.
     on_progress : callable, optional
-        Receives a `WatchProgress` at the start, when a shot has ended, and at the end.
+        Receives a `WatchProgress` at the start, after each shot, and at the end.
     should_stop : callable, optional
-        Asked now and then, also in other threads; when it returns true, the watch ends. What was
-        not finished is done when it is resumed.
+        Called regularly, also in other threads; the watch ends when it returns true. Unfinished
+        shots are inverted when it is resumed.
 
     Returns
     -------
@@ -131,24 +129,24 @@ def watch_stack(
         reader=reader,
         warm_start=1,
     )
-    kept = stored_type(dtype)
+    stored = stored_type(dtype)
     arrivals = Arrivals(place, pattern, settle=settle, existing=not skip_existing)
-    books = Books(arrivals, on_progress)
+    status = RunStatus(arrivals, on_progress)
     try:
-        ensure_compiled(lambda news: books.prepare(f"compiling, {news.message}"), should_stop)
+        ensure_compiled(lambda news: status.report_stage(f"compiling, {news.message}"), should_stop)
     except InversionCancelled:
         return None
     with clear_up_when_terminated(), locked(path):
         remove_unfinished(path)
         stacks = StackMaker(describe, place, reader, chained=warm_start)
-        watch = Watch(path, kept, stacks, arrivals, books, should_stop)
+        watch = Watch(path, stored, stacks, arrivals, status, should_stop)
         watch.open(overwrite=overwrite, redo_failed=redo_failed)
-        with observing(arrivals, polling=polling, on_note=books.note):
+        with observing(arrivals, polling=polling, on_note=status.report_note):
             watch.run(idle, shots)
-    return read_stack(path) if books.store is not None else None
+    return read_stack(path) if status.store is not None else None
 
 
-def _check_numbers(**given: float | None) -> None:
-    for name, value in given.items():
+def _check_numbers(**numbers: float | None) -> None:
+    for name, value in numbers.items():
         if value is not None and not value > 0:
             raise InputError(f"{name} is {value:g}: expected a number above 0")

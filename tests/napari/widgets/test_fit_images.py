@@ -41,7 +41,7 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.projection import project, transferred_displacement
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.pipeline import FitShot, read_recipe
-from napari_shadowinv.pipeline._fit import FitInputs, gathered_fit
+from napari_shadowinv.pipeline._fit import FitInputs, collect_fit_inputs
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 120_000  # ms
@@ -125,7 +125,7 @@ def layer_of(viewer: Any, role: str, word: str = "") -> Any:
 def inputs_of(tool: Any) -> FitInputs:
     """Return the inputs of the requested fit."""
     job = tool.request()
-    return gathered_fit(job.recipe, job.shots, names=job.names)
+    return collect_fit_inputs(job.recipe, job.shots, names=job.names)
 
 
 def texts(tool: Any, column: int) -> list[str]:
@@ -1031,7 +1031,7 @@ def test_a_recipe_tells_noise_and_point_spread(
     tool.recipes.load(path)
     assert inputs_of(tool).keywords["noise"] == (3.5, 3.5)
     assert tool.fields.state() == "B and E"
-    by_command = gathered_fit(
+    by_command = collect_fit_inputs(
         read_recipe(path), [FitShot(np.ones(SHAPE), setup) for setup in SETUPS]
     )
     assert inputs_of(tool).keywords["psf"] == pytest.approx(by_command.keywords["psf"], rel=1e-12)

@@ -297,7 +297,7 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool.store.edit.setText(str(tmp_path / "other.shadowinv.zarr"))
     tool.engine.picker.set_kind("scheduler")
     expect("address is ''")
-    monkeypatch.setattr(_engines, "_CONNECT_SECONDS", 0.3)
+    monkeypatch.setattr(_engines, "_CONNECT_TIMEOUT_S", 0.3)
     tool.engine.address.setText("tcp://127.0.0.1:9")
     expect("o scheduler responds at tcp://127.0.0.1:9")
     tool.engine.picker.set_kind("threads")
