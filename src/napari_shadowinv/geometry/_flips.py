@@ -395,7 +395,7 @@ def _sort_triangles(mesh: Mesh) -> None:
 
 @kernel_that_allocates
 def build(mesh: Mesh, order: IntArray, first: int, last: int) -> int:
-    """Put the sites `order[first:last]` in: the first part begins anew, the last one finishes."""
+    """Insert the sites `order[first:last]`; the first part starts a mesh, the last finishes it."""
     if first == 0:
         _start_with_ghosts(mesh)
     status = DONE
@@ -461,7 +461,7 @@ def _remove_strays(mesh: Mesh, strays: BoolArray) -> int:
 
 @kernel_that_allocates
 def relocate(mesh: Mesh, targets: FloatArray) -> int:
-    """Move the sites and repair the mesh; EXHAUSTED where building it anew is the better way."""
+    """Move the sites and repair the mesh; EXHAUSTED where building a new one is faster."""
     # All sites move at once, but for the corners of triangles that this would turn over: these
     # are taken out and put in again where they belong.
     n = targets.shape[0]

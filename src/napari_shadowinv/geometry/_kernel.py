@@ -3,7 +3,7 @@
 Numba caches machine code in the folder ``NUMBA_CACHE_DIR``, next to the package, or in the home
 directory. It fails if it can write to none of these, for example under an account without a home
 that runs a shared installation. Then a private folder in the temporary directory is used, which
-starts as a copy of the code next to the package. Failing that, each process compiles anew.
+starts as a copy of the code next to the package. Failing that, each process compiles again.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A triangulation as two flat arrays, and the moves that change it.
 
 Triangle t has the corners ``corners[3 t : 3 t + 3]``, counter-clockwise. The number
-``h = 3 t + k`` stands for that corner and for the edge opposite to it at once;
+``h = 3 t + k`` stands for both that corner and the edge opposite to it;
 ``twins[h]`` is the same edge seen from the triangle on its other side, or -1.
 A move rewrites the triangles that it touches and puts the edges that may have become
 irregular on the stack. Points n to n + 3 are the ghosts.

@@ -1,4 +1,4 @@
-"""How much of each pixel lies in each cell of a power diagram: `pixel_shares`.
+"""Overlap of each pixel with each cell of a power diagram: `pixel_shares`.
 
 With these areas, worked out once, the masses of the cells over any number of images are products
 with one sparse matrix.

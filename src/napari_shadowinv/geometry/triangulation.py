@@ -169,7 +169,7 @@ class RegularTriangulation:
 
     @cached_property
     def hidden(self) -> BoolArray:
-        """Which sites have an empty cell and are no vertex, shape (n,)."""
+        """True for sites with an empty cell, which are no vertex, shape (n,)."""
         return _read_only(self._in_given_order(self._mesh.hidden))
 
     @cached_property

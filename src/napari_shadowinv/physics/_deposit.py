@@ -23,11 +23,11 @@ Corners = tuple[float, float, float, float, float, float, float, float]
 
 _ONE = np.uint32(1)
 # Area relative to squared diameter below which a tile is a line and shares of its area are noise.
-_SLIVER = 1e-9
+_MIN_TILE_SHAPE = 1e-9
 # Area relative to that in the source below which a tile is deposited pixel by pixel.
-_THIN = 1e-3
+_MIN_AREA_RATIO = 1e-3
 # Flux relative to the brightest pixel's below which it is a rounding error.
-_DUST = 1e-12
+_MIN_FLUX_SHARE = 1e-12
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -56,11 +56,11 @@ def deposit_band(
     for a in range(first * tiles, last * tiles + 1):
         upper, lower = lower, upper
         pixels_above, pixels = pixels, pixels_above
-        _land(coefficients, knots, weights, a, top, lower)
+        _land_corners(coefficients, knots, weights, a, top, lower)
         _find_pixels(lower, window, pixels)
         if a > first * tiles:
             above, current = current, above
-            _spread(flux[(a - 1) // tiles], tiles, upper, lower, window, current)
+            _spread_flux(flux[(a - 1) // tiles], tiles, upper, lower, window, current)
             steps = above[1:-1] - current[1:-1]
             _add_edges(rises, steps, upper, pixels_above, upper, pixels_above, 1)
             _add_edges(rises, current[1:] - current[:-1], upper, pixels_above, lower, pixels, 0)
@@ -69,7 +69,7 @@ def deposit_band(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _land(
+def _land_corners(
     coefficients: FloatArray,
     knots: IntArray,
     weights: FloatArray,
@@ -77,7 +77,7 @@ def _land(
     top: int,
     out: FloatArray,
 ) -> None:
-    """Where the corners of line `a` land: the spline along y, then along x."""
+    """Compute the landed corners of line `a` by the spline along y, then along x."""
     tiles = knots.size
     row, phase = a // tiles, a % tiles
     start = row + knots[phase]
@@ -108,7 +108,7 @@ def _find_pixels(corners: FloatArray, window: FloatArray, out: IntArray) -> None
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _spread(
+def _spread_flux(
     flux: FloatArray,
     tiles: int,
     upper: FloatArray,
@@ -117,7 +117,7 @@ def _spread(
     out: FloatArray,
 ) -> None:
     """Flux per area of a line of tiles as they land; 0 for those that are deposited right away."""
-    thin = 2 * _THIN / (tiles * tiles)
+    thin = 2 * _MIN_AREA_RATIO / (tiles * tiles)
     for b in range(upper.shape[1] - 1):
         share = flux[b // tiles] / (tiles * tiles)
         y0, x0 = upper[0, b], upper[1, b]
@@ -241,7 +241,7 @@ def _add_sums(rises: FloatArray, window: FloatArray) -> None:
             brightest = max(brightest, total)
     for i in range(window.shape[0]):
         for j in range(window.shape[1]):
-            if rises[i, j] > _DUST * brightest:
+            if rises[i, j] > _MIN_FLUX_SHARE * brightest:
                 window[i, j] += rises[i, j]
 
 
@@ -262,7 +262,7 @@ def _deposit(window: FloatArray, share: float, double_area: float, corners: Corn
     if inside and i0 == i1 and j0 == j1:
         window[i0, j0] += share
         return
-    if abs(double_area) < _SLIVER * ((y_max - y_min) ** 2 + (x_max - x_min) ** 2):
+    if abs(double_area) < _MIN_TILE_SHAPE * ((y_max - y_min) ** 2 + (x_max - x_min) ** 2):
         _deposit_line(window, share, corners)
         return
 

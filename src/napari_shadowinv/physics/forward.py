@@ -29,9 +29,9 @@ from napari_shadowinv.physics._deposit import deposit_band
 __all__ = ["jacobian_determinant", "synthetic_image"]
 
 # A cubic spline without knots next to the border needs four samples.
-_SMALLEST_SIDE = 4
+_MIN_SIDE_PX = 4
 # Fixed, so that sums are formed in the same order whatever the number of threads.
-_BANDS = 32
+_N_BANDS = 32
 
 
 def synthetic_image(
@@ -158,10 +158,10 @@ def _checked_displacement(displacement: ArrayLike) -> FloatArray:
             f"displacement has shape {field.shape}: expected (2, height, width), "
             "the y component first"
         )
-    if min(field.shape[1:]) < _SMALLEST_SIDE:
+    if min(field.shape[1:]) < _MIN_SIDE_PX:
         raise InputError(
             f"displacement has shape {field.shape}: the image must be at least "
-            f"{_SMALLEST_SIDE} × {_SMALLEST_SIDE} pixels"
+            f"{_MIN_SIDE_PX} × {_MIN_SIDE_PX} pixels"
         )
     _refuse_non_finite("displacement", field)
     return field
@@ -195,7 +195,7 @@ def _refuse_non_finite(name: str, values: FloatArray) -> None:
 
 def _bands(height: int) -> list[tuple[int, int]]:
     """Cut the rows of the source into bands, always the same ones for a height."""
-    edges = np.linspace(0, height, min(_BANDS, height) + 1).astype(int).tolist()
+    edges = np.linspace(0, height, min(_N_BANDS, height) + 1).astype(int).tolist()
     return list(itertools.pairwise(edges))
 
 

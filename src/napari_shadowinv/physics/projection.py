@@ -18,7 +18,7 @@ refractive index   ∫ln η dz (m)                 the same, apart from dispersi
 
 Momentum p and velocity v are relativistic. Distances, magnification and pixels of both
 experiments may differ too: both look at the same point of the object with the middle of
-their images. The object is thin: rays go straight through it, whatever their direction.
+their images. The object is thin: rays of every direction pass straight through it.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ __all__ = [
 ]
 
 # A cubic spline needs four samples.
-_SMALLEST_SIDE = 4
+_MIN_SIDE_PX = 4
 # Share of a pixel by which rounding may put an image's edge beyond the other's.
-_SLACK = 1e-6
+_EDGE_TOLERANCE_PX = 1e-6
 # Pixels that differ by less are the same ones, divided and multiplied by a magnification.
-_SAME = 1e-9
+_SIZE_TOLERANCE = 1e-9
 
 
 def project(
@@ -181,10 +181,10 @@ def transferred_displacement(
     factor = _angle_ratio(made_with, setup, deflector, dispersion)
     ratio = setup.object_pixel_size / made_with.object_pixel_size
     old = (field.shape[1], field.shape[2])
-    size = _shape(old, ratio) if shape is None else _checked_shape(shape, old, ratio, setup)
+    size = _covered_shape(old, ratio) if shape is None else _checked_shape(shape, old, ratio, setup)
     # One factor, so that nothing changes, not even by rounding, where nothing differs.
     factor *= float(made_with.deflection_angle(1.0) / setup.deflection_angle(1.0))
-    if size == old and math.isclose(ratio, 1, rel_tol=_SAME):
+    if size == old and math.isclose(ratio, 1, rel_tol=_SIZE_TOLERANCE):
         return factor * field
     return factor * _resampled(field, size, ratio)
 
@@ -236,21 +236,21 @@ def _require_same_kind(made_with: Setup, setup: Setup) -> None:
 def _checked_field(displacement: ArrayLike) -> FloatArray:
     plain = plain_array(displacement, "displacement", VECTOR, unit=PIXELS)
     field = np.asarray(plain, dtype=np.float64)
-    if field.ndim != 3 or field.shape[0] != 2 or min(field.shape[1:]) < _SMALLEST_SIDE:
+    if field.ndim != 3 or field.shape[0] != 2 or min(field.shape[1:]) < _MIN_SIDE_PX:
         raise InputError(
             f"displacement has shape {field.shape}: expected (2, height, width), the y component "
-            f"first, at least {_SMALLEST_SIDE} pixels each way"
+            f"first, at least {_MIN_SIDE_PX} pixels each way"
         )
     return field
 
 
-def _shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
+def _covered_shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
     """Height and width in pixels of the new size that fit into the old image."""
-    height, width = (math.floor(n / ratio + _SLACK) for n in old)
-    if min(height, width) < _SMALLEST_SIDE:
+    height, width = (math.floor(n / ratio + _EDGE_TOLERANCE_PX) for n in old)
+    if min(height, width) < _MIN_SIDE_PX:
         raise InputError(
             f"the known field covers {height} × {width} pixels of the other setup: expected at "
-            f"least {_SMALLEST_SIDE} × {_SMALLEST_SIDE}; check the pixel sizes"
+            f"least {_MIN_SIDE_PX} × {_MIN_SIDE_PX}; check the pixel sizes"
         )
     return height, width
 
@@ -258,12 +258,12 @@ def _shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
 def _checked_shape(
     shape: tuple[int, int], old: tuple[int, int], ratio: float, setup: Setup
 ) -> tuple[int, int]:
-    if len(shape) != 2 or min(shape) < _SMALLEST_SIDE:
+    if len(shape) != 2 or min(shape) < _MIN_SIDE_PX:
         raise InputError(
             f"the other image has shape {tuple(shape)}: expected (height, width), at least "
-            f"{_SMALLEST_SIDE} pixels each way"
+            f"{_MIN_SIDE_PX} pixels each way"
         )
-    most = _shape(old, ratio)
+    most = _covered_shape(old, ratio)
     if shape[0] > most[0] or shape[1] > most[1]:
         raise InputError(
             f"the other image has shape {tuple(shape)} with pixels of "

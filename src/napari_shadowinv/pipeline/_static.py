@@ -1,4 +1,4 @@
-"""Whether one static field explains several images: `run_leave_one_out`, `run_windows`.
+"""Tests of one static field against several images: `run_leave_one_out`, `run_windows`.
 
 Images are processed in order of energy, so results do not depend on their order in the call.
 """

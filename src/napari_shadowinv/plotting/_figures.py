@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 DOTS_PER_INCH = 160  # of a figure's file
-_LARGEST_RESIDUAL = 50.0  # % of the mean
+_MAX_RESIDUAL_PERCENT = 50.0  # % of the mean
 
 
 def report_figure(
@@ -182,4 +182,4 @@ def _draw_residual(panel: Panel, inversion: Inversion) -> None:
     residual = np.where(inversion.mask, inversion.residual, np.nan)
     percent = 100 * residual / inversion.image[inversion.mask].mean()
     title = f"Residual: {100 * inversion.report.image_residual:.3g} % rms"
-    draw_differences(panel, percent, title, "Difference (% of mean)", _LARGEST_RESIDUAL)
+    draw_differences(panel, percent, title, "Difference (% of mean)", _MAX_RESIDUAL_PERCENT)

@@ -1,4 +1,4 @@
-"""Whether one static field explains several images, on a page: images left out, and windows."""
+"""Figures that test one static field against several images: images left out, and windows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where shots, and sources, come from: globs, lists of files, pages, arrays."""
+"""Origins of shots and sources: globs, lists of files, pages, arrays."""
 
 from __future__ import annotations
 

@@ -162,7 +162,7 @@ class _RunningShot:
 
 
 class Watch:
-    """Takes file after file, inverts two at once, and writes them in the order of arrival.
+    """The loop: inverts two files simultaneously, and writes them in the order of arrival.
 
     Shots alternate between two lanes; each starts from the last result in its lane.
     """

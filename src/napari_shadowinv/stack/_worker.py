@@ -226,7 +226,7 @@ def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:
 
 
 def threads_here(workers: int | None = None) -> int:
-    """Return how many threads one shot may use, so that all shots at once fill the machine."""
+    """Return the number of threads of a shot with which all simultaneous shots fill the machine."""
     # On a dask worker, workers default to the threads of all dask workers on this machine; in a
     # pool of dask to its `num_workers`, or one for each core.
     cores = available_threads(None)

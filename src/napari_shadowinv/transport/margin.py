@@ -65,7 +65,7 @@ class Margin:
 
     @cached_property
     def beyond(self) -> BoolArray:
-        """Where the margin is, shape (H + 2 m, W + 2 m)."""
+        """True in the margin, shape (H + 2 m, W + 2 m)."""
         beyond = np.ones(self.beam.shape, bool)
         self.within(beyond)[:] = False
         return beyond

@@ -211,7 +211,7 @@ class _Slot:
 
 @dataclass(frozen=True)
 class SitePlan:
-    """Everything about the sites that depends on the source alone."""
+    """Sites of a source on all levels, which do not depend on the image."""
 
     source: FloatArray  # (H, W)
     levels: Levels

@@ -19,8 +19,8 @@ pixel's side p, the distance L from object to detector and the magnification M, 
 deflection angle is a = d p M / L and the potential Φ = φ p² M / L, so that a = -∇Φ where
 d = -∇φ (Eq. 1 of the paper, Kasim et al., arXiv:1607.04179).
 
-A potential is known up to a constant: only its gradient deflects. Whatever is
-proportional to it (∫ln η dz, ∫n dz) is relative to the place where the potential is zero.
+A potential is determined up to a constant: only its gradient deflects. Quantities that are
+proportional to it (∫ln η dz, ∫n dz) are relative to the place where the potential is zero.
 """
 
 from __future__ import annotations
