@@ -87,11 +87,11 @@ def outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
 
 def needs() -> dict[str, set[str]]:
     """Every module of the package, and those of the package that it imports."""
-    found: dict[str, set[str]] = {module: set() for module in MODULES}
+    imports: dict[str, set[str]] = {module: set() for module in MODULES}
     for path, tree in TREES.items():
         names = imported(path, ast.walk(tree))
-        found[module_of(path)] |= {name for name in names if name.split(".")[0] == PACKAGE}
-    return found
+        imports[module_of(path)] |= {name for name in names if name.split(".")[0] == PACKAGE}
+    return imports
 
 
 def room_of(module: str) -> str:
@@ -104,10 +104,10 @@ def test_every_room_has_its_place():
 
 def test_a_room_imports_only_rooms_below_it():
     above = [
-        f"{module} imports {other}"
-        for module, others in needs().items()
-        for other in others
-        if room_of(module) != room_of(other) and HEIGHT[room_of(other)] >= HEIGHT[room_of(module)]
+        f"{module} imports {needed}"
+        for module, imported_modules in needs().items()
+        for needed in imported_modules
+        if room_of(module) != room_of(needed) and HEIGHT[room_of(needed)] >= HEIGHT[room_of(module)]
     ]
     assert not above
 
@@ -137,7 +137,7 @@ def test_no_module_is_too_long_to_be_read_at_once():
 
 def fields_of(wanted: str) -> dict[str, list[str]]:
     """Classes that declare a field of a name, by file."""
-    found: dict[str, list[str]] = {}
+    by_file: dict[str, list[str]] = {}
     for path, tree in TREES.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
@@ -150,18 +150,20 @@ def fields_of(wanted: str) -> dict[str, list[str]]:
                     and ast.unparse(part.value.func) == "Field"
                 ]
                 if wanted in names:
-                    found.setdefault(path.name, []).append(node.name)
-    return found
+                    by_file.setdefault(path.name, []).append(node.name)
+    return by_file
 
 
 @pytest.mark.parametrize("option", InversionOptions.model_fields)
 def test_an_option_is_declared_once(option):
-    own = {name for model in (*STEPS.values(), *ESTIMATES.values()) for name in model.parameters()}
-    assert option not in own  # its flag would be that of a step
+    step_parameters = {
+        name for model in (*STEPS.values(), *ESTIMATES.values()) for name in model.parameters()
+    }
+    assert option not in step_parameters  # its flag would be that of a step
     of_fits = ("seed", "threads", "beam_variation", "beam_scale")
     said_again = ["FitOptions"] if option in of_fits else []
-    found = [name for names in fields_of(option).values() for name in names]
-    assert sorted(found) == [*said_again, "InversionOptions"]
+    classes = [name for names in fields_of(option).values() for name in names]
+    assert sorted(classes) == [*said_again, "InversionOptions"]
 
 
 def names_declared() -> Counter[tuple[str, str]]:

@@ -48,9 +48,9 @@ def test_the_format_is_recognised_and_read(names, tmp_path, kind):
     path = tmp_path / "shot.pgm"
     path.write_bytes(b"P5\n4 3\n%d\n" % white + pixels.tobytes())
     assert names["PGM"].fits(path, path.read_bytes())
-    image, told = names["read_pgm"](path)
+    image, metadata = names["read_pgm"](path)
     np.testing.assert_array_equal(image, pixels)
-    assert told == {"bits": 8 * pixels.itemsize}
+    assert metadata == {"bits": 8 * pixels.itemsize}
 
 
 def test_the_setup_converts_and_projects(names):
@@ -64,13 +64,13 @@ def test_the_setup_converts_and_projects(names):
 def test_the_rooms_are_those_of_the_source():
     package = ROOT / "src" / "napari_shadowinv"
     rooms = {path.parent.name for path in package.glob("*/__init__.py")}
-    told = re.findall(r"^        ([_a-z]+)/ ", TEXT, re.MULTILINE)
-    assert set(told) == rooms
+    listed = re.findall(r"^        ([_a-z]+)/ ", TEXT, re.MULTILINE)
+    assert set(listed) == rooms
 
 
 def test_every_benchmark_is_listed_and_every_link_leads_somewhere():
-    told = re.findall(r"benchmarks/(\w+\.py)", TEXT)
-    own = {path.name for path in (ROOT / "benchmarks").glob("*.py")} - {"reference.py"}
-    assert set(told) == own
+    listed = re.findall(r"benchmarks/(\w+\.py)", TEXT)
+    benchmarks = {path.name for path in (ROOT / "benchmarks").glob("*.py")} - {"reference.py"}
+    assert set(listed) == benchmarks
     for target in re.findall(r"\]\(([^)#]+)\)", TEXT):
         assert (ROOT / target).exists(), target

@@ -60,14 +60,14 @@ def metadata(about: dict[str, str]) -> Message:
 
 
 def test_the_wheel_holds_the_package_and_nothing_else(wheel: dict[str, str]) -> None:
-    held = {name for name in wheel if ".dist-info/" not in name}
+    files = {name for name in wheel if ".dist-info/" not in name}
     sources = {
         path.relative_to(PACKAGE.parent).as_posix()
         for path in PACKAGE.rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    assert held == sources
-    assert {"napari_shadowinv/napari.yaml", "napari_shadowinv/py.typed"} <= held
+    assert files == sources
+    assert {"napari_shadowinv/napari.yaml", "napari_shadowinv/py.typed"} <= files
     assert wheel["napari_shadowinv/napari.yaml"] == (PACKAGE / "napari.yaml").read_text("utf-8")
 
 

@@ -57,19 +57,19 @@ LEFT_TO_THE_READER = {"info FILE": "info shot.shadowinv", "status": "status nigh
 
 def steps() -> list[tuple[str, str]]:
     """The commands and the Python of the README, from the top to the bottom."""
-    found = []
+    steps = []
     for match in STEP.finditer(README):
         kind = "python" if match["python"] else "command"
         text = match["python"] or match["line"] or match["inline"]
-        found.append((kind, LEFT_TO_THE_READER.get(text, text)))
-    return found
+        steps.append((kind, LEFT_TO_THE_READER.get(text, text)))
+    return steps
 
 
 def test_commands_and_python_work_one_after_the_other_in_one_folder(shot_folder):
     (setup,) = blocks("toml")
     (shot_folder / "setup.toml").write_text(setup, encoding="utf-8")
-    other = setup.replace("14.7", "3.0")  # "at another energy"
-    (shot_folder / "other.toml").write_text(other, encoding="utf-8")
+    slow_setup = setup.replace("14.7", "3.0")  # "at another energy"
+    (shot_folder / "other.toml").write_text(slow_setup, encoding="utf-8")
     (shot_folder / "shots").mkdir()
     for number in (1, 2):
         shutil.copy("shot.tif", f"shots/shot{number}.tif")

@@ -50,25 +50,25 @@ def test_the_file_is_a_recipe_that_works(folder):
 
 
 def test_each_step_and_each_source_is_shown_once_with_all_that_it_takes():
-    shown = tomllib.loads(STEPS_SHOWN)["steps"]
-    assert [each["step"] for each in shown] == list(STEPS)
-    for each in shown:
+    steps = tomllib.loads(STEPS_SHOWN)["steps"]
+    assert [each["step"] for each in steps] == list(STEPS)
+    for each in steps:
         assert set(each) == {"step", *STEPS[each["step"]].parameters()}
-    Recipe.model_validate({"steps": shown})
+    Recipe.model_validate({"steps": steps})
     rows = dict(re.findall(r"^\| `([a-z-]+)` \| (.*)\|$", PAGE, re.MULTILINE))
     models = {MeasuredSource.name(): MeasuredSource, **ESTIMATES}
     assert set(rows) == set(models)
     for name, model in models.items():
         assert set(model.parameters()) == set(re.findall(r"`([a-z_]+)[` ]", rows[name]))
         for parameter, field in model.parameters().items():
-            told = re.search(rf"`{parameter} = ([\d.]+|\".*?\")`", rows[name])
-            if told is not None and model is not MeasuredSource:
-                assert tomllib.loads(f"it = {told[1]}")["it"] == field.default
+            default = re.search(rf"`{parameter} = ([\d.]+|\".*?\")`", rows[name])
+            if default is not None and model is not MeasuredSource:
+                assert tomllib.loads(f"it = {default[1]}")["it"] == field.default
 
 
 def test_the_order_of_steps_is_that_of_the_command():
-    (told,) = re.findall(r"in the order (dark, .*?)\.", PAGE)
-    assert told.split(", ") == list(STEPS)
+    (order,) = re.findall(r"in the order (dark, .*?)\.", PAGE)
+    assert order.split(", ") == list(STEPS)
 
 
 def test_python_and_commands_work_one_after_the_other(folder):
@@ -83,8 +83,8 @@ def test_python_and_commands_work_one_after_the_other(folder):
         result = CliRunner().invoke(app, [*words, *fast])
         assert result.exit_code == 0, f"{command}: {result.output}"
     inversion = names["inversion"]
-    same = read("shot.shadowinv")
-    np.testing.assert_array_equal(same.potential, inversion.potential)  # type: ignore[attr-defined]
+    reloaded = read("shot.shadowinv")
+    np.testing.assert_array_equal(reloaded.potential, inversion.potential)  # type: ignore[attr-defined]
     assert read_recipe(Path("recipe.toml")).steps == names["recipe"].steps  # type: ignore[attr-defined]
     assert read("other.shadowinv").potential.shape == (15, 20)
 
@@ -107,10 +107,10 @@ def test_a_store_names_the_step_that_differs(folder):
     assert first.exit_code == 0, first.output
     second = CliRunner().invoke(app, [*batch, "--bin", "4", "--resume"])
     assert second.exit_code == 2
-    told = " ".join(second.output.split())
-    shown = re.search(r"    (night.shadowinv.zarr was started .*?)\n\n", PAGE, re.DOTALL)
-    assert shown is not None
-    assert " ".join(shown[1].split()) in told
+    output = " ".join(second.output.split())
+    refusal = re.search(r"    (night.shadowinv.zarr was started .*?)\n\n", PAGE, re.DOTALL)
+    assert refusal is not None
+    assert " ".join(refusal[1].split()) in output
 
 
 def test_every_link_leads_somewhere():

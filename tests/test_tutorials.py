@@ -101,16 +101,16 @@ def test_the_recipe_of_the_first_shadowgram_repeats_its_report(
     result = CliRunner().invoke(app, shlex.split(line))
     assert result.exit_code == 0, result.output
     assert Path("recipe_source.npy").exists()
-    found = float(read("toroid.shadowinv").attrs["image_residual"])
-    assert f"{100 * found:.2f} %" in page
+    residual = float(read("toroid.shadowinv").attrs["image_residual"])
+    assert f"{100 * residual:.2f} %" in page
 
 
 def test_two_energies_have_the_numbers_of_their_page(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     page = text_of("two-energies.md")
     names = run_blocks("two-energies.md")
-    *told, told_by_command = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
-    assert_same_but_for_rounding(capsys.readouterr().out, "".join(told))
+    *printed, printed_by_command = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
+    assert_same_but_for_rounding(capsys.readouterr().out, "".join(printed))
     assert names["found"].verdict == "determined"
     assert names["one"].verdict == "does not fit"
     assert names["error"](names["field"].displacement) < 1.2
@@ -125,10 +125,10 @@ def test_two_energies_have_the_numbers_of_their_page(tmp_path, monkeypatch, caps
     result = CliRunner().invoke(app, shlex.split(line), env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output
     rows = [" ".join(row.split()) for row in result.output.splitlines()]
-    shown = [" ".join(row.split()) for row in told_by_command.splitlines()]
-    starts = {row.split(" ")[0] for row in shown}
+    expected_rows = [" ".join(row.split()) for row in printed_by_command.splitlines()]
+    starts = {row.split(" ")[0] for row in expected_rows}
     rows = [row for row in rows if row.split(" ")[0] in starts]
-    assert_same_but_for_rounding("\n".join(rows), "\n".join(shown))
+    assert_same_but_for_rounding("\n".join(rows), "\n".join(expected_rows))
     saved = read("14.7MeV_fit.shadowinv")
     np.testing.assert_allclose(
         saved.displacement, names["field"].displacement, atol=0.02, err_msg="command and Python"
@@ -143,37 +143,39 @@ def test_the_film_pack_has_the_numbers_of_its_page(shared_data, tmp_path, monkey
     for file in data.iterdir():
         Path(file.name).symlink_to(file)
     page = text_of("film-pack.md")
-    films, told, layers, *_ = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
+    films, summary, layers, *_ = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
     (pack,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     Path("films.csv").write_text(films, encoding="utf-8")
     Path("pack.toml").write_text(pack, encoding="utf-8")
     line, *_ = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
     result = CliRunner().invoke(app, shlex.split(line), env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output
-    assert_same_but_for_rounding(result.output, told)
+    assert_same_but_for_rounding(result.output, summary)
     rows = Path("layers/layers.csv").read_text(encoding="utf-8").splitlines()
-    shown = layers.splitlines()
-    assert_same_but_for_rounding("\n".join([*rows[:3], "…", rows[-1]]), "\n".join(shown))
+    expected_rows = layers.splitlines()
+    assert_same_but_for_rounding("\n".join([*rows[:3], "…", rows[-1]]), "\n".join(expected_rows))
 
-    found = read("pack.shadowinv")
-    by_images = found["layer"].values[found["by_images"].values]
+    doses = read("pack.shadowinv")
+    by_images = doses["layer"].values[doses["by_images"].values]
     assert by_images.tolist() == list(range(1, 9)), "laid by what they show"
     assert "Films 1 to 8 are laid by what they show" in page
-    assert np.abs(found["shift"].values).max() == pytest.approx(8.3, abs=0.1)
-    assert f"{float(found['peak'][-1]):.1f} MeV" in page
+    assert np.abs(doses["shift"].values).max() == pytest.approx(8.3, abs=0.1)
+    assert f"{float(doses['peak'][-1]):.1f} MeV" in page
     nominal = np.genfromtxt("RCF_Stack_Design.csv", delimiter=",", skip_header=2, max_rows=1)[1:]
     # The last film sees all protons beyond its peak, too.
-    assert np.abs(found["energy"].values / nominal - 1)[:-1].max() < 0.05
-    assert found["peak"].values[-1] == pytest.approx(nominal[-1], rel=0.01)
+    assert np.abs(doses["energy"].values / nominal - 1)[:-1].max() < 0.05
+    assert doses["peak"].values[-1] == pytest.approx(nominal[-1], rel=0.01)
 
 
 def assert_same_but_for_rounding(printed: str, shown: str) -> None:
     """Compare words exactly, and numbers to 5 per cent or two units of the last digit shown."""
     number = r"[-+]?\d+(?:\.\d+)?"
     assert re.sub(number, "#", printed).split() == re.sub(number, "#", shown).split()
-    for here, there in zip(re.findall(number, printed), re.findall(number, shown), strict=True):
-        unit = 10.0 ** -len(there.partition(".")[2])
-        assert float(here) == pytest.approx(float(there), rel=0.05, abs=2 * unit)
+    for actual, expected in zip(
+        re.findall(number, printed), re.findall(number, shown), strict=True
+    ):
+        unit = 10.0 ** -len(expected.partition(".")[2])
+        assert float(actual) == pytest.approx(float(expected), rel=0.05, abs=2 * unit)
 
 
 @pytest.mark.parametrize("page", sorted(FOLDER.glob("*.md")), ids=lambda page: page.stem)
@@ -200,11 +202,11 @@ def test_the_table_of_sources_is_as_the_inversions_say():
     assert len(rows) == 5
     for title, peak, error, residual in rows:
         beam = source if title.startswith("the one") else by_title[title]().source(image, None)
-        found = invert(image, source=beam)
-        strength = 1e3 * np.hypot(*setup.path_integrated_b(found.displacement))
+        inversion = invert(image, source=beam)
+        strength = 1e3 * np.hypot(*setup.path_integrated_b(inversion.displacement))
         assert strength.max() == pytest.approx(float(peak), abs=0.06), title
-        wrong = 100 * np.linalg.norm(found.displacement - truth) / np.linalg.norm(truth)
+        wrong = 100 * np.linalg.norm(inversion.displacement - truth) / np.linalg.norm(truth)
         assert wrong == pytest.approx(float(error), abs=0.6), title
-        assert 100 * found.report.image_residual == pytest.approx(float(residual), abs=0.06)
-        codes = {caution.code for caution in found.report.warnings}
+        assert 100 * inversion.report.image_residual == pytest.approx(float(residual), abs=0.06)
+        codes = {caution.code for caution in inversion.report.warnings}
         assert ("closed-edge" in codes) == title.startswith("estimate"), title

@@ -73,58 +73,60 @@ def listed(needs: str | list[str]) -> list[str]:
 
 def mistakes(content: Any) -> list[str]:
     """What the runner would refuse, or what cannot work."""
-    found = [f"unknown key {key}" for key in set(content) - WORKFLOW_KEYS]
-    found += [f"no {key}" for key in ("name", "on", "permissions", "jobs") if not content.get(key)]
-    found += [f"unknown event {event}" for event in set(content["on"]) - EVENTS]
+    mistakes = [f"unknown key {key}" for key in set(content) - WORKFLOW_KEYS]
+    mistakes += [
+        f"no {key}" for key in ("name", "on", "permissions", "jobs") if not content.get(key)
+    ]
+    mistakes += [f"unknown event {event}" for event in set(content["on"]) - EVENTS]
     for name, job in content["jobs"].items():
-        told = job_mistakes(job, content)
-        found += [f"{name}: {mistake}" for mistake in told]
-    return found
+        job_faults = job_mistakes(job, content)
+        mistakes += [f"{name}: {mistake}" for mistake in job_faults]
+    return mistakes
 
 
 def job_mistakes(job: Any, content: Any) -> list[str]:
     needs = listed(job.get("needs", []))
-    found = [f"needs {need}, which is no job" for need in needs if need not in content["jobs"]]
+    mistakes = [f"needs {need}, which is no job" for need in needs if need not in content["jobs"]]
     matrix = job.get("strategy", {}).get("matrix", {})
-    found += [f"matrix {key} is no list" for key, values in matrix.items() if not values]
+    mistakes += [f"matrix {key} is no list" for key, values in matrix.items() if not values]
     expressions = conditions(job)
     for text in strings(job):
         expressions += EXPRESSION.findall(text)
     for context, key in (pair for text in expressions for pair in PROPERTY.findall(text)):
         if context not in CONTEXTS:
-            found.append(f"unknown context {context}")
+            mistakes.append(f"unknown context {context}")
         if context == "matrix" and key not in matrix:
-            found.append(f"matrix.{key} is not in the matrix")
+            mistakes.append(f"matrix.{key} is not in the matrix")
         if context == "needs" and key not in needs:
-            found.append(f"needs.{key} is not needed")
+            mistakes.append(f"needs.{key} is not needed")
     if "uses" in job:
-        found += [f"unknown key {key}" for key in set(job) - CALLING_JOB_KEYS]
+        mistakes += [f"unknown key {key}" for key in set(job) - CALLING_JOB_KEYS]
         called = ROOT / job["uses"]
         if not called.is_file() or "workflow_call" not in loaded(called)["on"]:
-            found.append(f"{job['uses']} cannot be called")
-        return found
-    found += [f"unknown key {key}" for key in set(job) - JOB_KEYS]
+            mistakes.append(f"{job['uses']} cannot be called")
+        return mistakes
+    mistakes += [f"unknown key {key}" for key in set(job) - JOB_KEYS]
     runners = matrix["os"] if job["runs-on"] == "${{ matrix.os }}" else [job["runs-on"]]
-    found += [f"unknown runner {runner}" for runner in runners if runner not in RUNNERS]
+    mistakes += [f"unknown runner {runner}" for runner in runners if runner not in RUNNERS]
     if "timeout-minutes" not in job:
-        found.append("no limit of time")
+        mistakes.append("no limit of time")
     for step in job["steps"]:
-        found += step_mistakes(step)
-    return found
+        mistakes += step_mistakes(step)
+    return mistakes
 
 
 def step_mistakes(step: Any) -> list[str]:
-    found = [f"unknown key {key}" for key in set(step) - STEP_KEYS]
+    mistakes = [f"unknown key {key}" for key in set(step) - STEP_KEYS]
     if ("uses" in step) == ("run" in step):
-        found.append("a step must have either uses or run")
+        mistakes.append("a step must have either uses or run")
     if "uses" in step and not ACTION.fullmatch(step["uses"]):
-        found.append(f"{step['uses']} has no version")
+        mistakes.append(f"{step['uses']} has no version")
     if "with" in step and "run" in step:
-        found.append("with is for uses")
+        mistakes.append("with is for uses")
     for path in re.findall(r"\.ci/[\w-]+", step.get("run", "")):
         if not (ROOT / path).is_file():
-            found.append(f"there is no {path}")
-    return found
+            mistakes.append(f"there is no {path}")
+    return mistakes
 
 
 def steps_of(name: str) -> list[Any]:
@@ -169,7 +171,7 @@ def test_the_tests_run_on_every_system_python_and_binding() -> None:
         "classifiers"
     ]
     pythons = [
-        found[1] for name in classifiers if (found := re.search(r"Python :: (3\.\d+)$", name))
+        match[1] for name in classifiers if (match := re.search(r"Python :: (3\.\d+)$", name))
     ]
     assert set(matrix["os"]) == RUNNERS
     assert matrix["python"] == pythons == ["3.11", "3.12", "3.13"]
@@ -209,7 +211,7 @@ def test_what_is_downloaded_was_uploaded_by_a_job_before(name: str) -> None:
     for job in jobs.values():
         if "uses" not in job:
             before = [jobs[need] for need in listed(job.get("needs", []))]
-            ready = {name for other in before for name in artifacts(other, "upload")}
+            ready = {name for needed in before for name in artifacts(needed, "upload")}
             assert artifacts(job, "download") <= ready
 
 
@@ -224,8 +226,8 @@ def test_a_release_is_published_for_a_tag_and_without_a_secret() -> None:
     assert last["uses"].startswith("pypa/gh-action-pypi-publish@")
     assert "with" not in last
     assert "secrets." not in (FOLDER / "release.yml").read_text("utf-8")
-    others = [job for name, job in content["jobs"].items() if name != "publish"]
-    assert not any("permissions" in job for job in others)
+    jobs = [job for name, job in content["jobs"].items() if name != "publish"]
+    assert not any("permissions" in job for job in jobs)
 
 
 @pytest.mark.parametrize("name", NAMES)

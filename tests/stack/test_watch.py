@@ -509,15 +509,9 @@ def test_ctrl_c_is_the_normal_end_unless_files_wait(
         "--n-sites", 100, "--out", out,
     )  # fmt: skip
     assert result.exit_code == code
-<<<<<<< HEAD
-    left = ", 2 not yet inverted" if files > 1 else ""
-    (end,) = [line for line in result.output.splitlines() if line.startswith("Stopped")]
-    assert end == f"Stopped: 1 done, 0 failed{left}; repeat the command to continue {out}."
-=======
     remainder = ", 2 not yet inverted" if files > 1 else ""
-    (end,) = [line for line in result.output.splitlines() if line.startswith("Ended")]
-    assert end == (f"Ended: 1 done, 0 failed{remainder}; repeat the command to go on with {out}.")
->>>>>>> ffd79d4 (Name the variables of pipeline and stack by what they hold)
+    (end,) = [line for line in result.output.splitlines() if line.startswith("Stopped")]
+    assert end == f"Stopped: 1 done, 0 failed{remainder}; repeat the command to continue {out}."
     assert list(read(out).status.values) == [DONE]
     assert not list(tmp_path.glob(".*.lock"))
 

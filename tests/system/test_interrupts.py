@@ -42,13 +42,13 @@ def test_without_ctrl_c_nothing_is_raised() -> None:
 
 
 def test_other_threads_leave_signals_alone() -> None:
-    seen = []
+    signals = []
 
     def look() -> None:
-        with interrupts_put_off():
-            seen.append(signal.getsignal(signal.SIGINT))
+        with defer_interrupts():
+            signals.append(signal.getsignal(signal.SIGINT))
 
     thread = threading.Thread(target=look)
     thread.start()
     thread.join()
-    assert seen == [signal.getsignal(signal.SIGINT)]
+    assert signals == [signal.getsignal(signal.SIGINT)]
