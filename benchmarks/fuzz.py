@@ -250,9 +250,9 @@ def read_whole(path: Path) -> None:
 
 
 def _load_shots(path: Path, dataset: Any) -> None:
-    from napari_shadowinv._system.safety import refusing_damage
+    from napari_shadowinv._system.safety import as_file_errors
 
-    refusing_damage(lambda _: dataset[["displacement", "caustic"]].load(scheduler="sync"))(path)
+    as_file_errors(lambda _: dataset[["displacement", "caustic"]].load(scheduler="sync"))(path)
 
 
 def serve() -> None:

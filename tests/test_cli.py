@@ -1276,7 +1276,7 @@ def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Pat
 
         def write_slowly(path, dataset):
             path.write_text("half")
-            files.interrupts_put_off = Room
+            files.defer_interrupts = Room
             print("now")
             time.sleep(60)
 

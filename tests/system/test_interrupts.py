@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from napari_shadowinv._system.machine import interrupts_put_off
+from napari_shadowinv._system.machine import defer_interrupts
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +24,7 @@ def test_ctrl_c_waits_for_the_end_of_the_block() -> None:
     done = []
 
     def work() -> None:
-        with interrupts_put_off():
+        with defer_interrupts():
             signal.raise_signal(signal.SIGINT)
             done.append("all of it")
 
@@ -36,7 +36,7 @@ def test_ctrl_c_waits_for_the_end_of_the_block() -> None:
 
 def test_without_ctrl_c_nothing_is_raised() -> None:
     before = signal.getsignal(signal.SIGINT)
-    with interrupts_put_off():
+    with defer_interrupts():
         assert signal.getsignal(signal.SIGINT) is not before
     assert signal.getsignal(signal.SIGINT) is before
 

@@ -15,7 +15,7 @@ import tifffile
 from scipy.io import savemat
 
 from napari_shadowinv._system.machine import physical_memory
-from napari_shadowinv._system.safety import LIMIT_VARIABLE, refusing_damage, size_limit
+from napari_shadowinv._system.safety import LIMIT_VARIABLE, as_file_errors, size_limit
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 from napari_shadowinv.film import Calibration
 from napari_shadowinv.io import read, read_toml
@@ -47,7 +47,7 @@ def test_special_files_are_refused_unopened(
 
 
 def test_whatever_a_reader_raises_is_one_error_with_its_reason(tmp_path: Path) -> None:
-    @refusing_damage
+    @as_file_errors
     def broken(path: Path, error: BaseException) -> None:
         raise error
 
@@ -68,11 +68,11 @@ def test_whatever_a_reader_raises_is_one_error_with_its_reason(tmp_path: Path) -
 
 
 def test_a_mistake_in_the_program_is_not_blamed_on_the_file(tmp_path: Path) -> None:
-    @refusing_damage
+    @as_file_errors
     def lacks_a_module(path: Path) -> None:
         import napari_shadowinv.nowhere  # noqa: F401
 
-    @refusing_damage
+    @as_file_errors
     def lacks_a_name(path: Path) -> None:
         nowhere  # type: ignore[name-defined]  # noqa: B018, F821
 

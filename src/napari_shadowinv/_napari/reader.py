@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.notifications import notify_errors, show_caution
-from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, STORE
 
@@ -81,7 +81,7 @@ def _matches(pattern: str) -> list[Path]:
     return in_counting_order(Path(name) for name in glob.glob(pattern))
 
 
-@refusing_damage
+@as_file_errors
 def _read_file(path: Path) -> list[FullLayerData]:
     from napari_shadowinv._napari.layer_metadata import result_of
     from napari_shadowinv._napari.layer_state import layers_of_dataset, warnings_for

@@ -18,7 +18,7 @@ from napari_shadowinv._napari.layers import (
     dataset_layers,
     sample_arrows,
 )
-from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io.formats import RESULT
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-@refusing_damage
+@as_file_errors
 def store_layers(path: Path, name: str = "", shot: int | None = None) -> list[FullLayerData]:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot.
 
@@ -43,13 +43,13 @@ def store_layers(path: Path, name: str = "", shot: int | None = None) -> list[Fu
     return dataset_layers(dataset, setup, frame, name, facts, shot)
 
 
-@refusing_damage
+@as_file_errors
 def first_shot(path: Path) -> int:
     """Return the index of the first finished shot of a store."""
     return _first_done(_open(path), path)
 
 
-@refusing_damage
+@as_file_errors
 def _open(path: Path) -> xarray.Dataset:
     """Open a store lazily with the axis of shots first, or raise a `FileFormatError`."""
     import xarray as xr
@@ -75,7 +75,7 @@ def _open(path: Path) -> xarray.Dataset:
     return with_own_setups(dataset).transpose("shot", "component", "y", "x", ...)
 
 
-@refusing_damage
+@as_file_errors
 def shot_of_store(path: Path, index: int) -> xarray.Dataset:
     """Read a shot of a store as the dataset of a single result.
 

@@ -1,7 +1,7 @@
 """Memory, threads and signals.
 
 - `physical_memory`, `available_threads`, `in_ranges`
-- Ctrl-C, SIGTERM and SIGHUP: `interrupts_put_off`, `clear_up_when_terminated`, `handling`
+- Ctrl-C, SIGTERM and SIGHUP: `defer_interrupts`, `clear_up_when_terminated`, `handling`
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ ENDING_SIGNALS = tuple(
 
 
 @contextmanager
-def interrupts_put_off() -> Iterator[None]:
+def defer_interrupts() -> Iterator[None]:
     """Put Ctrl-C, SIGTERM and SIGHUP off until the end of a block that must not be left half done.
 
     The block should be short.

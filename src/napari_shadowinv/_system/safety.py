@@ -1,6 +1,6 @@
 """What every reader relies on: no file blocks it, fills the memory or ends it with a traceback.
 
-- whatever a damaged file makes a reader raise is told in one sentence: `refusing_damage`
+- whatever a damaged file makes a reader raise is told in one sentence: `as_file_errors`
 - the same for the content of a dataset: `refusing_junk`
 - only regular files are opened: `check_regular`; links followed: `resolved_path`
 - a limit on what a file may unfold to in memory: `check_size`
@@ -39,7 +39,7 @@ class _DamagedContentError(InputError):
     """Content that its reader cannot use; a reader of files names the file instead."""
 
 
-def refusing_damage(
+def as_file_errors(
     read: Callable[Concatenate[Path, P], Content],
 ) -> Callable[Concatenate[str | Path, P], Content]:
     """Turn what a file makes its reader raise into a `FileFormatError`, with it as the cause."""

@@ -19,7 +19,7 @@ from rich import box, progress
 from rich.console import Console
 from rich.table import Column, Table
 
-from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._summary import Rows, options_text, two_columns
 from napari_shadowinv.cli._terminal import (
@@ -352,7 +352,7 @@ _FIT_COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
 }
 
 
-@refusing_damage
+@as_file_errors
 def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[Table], bool]:
     """Describe a store and each shot, and return whether anything is damaged.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli._summary import setup_text
 from napari_shadowinv.errors import FileFormatError, InputError
 
@@ -55,7 +55,7 @@ def field_from(path: Path, variable: str | None = None) -> Field:
     raise _no_field(path, f"a {kind.upper()} picture")
 
 
-@refusing_damage
+@as_file_errors
 def _read_fit_field(path: Path, dataset: xarray.Dataset) -> Field:
     """Read the only field of a fit, with the beam of its first image."""
     from napari_shadowinv.fitting import Fit

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from napari_shadowinv import __version__
 from napari_shadowinv._system.machine import physical_memory
-from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _summary
 from napari_shadowinv.physics.setup import setup_warnings
 
@@ -30,7 +30,7 @@ PACKAGES = (
 QT_BINDINGS = ("PyQt6", "PySide6", "PySide6_Essentials", "PyQt5", "PySide2")
 
 
-@refusing_damage
+@as_file_errors
 def file_table(path: Path, variable: str | None = None) -> Table:
     """Build a table of a file's kind and contents."""
     return _summary.two_columns(str(path), _rows(path, variable))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli._fit_result import fit_images, refine_inversion
 from napari_shadowinv.cli._outputs import protect
 from napari_shadowinv.cli._rerun import (
@@ -87,7 +87,7 @@ def rerun_fit(
     return FitRerun(again, tuple(names), tuple(changes), _difference(before, again))
 
 
-@refusing_damage
+@as_file_errors
 def _read_fit(path: Path, dataset: xarray.Dataset) -> Fit:
     return Fit.from_dataset(dataset)
 

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 
@@ -413,7 +413,7 @@ def combined_dose(
     return CombinedDose(np.exp(mean), np.where(outside, np.inf, error), outside)
 
 
-@refusing_damage
+@as_file_errors
 def _rows(path: Path) -> FloatArray:
     """Dose and red, green and blue pixel of every film, then spreads if all are told."""
     text = small_text(path, "a calibration table, comma-separated values", "utf-8-sig")

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 
@@ -302,7 +302,7 @@ def _in_reading_order(films: Sequence[FloatArray]) -> list[FloatArray]:
     return [film for row in rows for film in sorted(row, key=lambda one: one[:, 1].mean())]
 
 
-@refusing_damage
+@as_file_errors
 def _corners_in(path: Path) -> dict[str, FloatArray]:
     text = small_text(path, "a table of corners, comma-separated values", "utf-8-sig")
     lines = [line for line in csv.reader(text.splitlines()) if any(map(str.strip, line))]

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 
@@ -150,7 +150,7 @@ def _mass_loss(energies: FloatArray, charge_per_mass: float, excitation: float) 
     return np.asarray(_BETHE * charge_per_mass / squared * (0.5 * np.log(inside) - squared))
 
 
-@refusing_damage
+@as_file_errors
 def _from_srim(path: Path) -> Stopping:
     text = small_text(path, "a table of stopping and ranges by SRIM", "latin-1")
     density, unit = _DENSITY.search(text), _STOPPING_UNIT.search(text)

@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from napari_shadowinv._system.safety import check_regular, check_size, refusing_damage
+from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -52,7 +52,7 @@ _RANGES = ("diameter", "contrast", "eccentricity")
 _WORD = re.compile(r"(\w+)\s*=\s*([^\s,]+)[\s,]*")
 
 
-@refusing_damage
+@as_file_errors
 def read_tracks(path: Path) -> Tracks:
     """Read all tracks of a scan.
 

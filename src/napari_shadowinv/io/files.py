@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from napari_shadowinv._system.hidden_files import MAX_NAME_BYTES, hidden_name, sweep
-from napari_shadowinv._system.machine import clear_up_when_terminated, interrupts_put_off
+from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
 from napari_shadowinv._system.safety import check_regular
 from napari_shadowinv.errors import FileFormatError
 
@@ -155,7 +155,7 @@ def _written(path: Path, temporary: Path, overwrite: bool) -> Iterator[Path]:
         yield temporary
         # Someone else may have written the file during the work.
         check_output(path, overwrite)
-        with interrupts_put_off():
+        with defer_interrupts():
             # Only when the disk has the file is it known that there was room for it.
             with temporary.open("rb+") as file:
                 os.fsync(file.fileno())
@@ -169,5 +169,5 @@ def _written(path: Path, temporary: Path, overwrite: bool) -> Iterator[Path]:
         ) from error
     finally:
         # A second Ctrl-C must not leave the half of it behind.
-        with interrupts_put_off():
+        with defer_interrupts():
             temporary.unlink(missing_ok=True)

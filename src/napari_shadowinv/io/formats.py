@@ -17,7 +17,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, Literal
 
-from napari_shadowinv._system.safety import check_regular, refusing_damage
+from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv.errors import FileFormatError
 
 # How much of a file holds every mark, and how much shows what a file without one is.
@@ -181,7 +181,7 @@ _OTHERS = {
 }
 
 
-@refusing_damage
+@as_file_errors
 def format_of(path: Path) -> Format:
     """Tell the format of a file from its content, because its name may lie.
 

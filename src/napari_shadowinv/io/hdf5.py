@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from napari_shadowinv._system.safety import check_size, refusing_damage
+from napari_shadowinv._system.safety import as_file_errors, check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
@@ -162,7 +162,7 @@ def check_hdf5_seal(path: Path) -> None:
         )
 
 
-@refusing_damage
+@as_file_errors
 def read_hdf5(path: Path, name: str) -> AnyArray:
     """Read one array by its name, with those of its groups: ``shots/3/image``."""
     import h5py

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from napari_shadowinv._system.safety import check_regular, check_size, refusing_damage
+from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError
@@ -86,7 +86,7 @@ def _read_page(path: Path, page: Any) -> tuple[AnyArray, dict[str, Any]]:
     return array, {"bits": int(page.bitspersample)}
 
 
-@refusing_damage
+@as_file_errors
 def tiff_pages(path: Path) -> int:
     """Return how many pages a TIFF has."""
     check_regular(path, "a TIFF")
@@ -94,7 +94,7 @@ def tiff_pages(path: Path) -> int:
         return len(tiff.pages)
 
 
-@refusing_damage
+@as_file_errors
 def read_tiff_page(
     path: Path, number: int, *, channel: str | int | None = None
 ) -> tuple[FloatArray, tuple[Caution, ...]]:
@@ -205,7 +205,7 @@ def _read_with_pillow(path: Path, index: int = 0) -> AnyArray:
         return np.asarray(picture.read(index=index))
 
 
-@refusing_damage
+@as_file_errors
 def read_npy(path: Path) -> AnyArray:
     """Read an array of real numbers, of any shape and in its own dtype."""
     # Mapped first: a header that promises too much then fails before memory is asked for.

@@ -25,7 +25,7 @@ from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 
-from napari_shadowinv._system.safety import check_size, refusing_damage
+from napari_shadowinv._system.safety import as_file_errors, check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
@@ -96,7 +96,7 @@ def read_mat(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[st
     return array, {"variable": chosen.name, "bits": 8 * array.dtype.itemsize, "geometry": {}}
 
 
-@refusing_damage
+@as_file_errors
 def mat_variables(path: Path) -> list[Variable]:
     """List the variables of a MAT-file in its order, without their values."""
     with path.open("rb") as file:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.safety import check_regular, refusing_damage
+from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import (
@@ -61,7 +61,7 @@ def is_result(path: Path) -> bool:
     return known or str(attributes.get("format", "")).startswith(FORMAT)
 
 
-@refusing_damage
+@as_file_errors
 def is_ours(path: Path) -> bool:
     """Tell whether an HDF5 file is a ``.shadowinv`` result or pradformat; much else is HDF5 too."""
     check_regular(path, "an HDF5 file")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import is_pack
@@ -40,7 +40,7 @@ _DEEP_KEY = re.compile(
 _COMPLETE = {"energy", "source_object_distance", "object_image_distance"}
 
 
-@refusing_damage
+@as_file_errors
 def read(
     path: Path, *, channel: str | int | None = None, variable: str | None = None
 ) -> Radiograph | xarray.Dataset:
@@ -198,7 +198,7 @@ def read_dataset(path: str | Path) -> xarray.Dataset:
     return content
 
 
-@refusing_damage
+@as_file_errors
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the keys and values of a TOML file.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from napari_shadowinv._system.safety import refusing_damage
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import sha256
@@ -24,7 +24,7 @@ class Scan(NamedTuple):
     checksum: str
 
 
-@refusing_damage
+@as_file_errors
 def read_scan(path: Path) -> Scan:
     """Read a colour scan of film in its own dtype.
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.safety import refusing_damage, small_text
+from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.labels import (
@@ -401,7 +401,7 @@ def check_files(store: StackStore) -> None:
         )
 
 
-@refusing_damage
+@as_file_errors
 def _readable(path: Path) -> dict[str, Any]:
     import zarr
 
@@ -420,12 +420,12 @@ def _readable(path: Path) -> dict[str, Any]:
     return arrays
 
 
-@refusing_damage
+@as_file_errors
 def _values(path: Path, array: Any, which: Any) -> AnyArray:
     return np.asarray(array[which])
 
 
-@refusing_damage
+@as_file_errors
 def _parsed(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
     return [dict(json.loads(text)) if text else {} for text in texts]
 
@@ -435,7 +435,7 @@ def is_along_shots(array: Any) -> bool:
     return tuple(array.metadata.dimension_names or ())[:1] == ("shot",)
 
 
-@refusing_damage
+@as_file_errors
 def read_stack(path: Path) -> xarray.Dataset:
     """Open a store of many shots, also while it is written; arrays are read when asked for.
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._system.hidden_files import hidden_name, sweep
-from napari_shadowinv._system.machine import interrupts_put_off
+from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import replacing
@@ -71,7 +71,7 @@ def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> 
     new = hidden_name(path)
     try:
         # Zarr writes in a thread of its own, which would go on behind our back.
-        with interrupts_put_off():
+        with defer_interrupts():
             _write_template(new, contents)
         if path.exists():
             old = hidden_name(path)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv._system.machine import interrupts_put_off
+from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.labels import display_unit, setup_from_dataset
@@ -226,7 +226,7 @@ def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> 
         except BrokenPipeError:
             ffmpeg.wait()
         finally:
-            with interrupts_put_off():
+            with defer_interrupts():
                 ffmpeg.kill()
                 ffmpeg.wait()
         if ffmpeg.returncode:

@@ -17,7 +17,7 @@ from multiprocessing import resource_tracker
 from typing import Any
 
 from napari_shadowinv._system.hidden_files import temporary_folder
-from napari_shadowinv._system.machine import interrupts_put_off
+from napari_shadowinv._system.machine import defer_interrupts
 
 _ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
 _TRIMMING = "MALLOC_TRIM_THRESHOLD_"
@@ -36,7 +36,7 @@ def local_client(count: int) -> Iterator[Any]:
         spill_folder = str(opened.enter_context(temporary_folder("shadowinv")))
         opened.enter_context(dask.config.set({"temporary-directory": spill_folder}))
         # A partly started cluster cannot be closed.
-        with interrupts_put_off(), _hidden_from_workers():
+        with defer_interrupts(), _hidden_from_workers():
             cluster = distributed.LocalCluster(
                 n_workers=count,
                 threads_per_worker=1,

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.machine import interrupts_put_off
+from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.io.files import sha256, text_of
@@ -279,7 +279,7 @@ class Watch:
             self._arrivals.check()
         name = text_of(running.name)
         again = self._previous_report(name) is not None
-        with interrupts_put_off():
+        with defer_interrupts():
             outcome = self._write(name, replace(attempt, origin={**stamp_before, **attempt.origin}))
         self._redo.discard(name)
         self._lanes[running.lane] = self._start_for_next(attempt)
