@@ -13,6 +13,7 @@ from pydantic import (
 )
 
 from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv.options._beam import BeamScale, BeamVariation
 
 __all__ = [
     "FIELDS",
@@ -121,23 +122,8 @@ class FitOptions(CheckedModel):
         title="Samples",
         description="Number of random fields for the error bars; 0 for no error bars.",
     )
-    beam_variation: float | None = Field(
-        default=None,
-        ge=0,
-        lt=1,
-        title="Beam variation",
-        description=(
-            "Difference of the beam from its source (r.m.s., relative) that the error bars take "
-            "into account. Default: 0.05 for a source that was assumed, 0 for one that was given."
-        ),
-    )
-    beam_scale: float = Field(
-        default=0.25,
-        gt=0,
-        le=1,
-        title="Beam scale",
-        description="Distance over which the beam varies, in shorter sides of the image.",
-    )
+    beam_variation: BeamVariation = None
+    beam_scale: BeamScale = 0.25
     evidence: bool = Field(
         default=False,
         title="Evidence",

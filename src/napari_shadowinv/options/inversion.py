@@ -7,6 +7,7 @@ from typing import Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv.options._beam import BeamScale, BeamVariation
 
 __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
 
@@ -210,29 +211,8 @@ class InversionOptions(CheckedModel):
         ),
         json_schema_extra=_BUDGET,
     )
-    beam_variation: float | None = Field(
-        default=None,
-        ge=0,
-        lt=1,
-        title="Beam variation",
-        description=(
-            "Relative r.m.s. difference between the true beam and the source, for the error "
-            "budget. Default: 0.05 for a uniform or estimated source, 0 for a recorded one. If "
-            "image and source differ by more outside the object, that difference is used."
-        ),
-        json_schema_extra=_BUDGET,
-    )
-    beam_scale: float = Field(
-        default=0.25,
-        gt=0,
-        le=1,
-        title="Beam scale",
-        description=(
-            "Length over which the true beam differs from the source, as a share of the image's "
-            "shorter side."
-        ),
-        json_schema_extra=_BUDGET,
-    )
+    beam_variation: BeamVariation = Field(default=None, json_schema_extra=_BUDGET)
+    beam_scale: BeamScale = Field(default=0.25, json_schema_extra=_BUDGET)
     seed: int = Field(
         default=0,
         ge=0,
