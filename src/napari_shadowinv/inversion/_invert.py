@@ -277,19 +277,20 @@ def invert(
         coarse = len(answer.weights)
     with _timed("errors", seconds):
         errors = budget.errors(solutions, fields.displacement) if answer.converged else None
-    told = _report(prepared.in_units(), noise, solutions, fields, seconds, budget)
+    quality = _report(prepared.in_units(), noise, solutions, fields, seconds, budget)
     finest = adaptive and len(answer.weights) == levels.counts[-1]
-    if finest and errors is not None and told.warnings == prepared.warnings:
+    if finest and errors is not None and quality.warnings == prepared.warnings:
         missed = errors.accuracy_caution(
             options.accuracy, "with the most sites placed unless more are given"
         )
-        told = replace(told, warnings=(*told.warnings, *filter(None, [missed])))
+        quality = replace(quality, warnings=(*quality.warnings, *filter(None, [missed])))
     if errors is not None:
-        told = replace(told, warnings=(*filter(None, [errors.beam_caution()]), *told.warnings))
+        of_beam = filter(None, [errors.beam_caution()])
+        quality = replace(quality, warnings=(*of_beam, *quality.warnings))
     with _timed("prepare", seconds):
         beam = prepared.source if plan.measured else None
         signs = image_warnings(prepared.image, beam, prepared.mask)
-        told = replace(told, warnings=(*told.warnings, *signs))
+        quality = replace(quality, warnings=(*quality.warnings, *signs))
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,
@@ -308,7 +309,7 @@ def invert(
         ),
         mask=prepared.mask,
         report=replace(
-            told,
+            quality,
             sites_reason=_reason(levels, budget, adaptive, start, coarse),
             errors=errors,
         ),
