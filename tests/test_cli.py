@@ -1147,6 +1147,9 @@ def test_demo_recovers_its_field(folder: Path) -> None:
     peak, distance = (float(word.strip("%,")) for word in line.split()[2:5:2])
     assert abs(peak) < 1
     assert distance < 2
+    # 200 px of 1.5 µm, and a distance of 1.3 mm to the object and 20 mm behind it.
+    assert "magnification 16.38" in flat(result.stdout)
+    assert "field of view 300 × 300 µm" in flat(result.stdout)
     # The demo may repeat itself.
     again = shadowinv("demo", "--n-sites", 200, "--noise", 0, "--out", "tour")
     assert again.exit_code == 0, again.output
@@ -1159,6 +1162,21 @@ def test_demo_refuses_invalid_numbers(folder: Path, refused: Callable[..., None]
     refused("demo", "--n-sites", 2, names="n_sites")
     (folder / "demo").write_text("a file")
     refused("demo", names=("demo", "cannot be created as a folder"))
+
+
+@pytest.mark.parametrize("command", [["invert", "shot.npy"], ["batch", "*.npy", "--out", "a.zarr"]])
+def test_setup_warnings_come_before_the_work(
+    command: list[str], shot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise InputError("the work began")
+
+    monkeypatch.setattr("napari_shadowinv.pipeline.run", stopped)
+    monkeypatch.setattr("napari_shadowinv.cli._batch.run_batch", stopped)
+    Path("swapped.toml").write_text(PROTON_TOML.replace("= 0.01", "= 1").replace("0.3", "0.01"))
+    lines = shadowinv(*command, "--setup", "swapped.toml").stderr.splitlines()
+    assert lines[0].startswith("setup: the magnification is 1.01")
+    assert lines[-1].endswith("the work began")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names there are text")

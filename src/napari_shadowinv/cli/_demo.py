@@ -72,7 +72,7 @@ def demo_table(
     """Build the table of a demo: the quality of the inversion and its true error."""
     rows = [
         headline_row(inversion, setup),
-        ("setup", setup_text(setup)),
+        ("setup", setup_text(setup, shape=inversion.image.shape)),
         *inversion_rows(inversion, setup),
         ("error", _errors_text(fields, "Retrieved")),
         ("error of Poisson", _errors_text(fields, "Poisson")),

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from napari_shadowinv.cli import _flags, _inputs, _outputs
-from napari_shadowinv.cli._terminal import notify_errors, say
+from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
 from napari_shadowinv.io.formats import IMAGE_TITLES
 
 # Help of arguments, where it is longer than a line.
@@ -130,6 +130,7 @@ def fit(
     _outputs.protect_files_of(chosen, list(outputs))
     shots = read_rows(rows, chosen, channel=channel, variable=variable)
     _outputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
+    warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
     names = [str(row.file) for row in rows]
     if compare:
         result_fit = _fit_result.compare_fields(

@@ -9,7 +9,7 @@ import typer
 
 from napari_shadowinv.cli import _flags, _outputs
 from napari_shadowinv.cli._inputs import recipe_for_shots
-from napari_shadowinv.cli._terminal import notify_errors, say
+from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
 
 # Help of options, where it is longer than a line.
 HELP = {
@@ -106,6 +106,8 @@ def batch(
     )
     if save_recipe is not None:
         _outputs.save_recipe(save_recipe, chosen, [recipe, setup, options], overwrite)
+    if not quiet:
+        warn_of_setups([(chosen.setup, None)])
     run_batch(
         shots,
         out,

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import unicodedata
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._system.progress import OnProgress, Progress
     from napari_shadowinv.inversion import Inversion, Report
+    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 EXIT_MISTAKE = 2
@@ -90,6 +91,7 @@ def invert_shot(
     """Apply a recipe to a shot; errors name the file."""
     from napari_shadowinv.pipeline import run
 
+    warn_of_setups([(recipe.setup or shot.setup, shot.shape)])
     with nullcontext() if quiet else progress_bars() as show:
         try:
             return run(
@@ -97,6 +99,22 @@ def invert_shot(
             )
         except InputError as error:
             raise InputError(f"{shot.path}: {error}" if shot.path else str(error)) from error
+
+
+def warn_of_setups(experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]]) -> None:
+    """Print what is doubtful about setups and the shapes of their images, before work begins."""
+    from rich.console import Console
+
+    from napari_shadowinv.physics.setup import setup_warnings
+
+    texts = [
+        text
+        for setup, shape in experiments
+        if setup is not None
+        for text in setup_warnings(setup, shape)
+    ]
+    for text in dict.fromkeys(texts):
+        Console(stderr=True).print(plain(text, "yellow"), soft_wrap=True, highlight=False)
 
 
 @contextmanager

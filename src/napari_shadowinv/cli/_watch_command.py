@@ -10,7 +10,7 @@ import typer
 from napari_shadowinv.cli import _flags, _outputs
 from napari_shadowinv.cli._inputs import recipe_for_shots
 from napari_shadowinv.cli._stack_commands import HELP
-from napari_shadowinv.cli._terminal import notify_errors
+from napari_shadowinv.cli._terminal import notify_errors, warn_of_setups
 from napari_shadowinv.io.formats import NEW_SHOTS
 
 _SETTLE_HELP = (
@@ -106,6 +106,8 @@ def watch(
     )
     if save_recipe is not None:
         _outputs.save_recipe(save_recipe, chosen, [recipe, setup, options], overwrite)
+    if not quiet:
+        warn_of_setups([(chosen.setup, None)])
     run_watch(
         folder,
         out,
