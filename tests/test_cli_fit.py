@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from command_line import content, flat, interrupted, shadowinv
 from napari_shadowinv.cli._flags import fit_recipe_of
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitOptions, LeaveOneOut, Verdict, point_spread
 from napari_shadowinv.inversion.labels import setup_from_dataset
 from napari_shadowinv.io import read, write
@@ -25,6 +26,7 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import read_recipe
+from napari_shadowinv.plotting import fit_figure
 from napari_shadowinv.preprocessing import Bin, FitProvenance, Origin, Recipe, polynomial_source
 
 SHAPE = (48, 56)
@@ -670,3 +672,54 @@ def test_impossible_static_checks_are_refused(
 ) -> None:
     Path("mesh.csv").write_text("x,y,dx,dy,sigma\n20,10,0.5,-0.25,0.1\n")
     refused(*command.split(), names=names)
+
+
+def test_the_peak_of_a_fit_is_that_of_unmasked_pixels(
+    make_fit: Callable[..., Fit], proton_setup: ProtonSetup
+) -> None:
+    fit = make_fit()
+    field = fit.fields[0]
+    mask, move = fit.mask.copy(), field.displacement.copy()
+    mask[:, 5:9, 50:60] = False
+    move[:, 6, 55] = 1000.0  # only a continuation
+    hidden = dataclasses.replace(
+        fit,
+        mask=mask,
+        fields=(dataclasses.replace(field, displacement=move),),
+        setups=(proton_setup, proton_setup),
+    )
+    write("fit.shadowinv", hidden)
+    told = flat(shadowinv("info", "fit.shadowinv").stdout)
+    (peak,) = re.findall(r"peak \|d\|\s*([\d.]+)", told)
+    assert float(peak) == pytest.approx(np.hypot(*field.displacement).max(), rel=0.01)
+    # The largest value of the figure's colour scale, and the blank pixels.
+    (panel,) = [
+        axes for axes in fit_figure(hidden).axes if axes.get_title("left").startswith("Path")
+    ]
+    picture = panel.images[0]
+    np.testing.assert_array_equal(np.isnan(picture.get_array().filled(np.nan)), ~mask.any(axis=0))
+    in_si = proton_setup.path_integrated_b(field.displacement)
+    assert picture.get_clim()[1] == pytest.approx(1e6 * np.hypot(*in_si).max())
+
+
+def test_field_of_view_of_a_fit_is_in_its_table(
+    make_fit: Callable[..., Fit], proton_setup: ProtonSetup
+) -> None:
+    write("fit.shadowinv", make_fit(setups=(proton_setup, proton_setup)))
+    told = flat(shadowinv("info", "fit.shadowinv").stdout)
+    # 64 × 48 px of 1.5 µm, (1.3 + 20) / 1.3.
+    assert "magnification 16.38" in told
+    assert "field of view 96 × 72 µm" in told
+
+
+def test_setup_warnings_come_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fit(**_: Any) -> Fit:
+        raise InputError("the work began")
+
+    monkeypatch.setattr("napari_shadowinv.pipeline._fit.fit", fit)
+    text = Path("setup.toml").read_text()
+    near = text.replace("object_image_distance = 0.3", "object_image_distance = 1e-4")
+    Path("setup.toml").write_text(near)
+    lines = shadowinv(*PAIR, "--quiet").stderr.splitlines()
+    assert lines[0].startswith("setup: the magnification is")
+    assert lines[-1] == "the work began"

@@ -421,6 +421,23 @@ def test_the_colour_scale_of_a_film_is_fixed(store):
         np.testing.assert_array_equal(frame[60:, bar], scaled[brightest][60:, bar])
 
 
+def test_masked_pixels_leave_a_film_as_it_is(store):
+    from napari_shadowinv.plotting import stack_frames
+
+    dataset = read(store).load()
+    mask = np.ones(dataset.potential.shape[1:], bool)
+    mask[3:9, 3:9] = False
+    clean = dataset.assign(mask=(("y", "x"), mask))
+    wild = clean.assign(potential=clean.potential.where(mask, 1e6))
+    frames = list(stack_frames(wild, "potential"))
+    for frame, expected in zip(frames, stack_frames(clean, "potential"), strict=True):
+        np.testing.assert_array_equal(frame, expected)
+    # The mask of a fit's images: a pixel counts that one of them shows.
+    both = np.stack([mask, np.ones_like(mask)])
+    shown = stack_frames(wild.assign(mask=(("image", "y", "x"), both)), "potential")
+    assert not np.array_equal(next(shown), frames[0])
+
+
 def test_a_gif_keeps_the_colours_of_its_scale(store):
     from matplotlib import colormaps
 

@@ -191,7 +191,7 @@ def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
         *[("warning", caution.text) for caution in fit.warnings],
         *[(f"image {k + 1}", _image_text(fit, k, names)) for k in range(len(fit.images))],
         ("size", size_text(fit.images[0])),
-        ("setup", setup_text(fit.setups[0] if fit.setups else None)),
+        ("setup", setup_text(fit.setups[0] if fit.setups else None, shape=fit.images[0].shape)),
         *[(f"field {field.name}", _field_text(fit, field)) for field in fit.fields],
     ]
     rows += fit.error_rows
@@ -229,10 +229,11 @@ def _field_text(fit: Fit, field: FittedField) -> str:
     from napari_shadowinv.fitting import FIELDS
     from napari_shadowinv.physics.units import shown_fields
 
-    (pixels,) = shown_fields([field.displacement], None)
+    (pixels,) = shown_fields([field.displacement], None, mask=fit.used)
     row, column = pixels.peak
     peak = f"{fit.peak_text(field, pixels)}, at y = {row}, x = {column} px"
     if not fit.setups:
         return peak
-    (physical,) = shown_fields([field.displacement], fit.setups[0], FIELDS[field.name])
+    setup, deflector = fit.setups[0], FIELDS[field.name]
+    (physical,) = shown_fields([field.displacement], setup, deflector, mask=fit.used)
     return f"{fit.peak_text(field, physical)}; {peak}"

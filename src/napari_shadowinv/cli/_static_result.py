@@ -162,6 +162,8 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 def windows_table(windows: FitWindows) -> Table:
     """Build a table of the fit of each window, and the peaks of its fields."""
+    import numpy as np
+
     from napari_shadowinv.fitting import FIELDS
     from napari_shadowinv.physics.units import shown_fields
 
@@ -176,8 +178,10 @@ def windows_table(windows: FitWindows) -> Table:
     ]
     caption = "" if windows.setup else "Fields at the strength of the image displaced most."
     table = _table("Windows", headings, caption)
+    used = np.stack([fit.used for fit in windows.fits])[:, None, None]
+    unmasked = np.where(used, windows.displacement, np.nan)
     peaks = [
-        shown_fields(list(windows.displacement[:, m]), windows.setup, FIELDS[field.name])
+        shown_fields(list(unmasked[:, m]), windows.setup, FIELDS[field.name])
         for m, field in enumerate(fields)
     ]
     energies, times = windows.energies, windows.times_of_flight

@@ -101,16 +101,14 @@ class FittedField:
             return self.uncertainty
         return np.hypot(self.uncertainty, self.beam_uncertainty)
 
-    @property
-    def error_of_peak(self) -> float:
-        """Standard deviation of the largest displacement as a share of it; NaN if not known."""
-        length = np.hypot(*self.displacement)
-        row, column = np.unravel_index(np.argmax(length), length.shape)
-        if self.total_uncertainty is None or not length[row, column] > 0:
+    def error_at(self, row: int, column: int) -> float:
+        """Return the relative standard deviation of the displacement in a pixel; NaN if unknown."""
+        move = self.displacement[:, row, column]
+        length = np.hypot(*move)
+        if self.total_uncertainty is None or not length > 0:
             return float("nan")
-        along = self.displacement[:, row, column] / length[row, column]
-        error = np.hypot(*(along * self.total_uncertainty[:, row, column]))
-        return float(error / length[row, column])
+        error = np.hypot(*(move / length * self.total_uncertainty[:, row, column]))
+        return float(error / length)
 
 
 @dataclass(frozen=True)
@@ -246,6 +244,11 @@ class Fit:
     provenance: FitProvenance | None = None
 
     @property
+    def used(self) -> BoolArray:
+        """Pixels that at least one image uses, shape (H, W); elsewhere the fields have no data."""
+        return np.asarray(self.mask.any(axis=0))
+
+    @property
     def error_rows(self) -> list[tuple[str, str]]:
         """The errors of the displacement in words: names and texts."""
         report = self.report
@@ -279,7 +282,7 @@ class Fit:
 
     def peak_text(self, field: FittedField, shown: ShownField) -> str:
         """Return the largest magnitude of a field with its total error, in the unit shown."""
-        share = field.error_of_peak
+        share = field.error_at(*shown.peak)
         if np.isnan(share):
             return shown.peak_text()
         cause = self.report.beam.name if self.report.beam else "noise"

@@ -181,7 +181,7 @@ def shown_potential(potential: FloatArray, setup: Setup | None) -> tuple[FloatAr
     if setup is None:
         return potential, "px²"
     metres = setup.potential(potential)
-    factor, prefix = prefix_for(float(np.abs(metres).max()))
+    factor, prefix = prefix_for(float(np.nanmax(np.abs(metres))))
     return metres * factor, f"{prefix}m"
 
 

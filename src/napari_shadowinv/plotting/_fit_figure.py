@@ -39,7 +39,7 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     in units of the noise's r.m.s. standard deviation. Below for each field: its potential where
     there is room, the field with arrows, the standard deviation that the noise leaves, and
     profiles along the dashed lines on the field. White outlines mark where rays have crossed in
-    any image.
+    any image; masked pixels are hatched.
 
     Parameters
     ----------
@@ -94,10 +94,11 @@ def _kinds(fit: Fit) -> tuple[str, ...]:
 def _field_in_units(fit: Fit, field: FittedField) -> tuple[ShownField, ShownField | None]:
     """Return a field and its standard deviation, each in a handy unit."""
     setup = fit.setups[0] if fit.setups else None
-    (in_units,) = shown_fields([field.displacement], setup, FIELDS[field.name])
+    deflector = FIELDS[field.name]
+    (in_units,) = shown_fields([field.displacement], setup, deflector, mask=fit.used)
     if field.uncertainty is None:
         return in_units, None
-    (error,) = shown_fields([field.uncertainty], setup, FIELDS[field.name])
+    (error,) = shown_fields([field.uncertainty], setup, deflector, mask=fit.used)
     return in_units, error
 
 
@@ -107,13 +108,15 @@ def _draw_image(panel: Panel, fit: Fit, k: int, kind: str) -> None:
         used = fit.residual[k][fit.mask[k]]
         noise = float(np.sqrt((used**2).mean() / fit.chi2[k])) if fit.chi2[k] > 0 else 1.0
         title = f"Residual: χ² {fit.chi2[k]:.3g}"
-        draw_differences(panel, fit.residual[k] / noise, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
+        residual = np.where(fit.mask[k], fit.residual[k] / noise, np.nan)
+        draw_differences(panel, residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
         return
     plane = {"Beam": fit.source, "Image": fit.images, "Re-projection": fit.reprojection}[kind][k]
     probe = f": {fit.setups[k].probe}" if fit.setups else ""
     title = f"Image {k + 1}{probe}" if kind == "Image" else kind
     scale = fit.source if kind == "Beam" else fit.images
-    draw_intensity(panel, plane / mean, title, intensity_limits(scale[k] / mean))
+    hidden = plane / mean if kind == "Beam" else np.where(fit.mask[k], plane / mean, np.nan)
+    draw_intensity(panel, hidden, title, intensity_limits(scale[k] / mean))
 
 
 def _draw_fitted(
@@ -131,7 +134,8 @@ def _draw_fitted(
     contents = contents[-len(panels) :] if len(panels) < len(contents) else contents
     for panel, content in zip(panels, contents, strict=False):
         if content == "potential":
-            draw_potential(panel, field.potential, fit.setups[0] if fit.setups else None)
+            potential = np.where(fit.used, field.potential, np.nan)
+            draw_potential(panel, potential, fit.setups[0] if fit.setups else None)
         elif content == "field":
             draw_field(panel, in_units, title)
             outline_caustics(panel, _crossed_rays(fit))
@@ -179,6 +183,8 @@ def _footer(fit: Fit, fields: list[ShownField], letters: int) -> list[tuple[str,
     facts = [fit.peak_text(*each) for each in zip(fit.fields, fields, strict=True)]
     facts += [f"{name}: {text}" for name, text in fit.error_rows]
     facts.append(f"gains {', '.join(f'{gain:.3g}' for gain in fit.gains)}")
+    if not fit.mask.all():
+        facts.append(f"hatched: masked, {100 * (1 - fit.mask.mean()):.2g} % of the pixels")
     if fit.folded:
         facts.append(f"rays cross over {fit.folded:.1%} of the image")
     facts.append(f"{fit.report.iterations} steps in {sum(fit.report.seconds.values()):.1f} s")

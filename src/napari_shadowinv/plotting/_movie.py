@@ -32,6 +32,7 @@ _DOTS_PER_INCH = 120
 _OUTLIER_SHARE = 0.02  # share of the shots whose extremes may lie beyond the colour scale
 _COLOUR_MAP = "viridis"
 _RATE_FACTOR = 10  # of H.264: 0 is lossless, 51 the worst
+_RECORDED = ("image", "source", "mask")  # shown under masks, too
 _GREYS = 56  # colours of a GIF that are reserved for text
 _LETTER_WIDTH_IN = 0.075
 _LINE_HEIGHT_IN = 0.15
@@ -71,7 +72,8 @@ def stack_frames(
             f"the stack has no images {variable!r}: expected one of {', '.join(images)}"
         )
     field = stack[variable]
-    low, high = _limits(field) if limits is None else limits
+    used = None if variable in _RECORDED else stack.get("mask")
+    low, high = _limits(field, used) if limits is None else limits
     if not high > low:
         raise InputError(f"limits are {low:g} and {high:g}: the second must be larger")
     unit = str(field.attrs.get("units", ""))
@@ -82,7 +84,7 @@ def stack_frames(
     shape = field.sizes["y"], field.sizes["x"]
     draw = _Frame(shape, _common_setup(stack), label, (factor * low, factor * high))
     return (
-        draw(factor * _plane(field, index), str(stack["name"].values[index]))
+        draw(factor * _plane(field, index, used), str(stack["name"].values[index]))
         for index in range(field.sizes["shot"])
     )
 
@@ -97,14 +99,20 @@ def _common_setup(stack: xarray.Dataset) -> Any:
     return setups[0] if len(sizes) == 1 else None
 
 
-def _plane(field: xarray.DataArray, index: int) -> FloatArray:
+def _plane(field: xarray.DataArray, index: int, used: xarray.DataArray | None) -> FloatArray:
+    """Values or lengths in one shot, NaN where a mask leaves pixels out."""
     values = np.asarray(field.isel(shot=index).values, dtype=np.float64)
-    return values if values.ndim == 2 else np.sqrt((values**2).sum(axis=0))
+    plane: FloatArray = values if values.ndim == 2 else np.sqrt((values**2).sum(axis=0))
+    if used is None:
+        return plane
+    mask = np.asarray(used.isel(shot=index) if "shot" in used.dims else used, dtype=bool)
+    # A fit uses a pixel that one of its images shows.
+    return np.where(mask.reshape(-1, *plane.shape).any(axis=0), plane, np.nan)
 
 
-def _limits(field: xarray.DataArray) -> tuple[float, float]:
-    planes = (_plane(field, index) for index in range(field.sizes["shot"]))
-    extremes = np.array([(plane.min(), plane.max()) for plane in planes])
+def _limits(field: xarray.DataArray, used: xarray.DataArray | None) -> tuple[float, float]:
+    planes = (_plane(field, index, used) for index in range(field.sizes["shot"]))
+    extremes = np.array([(np.nanmin(plane), np.nanmax(plane)) for plane in planes])
     low = float(np.quantile(extremes[:, 0], _OUTLIER_SHARE, method="lower"))
     high = float(np.quantile(extremes[:, 1], 1 - _OUTLIER_SHARE, method="higher"))
     if "component" in field.dims:
@@ -129,15 +137,16 @@ class _Frame:
             self._figure, (panel,) = new_page(grid, image_scale(shape, setup), None)
             # Without values: the colour bar must not depend on the first shot.
             panel.show(np.full(shape, limits[0]), "", "\n".join(lines), _COLOUR_MAP, limits)
-        self._axes = panel.axes
+        self._panel = panel
         self._picture = panel.axes.images[0]
 
     def __call__(self, plane: FloatArray, name: str) -> NDArray[np.uint8]:
         from matplotlib import rc_context
 
+        self._panel.hatch_gaps(plane)
         self._picture.set_data(plane)
         with rc_context(STYLE):
-            self._axes.set_title(name)
+            self._panel.axes.set_title(name)
             self._figure.set_dpi(_DOTS_PER_INCH)
             canvas: Any = self._figure.canvas
             canvas.draw()

@@ -171,8 +171,7 @@ class Panel:
         The ends of the colour bar are pointed where limits cut the plane.
         """
         low, high = limits
-        if np.isnan(plane).any():
-            self.axes.patch.set(facecolor="0.92", edgecolor="0.6", hatch="////")
+        self.hatch_gaps(plane)
         # Smoothing would hide single bad pixels.
         choices: Any = {"vmin": low, "vmax": high, "interpolation": "nearest", "aspect": "equal"}
         extent = self.scale.extent(plane.shape)
@@ -188,6 +187,11 @@ class Panel:
         bar = figure.colorbar(picture, cax=room, extend=extend.get((below, above), "neither"))
         bar.set_label(label)
         bar.outline.set_linewidth(0.7)
+
+    def hatch_gaps(self, plane: FloatArray) -> None:
+        """Hatch the background if it shows through a plane, where that is NaN."""
+        if np.isnan(plane).any():
+            self.axes.patch.set(facecolor="0.92", edgecolor="0.6", hatch="////")
 
     def contour(self, plane: AnyArray, levels: ArrayLike, colour: str, **style: Any) -> None:
         """Draw lines of equal value onto the picture."""

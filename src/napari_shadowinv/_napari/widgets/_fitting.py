@@ -215,5 +215,6 @@ def _peak_name(fit: Fit, field: FittedField) -> str:
 
 
 def _peak_text(fit: Fit, field: FittedField) -> str:
-    (shown_field,) = shown_fields([field.displacement], setup_of_fit(fit), FIELDS[field.name])
+    setup, deflector = setup_of_fit(fit), FIELDS[field.name]
+    (shown_field,) = shown_fields([field.displacement], setup, deflector, mask=fit.used)
     return fit.peak_text(field, shown_field).removeprefix("peak ")
