@@ -23,6 +23,7 @@ CAUTION_CODES: Mapping[str, str] = MappingProxyType(
         "folds": "rays cross",
         "closed-edge": "the field reaches the closed edge of the image",
         "cut-object": "the edge of the image seems to cut the object",
+        "correlated-noise": "noise is correlated over too many pixels to be measured",
         "beam": "image and source differ outside the object",
         "masked-peak": "the peak of the field lies at masked pixels",
         "accuracy": "the requested accuracy was not reached",

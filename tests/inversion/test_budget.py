@@ -378,6 +378,20 @@ def test_correlated_noise_is_the_scatter_of_repeats(blur):
     assert np.median(lengths) == pytest.approx(blur, rel=0.3)
 
 
+@pytest.mark.parametrize("blur", [4.0, 6.0])
+def test_noise_correlated_over_many_pixels_is_named(blur):
+    clean = synthetic_image(phantoms.gaussian_blob((160, 160), 60.0, 16.0, (70, 84)).displacement)
+    rng = np.random.default_rng(7)
+    noise = gaussian_filter(rng.normal(size=clean.shape), blur, mode="wrap")
+    options = InversionOptions(n_sites=900, negative="clip")
+    white = clean + 0.02 * rng.normal(size=clean.shape)
+    cautions = invert(white + 0.05 * noise / noise.std(), options=options).report.warnings
+    assert "correlated-noise" in [caution.code for caution in cautions]
+    for image in (white, clean):
+        cautions = invert(image, options=options).report.warnings
+        assert "correlated-noise" not in [caution.code for caution in cautions]
+
+
 @pytest.mark.parametrize("noise", [gaussian, counting])
 def test_white_noise_is_not_called_correlated(every_image, noise):
     for seed in range(10):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from napari_shadowinv import (
     InputError,
@@ -81,6 +82,23 @@ def test_error_bars_of_one_shot_are_the_scatter_of_many(
         assert np.median(std / np.std(fields, axis=0, ddof=1)) == pytest.approx(1, abs=0.25)
         covered = np.mean([np.abs(field - truth) < std for field in fields])
         assert covered == pytest.approx(0.683, abs=0.08)
+
+
+def test_error_bars_of_correlated_noise_are_the_scatter_of_many():
+    clean = synthetic_image(gaussian_blob((96, 100), 30.0, 12.0, (45.0, 52.0)).displacement)
+    sites = plan_sites(np.ones(clean.shape), InversionOptions(n_sites=2400))
+    rng = np.random.default_rng(4)
+
+    def shot():
+        noise = ndimage.gaussian_filter(rng.normal(size=clean.shape), 1.2, mode="wrap")
+        return clean + 0.03 * noise / noise.std()
+
+    found = uncertainty(shot(), 60, plan=sites, noise=0.03, options=OPTIONS)
+    assert "correlated over 1." in found.noise
+    others = [invert(shot(), plan=sites, options=OPTIONS).displacement for _ in range(20)]
+    ratio = found.displacement_std / np.std(others, axis=0, ddof=1)
+    # Without correlation, they would be four times as small.
+    assert np.median(ratio) == pytest.approx(1, abs=0.35)
 
 
 def test_the_inversion_is_that_of_the_image(counts, plan):

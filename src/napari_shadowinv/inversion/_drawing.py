@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage
 
 from napari_shadowinv._system.arrays import plain_array, unpack_array
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -13,8 +15,10 @@ from napari_shadowinv.errors import InputError
 
 __all__ = ["Draw", "noise_of"]
 
-Draw = Callable[[np.random.Generator], FloatArray]
+Draw = Callable[[np.random.Generator, float], FloatArray]
+"""Returns a noisy image, with noise that a Gaussian of some standard deviation (px) correlates."""
 
+_BLUR_REACH = 4.0  # standard deviations
 _MOST_QUANTA = 1e18  # numpy draws no larger Poisson numbers
 
 
@@ -58,7 +62,8 @@ def _poisson(values: FloatArray, gain: float | None) -> tuple[Draw, str]:
             f"gain is {gain:g} and the brightest pixel {values.max():g}: that is more than "
             f"{_MOST_QUANTA:g} quanta in a pixel, expected fewer: check the unit of the gain"
         )
-    return lambda rng: gain * rng.poisson(quanta), f"Poisson, gain {gain:g}"
+    # A blur leaves the counting noise of many pixels as it was.
+    return lambda rng, blur: gain * rng.poisson(quanta), f"Poisson, gain {gain:g}"
 
 
 def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[Draw, str]:
@@ -79,4 +84,17 @@ def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[D
             "deviations in the image's units"
         )
     described = f"Gaussian, {sigma:g}" if sigma.ndim == 0 else "Gaussian, pixel by pixel"
-    return lambda rng: values + deviation * rng.normal(size=values.shape), described
+    return lambda rng, blur: values + deviation * _normal(rng, values.shape, blur), described
+
+
+def _normal(rng: np.random.Generator, shape: tuple[int, ...], blur: float) -> FloatArray:
+    """Normal noise of deviation 1, correlated as by a Gaussian blur (px)."""
+    if not blur > 0:
+        return rng.normal(size=shape)
+    reach = math.ceil(_BLUR_REACH * blur)
+    kernel = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * blur**2))
+    kernel /= np.sqrt((kernel**2).sum())
+    noise: FloatArray = rng.normal(size=[side + 2 * reach for side in shape])
+    for axis in (0, 1):
+        noise = ndimage.correlate1d(noise, kernel, axis)
+    return noise[reach:-reach, reach:-reach]

@@ -20,7 +20,6 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.linear_surface import WIDTH
 from napari_shadowinv.geometry.overlaps import pixel_shares
-from napari_shadowinv.inversion._drawing import Draw
 from napari_shadowinv.inversion._linear_readout import LinearReadout
 from napari_shadowinv.inversion.normalise import floored_by
 from napari_shadowinv.inversion.readout import read_out
@@ -56,7 +55,7 @@ class Resolving:
 
     plan: SitePlan
     start: FloatArray
-    draw: Draw
+    draw: Callable[[np.random.Generator], FloatArray]
     options: InversionOptions
 
     def sample(self, seeds: list[Seed], report: Reporter) -> Sample:

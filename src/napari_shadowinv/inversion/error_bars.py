@@ -186,8 +186,9 @@ def uncertainty(
     noise : "poisson" or float or array_like of shape (H, W)
         ``"poisson"``: each pixel counts quanta (photons, protons), whose number scatters by
         its square root. Else the standard deviation of Gaussian noise, in the image's units.
-        Noise is taken as independent from pixel to pixel. Samples that it drives below zero are
-        clipped there, whatever `options.negative` says of the image.
+        Gaussian noise is as correlated between pixels as that of the image is measured to be.
+        Samples that it drives below zero are clipped there, whatever `options.negative` says of
+        the image.
     gain : float, optional
         Of Poisson noise only: the image's units that one detected quantum makes; a pixel of
         value v then scatters by √(gain · v). Default: 1 for an image of whole numbers, which are
@@ -224,7 +225,7 @@ def uncertainty(
     if plan is None:
         image, source, mask = unpack_shot(image, source, mask)
     check_memory(np.shape(image), bytes_per_pixel(options), "an inversion")
-    draw, described = noise_of(image, noise, gain, mask if plan is None else plan.mask)
+    draw_noise, described = noise_of(image, noise, gain, mask if plan is None else plan.mask)
     if plan is None:
         beam = prepare(image, source, options, mask).source
         plan = plan_sites(
@@ -251,7 +252,15 @@ def uncertainty(
     threads = max(1, available_threads(options.threads) // workers)
     clipping = options.model_copy(update={"threads": threads, "negative": "clip"})
     levels = plan.levels.up_to(len(inversion.weights))
-    resolving = Resolving(replace(plan, levels=levels), inversion.weights, draw, clipping)
+    correlation = 0.0 if inversion.errors is None else inversion.errors.noise_correlation
+    if correlation and not isinstance(noise, str):
+        described += f", correlated over {correlation:.2g} px"
+    resolving = Resolving(
+        replace(plan, levels=levels),
+        inversion.weights,
+        lambda rng: draw_noise(rng, correlation),
+        clipping,
+    )
     resolving = resolving.to_tolerance_of_noise(seeds[0])
     report = Reporter(on_progress, should_stop)
     here = np.stack([inversion.potential, *inversion.displacement])

@@ -47,6 +47,10 @@ _MIN_DEVIATION = 1e-4  # of the brightness; below are the smooth flanks of noise
 _MAX_PLATEAU_RISE = 1.35  # of V at the largest lag over the one before
 _MIN_CORRELATION = 0.05
 _CLIP_DEVIATIONS = 5.0
+
+_MIN_FAR_RISE = 1.4  # of V at the largest lag over V(1), in most of the quiet tiles
+_MAX_FAR_UNEVENNESS = 0.62  # of its logarithm between tiles: noise has up to 0.6, structure 0.64
+_MAX_FAR_SPREAD = 0.85  # of the logarithm of V: noise has up to 0.75, structure 1 and more
 # White noise on pixels has waves up to 3.51 rad/px, averaged over directions of its logarithm;
 # a Gaussian blur of standard deviation b ends them at exp(-γ/2) / b.
 _GRAIN_PER_BLUR = 3.51 / math.exp(-0.5772 / 2)
@@ -64,6 +68,9 @@ class ImageNoise:
     correlation_length : float
         Standard deviation of the Gaussian blur that clumps white noise as much, px; 0 for white
         noise.
+    is_correlated_far : bool
+        Whether calm parts vary over more pixels than a correlation can be measured: all of the
+        above is then too small.
     """
 
     def __init__(self, prepared: Prepared, options: InversionOptions | None = None) -> None:
@@ -74,6 +81,7 @@ class ImageNoise:
         used = mask[1:, 1:] & mask[1:, :-1] & mask[:-1, 1:] & mask[:-1, :-1]
         differences = _finest(excess, used)
         inflation, self.clumping = _correlation(excess, mask)
+        self.is_correlated_far = self.clumping == 1 and _is_correlated_far(excess, mask)
         self.largest = _rms(differences) * math.sqrt(inflation)
         self.typical = _clipped(differences) * math.sqrt(inflation)
         # The source's mean, in units of the recorded image.
@@ -86,6 +94,7 @@ class ImageNoise:
         elif counts is not None:
             self._terms[1] = counts / quantum
             self.clumping = 1.0  # a blur leaves the counting noise of many pixels as it was
+            self.is_correlated_far = False
         elif used.any():
             bright = image[1:, 1:] + image[1:, :-1] + image[:-1, 1:] + image[:-1, :-1]
             self._terms = inflation * _terms(bright[used] / (4 * mean), differences)
@@ -142,18 +151,11 @@ def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
     is_rising = used & (_difference_variance(tiles, side, _RISE_LAG_PX) > _MIN_RISE * finest)
     if is_rising.mean() < _QUIET_SHARE * (1 - _LOW_QUANTILE):
         return 1.0, 1.0
-    tiles = _without_hot_pixels(tiles)
-    finest = _difference_variance(tiles, side, 1)
-    used &= finest > 0
-    rise = np.where(
-        used, _difference_variance(tiles, side, lags[-1]) / np.where(used, finest, 1.0), 1.0
-    )
-    around = _around(rise)
-    quiet = used & (around <= np.quantile(around, _QUIET_SHARE))
-    count = int(quiet.sum())
+    tiles = _quiet_tiles(tiles, used, side, lags[-1])
+    count = len(tiles)
     if count < _MIN_TILES:
         return 1.0, 1.0
-    tiles, finest = tiles[quiet], finest[quiet]
+    finest = _difference_variance(tiles, side, 1)
     rise = _difference_variance(tiles, side, _RISE_LAG_PX) / np.maximum(finest, 1e-300)
     least = max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(count))
     if np.quantile(rise, _LOW_QUANTILE) < least or np.log(rise).std() > _MAX_UNEVENNESS:
@@ -171,6 +173,34 @@ def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
     steps = np.arange(lags[-1] + 1)
     along_axis = np.interp(steps, [0, *lags], [1.0, *correlation])
     return inflation, float((2 * along_axis.sum() - 1) ** 2)
+
+
+def _is_correlated_far(excess: FloatArray, mask: BoolArray) -> bool:
+    """Whether tiles vary over many pixels, all of them alike, as noise does and structure not."""
+    lag = _LAGS_PX[-1]
+    if min(excess.shape) < _MIN_SIDE_PX:
+        return False
+    tiles = _quiet_tiles(*_tiles(excess, mask, _TILE_PX, lag), _TILE_PX, lag)
+    if len(tiles) < _MIN_TILES:
+        return False
+    far = _difference_variance(tiles, _TILE_PX, lag)
+    rise = far / _difference_variance(tiles, _TILE_PX, 1)
+    return bool(
+        np.quantile(rise, _LOW_QUANTILE) > _MIN_FAR_RISE
+        and np.log(rise).std() < _MAX_FAR_UNEVENNESS
+        and np.log(far).std() < _MAX_FAR_SPREAD
+        and np.median(far) > _MIN_DEVIATION**2
+    )
+
+
+def _quiet_tiles(tiles: FloatArray, used: BoolArray, side: int, lag: int) -> FloatArray:
+    """Choose the tiles with the least structure around them, without hot pixels."""
+    tiles = _without_hot_pixels(tiles)
+    finest = _difference_variance(tiles, side, 1)
+    used = used & (finest > 0)
+    rise = np.where(used, _difference_variance(tiles, side, lag) / np.where(used, finest, 1.0), 1.0)
+    around = _around(rise)
+    return tiles[used & (around <= np.quantile(around, _QUIET_SHARE))]
 
 
 def _tiles(

@@ -127,6 +127,7 @@ def doubts(
     texts = {
         "misfit": misfit,
         "folds": _deep_folds(jacobian, prepared.mask),
+        "correlated-noise": _far_correlation(noise),
         "masked-peak": _peak_at_mask(displacement, prepared.mask),
     }
     if options.boundary == "closed":
@@ -211,6 +212,17 @@ def _nothing_found(noise: ImageNoise, rms: float) -> str:
         f"no deflection found: the displacement of {rms:.2g} px (r.m.s.) is no larger than the "
         f"{usual:.2g} px expected from the image's noise of {noise.typical:.1%} per pixel; "
         "average shots, or bin or smooth the image, before interpreting the field"
+    )
+
+
+def _far_correlation(noise: ImageNoise) -> str:
+    """Noise whose strength at long wavelengths is not known."""
+    if not noise.is_correlated_far:
+        return ""
+    return (
+        "correlated noise: calm parts of the image vary over 4 px and more, all alike, as noise "
+        "does that is correlated over 3 px or more, or the texture of a beam: the error by noise "
+        "is too small; compare several shots, and use images that were not smoothed or resampled"
     )
 
 
