@@ -18,11 +18,8 @@ from napari_shadowinv.preprocessing import (
     ReferencePair,
     image_warnings,
 )
-from napari_shadowinv.preprocessing.image_checks import (
-    dark_level,
-    saturated_share,
-    stray_pixels,
-)
+from napari_shadowinv.preprocessing.image_checks import saturated_share, stray_pixels
+from napari_shadowinv.preprocessing.photon_transfer import dark_level
 
 SHAPE = (160, 160)
 COUNTS = 300
@@ -81,6 +78,35 @@ def test_dark_level_needs_no_kind_of_noise_to_be_silent(power):
     image = synthetic_image(toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement)
     rng = np.random.default_rng(2)
     assert dark_level(image + 0.05 * image**power * rng.normal(size=SHAPE)) == 0
+
+
+def test_dark_level_of_image_and_source_needs_no_deep_shadows():
+    truth = toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement
+    clean = synthetic_image(truth, beam())
+    alone = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        image, source = (rng.poisson(COUNTS * plane).astype(float) for plane in (clean, beam()))
+        offset = 0.2 * image.mean()
+        found = dark_level(image + offset, None, source + offset)
+        assert found == pytest.approx(0.2 / 1.2, rel=0.3)
+        assert dark_level(image, None, source) == 0
+        alone.append(dark_level(image + offset))
+    assert np.count_nonzero(alone) < 4
+
+
+@pytest.mark.parametrize(("uneven", "speckle"), [(0.03, 0.0), (0.0, 0.1), (0.01, 0.03)])
+def test_noise_in_proportion_to_the_signal_is_no_dark_level(uneven, speckle):
+    truth = toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement
+    rng = np.random.default_rng(3)
+    pixels = 1 + uneven * rng.normal(size=SHAPE)
+
+    def recorded(clean):
+        flickering = np.clip(1 + speckle * rng.normal(size=SHAPE), 0, None)
+        return rng.poisson(1000 * clean * pixels * flickering).astype(float)
+
+    image, source = recorded(synthetic_image(truth, beam())), recorded(beam())
+    assert dark_level(image, None, source) == 0
 
 
 def test_dark_level_ignores_masked_pixels(shot):

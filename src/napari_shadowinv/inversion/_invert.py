@@ -289,7 +289,7 @@ def invert(
         quality = replace(quality, warnings=(*of_beam, *quality.warnings))
     with _timed("prepare", seconds):
         beam = prepared.source if plan.measured else None
-        signs = image_warnings(prepared.image, beam, prepared.mask)
+        signs = image_warnings(prepared.image * prepared.flux_scale, beam, prepared.mask)
         quality = replace(quality, warnings=(*quality.warnings, *signs))
     reprojection = fields.reprojection * prepared.unit
     return Inversion(

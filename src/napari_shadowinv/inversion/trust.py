@@ -377,7 +377,7 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) 
                 return (
                     f"the {side} edge of the image seems to cut the object: the image's contrast "
                     "there is as strong as inside, and what lies beyond is missing, which makes "
-                    "the field wrong, by 20 to 70 % in tests; use a wider crop or field of view, "
+                    "the field wrong, by 7 to 73 % in tests; use a wider crop or field of view, "
                     "or try a free boundary (--boundary free), see docs/boundary.md"
                 )
     return ""

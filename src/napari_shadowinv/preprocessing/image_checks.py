@@ -1,8 +1,8 @@
 """Signs in an image and its reference that they are not what an inversion takes them for.
 
 - all of them, in sentences: `image_warnings`
-- of one image: `dark_level`, `saturated_share`, `stray_pixels`
-- of an image and its reference: `ReferencePair`
+- of one image: `saturated_share`, `stray_pixels`
+- of an image and its reference: `dark_level`, `ReferencePair`
 
 An image shall be linear in the fluence, without offset, and on the same pixels as its reference.
 Nothing here changes an image: each sentence says what was seen, what it does to the field, and
@@ -21,34 +21,20 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
-from scipy.optimize import nnls
 
-from napari_shadowinv._system.arrays import order_by_value
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.preprocessing.photon_transfer import dark_level
 
 __all__ = [
     "ReferencePair",
-    "dark_level",
     "image_warnings",
     "saturated_share",
     "stray_pixels",
 ]
 
 _NORMAL_MAD = 1.4826
-
-# Dark level
-_DARK_SAMPLES = 120_000
-_DARK_BINS = 20
-_BRIGHTEST_LEFT_OUT = 0.05  # share of the pixels: bright lines are not smooth
-_CLIPPED_AT, _CLIPPED_VARIANCE = 3.0, 0.9733  # standard deviations; variance of a clipped normal
-_MIN_DARK_PIXELS = 4000
-_WIDE_RANGE, _MIN_RANGE = 2.0, 1.3  # brightest over dimmest bin
-_MIN_DARK = 0.05  # of the mean
-_MIN_DARK_GAIN, _MIN_DARK_GAIN_NARROW = 8.0, 40.0  # in χ², over χ² per degree of freedom
-_MAX_DARK_CHI2 = 3.0  # per degree of freedom
 
 # Saturation
 _MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE = 10, 5e-4
@@ -107,7 +93,7 @@ def image_warnings(
 
 
 def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -> Iterator[Caution]:
-    if dark := max(dark_level(image, usable), 0 if source is None else dark_level(source, usable)):
+    if dark := dark_level(image, usable, source):
         yield Caution(
             "dark-level",
             f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
@@ -159,78 +145,6 @@ def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -
             "from the source: the shift would be taken for a field; "
             "align source and image, or cut both to the same part of the beam (step 'crop')",
         )
-
-
-def dark_level(image: FloatArray, mask: BoolArray | None = None) -> float:
-    """Estimate an offset that was left in an image, as a share of its mean, from its noise.
-
-    The variance of counts is proportional to the signal, so it vanishes where the signal does
-    (photon transfer). Noise of reading moves that point below the offset, never above.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-    mask : ndarray of bool, shape (H, W), optional
-        True at usable pixels.
-
-    Returns
-    -------
-    float
-        0 unless the noise cannot be explained without an offset, by any sum of a constant
-        variance, one in proportion to the signal, and one to its square. That takes deep
-        shadows and noise of counting.
-    """
-    brightness, deviation = _local_noise(image, mask)
-    if brightness.size < _MIN_DARK_PIXELS:
-        return 0.0
-    mean = brightness.mean()
-    if not mean > 0:
-        return 0.0
-    order = order_by_value(brightness)
-    order = order[: int((1 - _BRIGHTEST_LEFT_OUT) * order.size)]
-    bins = np.array_split(order, _DARK_BINS)
-    levels = np.array([brightness[part].mean() for part in bins]) / mean
-    if not levels[0] > _MIN_DARK or levels[-1] < _MIN_RANGE * levels[0]:
-        return 0.0
-    variances = np.array([_clipped_variance(deviation[part]) for part in bins]) / mean**2
-    if not (variances > 0).all():
-        return 0.0
-    # Neighbouring differences share pixels: a third fewer count.
-    weights = np.sqrt(np.array([len(part) for part in bins]) / 3) / variances
-    powers = np.stack([np.ones_like(levels), levels, levels**2], axis=1)
-    without = nnls(powers * weights[:, None], variances * weights)[1] ** 2
-    # Weighted least squares of v = g (m - D).
-    line = np.stack([levels, -np.ones_like(levels)], axis=1) * weights[:, None]
-    (gain, offset), *_ = np.linalg.lstsq(line, variances * weights, rcond=None)
-    with_offset = float((((gain * levels - offset) - variances) ** 2 * weights**2).sum())
-    if not gain > 0:
-        return 0.0
-    dark = float(offset / gain)
-    chi2 = max(1.0, with_offset / (_DARK_BINS - 2))
-    is_wide = levels[-1] > _WIDE_RANGE * levels[0]
-    least = (_MIN_DARK_GAIN if is_wide else _MIN_DARK_GAIN_NARROW) * chi2
-    explained = chi2 < _MAX_DARK_CHI2 and without - with_offset > least
-    return dark if explained and dark > _MIN_DARK else 0.0
-
-
-def _local_noise(image: FloatArray, mask: BoolArray | None) -> tuple[FloatArray, FloatArray]:
-    """Mean of 3 × 3 pixels, and a deviation in which all but noise cancels, where usable."""
-    rows = max(1, image.size // _DARK_SAMPLES)  # of long images, lines far apart
-    starts = np.arange(0, image.shape[0] - 2, rows)
-    above, here, below = (image[starts + shift] for shift in range(3))
-    column_sums, bends = above + here + below, above - 2 * here + below
-    means = (column_sums[:, 2:] + column_sums[:, 1:-1] + column_sums[:, :-2]) / 9
-    deviations = np.abs(bends[:, 2:] - 2 * bends[:, 1:-1] + bends[:, :-2]) / 6
-    if mask is None or mask.all():
-        return means.ravel(), deviations.ravel()
-    inside = np.asarray(sliding_window_view(mask, (3, 3)).all(axis=(2, 3)))[starts]
-    return means[inside], deviations[inside]
-
-
-def _clipped_variance(deviations: FloatArray) -> float:
-    limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(deviations))
-    usual = deviations[deviations <= limit]
-    return float((usual**2).mean()) / _CLIPPED_VARIANCE
 
 
 def saturated_share(image: FloatArray, mask: BoolArray | None = None) -> float:
