@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.signal import oaconvolve
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting.priors import Prior
@@ -197,14 +197,15 @@ class Scene:
     def linear(self, unknowns: Unknowns, counts: list[IntArray]) -> Linear:
         """Return the scene to first order around unknowns."""
         shots = list(self._shots(unknowns, counts))
+        of_beam, of_frame = bool(self.beam_modes), bool(self.free_frames.any())
         jacobians = [
-            self.rays.jacobian(
-                *shot[1:],
-                of_beam=bool(self.beam_modes),
-                of_frame=shot[0] > 0 and bool(self.free_frames.any()),
-            )
+            self.rays.jacobian(*shot[1:], of_beam=of_beam, of_frame=shot[0] > 0 and of_frame)
             for shot in shots
         ]
+        if not of_beam and not of_frame:
+            columns = math.prod(self.rays.shape)
+            for jacobian in jacobians:
+                jacobian.resize(jacobian.shape[0], columns)
         return Linear(self, unknowns, jacobians, [self._bare(*shot) for shot in shots])
 
     def _shots(self, unknowns: Unknowns, counts: list[IntArray]) -> Iterator[_Shot]:
@@ -277,7 +278,8 @@ class Scene:
     def _spread_back(self, k: int, pull: FloatArray) -> FloatArray:
         width = self.psf[k]
         turned = width if isinstance(width, float) else width[::-1, ::-1]
-        return _spread(np.pad(pull, self.rays.beyond), turned)
+        padded = np.pad(pull, self.rays.beyond) if self.rays.beyond else pull
+        return _spread(padded, turned)
 
 
 @dataclass(frozen=True)
@@ -289,7 +291,8 @@ class Linear:
     scene, unknowns
         The scene and the unknowns around which it is linear.
     jacobians : list of csr_array
-        As `RayModel.jacobian` returns them, for each image.
+        As `RayModel.jacobian` returns them, for each image; without the beam's and the frame's
+        columns if neither is unknown.
     bare : list of ndarray
         The images without their gains.
     """
@@ -308,16 +311,18 @@ class Linear:
     def pushed(self, change: Unknowns) -> FloatArray:
         """Return the change of all residuals (f - I) / σ, to first order, shape (L, H, W)."""
         scene = self.scene
-        of_shape = scene._beam_shape(self.unknowns) * scene._modes(change.beam)
         potentials = scene.potentials(change)
-        gains = np.exp(self.unknowns.gains)
+        if self._has_others:
+            of_shape = self._beam_shape * scene._modes(change.beam)
         changes = np.empty_like(scene.images)
         for k, jacobian in enumerate(self.jacobians):
-            of_beam = scene.beams[k] * of_shape
-            columns = [potentials[k].ravel(), of_beam.ravel(), change.frames[k]]
-            landed = (jacobian @ np.concatenate(columns)).reshape(scene.rays.seen)
+            columns = potentials[k].ravel()
+            if self._has_others:
+                of_beam = scene.beams[k] * of_shape
+                columns = np.concatenate([columns, of_beam.ravel(), change.frames[k]])
+            landed = (jacobian @ columns).reshape(scene.rays.seen)
             bare = scene._spread(k, landed) + change.gains[k] * self.bare[k]
-            changes[k] = np.sqrt(scene.weights[k]) * gains[k] * bare
+            np.multiply(self._roots[k], bare, out=changes[k])
         return changes
 
     def pulled(self, residuals: FloatArray) -> Unknowns:
@@ -325,18 +330,37 @@ class Linear:
         scene = self.scene
         slope = self.unknowns.zeros()
         of_shape = np.zeros(scene.beams.shape[1:])
-        gains = np.exp(self.unknowns.gains)
-        for k, jacobian in enumerate(self.jacobians):
-            pull = gains[k] * np.sqrt(scene.weights[k]) * residuals[k]
+        for k, transposed in enumerate(self._transposed):
+            pull = self._roots[k] * residuals[k]
             slope.gains[k] = np.einsum("yx,yx", pull, self.bare[k])
-            columns = jacobian.T @ scene._spread_back(k, pull).ravel()
-            of_potential, of_beam, of_frame = np.split(columns, [math.prod(scene.rays.shape), -6])
+            columns = transposed @ scene._spread_back(k, pull).ravel()
+            of_potential, others = np.split(columns, [math.prod(scene.rays.shape)])
             psi = of_potential.reshape(scene.rays.shape)
             slope.potentials[:] += scene.strengths[k][:, None, None] * psi
-            of_shape += of_beam.reshape(of_shape.shape) * scene.beams[k]
-            slope.frames[k] = of_frame
-        slope.beam[:] = scene._of_modes(of_shape * scene._beam_shape(self.unknowns))
+            if self._has_others:
+                of_shape += others[:-6].reshape(of_shape.shape) * scene.beams[k]
+                slope.frames[k] = others[-6:]
+        if self._has_others:
+            slope.beam[:] = scene._of_modes(of_shape * self._beam_shape)
         return scene._only_free(slope)
+
+    @property
+    def _has_others(self) -> bool:
+        """Whether the Jacobians have columns for the beam and the frame."""
+        return self.jacobians[0].shape[1] > math.prod(self.scene.rays.shape)
+
+    @cached_property
+    def _transposed(self) -> list[csc_array]:
+        return [jacobian.T for jacobian in self.jacobians]
+
+    @cached_property
+    def _beam_shape(self) -> FloatArray:
+        return self.scene._beam_shape(self.unknowns)
+
+    @cached_property
+    def _roots(self) -> FloatArray:
+        """The gain over the standard deviation of the noise, shape (L, H, W)."""
+        return np.sqrt(self.scene.weights) * np.exp(self.unknowns.gains)[:, None, None]
 
 
 _Shot = tuple[int, FloatArray, IntArray, FloatArray, FloatArray]  # number, ψ, rays, beam, frame
