@@ -246,10 +246,14 @@ class Scene:
         frames = np.where(self.free_frames, slope.frames, 0.0)
         frames[0] = 0
         return slope._replace(
-            beam=np.where(self.prior.beam_weights > 0, slope.beam, 0.0),
+            beam=np.where(self._free_modes, slope.beam, 0.0),
             gains=slope.gains if self.free_gains else np.zeros_like(slope.gains),
             frames=frames,
         )
+
+    @cached_property
+    def _free_modes(self) -> BoolArray:
+        return np.asarray(self.prior.beam_weights > 0)
 
     @cached_property
     def _cosines(self) -> tuple[FloatArray, FloatArray]:

@@ -82,11 +82,10 @@ class Prior:
     def times(self, change: Unknowns) -> Unknowns:
         """Return the terms' Hessian times a change."""
         waves = dctn(change.potentials, axes=(1, 2), norm="ortho")
-        waves *= self.of_rough.sum(axis=1)
+        waves *= self._rough_weights
         slope = idctn(waves, axes=(1, 2), norm="ortho")
-        steps_y, steps_x = self._steps(change.potentials)
-        slope -= self.tie * np.diff(steps_y, axis=1, prepend=0, append=0)
-        slope -= self.tie * np.diff(steps_x, axis=2, prepend=0, append=0)
+        for axis, steps in enumerate(self._steps(change.potentials), 1):
+            slope -= self.tie * _differences(steps, axis)
         slope += self.tie * self._fading * change.potentials
         if self.fiducials is not None:
             weights = 1 / self.fiducials.errors[:, None] ** 2
@@ -107,8 +106,8 @@ class Prior:
         in_y, in_x = (rng.normal(size=steps.shape) for steps in (steps_y, steps_x))
         along_y, along_x = self._in_pad
         root = np.sqrt(self.tie)
-        potentials -= root * np.diff(in_y * along_y, axis=1, prepend=0, append=0)
-        potentials -= root * np.diff(in_x * along_x, axis=2, prepend=0, append=0)
+        potentials -= root * _differences(in_y * along_y, 1)
+        potentials -= root * _differences(in_x * along_x, 2)
         potentials += root * np.sqrt(self._fading) * rng.normal(size=potentials.shape)
         if self.fiducials is not None:
             errors = self.fiducials.errors[:, None]
@@ -132,6 +131,10 @@ class Prior:
         return KNOT**2 * self.smoothness[:, :, None, None] * powers
 
     @cached_property
+    def _rough_weights(self) -> FloatArray:
+        return np.asarray(self.of_rough.sum(axis=1))
+
+    @cached_property
     def wave_numbers(self) -> FloatArray:
         """k² of each cosine of the coefficients, px⁻²."""
         waves = [np.pi * np.arange(n) / (n * KNOT) for n in self.rays.shape]
@@ -143,7 +146,7 @@ class Prior:
         lowest = (np.pi / (max(self.rays.shape) * KNOT)) ** 2 + (0.2 / self.decay) ** 2
         # A fifth of the coefficients or so lies in the pad.
         tied = self.tie * (0.2 * squares + lowest)
-        return np.asarray(self.of_rough.sum(axis=1) + KNOT**2 * tied)
+        return np.asarray(self._rough_weights + KNOT**2 * tied)
 
     @cached_property
     def beam_weights(self) -> FloatArray:
@@ -182,7 +185,8 @@ class Prior:
 
     def _steps(self, potentials: FloatArray) -> tuple[FloatArray, FloatArray]:
         along_y, along_x = self._in_pad
-        return np.diff(potentials, axis=1) * along_y, np.diff(potentials, axis=2) * along_x
+        in_y = (potentials[:, 1:] - potentials[:, :-1]) * along_y
+        return in_y, (potentials[:, :, 1:] - potentials[:, :, :-1]) * along_x
 
     @cached_property
     def _splines_there(self) -> tuple[IntArray, IntArray, FloatArray]:
@@ -208,3 +212,14 @@ class Prior:
         total = np.zeros(self.rays.shape)
         np.add.at(total, (rows, columns), np.einsum("ncij,nc->nij", tables, pulls))
         potentials += self.strengths[:, None, None] * total
+
+
+def _differences(steps: FloatArray, axis: int) -> FloatArray:
+    """Differences of neighbours along an axis, with zeros beyond the ends."""
+    shape = list(steps.shape)
+    shape[axis] += 1
+    differences = np.zeros(shape)
+    along = differences.swapaxes(0, axis)
+    along[:-1] = steps.swapaxes(0, axis)
+    along[1:] -= steps.swapaxes(0, axis)
+    return differences

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +32,8 @@ class Unknowns(NamedTuple):
 
     def like(self, flat: FloatArray) -> Unknowns:
         """Return the same unknowns with the values of a flat array."""
-        ends = np.cumsum([part.size for part in self])[:-1]
-        parts = np.split(flat, ends)
+        ends = [0, *accumulate(part.size for part in self)]
+        parts = (flat[begin:end] for begin, end in pairwise(ends))
         return Unknowns(*(new.reshape(old.shape) for new, old in zip(parts, self, strict=True)))
 
     def only(self, numbers: Sequence[int]) -> Unknowns:
