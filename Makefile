@@ -20,7 +20,7 @@ CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/i
 	tests/test_cli.py tests/test_plotting.py tests/stack/test_lazy.py tests/stack/test_run.py \
 	tests/stack/test_statistics.py
 
-.PHONY: demo test coverage test-oldest docs gallery lint dist check-wheel format clean
+.PHONY: demo test test-pyside kernels coverage test-oldest docs gallery lint dist check-wheel format clean
 
 demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
@@ -32,12 +32,19 @@ docs: $(VENV)/installed-dev
 	GALLERY=$(GALLERY) $(BIN)/sphinx-build -W --keep-going -q docs build/docs
 	@echo "open build/docs/index.html"
 
-test: lint docs
+test: $(VENV)/installed-dev
 	@sh .ci/need-display
+	@$(MAKE) --no-print-directory -j3 lint docs kernels
 	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES)
-	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES) -q \
+	@$(MAKE) --no-print-directory -j2 check-wheel test-pyside
+
+test-pyside: $(VENV)/installed-dev
+	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest -q \
 		tests/napari/widgets/test_tools.py tests/napari/widgets/test_forms.py
-	@$(MAKE) --no-print-directory check-wheel
+
+# Compiled beforehand, so that not every process of the tests compiles them.
+kernels: $(VENV)/installed-dev
+	@$(BIN)/python -c "from napari_shadowinv.fitting.compilation import ensure_compiled; ensure_compiled()"
 
 coverage: $(VENV)/installed-dev
 	@sh .ci/need-display
